@@ -1,0 +1,28 @@
+"""The physics of a contact lattice in plain numpy: cells, contacts, drives, Bloch bands, finite chains."""
+
+from vipetsc.lattice.bloch import Band, BlochPoint, bloch, max_group_velocity, pass_bands
+from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
+from vipetsc.lattice.chain import Chain, log_clearances, spread_sites
+from vipetsc.lattice.contact import Bilinear, Contact, ContactLaw, Hertz, contact_stiffness
+from vipetsc.lattice.drive import ToneBurst
+
+__all__ = [
+    "Band",
+    "Bilinear",
+    "BlochPoint",
+    "Chain",
+    "Contact",
+    "ContactLaw",
+    "Hertz",
+    "Spring",
+    "ToneBurst",
+    "UnitCell",
+    "bloch",
+    "contact_stiffness",
+    "diatomic",
+    "four_band",
+    "log_clearances",
+    "max_group_velocity",
+    "pass_bands",
+    "spread_sites",
+]

@@ -1,0 +1,120 @@
+"""Bloch bands of a unit cell: frequencies, eigenvectors, group velocities, pass bands and gaps."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq, minimize_scalar
+
+from vipetsc.lattice.cell import UnitCell
+
+
+@dataclass(frozen=True)
+class BlochPoint:
+    """Solution of the Bloch problem; leading axes are those of ``wavenumber`` (rad per cell).
+
+    ``frequency`` (..., band) in rad/s, ``vectors`` (..., dof, band) mass-normalised, ``group_velocity``
+    (..., band) in cells/s.
+    """
+
+    wavenumber: np.ndarray
+    frequency: np.ndarray
+    vectors: np.ndarray
+    group_velocity: np.ndarray
+
+
+@dataclass(frozen=True)
+class Band:
+    """A pass band (1-based ``number``, lowest first) between two frequencies in rad/s."""
+
+    number: int
+    low: float
+    high: float
+
+
+def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
+    """Frequencies, eigenvectors and group velocities of ``cell`` at wavenumbers ``kappa`` (rad per cell).
+
+    Solves (K(kappa) - omega^2 M) u = 0; the group velocity is d omega/d kappa = u* K' u / (2 omega), taken
+    as the limit from kappa > 0 where omega = 0.
+    """
+    kappa = np.asarray(kappa, float)
+    at = np.where(np.abs(kappa) < 1e-7, 1e-7, kappa)
+    root = 1 / np.sqrt(np.asarray(cell.masses))
+    scale = root[:, None] * root[None, :]
+    squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)
+    frequency = np.sqrt(np.maximum(squared, 0))
+    near_squared, near = np.linalg.eigh(cell.stiffness_matrix(at) * scale)
+    slope = _stiffness_slope(cell, at) * scale
+    rise = np.einsum("...ij,...ik,...kj->...j", near.conj(), slope, near).real
+    group_velocity = rise / (2 * np.sqrt(np.maximum(near_squared, np.finfo(float).tiny)))
+    return BlochPoint(kappa, frequency, vectors * root[:, None], group_velocity)
+
+
+def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
+    k = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
+    for mass, offset, other, stiffness in cell.couplings():
+        k[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * kappa * offset)
+    return k
+
+
+def _frequency(cell: UnitCell, band: int, kappa: float) -> float:
+    return float(bloch(cell, kappa).frequency[band - 1])
+
+
+def _extremum(function, kappa: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    """Largest value of ``function`` over [0, pi] and where: the best grid point, refined."""
+    best = int(np.argmax(values))
+    bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, len(kappa) - 1)]
+    found = minimize_scalar(
+        lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10}
+    )
+    return (float(found.x), float(-found.fun)) if -found.fun > values[best] else (kappa[best], values[best])
+
+
+def pass_bands(cell: UnitCell, points: int = 721) -> list[Band]:
+    """Pass bands, lowest first; edges are the extremes over kappa in [0, pi], refined off the grid."""
+    kappa = np.linspace(0, np.pi, points)
+    frequency = bloch(cell, kappa).frequency
+    bands = []
+    for b in range(cell.dofs):
+        _, high = _extremum(lambda x, b=b: _frequency(cell, b + 1, x), kappa, frequency[:, b])
+        _, low = _extremum(lambda x, b=b: -_frequency(cell, b + 1, x), kappa, -frequency[:, b])
+        bands.append(Band(b + 1, max(-low, 0.0), high))
+    return bands
+
+
+def gaps(bands: list[Band]) -> list[tuple[float, float]]:
+    """Band gaps (low, high) in rad/s between consecutive pass bands; the region above is not one."""
+    return [(a.high, b.low) for a, b in itertools.pairwise(bands) if b.low > a.high]
+
+
+def max_group_velocity(cell: UnitCell, band: int, points: int = 721) -> tuple[float, float, float]:
+    """Where ``band`` (1-based) is fastest: wavenumber (rad per cell), frequency (rad/s), |v_g| (cells/s)."""
+
+    def speed(kappa: float) -> float:
+        return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
+
+    kappa = np.linspace(0, np.pi, points)
+    where, fastest = _extremum(speed, kappa, np.abs(bloch(cell, kappa).group_velocity[:, band - 1]))
+    return where, _frequency(cell, band, where), fastest
+
+
+def waves_at(cell: UnitCell, frequency: float, points: int = 721) -> list[tuple[int, float, float]]:
+    """Propagating waves of ``frequency`` (rad/s): (band, kappa in (0, pi), |v_g| in cells/s); [] in a gap."""
+    kappa = np.linspace(0, np.pi, points)
+    offset = bloch(cell, kappa).frequency - frequency
+    waves = []
+    for b in range(cell.dofs):
+        for i in np.nonzero(offset[:-1, b] * offset[1:, b] <= 0)[0]:
+            if offset[i, b] == 0 and i > 0:
+                continue
+            root = brentq(
+                lambda x, b=b: _frequency(cell, b + 1, x) - frequency, kappa[i], kappa[i + 1], xtol=1e-13
+            )
+            speed = float(abs(bloch(cell, root).group_velocity[b]))
+            waves.append((b + 1, root, speed))
+    return waves

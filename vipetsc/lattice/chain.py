@@ -1,0 +1,78 @@
+"""A finite lattice: how many cells, how it ends, which cells carry contacts, and its linear response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.linalg import spsolve
+
+from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.drive import ToneBurst
+
+Ends = Literal["fixed", "free", "periodic"]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """``cells`` unit cells in a row; contact ``sites`` are 0-based cells, ``clearances`` in m, one a site.
+
+    ``ends``: ``fixed`` puts a wall at either end, held by the inter-cell springs; ``free`` cuts those
+    springs; ``periodic`` joins the last cell to the first.
+    """
+
+    cell: UnitCell
+    cells: int
+    ends: Ends = "fixed"
+    sites: tuple[int, ...] = ()
+    clearances: tuple[float, ...] = ()
+
+    def stiffness_matrix(self) -> csc_matrix:
+        """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; needs little for <= 1e6."""
+        n, d = self.cells, self.cell.dofs
+        rows, columns, values = [], [], []
+        index = np.arange(n)
+        for mass, offset, other, stiffness in self.cell.couplings():
+            neighbour = index + offset
+            inside = (neighbour >= 0) & (neighbour < n)
+            if self.ends == "periodic":
+                neighbour, inside = neighbour % n, np.ones(n, bool)
+            held = np.ones(n, bool) if self.ends == "fixed" else inside
+            own = index * d + mass
+            rows += [own[held], own[inside]]
+            columns += [own[held], neighbour[inside] * d + other]
+            values += [np.full(held.sum(), stiffness), np.full(inside.sum(), -stiffness)]
+        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+        return coo_matrix(entries, shape=(n * d, n * d)).tocsc()
+
+    def masses(self) -> np.ndarray:
+        """Masses (cells dofs,) in kg, ordered cell by cell."""
+        return np.tile(np.asarray(self.cell.masses), self.cells)
+
+    def wave_scale(self, drive: ToneBurst, cell: int = 0, mass: int = 0, longest: int = 400) -> float:
+        """Displacement amplitude in m of the linear wave that ``drive`` makes; velocity is Om times that.
+
+        The largest steady response to the burst's peak force at the complex frequency Om (1 - i/Nc), whose
+        imaginary part stands for the finite burst. Scales exactly with the drive's amplitude. A lattice
+        longer than ``longest`` is cut there: the wave is evanescent at that frequency.
+        """
+        near = Chain(self.cell, min(self.cells, longest), self.ends)
+        at = cell if cell < near.cells // 2 else max(near.cells - (self.cells - cell), 0)
+        omega = drive.frequency * (1 - 1j / drive.cycles)
+        dynamic = near.stiffness_matrix() - diags(near.masses() * omega**2)
+        force = np.zeros(near.cells * self.cell.dofs, complex)
+        force[at * self.cell.dofs + mass] = 1.0
+        response = float(np.abs(spsolve(dynamic.tocsc(), force)).max())
+        return response * 2 * abs(drive.window_amplitude)
+
+
+def spread_sites(first: float, last: float, count: int) -> tuple[int, ...]:
+    """``count`` evenly spaced sites as 0-based cells, from the 1-based positions ``first`` to ``last``."""
+    return tuple(int(c) - 1 for c in np.round(np.linspace(first, last, count)))
+
+
+def log_clearances(first: float, last: float, count: int) -> tuple[float, ...]:
+    """``count`` clearances in m, log-spaced from the leading site's ``first`` to ``last``."""
+    return tuple(float(c) for c in np.geomspace(first, last, count))
