@@ -1,0 +1,1 @@
+"""Nonlinear normal modes of conservative systems with contacts: shooting, continuation, stability."""

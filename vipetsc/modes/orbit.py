@@ -1,0 +1,131 @@
+"""Arcs of orbits: state, sensitivities and contact changes after a given time, by the flow of one's choice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from vipetsc.modes import kernel
+from vipetsc.modes.system import System, contact_directions, direction
+
+
+class FlowError(RuntimeError):
+    """The flow could not cover the requested time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """A piece of an orbit of ``duration`` seconds.
+
+    ``start`` and ``end`` (2n,) hold displacements in m, then velocities in m/s; ``sensitivity`` (2n, 2n) is
+    d end/d start; ``acceleration`` (2, n) in m/s^2 at both ends; ``events`` (changes, 4) lists time in s,
+    contact, side (1 or -1) and kind (1 onset, -1 separation); ``closed`` the seconds with a contact closed.
+    """
+
+    duration: float
+    start: np.ndarray
+    end: np.ndarray
+    sensitivity: np.ndarray
+    acceleration: np.ndarray
+    events: np.ndarray
+    episodes: int
+    closed: float
+    steps: int
+
+    def blocks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The (n, n) blocks du/du0, du/dv0, dv/du0, dv/dv0 of the sensitivity."""
+        n = len(self.start) // 2
+        s = self.sensitivity
+        return s[:n, :n], s[:n, n:], s[n:, :n], s[n:, n:]
+
+
+class Flow:
+    """What every flow offers; a subclass gives its ``name`` and ``arc``.
+
+    Parameters
+    ----------
+    system
+        The system in motion.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+
+    @classmethod
+    def named(cls, name: str) -> type[Flow]:
+        """The flow called ``name``; raises KeyError for an unknown one."""
+        return {flow.name: flow for flow in cls.__subclasses__()}[name]
+
+    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
+        """The orbit from ``start`` (2n,) over ``duration`` seconds; ``period`` helps to choose steps.
+
+        Raises
+        ------
+        FlowError
+            If the time cannot be covered.
+        """
+        raise NotImplementedError
+
+    def finish(
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        sensitivity: np.ndarray,
+        duration: float,
+        events: np.ndarray,
+        closed: float,
+        steps: int,
+    ) -> Arc:
+        """An arc with the quantities that follow from the others."""
+        n, system = self.system.dofs, self.system
+        acceleration = np.array([-system.forces(z[:n]) / system.masses for z in (start, end)])
+        episodes = int(np.sum(system.gaps(start[:n]) > 0) + np.sum(events[:, 3] == 1))
+        return Arc(duration, start, end, sensitivity, acceleration, events, episodes, closed, steps)
+
+
+class Compiled(Flow):
+    """Dormand and Prince's 8(5,3) pair, landing on every contact change; see ``kernel``.
+
+    ``rtol`` is the error per step relative to the orbit's size, ``loose`` that of the sensitivities.
+    """
+
+    name = "compiled"
+
+    def __init__(self, system: System, rtol: float = 1e-13, loose: float = 1e-11, capacity: int = 2000) -> None:
+        super().__init__(system)
+        self.rtol, self.loose, self.capacity = rtol, loose, capacity
+        self._arrays = kernel_arrays(system)
+        self._pace = float(system.linear_modes()[0][-1])
+
+    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
+        """See ``Flow.arc``."""
+        n = self.system.dofs
+        y = np.hstack([np.asarray(start, float)[:, None], np.eye(2 * n)])
+        events = np.empty((self.capacity, 4))
+        pace = max(self._pace, 2 * np.pi / period)
+        status, count, closed, steps = kernel.flow(
+            y, duration, self.rtol, self.loose, pace, pace, *self._arrays, events
+        )
+        if status:
+            why = {1: "the step became too small", 2: f"more than {self.capacity} contact changes"}[status]
+            raise FlowError(f"the flow stopped after {count} contact changes in {duration:.6g} s: {why}")
+        return self.finish(start, y[:, 0].copy(), y[:, 1:].copy(), duration, events[:count].copy(), closed, steps)
+
+
+def kernel_arrays(system: System) -> tuple[np.ndarray, ...]:
+    """The system as the arrays that the compiled kernels take, in their order."""
+    law = [(p.clearance, p.law.stiffness, p.law.law.exponent) for p in system.contacts]
+    springs = [(s.quadratic, s.cubic) for s in system.springs]
+    spring_rows = [direction(s.start, s.end, system.dofs) for s in system.springs]
+    return (
+        1 / np.asarray(system.masses, float),
+        np.ascontiguousarray(system.stiffness, float),
+        contact_directions(system),
+        np.array(law).reshape(len(law), 3),
+        np.array(spring_rows).reshape(len(springs), system.dofs),
+        np.array(springs).reshape(len(springs), 2),
+    )

@@ -1,0 +1,195 @@
+"""A conservative system of masses, springs and contact pairs, with any number of degrees of freedom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from vipetsc.lattice import Chain, Contact, UnitCell
+
+
+@dataclass(frozen=True)
+class ContactPair:
+    """Contact between two masses (0-based), on both sides of a ``clearance`` in m.
+
+    ``host`` may be None for a contact with the ground; w = u_resonator - u_host.
+    """
+
+    host: int | None
+    resonator: int
+    clearance: float
+    law: Contact
+
+
+@dataclass(frozen=True)
+class SmoothSpring:
+    """A nonlinear spring of elongation z = u_end - u_start with the force ``quadratic`` z^2 + ``cubic`` z^3.
+
+    Units N/m^2 and N/m^3; ``start`` None is the ground. The linear part belongs into the stiffness matrix.
+    """
+
+    start: int | None
+    end: int
+    cubic: float = 0.0
+    quadratic: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """M u'' + K u + contact forces + smooth spring forces = 0.
+
+    Parameters
+    ----------
+    masses
+        (n,) in kg.
+    stiffness
+        (n, n) in N/m, symmetric.
+    contacts, springs
+        Contact pairs and smooth nonlinear springs.
+
+    Raises
+    ------
+    ValueError
+        If a mass is not positive, the stiffness is not symmetric, an index lies outside the system, a
+        clearance is not positive, or a contact dissipates: normal modes exist in conservative systems.
+    """
+
+    masses: np.ndarray
+    stiffness: np.ndarray
+    contacts: tuple[ContactPair, ...] = ()
+    springs: tuple[SmoothSpring, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.masses)
+        if not (np.all(np.isfinite(self.masses)) and np.all(np.asarray(self.masses) > 0)):
+            raise ValueError(f"masses {self.masses!r} must be positive (kg)")
+        if self.stiffness.shape != (n, n) or not np.allclose(self.stiffness, self.stiffness.T, rtol=1e-12):
+            raise ValueError(f"the stiffness must be a symmetric matrix of shape ({n}, {n})")
+        for pair in self.contacts:
+            if pair.clearance <= 0:
+                raise ValueError(f"clearance {pair.clearance!r} must be positive (m)")
+            if pair.law.restitution != 1:
+                raise ValueError(
+                    f"restitution {pair.law.restitution!r} dissipates; nonlinear normal modes need restitution = 1"
+                )
+        ends = [(p.host, p.resonator) for p in self.contacts] + [(s.start, s.end) for s in self.springs]
+        for start, end in ends:
+            if start == end or not all(i is None or 0 <= i < n for i in (start, end)):
+                raise ValueError(f"({start}, {end}) is not a pair of the system's {n} masses")
+
+    @classmethod
+    def assemble(
+        cls,
+        masses: Iterable[float],
+        springs: Iterable[tuple[int | None, int, float]],
+        contacts: Iterable[ContactPair] = (),
+        smooth: Iterable[SmoothSpring] = (),
+    ) -> System:
+        """A system from linear springs (start, end, stiffness in N/m); start None is the ground."""
+        masses = np.asarray(list(masses), float)
+        stiffness = np.zeros((len(masses), len(masses)))
+        for start, end, k in springs:
+            d = direction(start, end, len(masses))
+            stiffness += k * np.outer(d, d)
+        return cls(masses, stiffness, tuple(contacts), tuple(smooth))
+
+    @classmethod
+    def from_chain(cls, chain: Chain, law: Contact) -> System:
+        """The finite lattice ``chain`` with its contact sites, as one system (small chains: dense)."""
+        d, cell = chain.cell.dofs, chain.cell
+        pairs = (
+            ContactPair(site * d + cell.host, site * d + cell.resonator, clearance, law)
+            for site, clearance in zip(chain.sites, chain.clearances, strict=True)
+        )
+        return cls(chain.masses(), chain.stiffness_matrix().toarray(), tuple(pairs))
+
+    @classmethod
+    def reduced(cls, cell: UnitCell, clearance: float, law: Contact) -> System:
+        """The paper's 2-DoF model of a cell's contact pair (Sec. IV); masses are (host, resonator).
+
+        Each of the host's springs to other masses is shared between its two masses: held at its middle it
+        has twice its stiffness, and the paper takes half of the total. The resonator's likewise.
+        """
+        ground = {cell.host: 0.0, cell.resonator: 0.0}
+        between = 0.0
+        for mass, offset, other, stiffness in cell.couplings():
+            if offset == 0 and {mass, other} == set(ground):
+                between += stiffness / 2  # couplings lists every spring from both ends
+            elif mass in ground:
+                ground[mass] += 2 * stiffness / 2
+        springs = [(None, 0, ground[cell.host]), (0, 1, between), (None, 1, ground[cell.resonator])]
+        masses = (cell.masses[cell.host], cell.masses[cell.resonator])
+        return cls.assemble(masses, springs, (ContactPair(0, 1, clearance, law),))
+
+    @property
+    def dofs(self) -> int:
+        """Number of degrees of freedom."""
+        return len(self.masses)
+
+    @property
+    def odd(self) -> bool:
+        """Whether all forces change sign with the displacement."""
+        return all(s.quadratic == 0 for s in self.springs)
+
+    def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) without contact."""
+        squared, shapes = eigh(self.stiffness, np.diag(self.masses))
+        return np.sqrt(np.maximum(squared, 0)), shapes * np.sign(shapes[np.abs(shapes).argmax(0), range(self.dofs)])
+
+    def gaps(self, u: np.ndarray) -> np.ndarray:
+        """|w| - clearance in m of every contact at displacements ``u`` (..., n); shape (..., contacts)."""
+        d = contact_directions(self)
+        return np.abs(u @ d.T) - np.array([p.clearance for p in self.contacts])
+
+    def forces(self, u: np.ndarray) -> np.ndarray:
+        """Restoring forces (n,) in N at displacements ``u`` (n,) in m."""
+        force = self.stiffness @ u
+        for d, pair in zip(contact_directions(self), self.contacts, strict=True):
+            force = force + d * pair.law.force(d @ u, pair.clearance)
+        for s in self.springs:
+            d = direction(s.start, s.end, self.dofs)
+            z = d @ u
+            force = force + d * (s.quadratic * z**2 + s.cubic * z**3)
+        return force
+
+    def energy(self, u: np.ndarray, v: np.ndarray) -> float:
+        """Kinetic and potential energy in J at displacements ``u`` and velocities ``v`` (n,)."""
+        total = 0.5 * (self.masses * v) @ v + 0.5 * u @ self.stiffness @ u
+        for d, pair in zip(contact_directions(self), self.contacts, strict=True):
+            total += pair.law.potential(d @ u, pair.clearance)
+        for s in self.springs:
+            z = direction(s.start, s.end, self.dofs) @ u
+            total += s.quadratic * z**3 / 3 + s.cubic * z**4 / 4
+        return float(total)
+
+    def grazing_energy(self, mode: int) -> float:
+        """Energy in J at which linear mode ``mode`` (0-based) first touches a contact; inf if it never does."""
+        omega, shapes = self.linear_modes()
+        reach = np.abs(contact_directions(self) @ shapes[:, mode])
+        amplitude = [p.clearance / r for p, r in zip(self.contacts, reach, strict=True) if r > 0]
+        return 0.5 * omega[mode] ** 2 * min(amplitude) ** 2 if amplitude else float("inf")
+
+    def closed_frequencies(self) -> np.ndarray:
+        """Frequencies (n,) in rad/s with every contact closed and no clearance: the bilinear law's limit."""
+        stiffness = self.stiffness.copy()
+        for d, pair in zip(contact_directions(self), self.contacts, strict=True):
+            stiffness += pair.law.stiffness * np.outer(d, d)
+        return np.sqrt(eigh(stiffness, np.diag(self.masses), eigvals_only=True))
+
+
+def direction(start: int | None, end: int, dofs: int) -> np.ndarray:
+    """The row (n,) that turns displacements into the elongation u_end - u_start."""
+    row = np.zeros(dofs)
+    row[end] = 1.0
+    if start is not None:
+        row[start] = -1.0
+    return row
+
+
+def contact_directions(system: System) -> np.ndarray:
+    """Rows (contacts, n) with w = rows @ u."""
+    rows = [direction(p.host, p.resonator, system.dofs) for p in system.contacts]
+    return np.array(rows).reshape(len(rows), system.dofs)
