@@ -1,0 +1,228 @@
+"""Pseudo-arclength continuation as an iterator over points; the caller owns the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vipetsc.modes.chart import Chart, Grazing, Relative
+from vipetsc.modes.point import Point
+from vipetsc.modes.shooting import Attempt, Corrector, Shooting
+
+
+class ContinuationError(RuntimeError):
+    """The branch cannot go on; the message says where, why, and which option to turn."""
+
+
+@dataclass(frozen=True)
+class Guards:
+    """Bounds on one step that keep a branch from jumping to another arc; infinity switches one off.
+
+    Residuals cannot tell a jump: both arcs satisfy the equations to rounding.
+
+    Parameters
+    ----------
+    half_trace
+        Change of asinh(c) of every Floquet half-trace c.
+    contacts
+        Change of the number of contact episodes of the arc.
+    corrector
+        Length of the correction over the step's length.
+    turn
+        Angle in rad between consecutive tangents.
+    """
+
+    half_trace: float = 0.5
+    contacts: float = 1
+    corrector: float = 0.2
+    turn: float = 0.4
+
+    @classmethod
+    def off(cls) -> Guards:
+        """Ordinary step control: Newton's convergence alone decides."""
+        return cls(np.inf, np.inf, np.inf, np.inf)
+
+
+@dataclass(frozen=True)
+class StepControl:
+    """How a branch is followed.
+
+    ``first``, ``smallest`` and ``largest`` steps are in units of the chart (relative changes); the branch ends
+    outside ``energy`` (J), outside ``frequency`` (Hz) or after ``points`` points. ``chart`` is ``relative``, ``logarithmic``,
+    ``grazing`` or ``auto`` (grazing near a contact at the arc's start, relative elsewhere).
+    """
+
+    first: float = 1e-3
+    smallest: float = 1e-13
+    largest: float = 0.1
+    growth: float = 2.0
+    points: int = 5000
+    energy: tuple[float, float] = (0.0, np.inf)
+    frequency: tuple[float, float] = (0.0, np.inf)
+    chart: str = "relative"
+    guards: Guards = field(default_factory=Guards)
+
+
+class Continuation:
+    """Iterates over the points of a branch, from ``start`` in the direction of growing or falling energy.
+
+    Each point is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended. The
+    iterator's whole state is its last point and the next step, so that a stored branch can be resumed.
+
+    Raises
+    ------
+    ContinuationError
+        While iterating, if the step falls below the smallest or the tangent is degenerate.
+    """
+
+    def __init__(
+        self,
+        corrector: Corrector,
+        start: Point,
+        control: StepControl,
+        direction: int = 1,
+        step: float | None = None,
+    ) -> None:
+        self.corrector, self.problem, self.control = corrector, corrector.problem, control
+        self.point = start
+        if start.tangent is None:
+            self.point = replace(start, tangent=first_tangent(corrector, start, direction))
+        self.step = control.first if step is None else step
+        self.ending = "not finished"
+        self.rejected: list[str] = []
+
+    def __iter__(self) -> Iterator[Point]:
+        for _ in range(self.control.points):
+            self.point = self._next()
+            yield self.point
+            low, high = self.control.energy
+            slow, fast = self.control.frequency
+            if not low <= self.point.energy <= high:
+                self.ending = f"left the energy range {low:g} to {high:g} J"
+                return
+            if not slow <= self.point.frequency <= fast:
+                self.ending = f"left the frequency range {slow:g} to {fast:g} Hz"
+                return
+        self.ending = f"{self.control.points} points reached: raise nnm.points to go on"
+
+    def chart(self, point: Point) -> Chart:
+        """The unknowns used for the step that leaves ``point``."""
+        return chart_at(self.problem, self.control.chart, point)
+
+    def _next(self) -> Point:
+        last = self.point
+        chart = self.chart(last)
+        xi = chart.encode(last.x, last.period)
+        tangent = unit(np.linalg.solve(chart.derivative(xi), last.tangent))
+        last_attempt, why = None, "no step tried"
+        while self.step >= self.control.smallest:
+            attempt = self.corrector.solve(chart, xi + self.step * tangent, tangent, tangent @ xi + self.step)
+            if not attempt.converged:
+                last_attempt, why = attempt, f"no convergence ({attempt.reason})"
+                self.step *= 0.4
+                continue
+            point, strain, what = self._judge(last, chart, xi, tangent, attempt)
+            if strain <= 1.0:
+                effort = max(strain / 0.7, attempt.newton / 5, 1 / self.control.growth)
+                self.step = min(self.step / effort, self.control.largest)
+                return point
+            last_attempt, why = attempt, what
+            self.step *= min(max(0.8 / strain, 0.1), 0.7)
+        raise ContinuationError(failure(last, why, last_attempt, self.control))
+
+    def _judge(
+        self, last: Point, chart: Chart, xi: np.ndarray, tangent: np.ndarray, attempt: Attempt
+    ) -> tuple[Point, float, str]:
+        """The corrected point, how far it strains the guards (1 is the bound), and which guard most."""
+        guards = self.control.guards
+        direction = null_vector(self.corrector.matrix(attempt.xi)[:-1])
+        turn = direction @ tangent
+        if turn < 0:
+            direction, turn = -direction, -turn
+        point = Point.of(
+            self.problem,
+            attempt,
+            chart,
+            tangent=chart.derivative(attempt.xi) @ direction,
+            index=last.index + 1,
+            step=self.step,
+        )
+        strains = {
+            "the half-trace changes too much": half_trace_change(last, point) / guards.half_trace,
+            "more than one contact appears or goes": abs(point.episodes - last.episodes) / guards.contacts,
+            "the corrector goes too far": np.linalg.norm(attempt.xi - xi - self.step * tangent)
+            / self.step
+            / guards.corrector,
+            "the branch turns too sharply": np.arccos(min(turn, 1.0)) / guards.turn,
+        }
+        worst = max(strains, key=strains.get)
+        if worst.startswith("more") and strains[worst] <= 1:  # one contact more is no reason to slow down
+            others = {k: v for k, v in strains.items() if k != worst}
+            worst = max(others, key=others.get)
+        return point, float(strains[worst]), worst
+
+
+def chart_at(problem: Shooting, name: str, point: Point) -> Chart:
+    """The chart called ``name`` at a point; ``auto`` is grazing within 5 % of it and relative elsewhere."""
+    if name == "auto":
+        gaps = problem.system.gaps(point.x) if problem.map.start == "rest" else np.array([np.inf])
+        clearances = np.array([p.clearance for p in problem.system.contacts])
+        near = len(clearances) > 0 and np.abs(gaps / clearances).min() < 0.05
+        return (Grazing if near else Relative)(problem.system, point.x, point.period)
+    return Chart.named(name)(problem.system, point.x, point.period)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """The vector over its length."""
+    return vector / np.linalg.norm(vector)
+
+
+def null_vector(matrix: np.ndarray) -> np.ndarray:
+    """Unit null vector (n + 1,) of an (n, n + 1) matrix."""
+    return np.linalg.svd(matrix)[2][-1]
+
+
+def half_trace_change(a: Point, b: Point) -> float:
+    """Largest change of asinh(c) over the half-traces of two points; 0 for one degree of freedom."""
+    change = np.arcsinh(a.half_traces) - np.arcsinh(b.half_traces)
+    return float(np.abs(change).max(initial=0.0))
+
+
+def first_tangent(corrector: Corrector, start: Point, direction: int) -> np.ndarray:
+    """Tangent d(x, period) at a corrected point, towards growing (+1) or falling (-1) energy.
+
+    Raises
+    ------
+    ContinuationError
+        If the point is a branch point, where the tangent is not unique.
+    """
+    problem = corrector.problem
+    chart = Relative(problem.system, start.x, start.period)
+    xi = chart.encode(start.x, start.period)
+    matrix = problem.jacobian(problem.arc(start.x, start.period)) @ chart.derivative(xi)
+    values = np.linalg.svd(matrix)[1]
+    if values[-1] < 1e-12 * values[0]:
+        raise ContinuationError(
+            f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values {values}; "
+            "start elsewhere (nnm.start_energy) or switch branches there"
+        )
+    tangent = chart.derivative(xi) @ null_vector(matrix)
+    rise = problem.energy_gradient(start.x) @ tangent[:-1]
+    return tangent * (np.sign(rise) * direction or direction)
+
+
+def failure(last: Point, why: str, attempt: Attempt | None, control: StepControl) -> str:
+    """The message of a step that became too small: where, why, the residuals, the option to turn."""
+    history = " ".join(f"{r:.1e}" for r in attempt.history) if attempt else "none"
+    knob = {
+        "the half": "nnm.guards.half_trace",
+        "more tha": "nnm.guards.contacts",
+        "the corr": "nnm.guards.corrector",
+        "the bran": "nnm.guards.turn",
+    }.get(why[:8], "nnm.max_newton or nnm.tolerance")
+    return (
+        f"step below {control.smallest:g} after point {last.index} (E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): "
+        f"{why}; residuals of the last attempt: {history}; turn nnm.smallest_step or {knob}"
+    )

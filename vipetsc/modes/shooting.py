@@ -1,0 +1,217 @@
+"""Shooting: a periodic orbit as a boundary value problem over a part of its period, solved by PETSc's SNES."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from vipetsc.modes.chart import Chart
+from vipetsc.modes.orbit import Arc, Flow, FlowError
+
+Section = Literal["rest", "centre"]
+
+
+@dataclass(frozen=True)
+class ShootingMap:
+    """Where an arc starts and ends, and what fraction of the period it takes.
+
+    ``rest`` is v = 0, ``centre`` is u = 0. An odd system's symmetric orbit goes from rest to the centre in a
+    quarter period; any reversible one from rest to rest in a half.
+    """
+
+    name: str
+    start: Section
+    end: Section
+    fraction: float
+
+
+MAPS = {
+    m.name: m
+    for m in (
+        ShootingMap("quarter", "rest", "centre", 0.25),
+        ShootingMap("half", "rest", "rest", 0.5),
+        ShootingMap("whole", "rest", "rest", 1.0),
+        ShootingMap("half-centre", "centre", "centre", 0.5),
+    )
+}
+
+
+class Shooting:
+    """Periodic orbits of ``flow.system``: initial values x (n,) and period are sought.
+
+    x are displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre.
+
+    Raises
+    ------
+    ValueError
+        If the map needs an odd system and the system is not.
+    """
+
+    def __init__(self, flow: Flow, shooting_map: ShootingMap) -> None:
+        if "centre" in (shooting_map.start, shooting_map.end) and not flow.system.odd:
+            raise ValueError(
+                f"the {shooting_map.name} map needs forces that change sign with the displacement; "
+                "this system's do not: use map = 'half'"
+            )
+        self.flow, self.system, self.map = flow, flow.system, shooting_map
+
+    def arc(self, x: np.ndarray, period: float) -> Arc:
+        """The arc from initial values ``x``; raises FlowError where the flow fails."""
+        start = np.zeros(2 * self.system.dofs)
+        start[self._part(self.map.start, free=True)] = x
+        return self.flow.arc(start, self.map.fraction * period, period)
+
+    def unknowns(self, arc: Arc) -> np.ndarray:
+        """The initial values (n,) of an arc."""
+        return arc.start[self._part(self.map.start, free=True)]
+
+    def residual(self, arc: Arc) -> np.ndarray:
+        """What should vanish at the arc's end (n,): displacements in m or velocities in m/s."""
+        return arc.end[self._part(self.map.end, free=False)]
+
+    def jacobian(self, arc: Arc) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
+        rows, columns = self._part(self.map.end, free=False), self._part(self.map.start, free=True)
+        rate = np.append(arc.end[self.system.dofs :], arc.acceleration[1])[rows]
+        return np.column_stack([arc.sensitivity[rows, columns], self.map.fraction * rate])
+
+    def residual_scale(self, size: float, period: float) -> float:
+        """Size of a residual that is as large as initial values of ``size``."""
+        if self.map.start == self.map.end:
+            return size
+        return size * 2 * np.pi / period if self.map.end == "rest" else size
+
+    def energy(self, x: np.ndarray) -> float:
+        """Energy in J of the orbit with initial values ``x``."""
+        zero = np.zeros_like(x)
+        return self.system.energy(x, zero) if self.map.start == "rest" else self.system.energy(zero, x)
+
+    def energy_gradient(self, x: np.ndarray) -> np.ndarray:
+        """dE/dx (n,)."""
+        return self.system.forces(x) if self.map.start == "rest" else self.system.masses * x
+
+    def _part(self, section: Section, free: bool) -> slice:
+        """The half of the state that is free, or zero, on a section."""
+        n = self.system.dofs
+        return slice(0, n) if (section == "rest") == free else slice(n, 2 * n)
+
+
+@dataclass(eq=False)
+class Attempt:
+    """What a corrector did: ``history`` of residual norms, and ``reason`` why it stopped."""
+
+    converged: bool
+    reason: str
+    history: list[float] = field(default_factory=list)
+    xi: np.ndarray | None = None
+    arc: Arc | None = None
+
+    @property
+    def newton(self) -> int:
+        """Newton steps taken."""
+        return max(len(self.history) - 1, 0)
+
+
+class Corrector:
+    """Newton's method (PETSc SNES) for the shooting equations and one more linear row.
+
+    Parameters
+    ----------
+    problem
+        The shooting problem.
+    tolerance
+        Scaled residual at which an orbit counts as found.
+    step_tolerance
+        Newton step (of unknowns of order one) below which rounding allows no more.
+    max_newton
+        Newton steps allowed.
+
+    PETSc options take the prefix ``nnm_``, for example ``-nnm_snes_monitor``.
+    """
+
+    def __init__(
+        self, problem: Shooting, tolerance: float = 1e-13, step_tolerance: float = 1e-14, max_newton: int = 7
+    ) -> None:
+        self.problem, self.tolerance, self.step_tolerance = problem, tolerance, step_tolerance
+        size = problem.system.dofs + 1
+        self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
+        self._residual = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
+        self._xi = self._residual.duplicate()
+        self._matrix = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
+        self._matrix.setUp()
+        snes.setOptionsPrefix("nnm_")
+        snes.setFunction(self._function, self._residual)
+        snes.setJacobian(self._jacobian, self._matrix)
+        snes.setTolerances(max_it=max_newton)
+        snes.setConvergenceTest(self._test)
+        snes.getKSP().setType("preonly")
+        snes.getKSP().getPC().setType("lu")
+        options = PETSc.Options("nnm_")
+        if not options.hasName("snes_linesearch_type"):
+            options["snes_linesearch_type"] = "basic"  # step control is the continuation's business
+        snes.setFromOptions()
+        self._equation: tuple[Chart, np.ndarray, float] | None = None
+        self._last: tuple[np.ndarray, Arc] | None = None
+        self._history: list[float] = []
+
+    def solve(self, chart: Chart, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        """Solve shooting(xi) = 0 and row . xi = value, starting from ``guess`` (n + 1,)."""
+        self._equation, self._last, self._history = (chart, row, value), None, []
+        self._xi.setArray(guess)
+        try:
+            self._snes.solve(None, self._xi)
+        except FlowError as error:
+            return Attempt(False, str(error), self._history)
+        reason = self._snes.getConvergedReason()
+        name = _REASONS.get(reason, str(reason))
+        xi = self._xi.getArray().copy()
+        return Attempt(reason > 0, name, self._history, xi, self._arc(xi))
+
+    def _arc(self, xi: np.ndarray) -> Arc:
+        if self._last is None or not np.array_equal(self._last[0], xi):
+            self._last = xi.copy(), self.problem.arc(*self._equation[0].decode(xi))
+        return self._last[1]
+
+    def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        chart, row, value = self._equation
+        xi = x.getArray(readonly=True)
+        if not np.all(np.isfinite(xi)) or chart.decode(xi)[1] <= 0:
+            raise FlowError("Newton left the domain: the period is not positive")
+        scale = self.problem.residual_scale(chart.size, chart.period)
+        f.setArray(np.append(self.problem.residual(self._arc(xi)) / scale, row @ xi - value))
+
+    def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
+        matrix.getDenseArray()[:] = self.matrix(x.getArray(readonly=True))
+        matrix.assemble()
+
+    def matrix(self, xi: np.ndarray) -> np.ndarray:
+        """The scaled Jacobian (n + 1, n + 1) at ``xi``; its last row is the linear one."""
+        chart, row, _ = self._equation
+        scale = self.problem.residual_scale(chart.size, chart.period)
+        shooting = self.problem.jacobian(self._arc(xi)) @ chart.derivative(xi) / scale
+        return np.vstack([shooting, row])
+
+    def _test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | bool:
+        _, step, residual = norms
+        self._history.append(residual)
+        reasons = PETSc.SNES.ConvergedReason
+        if not np.isfinite(residual):
+            return reasons.DIVERGED_FNORM_NAN
+        if residual <= self.tolerance:
+            return reasons.CONVERGED_FNORM_ABS
+        if iteration and step <= self.step_tolerance:
+            return reasons.CONVERGED_SNORM_RELATIVE
+        if residual > 1e3 * max(self._history[0], 1e-3):
+            return reasons.DIVERGED_DTOL
+        return reasons.ITERATING
+
+
+_REASONS = {
+    value: name.lower().replace("_", " ")
+    for name, value in vars(PETSc.SNES.ConvergedReason).items()
+    if name.startswith(("CONVERGED", "DIVERGED"))
+}
