@@ -36,8 +36,8 @@ class Guards:
 
     half_trace: float = 0.5
     contacts: float = 1
-    corrector: float = 0.2
-    turn: float = 0.4
+    corrector: float = 0.05
+    turn: float = 0.2
 
     @classmethod
     def off(cls) -> Guards:
@@ -185,9 +185,15 @@ def null_vector(matrix: np.ndarray) -> np.ndarray:
 
 
 def half_trace_change(a: Point, b: Point) -> float:
-    """Largest change of asinh(c) over the half-traces of two points; 0 for one degree of freedom."""
-    change = np.arcsinh(a.half_traces) - np.arcsinh(b.half_traces)
-    return float(np.abs(change).max(initial=0.0))
+    """Distance between the sets of asinh(c) of two points: no half-trace is further from the other set.
+
+    Half-traces may meet and turn into a complex pair, so that they have no lasting order. 0 for one degree of
+    freedom.
+    """
+    distance = np.abs(np.arcsinh(a.half_traces)[:, None] - np.arcsinh(b.half_traces)[None, :])
+    if not distance.size:
+        return 0.0
+    return float(max(distance.min(axis=0).max(), distance.min(axis=1).max()))
 
 
 def first_tangent(corrector: Corrector, start: Point, direction: int) -> np.ndarray:
