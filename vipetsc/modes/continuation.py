@@ -190,10 +190,16 @@ def half_trace_change(a: Point, b: Point) -> float:
     Half-traces may meet and turn into a complex pair, so that they have no lasting order. 0 for one degree of
     freedom.
     """
-    distance = np.abs(np.arcsinh(a.half_traces)[:, None] - np.arcsinh(b.half_traces)[None, :])
+    distance = np.abs(_squashed(a.half_traces)[:, None] - _squashed(b.half_traces)[None, :])
     if not distance.size:
         return 0.0
     return float(max(distance.min(axis=0).max(), distance.min(axis=1).max()))
+
+
+def _squashed(c: np.ndarray) -> np.ndarray:
+    """asinh of the modulus with the number's own phase: asinh itself jumps on the imaginary axis."""
+    size = np.maximum(np.abs(c), np.finfo(float).tiny)
+    return c * (np.arcsinh(size) / size)
 
 
 def first_tangent(corrector: Corrector, start: Point, direction: int) -> np.ndarray:
