@@ -1,0 +1,1 @@
+"""A lattice in motion, on PETSc."""
