@@ -36,8 +36,12 @@ class CaseError(ValueError):
 
     def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
         self.problems = list(problems)
+        self.source = source
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
         super().__init__(f"{source}: {count}\n" + "\n".join(f"  {p}" for p in self.problems))
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.problems, self.source)
 
 
 def _number(value: Any) -> Any:
