@@ -99,7 +99,7 @@ def dispersion(
     Dispersion
         On kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
     """
-    t, x = velocity[samples, cells, 0].shape
+    t, x = (len(range(n)[window]) for n, window in zip(velocity.shape, (samples, cells), strict=False))
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
     frequency = frequency[frequency <= highest]
