@@ -146,9 +146,7 @@ def _arrival(run: RunFile, kinetic: np.ndarray) -> Arrival:
     return Arrival(front_arrival(kinetic[:, site]), reason)
 
 
-def _put(
-    group: h5py.Group, name: str, values: object, units: str, long_name: str, *dims: str
-) -> h5py.Dataset:
+def _put(group: h5py.Group, name: str, values: object, units: str, long_name: str, *dims: str) -> h5py.Dataset:
     """Write ``values`` over the named dimensions; without any, an array becomes a dimension scale itself."""
     data = group.create_dataset(name, data=values)
     data.attrs["units"], data.attrs["long_name"] = units, long_name
