@@ -200,9 +200,7 @@ def _with_preset(table: dict[str, Any]) -> dict[str, Any]:
 
 def _resolved(sections: dict[str, Any]) -> dict[str, dict]:
     """Every choice made: sites and clearances listed; stiffness, frequency and times as numbers."""
-    tables = {
-        name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()
-    }
+    tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()}
     lattice, contacts, drive, time = (sections[n] for n in ("lattice", "contacts", "drive", "time"))
     cell = unit_cell_of(lattice)
 

@@ -69,9 +69,7 @@ def _extremum(function, kappa: np.ndarray, values: np.ndarray) -> tuple[float, f
     """Largest value of ``function`` over [0, pi] and where: the best grid point, refined."""
     best = int(np.argmax(values))
     bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, len(kappa) - 1)]
-    found = minimize_scalar(
-        lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10}
-    )
+    found = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
     return (float(found.x), float(-found.fun)) if -found.fun > values[best] else (kappa[best], values[best])
 
 
