@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -13,11 +15,11 @@ import petsc4py
 
 petsc4py.init(["pytest", "-no_signal_handler"])
 
+from mpi4py import MPI
+
 import h5py
 import numpy as np
 import pytest
-
-from mpi4py import MPI
 
 from vipetsc.case import Case
 
@@ -61,3 +63,22 @@ def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]
     for name, values in first.items():
         assert values.shape == second[name].shape, name
         assert values.tobytes() == second[name].tobytes(), name
+
+
+def clean_environment() -> dict[str, str]:
+    """The environment without what this process's own MPI put into it: a child may then be an mpirun."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "PRTE", "OMPI_UNIVERSE"))}
+    return kept | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+
+
+@pytest.fixture
+def vipetsc():
+    """Call the program as a user types it: ``vipetsc(ranks, "run", ...)`` returns the ended process."""
+
+    def call(ranks: int, *arguments: object, timeout: float = 120, **options) -> subprocess.CompletedProcess:
+        launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
+        command = [*launcher, sys.executable, "-m", "vipetsc", *map(str, arguments)]
+        options = {"capture_output": True, "text": True, "env": clean_environment()} | options
+        return subprocess.run(command, timeout=timeout, check=False, **options)
+
+    return call

@@ -286,7 +286,11 @@ def test_the_linear_ridge_lies_on_the_bloch_branch(folder):
     from vipetsc.spectra import fourier
 
     case = Case.from_table(
-        {"lattice": {"preset": "diatomic", "reading": "printed"}, "contacts": {"sites": 0}, "drive": {"amplitude": 0.1}}
+        {
+            "lattice": {"preset": "diatomic", "reading": "printed"},
+            "contacts": {"sites": 0},
+            "drive": {"amplitude": 0.1},
+        }
     )
     simulate(case, folder / "run")
     data = datasets(folder / "run" / "run.h5")

@@ -42,9 +42,7 @@ def dispersion(run: RunFile, analysis: h5py.File | None) -> Figure:
         axes.set(xlabel="Wavenumber κ (π rad/cell)", xlim=(0, wavenumber[-1] / np.pi), ylim=(0, top / 1e3))
         style.letter(axes, f"({'abc'[i]}) {PANELS[name]}")
     maps[0].set_ylabel("Angular frequency ω (krad/s)")
-    figure.colorbar(
-        image, ax=maps, label="Mean kinetic energy per bin (J)", location="right", pad=0.01, extend="min"
-    )
+    figure.colorbar(image, ax=maps, label="Mean kinetic energy per bin (J)", location="right", pad=0.01, extend="min")
     _sums(side, cell, frequency[kept], spectra, run.model.drive.frequency)
     style.letter(side, f"({'abc'[len(shown)]}) Sum over κ")
     return figure
@@ -65,9 +63,7 @@ def _sums(axes: Axes, cell: UnitCell, frequency: np.ndarray, spectra: dict, driv
         total = spectrum.sum(axis=0)
         largest = max(largest, total.max())
         label = PANELS[name].split()[0].lower()
-        axes.plot(
-            np.maximum(total, 1e-300), frequency / 1e3, color=colours.get(name, style.BLACK), lw=0.7, label=label
-        )
+        axes.plot(np.maximum(total, 1e-300), frequency / 1e3, color=colours.get(name, style.BLACK), lw=0.7, label=label)
     axes.axhline(driven / 1e3, color=style.BLACK, lw=0.6, ls=":")
     largest = largest or 1.0
     axes.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")
