@@ -200,9 +200,7 @@ def _with_preset(table: dict[str, Any]) -> dict[str, Any]:
 
 def _resolved(sections: dict[str, Any]) -> dict[str, dict]:
     """Every choice made: sites and clearances listed; stiffness, frequency and times as numbers."""
-    tables = {
-        name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()
-    }
+    tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()}
     lattice, contacts, drive, time = (sections[n] for n in ("lattice", "contacts", "drive", "time"))
     cell = unit_cell_of(lattice)
 
@@ -216,9 +214,7 @@ def _resolved(sections: dict[str, Any]) -> dict[str, dict]:
     tables["contacts"] |= {"sites": sites, "clearance": list(clearance)}
     if contacts.stiffness is None and contacts.modulus is not None:
         stiffness = contact_stiffness(contacts.modulus, contacts.radius, contacts.poisson)
-        tables["contacts"] = {
-            k: v for k, v in tables["contacts"].items() if k not in ("modulus", "radius", "poisson")
-        }
+        tables["contacts"] = {k: v for k, v in tables["contacts"].items() if k not in ("modulus", "radius", "poisson")}
         tables["contacts"]["stiffness"] = float(stiffness)
 
     if drive.wavenumber is not None:

@@ -39,16 +39,10 @@ def cross_problems(sections: dict[str, Any], bad: set[str]) -> list[Problem]:
         both = lattice.preset is not None and lattice.cell is not None
         check(not both, "lattice.preset", lattice.preset, "give a preset or [lattice.cell], not both")
         for key, value in (("lattice.lambda", lattice.lam), ("lattice.eta", lattice.eta)):
-            check(
-                value is None or lattice.preset == "four-band", key, value, "only the four-band preset has it"
-            )
+            check(value is None or lattice.preset == "four-band", key, value, "only the four-band preset has it")
         wrong = cell_problems(*lattice.cell.parts()) if lattice.cell else []
         problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
-        cell = (
-            None
-            if both or wrong or any(p.key.startswith("lattice.") for p in problems)
-            else unit_cell_of(lattice)
-        )
+        cell = None if both or wrong or any(p.key.startswith("lattice.") for p in problems) else unit_cell_of(lattice)
 
     if sound("lattice.cells", "contacts.sites"):
         sites = sites_of(lattice, contacts)
@@ -100,18 +94,12 @@ def cross_problems(sections: dict[str, Any], bad: set[str]) -> list[Problem]:
             nyquist = np.pi / pass_bands(cell)[-1].high
             remedy = f"too coarse for the bands; the top band's Nyquist interval is {nyquist:.4g} s"
             check(time.sample_interval < nyquist, "time.sample_interval", time.sample_interval, remedy)
-    if (
-        sound("time.sample_interval", "time.end")
-        and time.sample_interval != "auto"
-        and time.end != "traverse"
-    ):
+    if sound("time.sample_interval", "time.end") and time.sample_interval != "auto" and time.end != "traverse":
         check(time.end >= time.sample_interval, "time.end", time.end, "shorter than one sample interval")
     if output.window is not None and sound("lattice.cells"):
         first, last = output.window
         fits = 1 <= first <= last <= lattice.cells
-        check(
-            fits, "output.window", output.window, f"must be [first, last] within cells 1 to {lattice.cells}"
-        )
+        check(fits, "output.window", output.window, f"must be [first, last] within cells 1 to {lattice.cells}")
     return problems
 
 

@@ -36,8 +36,12 @@ class CaseError(ValueError):
 
     def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
         self.problems = list(problems)
+        self.source = source
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
         super().__init__(f"{source}: {count}\n" + "\n".join(f"  {p}" for p in self.problems))
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.problems, self.source)
 
 
 def _number(value: Any) -> Any:
@@ -198,7 +202,7 @@ def with_overrides(table: dict, overrides: Iterable[str]) -> tuple[dict, list[Pr
         try:
             value = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
-            value = text
+            value = _bare(text)
         place = table
         for parent in parents:
             place = place.setdefault(parent, {}) if isinstance(place, dict) else place
@@ -207,6 +211,14 @@ def with_overrides(table: dict, overrides: Iterable[str]) -> tuple[dict, list[Pr
         else:
             problems.append(Problem(f"--set {path}", value, f"{'.'.join(parents)} is a value, not a section"))
     return table, problems
+
+
+def _bare(text: str) -> float | str:
+    """A value that TOML would not take: a number such as .5, or a word."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def read_section(kind: type[Section], table: Any, name: str) -> tuple[Section, list[Problem]]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
+
+from petsc4py import PETSc
 
 import numpy as np
 from scipy.special import gamma
-
-from petsc4py import PETSc
 
 from vipetsc.dynamics import contact_kernel, kernel
 from vipetsc.dynamics.operator import LatticeOperator
@@ -48,9 +48,9 @@ class ImpactTracker:
         self.operator = operator
         self.contact = contact
         self.floor = contact.approach_floor
-        masses = 1 / operator.p[operator.q[kernel.INVERSE_MASS] :]
-        host, resonator = masses[operator.q[kernel.HOST]], masses[operator.q[kernel.RESONATOR]]
-        self.reduced_mass = float(host * resonator / (host + resonator))
+        mobility = operator.p[operator.q[kernel.INVERSE_MASS] :]
+        pair = mobility[operator.q[kernel.HOST]] + mobility[operator.q[kernel.RESONATOR]]
+        self.reduced_mass = 1 / float(pair)
         self.sites = operator.layout.sites
         self.start = np.zeros((len(self.sites), 3))
         self.end = np.zeros((len(self.sites), 3))
@@ -111,7 +111,7 @@ class ImpactTracker:
                     continue
                 # At a landing |w - D| is rounding: the rate tells on which side the site goes on.
                 if rate <= 0 and value <= tolerance:
-                    self.counts.grazes += self.operator.mode[site] == kernel.FREE
+                    self.counts.grazes += int(self.operator.mode[site] == kernel.FREE)
                     continue
                 self._change(site, int(mode), t, state)
                 switched += 1
@@ -125,7 +125,7 @@ class ImpactTracker:
         energy = state.array_r[operator.q[kernel.DISSIPATED] + site]
         if before == kernel.FREE:
             rate = self.start[site, 1]
-            self.counts.floored += abs(rate) < self.floor
+            self.counts.floored += int(abs(rate) < self.floor)
             operator.approach[site] = np.sign(mode) * max(abs(rate), self.floor)
             self.open[site] = Episode(self.sites[site], int(np.sign(mode)), t, float(rate), loss=-float(energy))
         elif mode == kernel.FREE:
@@ -146,5 +146,25 @@ class ImpactTracker:
         """Contact time in s of an isolated conservative impact at ``speed`` in m/s (Johnson 1985, sec. 11.4)."""
         kc, n = self.contact.stiffness, self.contact.law.exponent
         depth = ((n + 1) / 2 * self.reduced_mass * speed**2 / kc) ** (1 / (n + 1))
-        # Depth over speed times the integral of dx / sqrt(1 - x^(n+1)), twice: pi for n = 1, 2.943 for n = 3/2.
-        return float(depth / speed * 2 * np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1))))
+        # Integral of dx / sqrt(1 - x^(n+1)) over [0, 1]: pi/2 for n = 1, 1.4716 for n = 3/2.
+        integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
+        return float(2 * integral * depth / speed)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Contact state of the owned sites."""
+        episodes = [[site, site in self.pulling, *asdict(e).values()] for site, e in self.open.items()]
+        return {
+            "mode": self.operator.mode.copy(),
+            "approach": self.operator.approach.copy(),
+            "open": np.array(episodes, float),
+            "impact_counts": np.array(astuple(self.counts)),
+        }
+
+    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
+        """Go back to a checkpoint."""
+        self.operator.mode[:] = checkpoint["mode"]
+        self.operator.approach[:] = checkpoint["approach"]
+        rows = checkpoint["open"].tolist()
+        self.open = {int(row[0]): Episode(int(row[2]), int(row[3]), *row[4:]) for row in rows}
+        self.pulling = {int(row[0]) for row in rows if row[1]}
+        self.counts = ImpactCounts(*checkpoint["impact_counts"].tolist())

@@ -11,24 +11,27 @@ The route (PETSc's own event handling loses short contacts and its error control
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import astuple, dataclass
 
 from mpi4py import MPI
 from petsc4py import PETSc
+
+import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.dynamics.impacts import ImpactTracker
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.lattice import Hertz
+from vipetsc.parallel import StopRequest
 
 # PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
 # and often saves a step on the way to a sample.
 STRETCH = 1.08
 # Newton steps for one landing before the search is repeated on a shorter step.
 LANDING_STEPS = 8
+# Steps and rejected trials on the way to one time beyond which a run counts as stalled.
+MOST_TRIALS = 200_000
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
 
@@ -56,6 +59,8 @@ class Integrator:
         The lattice, its distribution, right-hand side and contact state.
     native
         Register the compiled right-hand side directly (default), or through Python with the same bits.
+    stop
+        Looked at after every step; a request on any rank ends ``advance`` on all.
 
     PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor.
     """
@@ -67,6 +72,7 @@ class Integrator:
         operator: LatticeOperator,
         tracker: ImpactTracker,
         native: bool = True,
+        stop: StopRequest | None = None,
     ) -> None:
         self.comm = layout.comm
         self.tracker = tracker
@@ -79,7 +85,7 @@ class Integrator:
         self._first_step = 0.002 / model.drive.frequency
         self.step = self.free_step = 0.05 / model.drive.frequency
         self._buffer = np.empty(2)
-        self._stop = False
+        self._stop = stop or StopRequest()
         self._any_open = False
         # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
         # as h^(5/2). The shares are those that the controller settles at.
@@ -117,16 +123,15 @@ class Integrator:
         """The Runge-Kutta type in use, PETSc options included."""
         return self.ts.getRKType()
 
-    def request_stop(self) -> None:
-        """Ask for a stop after the next step; any rank may, all ranks end together."""
-        self._stop = True
-
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s; returns False if a stop was requested.
 
         Raises StalledError where no step can be taken.
         """
+        tried = self.counts.steps + self.counts.rejected
         while self.time < target:
+            if self.counts.steps + self.counts.rejected - tried > MOST_TRIALS:
+                raise StalledError(f"{MOST_TRIALS} steps did not reach t = {target:.6g} s")
             if not self._step(target):
                 return False
         return True
@@ -158,7 +163,7 @@ class Integrator:
         end = target if parts == 1 else self.time + h
         self.tracker.observe(end, self.state, self.tracker.end)
         share, site, row = self.tracker.first_change(h)
-        self._buffer[:] = share, -float(self._stop)
+        self._buffer[:] = share, -float(self._stop.requested)
         self.comm.Allreduce(MPI.IN_PLACE, self._buffer, MPI.MIN)
         if self._buffer[0] <= 1.0:
             self._land(h, float(self._buffer[0]), share, site, row)
@@ -229,3 +234,22 @@ class Integrator:
             self.step = self.free_step
         tracker.observe(self.time, self.state, tracker.start)
         self.ts.restartStep()
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """All that a resumed run needs to go on with the same bits, this rank's share."""
+        return {
+            "state": self.state.array_r.copy(),
+            "time": np.array(self.time),
+            "steps": np.array([self.step, self.free_step, float(self._any_open)]),
+            "counts": np.array(astuple(self.counts)),
+        }
+
+    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
+        """Go back to a checkpoint; the tracker must have been restored before."""
+        self.state.array[:] = checkpoint["state"]
+        self.time = float(checkpoint["time"])
+        self.step, self.free_step, any_open = checkpoint["steps"].tolist()
+        self._any_open = bool(any_open)
+        self.counts = StepCounts(*checkpoint["counts"].tolist())
+        self.ts.restartStep()
+        self.tracker.observe(self.time, self.state, self.tracker.start)

@@ -161,6 +161,13 @@ def _add_exactly(sums, at, value, unit):
     sums[at + 1] += np.int64(np.rint((value - coarse * unit) / unit * 2.0**40))
 
 
+@njit("void(f8[::1], i8[::1], f8, i8[::1])", **_options)
+def add_dissipated(y, q, unit, sums):
+    """Add the owned sites' dissipated energies to ``sums[6:8]``, as ``add_energies`` does."""
+    for site in range(q[SITES]):
+        _add_exactly(sums, 6, y[q[DISSIPATED] + site], unit)
+
+
 @njit("void(f8[::1], i8[::1], f8[::1], f8, i8[::1])", **_options)
 def add_energies(y, q, p, unit, sums):
     """Add this rank's kinetic, spring and contact energy to ``sums`` (2 integers each, in units of J).

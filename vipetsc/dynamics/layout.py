@@ -9,11 +9,12 @@ the left, then on the right. Mass by mass keeps every inner loop contiguous.
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-import numpy as np
+from itertools import pairwise
 
 from mpi4py import MPI
 from petsc4py import PETSc
+
+import numpy as np
 
 from vipetsc.case import Model
 
@@ -38,7 +39,7 @@ class Layout:
         """Cells in equal blocks, the first ranks one more where they do not divide; a rank may be empty."""
         cells, dofs = model.chain.cells, model.chain.cell.dofs
         cuts = [r * (cells // comm.size) + min(r, cells % comm.size) for r in range(comm.size + 1)]
-        ranges = tuple(zip(cuts[:-1], cuts[1:], strict=True))
+        ranges = tuple(pairwise(cuts))
         sizes = []
         for a, b in ranges:
             extras = (a <= model.drive_cell < b) + sum(a <= c < b for c in model.chain.sites)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ctypes
 
+from petsc4py import PETSc
+
 import numba
 import numpy as np
 from llvmlite import binding
 from numba import types
 from numba.extending import intrinsic
-
-from petsc4py import PETSc
 
 from vipetsc.dynamics import kernel
 
@@ -49,7 +49,13 @@ def compile_callback() -> numba.core.ccallback.CFunc:
     for name in _CALLS:
         binding.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
     begin, end, get, restore, get_write, restore_write = (types.ExternalFunction(n, s) for n, s in _CALLS.items())
-    words, exchange, slot, owned, ghosted = kernel.WORDS, kernel.EXCHANGE, kernel.SLOT, kernel.OWNED, kernel.GHOSTED
+    words, exchange, slot, owned, ghosted = (
+        kernel.WORDS,
+        kernel.EXCHANGE,
+        kernel.SLOT,
+        kernel.OWNED,
+        kernel.GHOSTED,
+    )
     rhs, header = kernel.right_hand_side, kernel.HEADER
 
     @numba.cfunc("i4(i8, f8, i8, i8, i8)", cache=True)

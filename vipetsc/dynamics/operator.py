@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ctypes
 
-import numpy as np
-
 from petsc4py import PETSc
+
+import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.dynamics import kernel, native

@@ -69,9 +69,7 @@ def _extremum(function, kappa: np.ndarray, values: np.ndarray) -> tuple[float, f
     """Largest value of ``function`` over [0, pi] and where: the best grid point, refined."""
     best = int(np.argmax(values))
     bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, len(kappa) - 1)]
-    found = minimize_scalar(
-        lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10}
-    )
+    found = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
     return (float(found.x), float(-found.fun)) if -found.fun > values[best] else (kappa[best], values[best])
 
 
@@ -112,9 +110,7 @@ def waves_at(cell: UnitCell, frequency: float, points: int = 721) -> list[tuple[
         for i in np.nonzero(offset[:-1, b] * offset[1:, b] <= 0)[0]:
             if offset[i, b] == 0 and i > 0:
                 continue
-            root = brentq(
-                lambda x, b=b: _frequency(cell, b + 1, x) - frequency, kappa[i], kappa[i + 1], xtol=1e-13
-            )
+            root = brentq(lambda x, b=b: _frequency(cell, b + 1, x) - frequency, kappa[i], kappa[i + 1], xtol=1e-13)
             speed = float(abs(bloch(cell, root).group_velocity[b]))
             waves.append((b + 1, root, speed))
     return waves

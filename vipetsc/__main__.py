@@ -1,0 +1,35 @@
+"""Front door: ``python -m vipetsc VERB``, alone or under ``mpirun -n N``; PETSc options after ``--``."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one verb on all ranks; returns the exit code (0 done, 2 bad input, 1 anything else)."""
+    # One thread a rank: the ranks are the parallelism, and threads would fight over the cores.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    arguments = sys.argv[1:] if arguments is None else arguments
+    own, _, petsc = (arguments, None, []) if "--" not in arguments else _split(arguments)
+
+    import petsc4py
+
+    # Signals are ours: SIGTERM ends a run at its next step, with a checkpoint.
+    petsc4py.init([sys.argv[0], "-no_signal_handler", *petsc])
+    from vipetsc.parallel import install_abort_hook
+
+    install_abort_hook()
+    from vipetsc import cli
+
+    return cli.main(own)
+
+
+def _split(arguments: list[str]) -> tuple[list[str], str, list[str]]:
+    at = arguments.index("--")
+    return arguments[:at], "--", arguments[at + 1 :]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,218 @@
+"""Verbs, arguments and exit codes; no numerics."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from mpi4py import MPI
+
+import vipetsc
+from vipetsc.case import Case, CaseError
+from vipetsc.parallel import StopRequest, on_root
+from vipetsc.reports import bands_table, doctor_table, run_table, validate_table
+from vipetsc.store import FolderError, write_text
+
+DONE, FAILED, BAD_INPUT = 0, 1, 2
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that speaks on rank 0 only and lets all ranks leave together."""
+
+    def _print_message(self, message: str, file=None) -> None:
+        if message and MPI.COMM_WORLD.rank == 0:
+            super()._print_message(message, file)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the verb named in ``arguments`` on all ranks; returns the exit code."""
+    options = _parser().parse_args(_with_verb(arguments))
+    try:
+        return options.verb(options, MPI.COMM_WORLD)
+    except (CaseError, FolderError) as error:
+        _say(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
+        return BAD_INPUT
+
+
+def _with_verb(arguments: list[str]) -> list[str]:
+    """No verb means the built-in case, as ``run``."""
+    if arguments and arguments[0] in {*VERBS, "-h", "--help", "--version"}:
+        return arguments
+    if arguments and not arguments[0].startswith("-"):
+        return arguments  # argparse names the verbs
+    return ["run", *arguments]
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="python -m vipetsc",
+        description="Waves in phononic lattices with vibro-impacts. Without a verb: the built-in four-band case.",
+        epilog="PETSc options go after --, as in: python -m vipetsc run CASE -- -ts_rk_type 5dp -log_view",
+    )
+    parser.add_argument("--version", action="version", version=f"vipetsc {vipetsc.__version__}")
+    verbs = parser.add_subparsers(dest="name", required=True, metavar="VERB")
+    for name, (function, text, arguments) in VERBS.items():
+        verb = verbs.add_parser(name, help=text, description=text)
+        verb.set_defaults(verb=function)
+        for argument in arguments:
+            argument(verb)
+    return parser
+
+
+def _case(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("case", nargs="?", metavar="CASE", help="case file (TOML); the built-in case if left out")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one value; may be repeated"
+    )
+
+
+def _folder(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, metavar="DIR", help="output folder; runs/<case> if left out")
+    parser.add_argument("--force", action="store_true", help="replace the run in the output folder")
+
+
+def _resume(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--resume", action="store_true", help="go on with the unfinished run in the output folder")
+
+
+def _json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def _plot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", type=Path, metavar="PATH", help="a run's folder, or its run.h5")
+    parser.add_argument("--fig", action="append", metavar="NAME", help="only this figure; may be repeated")
+    parser.add_argument("--format", action="append", choices=("png", "pdf"), help="png if left out; may be repeated")
+
+
+def _load(options: argparse.Namespace, comm: MPI.Comm) -> Case:
+    """The case, read on rank 0 alone."""
+
+    def read() -> Case:
+        if options.case is None:
+            return Case.builtin(options.set)
+        try:
+            return Case.load(options.case, options.set)
+        except OSError as error:
+            raise FolderError(f"{options.case}: {error.strerror}; a case file (TOML) is needed") from None
+
+    return on_root(comm, read)
+
+
+def _say(comm: MPI.Comm, text: str, file=None) -> None:
+    if comm.rank == 0:
+        print(text, file=file or sys.stdout, flush=True)
+
+
+def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """One simulation, its analysis and pictures."""
+    from vipetsc.dynamics import simulate
+
+    if options.force and options.resume:
+        raise FolderError("--force and --resume exclude each other: begin anew, or go on")
+    case = _load(options, comm)
+    for warning in on_root(comm, case.warnings):
+        _say(comm, f"vipetsc: warning: {warning}", sys.stderr)
+    folder = options.out or Path("runs") / case.name
+    stop = StopRequest().install()
+    result = simulate(
+        case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True
+    )  # fmt: skip
+    _say(comm, run_table(result))
+    if result.resumable:
+        return FAILED
+    if case.output.fields and result.statistics["samples"] > 1:
+        _analyse_and_draw(case, folder, comm)
+    return DONE if result.complete else FAILED
+
+
+def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
+    from vipetsc.figures import draw
+    from vipetsc.studies.analysis import analyse
+
+    on_root(comm, lambda: analyse(folder / "run.h5", folder / "analysis.h5"))
+    if case.output.figures:
+        drawn = comm.gather(draw(folder, share=(comm.rank, comm.size)))
+        for path in sorted(str(p) for paths in drawn or [] for p in paths):
+            _say(comm, f"  {path}")
+
+
+def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Check a case and print what follows from it."""
+    case = _load(options, comm)
+    _say(comm, on_root(comm, lambda: validate_table(case, comm.size)))
+    for warning in on_root(comm, case.warnings):
+        _say(comm, f"warning: {warning}")
+    return DONE
+
+
+def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Pass bands, gaps and group velocities of a case's cell; a table and a picture."""
+    case = _load(options, comm)
+
+    def report() -> str:
+        table = bands_table(case.unit_cell())
+        if options.out is not None:
+            from vipetsc.figures import look, save
+            from vipetsc.figures.bands import bands as band_diagram
+
+            options.out.mkdir(parents=True, exist_ok=True)
+            with look():
+                figure = band_diagram(case.unit_cell(), case.drive.frequency)
+                picture = save(figure, options.out / "bands.png")
+            write_text(options.out / "bands.json", json.dumps(table, indent=2) + "\n")
+            table["picture"] = str(picture)
+        return json.dumps(table, indent=2) if options.json else bands_table(case.unit_cell(), as_text=True)
+
+    _say(comm, on_root(comm, report))
+    return DONE
+
+
+def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Pictures of a finished run again, from its files."""
+    from vipetsc.figures import draw, run_figures
+    from vipetsc.records import RunFile
+    from vipetsc.studies.analysis import analyse
+
+    folder = options.path.parent if options.path.name == "run.h5" else options.path
+
+    def check() -> None:
+        unknown = set(options.fig or []) - set(run_figures)
+        if unknown:
+            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(run_figures)}")
+        run, analysis = folder / "run.h5", folder / "analysis.h5"
+        if not run.exists():
+            raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
+        try:
+            with RunFile(run):
+                pass
+        except (OSError, ValueError, KeyError) as error:
+            raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
+        if not analysis.exists() or analysis.stat().st_mtime < run.stat().st_mtime:
+            analyse(run, analysis)
+
+    on_root(comm, check)
+    formats = tuple(options.format or ("png",))
+    drawn = comm.gather(draw(folder, options.fig, formats=formats, share=(comm.rank, comm.size)))
+    for path in sorted(str(p) for paths in drawn or [] for p in paths):
+        _say(comm, path)
+    return DONE
+
+
+def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Versions, MPI, HDF5 and ranks; what is missing and how to get it."""
+    text, healthy = doctor_table(comm)
+    _say(comm, text)
+    return DONE if healthy else FAILED
+
+
+VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
+    "run": (run, "one simulation, its analysis and pictures", (_case, _folder, _resume)),
+    "validate": (validate, "check a case; print band edges, frequency, end time, size and cost", (_case,)),
+    "bands": (bands, "pass bands, gaps and group velocities of a cell", (_case, _folder, _json)),
+    "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),
+    "doctor": (doctor, "versions and what is missing", ()),
+}

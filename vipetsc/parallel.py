@@ -1,0 +1,110 @@
+"""Ranks that work, fail and end together; progress and messages from rank 0."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from types import FrameType
+from typing import Any, TypeVar
+
+from mpi4py import MPI
+
+from tqdm import tqdm
+
+T = TypeVar("T")
+
+
+def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
+    """Let a rank that raises end all ranks, with one message; otherwise the others wait for it for ever."""
+
+    def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        where = f"rank {comm.rank}: " if comm.size > 1 else ""
+        if isinstance(error, OSError):
+            # A full disk or a missing right is the machine's matter: the trace would hide the message.
+            sys.stderr.write(f"vipetsc: {where}{error}\n")
+        else:
+            text = "".join(traceback.format_exception(kind, error, trace))
+            sys.stderr.write(f"vipetsc: {where}{text}")
+        sys.stdout.flush()
+        sys.stderr.flush()
+        if comm.size > 1:
+            comm.Abort(1)
+        # Without the usual farewell: HDF5 crashes in its own after a full disk.
+        os._exit(1)
+
+    sys.excepthook = hook
+
+
+def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
+    """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
+    value, error = None, None
+    if comm.rank == 0:
+        try:
+            value = function()
+        except Exception as caught:
+            error = caught
+    value, error = comm.bcast((value, error))
+    if error is not None:
+        raise error
+    return value
+
+
+class StopRequest:
+    """Turns SIGTERM and SIGINT into a request that a loop can see; a second one ends the process at once."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def install(self) -> StopRequest:
+        """Listen from now on; returns itself."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._receive)
+        return self
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        signal.signal(number, signal.SIG_DFL)
+
+
+class Progress:
+    """How far a run is, on rank 0: a bar on a terminal, otherwise a line every ``interval`` seconds."""
+
+    def __init__(self, comm: MPI.Comm, total: float, unit: str, interval: float = 5.0, show: bool = True) -> None:
+        self._total, self._unit, self._interval = total, unit, interval
+        self._begin = self._last = time.monotonic()
+        self._done = self._first = 0.0
+        self._show = show and comm.rank == 0
+        terminal = self._show and sys.stderr.isatty()
+        layout = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
+        self._bar = tqdm(total=total, unit=unit, bar_format=layout, file=sys.stderr) if terminal else None
+
+    def start_at(self, done: float) -> None:
+        """Count from ``done``, where a resumed run begins."""
+        self._first = self._done = done
+        if self._bar is not None:
+            self._bar.update(done)
+
+    def update(self, done: float) -> None:
+        """Report that ``done`` of the total is reached."""
+        if not self._show:
+            return
+        now = time.monotonic()
+        if self._bar is not None:
+            self._bar.update(done - self._done)
+            self._done = done
+        elif now - self._last >= self._interval:
+            rate = (done - self._first) / (now - self._begin)
+            left = (self._total - done) / rate if rate > 0 else float("inf")
+            share = f"{100 * done / self._total:3.0f} %  {done:.4g} of {self._total:.4g} {self._unit}"
+            sys.stderr.write(f"{share}, {left:.0f} s left\n")
+            sys.stderr.flush()
+            self._last = now
+
+    def close(self) -> None:
+        """End the bar, if there is one."""
+        if self._bar is not None:
+            self._bar.close()

@@ -1,0 +1,134 @@
+"""Fourier measures of a sampled lattice: kinetic energy, wavenumber content, dispersion and its ridge.
+
+A field is anything that can be indexed as ``velocity[..., dof]`` to give a (t, cell) array: a numpy array
+or an HDF5 dataset, of which one mass at a time is then held in memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft
+
+TAPER = 0.1
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """Mean kinetic energy in J per bin, ``energy`` (wavenumber, frequency); sums to that of the window.
+
+    ``wavenumber`` in rad per cell, ``frequency`` in rad/s. A wave that travels towards higher cells with
+    phase velocity omega/kappa > 0 has kappa > 0.
+    """
+
+    wavenumber: np.ndarray
+    frequency: np.ndarray
+    energy: np.ndarray
+
+    def folded(self) -> Dispersion:
+        """The same with kappa and -kappa added up, on [0, pi]."""
+        length = len(self.wavenumber)
+        half = length // 2 + 1
+        positive = (length - 1) // 2  # row of kappa = 0 in ascending order over (-pi, pi]
+        energy = self.energy[positive:].copy()
+        energy[1 : positive + 1] += self.energy[:positive][::-1]
+        return Dispersion(self.wavenumber[positive : positive + half], self.frequency, energy)
+
+
+def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
+    """Kinetic energy (t, cell) in J of every cell, from ``velocity`` (t, cell, dof) in m/s, masses in kg."""
+    return sum(0.5 * m * np.square(velocity[..., j]) for j, m in enumerate(np.asarray(masses)))
+
+
+def wavenumber_content(velocity: np.ndarray, masses: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Kinetic energy per wavenumber over time: kappa (k) in [0, pi] rad per cell, content (t, k) in J.
+
+    Both signs of kappa are added up; the content of a sample sums to its kinetic energy (Parseval).
+    """
+    cells = velocity.shape[1]
+    content = 0.0
+    for j, mass in enumerate(np.asarray(masses)):
+        spectrum = fft.rfft(velocity[..., j], axis=1)
+        content = content + 0.5 * mass / cells * (spectrum.real**2 + spectrum.imag**2)
+    content[:, 1 : (cells + 1) // 2] *= 2
+    return 2 * np.pi * np.arange(cells // 2 + 1) / cells, content
+
+
+def taper(length: int, fraction: float) -> np.ndarray:
+    """Tukey window (length) with cosine flanks over ``fraction`` of it, scaled to mean square 1."""
+    x = (np.arange(length) + 0.5) / length
+    flank = np.minimum(x, 1 - x)
+    window = np.ones(length)
+    if fraction > 0:
+        window = 0.5 * (1 - np.cos(2 * np.pi * np.minimum(flank / fraction, 0.5)))
+    return window / np.sqrt(np.mean(window**2))
+
+
+def dispersion(
+    velocity: np.ndarray,
+    masses: ArrayLike,
+    interval: float,
+    *,
+    cells: slice = slice(None),
+    samples: slice = slice(None),
+    tapers: tuple[float, float] = (TAPER, TAPER),
+    lengths: tuple[int, int] | None = None,
+    highest: float = np.inf,
+) -> Dispersion:
+    """Energy over wavenumber and frequency by 2-D FFT of mass-weighted velocities, added over the masses.
+
+    Parameters
+    ----------
+    velocity
+        (t, cell, dof) in m/s, sampled every ``interval`` seconds.
+    masses
+        Masses (dof) in kg; ones give a plain velocity spectrum.
+    cells, samples
+        Windows in space and time.
+    tapers
+        Fractions of the (time, space) window under cosine flanks at its two ends together; 0 for none.
+    lengths
+        Transform lengths (time, space), zero-padded; by default the next that is fast.
+    highest
+        Frequencies above are dropped, rad/s.
+
+    Returns
+    -------
+    Dispersion
+        On kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
+    """
+    t, x = (len(range(n)[window]) for n, window in zip(velocity.shape, (samples, cells), strict=False))
+    nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
+    frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
+    frequency = frequency[frequency <= highest]
+    window = taper(t, tapers[0])[:, None] * taper(x, tapers[1])
+    energy = 0.0
+    for j, mass in enumerate(np.asarray(masses)):
+        spectrum = fft.rfft(velocity[samples, cells, j] * window, nt, axis=0)[: len(frequency)]
+        # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
+        spectrum = fft.ifft(spectrum, nx, axis=1, norm="forward")
+        energy = energy + mass * (spectrum.real**2 + spectrum.imag**2)
+    energy /= 2 * t * nt * nx
+    energy[1 : (nt + 1) // 2] *= 2
+    order = np.roll(np.arange(nx), (nx - 1) // 2)
+    wavenumber = 2 * np.pi * np.where(order > nx // 2, order - nx, order) / nx
+    return Dispersion(wavenumber, frequency, energy.T[order])
+
+
+def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:
+    """Ridge of a dispersion: energetic wavenumbers (k) and the frequency (k) in rad/s of each one's peak.
+
+    A wavenumber counts when its peak exceeds ``floor`` times the largest; the peak is refined by the
+    parabola through the logarithms of the three samples around it.
+    """
+    energy, frequency = spectrum.energy, spectrum.frequency
+    peak = np.argmax(energy[:, 1:-1], axis=1) + 1
+    rows = np.arange(len(energy))
+    loud = np.nonzero(energy[rows, peak] > floor * energy.max())[0]
+    around = energy[loud[:, None], peak[loud, None] + np.array([-1, 0, 1])]
+    left, top, right = np.log(np.maximum(around, np.finfo(float).tiny)).T
+    offset = 0.5 * (left - right) / (left - 2 * top + right)
+    step = frequency[1] - frequency[0]
+    return spectrum.wavenumber[loud], frequency[peak[loud]] + np.clip(offset, -0.5, 0.5) * step
