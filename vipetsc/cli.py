@@ -140,6 +140,55 @@ def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
             _say(comm, f"  {path}")
 
 
+def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Nonlinear normal modes: the branches of a case, their files and pictures."""
+    from vipetsc.modes.follow import follow_all
+    from vipetsc.modes.options import NnmCase
+    from vipetsc.modes.report import BranchLog, branch_table
+
+    if options.force and options.resume:
+        raise FolderError("--force and --resume exclude each other: begin anew, or go on")
+
+    def read() -> NnmCase:
+        try:
+            return NnmCase.load(options.case, options.set)
+        except OSError as error:
+            raise FolderError(f"{options.case}: {error.strerror}; a case file (TOML) is needed") from None
+
+    case = on_root(comm, read)
+    folder = options.out or Path("runs") / case.name
+
+    def prepare() -> None:
+        kept = folder / "case.toml"
+        if options.resume:
+            if not kept.exists():
+                raise FolderError(f"{folder}: holds no branches to resume; leave out --resume")
+        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not options.force:
+            raise FolderError(f"{folder}: exists; --force replaces the branches in it, --resume goes on with them")
+        folder.mkdir(parents=True, exist_ok=True)
+        if options.force:
+            for old in folder.glob("branch-*.*"):
+                old.unlink()
+        write_text(kept, case.to_toml())
+
+    on_root(comm, prepare)
+    branches = follow_all(case, folder, comm, options.resume, BranchLog(sys.stderr))
+    for branch in branches:
+        _say(comm, branch_table(branch))
+
+    def pictures() -> list[Path]:
+        from vipetsc.figures import draw_backbone
+
+        paths = sorted(folder.glob("branch-*.h5"))
+        return [draw_backbone([path], folder / "figures" / f"{path.stem}.png") for path in paths]
+
+    if comm.rank == 0:
+        for path in pictures():
+            _say(comm, f"  {path}")
+    failed = comm.bcast(any(b.ending.startswith("failed") for b in branches))
+    return FAILED if failed else DONE
+
+
 def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Check a case and print what follows from it."""
     case = _load(options, comm)
@@ -209,10 +258,18 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE if healthy else FAILED
 
 
+def _branches(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("case", metavar="CASE", help="case file (TOML) with a section [nnm]")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one value; may be repeated"
+    )
+
+
 VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
     "run": (run, "one simulation, its analysis and pictures", (_case, _folder, _resume)),
     "validate": (validate, "check a case; print band edges, frequency, end time, size and cost", (_case,)),
     "bands": (bands, "pass bands, gaps and group velocities of a cell", (_case, _folder, _json)),
+    "nnm": (nnm, "nonlinear normal modes: frequency-energy branches", (_branches, _folder, _resume)),
     "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),
     "doctor": (doctor, "versions and what is missing", ()),
 }

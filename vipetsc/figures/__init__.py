@@ -5,12 +5,13 @@ from importlib import import_module
 _HOMES = {
     "bands": "vipetsc.figures.bands",
     "draw": "vipetsc.figures.registry",
+    "draw_backbone": "vipetsc.figures.backbone",
     "run_figures": "vipetsc.figures.registry",
     "save": "vipetsc.figures.registry",
     "look": "vipetsc.figures.style",
 }
 
-__all__ = ["bands", "draw", "look", "run_figures", "save"]
+__all__ = ["bands", "draw", "draw_backbone", "look", "run_figures", "save"]
 
 
 def __getattr__(name: str) -> object:

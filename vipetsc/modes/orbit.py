@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -129,3 +129,30 @@ def kernel_arrays(system: System) -> tuple[np.ndarray, ...]:
         np.array(spring_rows).reshape(len(springs), system.dofs),
         np.array(springs).reshape(len(springs), 2),
     )
+
+
+class FiniteDifferences(Flow):
+    """Another flow with its sensitivities replaced by central differences, the paper's choice in region III.
+
+    ``step`` is relative to the orbit's size; velocities count as displacements over a radian of the period.
+    """
+
+    name = "finite-differences"
+
+    def __init__(self, flow: Flow, step: float = 1e-6) -> None:
+        super().__init__(flow.system)
+        self.flow, self.step = flow, step
+
+    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
+        """See ``Flow.arc``."""
+        n = self.system.dofs
+        centre = self.flow.arc(start, duration, period)
+        rate = 2 * np.pi / period
+        size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / rate)
+        columns = []
+        for i in range(2 * n):
+            move = np.zeros(2 * n)
+            move[i] = self.step * size * (1.0 if i < n else rate)
+            ends = [self.flow.arc(start + s * move, duration, period).end for s in (1, -1)]
+            columns.append((ends[0] - ends[1]) / (2 * move[i]))
+        return replace(centre, sensitivity=np.column_stack(columns))

@@ -1,0 +1,188 @@
+"""The frequency-energy plot of a branch, with its grazing inset, slope and phase portraits, from its file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vipetsc.figures import style
+from vipetsc.figures.registry import save
+
+UNSTABLE = 1.0 + 1e-6
+_REGIONS = ("I", "II", "III", "IV")
+_SHADES = ("#FFFFFF", "#EEEEEE", "#FFFFFF", "#EEEEEE")
+_MARKS = {
+    "fold-energy": ("o", "energy fold"),
+    "fold-frequency": ("s", "frequency fold"),
+    "branch-point": ("D", "branch point"),
+    "symmetry-breaking": ("^", "symmetry breaking"),
+    "period-doubling": ("v", "period doubling"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class BranchFile:
+    """What the figure needs of a ``branch-<name>.h5``: arrays over points, orbits (may be empty)."""
+
+    name: str
+    data: dict[str, np.ndarray]
+    kinds: list[str]
+    orbits: dict[str, np.ndarray]
+
+    @classmethod
+    def read(cls, path: Path) -> BranchFile:
+        """Raises OSError or KeyError if the file holds no branch."""
+        with h5py.File(path) as file:
+            names = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind")
+            data = {name: file[name][...] for name in names}
+            kinds = str(file["kind"].attrs["flag_meanings"]).split()
+            orbits = {n: v[...] for n, v in file["orbits"].items()} if "orbits" in file else {}
+            return cls(str(file.attrs["name"]), data, [kinds[k] for k in data["kind"]], orbits)
+
+
+def draw_backbone(paths: Sequence[Path], target: Path) -> Path:
+    """Draw the branches in ``paths`` (one page, a column a branch) into ``target``; returns it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with style.look():
+        return save(backbone([BranchFile.read(Path(p)) for p in paths]), target)
+
+
+def backbone(branches: Sequence[BranchFile]) -> Figure:
+    """The paper's Fig. FEP: frequency, slope and portraits of regions I-IV; one column a branch."""
+    count = len(branches)
+    width = style.COLUMN if count == 1 else style.PAGE
+    with_orbits = any(b.orbits for b in branches)
+    figure = style.new_figure(width, 5.6 if with_orbits else 3.8)
+    heights = (1.5, 1.0, 1.25) if with_orbits else (1.5, 1.0)
+    rows = figure.subfigures(len(heights), count, squeeze=False, height_ratios=heights)
+    for column, branch in enumerate(branches):
+        label = chr(ord("a") + column)
+        top = rows[0, column].subplots()
+        frequency_energy(top, branch)
+        style.letter(top, f"({label}) {branch.name}")
+        slope(rows[1, column].subplots(), branch)
+        if with_orbits:
+            portraits(rows[2, column], branch)
+    return figure
+
+
+def frequency_energy(axes: Axes, branch: BranchFile) -> None:
+    """Frequency over energy; unstable parts coloured, special points marked, grazing in the inset."""
+    _shade(axes, branch)
+    _line(axes, branch)
+    axes.set(xscale="log", yscale=_scale(branch.data["frequency"]), xlabel="energy (J)", ylabel="frequency (Hz)")
+    energy, frequency = branch.data["energy"], branch.data["frequency"]
+    few = sum(k in _MARKS for k in branch.kinds) <= 12
+    for kind, (mark, text) in _MARKS.items():
+        at = [i for i, k in enumerate(branch.kinds) if k == kind]
+        if at and few:
+            axes.plot(energy[at], frequency[at], mark, ms=3, mfc="white", mec=style.BLACK, mew=0.6, label=text, zorder=4)
+    axes.plot([], [], color=style.BLUE, label="stable")
+    if np.any(branch.data["multiplier_max"] > UNSTABLE):
+        axes.plot([], [], color=style.VERMILION, label="unstable")
+    touched = np.nonzero(branch.data["contacts"] > 0)[0]
+    monotone = np.ptp(frequency) > 0 and (few or not touched.size)
+    axes.legend(loc="lower right" if monotone else "best", fontsize=6)
+    if touched.size and few:
+        _grazing_inset(axes, branch, touched[0])
+
+
+def slope(axes: Axes, branch: BranchFile) -> None:
+    """|df/dE| over energy where contacts act, with its power laws' local exponents left to the text."""
+    _shade(axes, branch)
+    energy, steep = branch.data["energy"], np.abs(branch.data["slope"])
+    moving = branch.data["contacts"] > 0 if np.any(branch.data["contacts"] > 0) else np.ones(len(energy), bool)
+    moving &= np.array([k == "regular" for k in branch.kinds])
+    axes.plot(energy[moving], steep[moving], color=style.BLUE, lw=0.9)
+    axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel=r"|d$f$/d$E$| (Hz/J)")
+    axes.set_xlim(energy.min(), energy.max())
+
+
+def portraits(place: object, branch: BranchFile) -> None:
+    """Phase portraits of the stored orbits of regions I-IV: the resonator (or last mass) and the host."""
+    if not branch.orbits:
+        style.say(place.subplots(), "no orbits stored")
+        return
+    number = branch.orbits["number"]
+    shown = min(len(number), 4)
+    axes = place.subplots(1, shown, squeeze=False)[0]
+    regular = [i for i, k in enumerate(branch.kinds) if k == "regular"]
+    for k in range(shown):
+        u, v = branch.orbits["displacement"][k], branch.orbits["velocity"][k]
+        for dof, colour in zip(range(min(u.shape[1], 2)), (style.BLUE, style.VERMILION), strict=False):
+            closed = np.append(np.arange(len(u)), 0)
+            axes[k].plot(u[closed, dof] / np.abs(u).max(), v[closed, dof] / np.abs(v).max(), color=colour, lw=0.8)
+        region = branch.data["region"][min(regular, key=lambda i: abs(i - _place(branch, branch.orbits["energy"][k])))]
+        axes[k].set_title(f"{_REGIONS[region - 1]}\n{branch.orbits['energy'][k]:.2g} J", loc="center", fontsize=7)
+        axes[k].set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
+        axes[k].set_xlabel(r"$u$/max")
+        if k:
+            axes[k].set_yticklabels([])
+    axes[0].set_ylabel(r"$\dot u$/max")
+    axes[0].plot([], [], color=style.BLUE, label="mass 1")
+    axes[0].plot([], [], color=style.VERMILION, label="mass 2")
+    place.legend(loc="lower center", ncols=2, fontsize=6, bbox_to_anchor=(0.5, -0.02))
+
+
+def _place(branch: BranchFile, energy: float) -> int:
+    return int(np.abs(np.log(branch.data["energy"] / energy)).argmin())
+
+
+def _line(axes: Axes, branch: BranchFile, width: float = 1.1) -> None:
+    """The branch, blue where stable and vermilion where not; neighbours share their end points."""
+    energy, frequency = branch.data["energy"], branch.data["frequency"]
+    loose = branch.data["multiplier_max"] > UNSTABLE
+    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2)
+    either = loose.copy()
+    either[1:] |= loose[:-1] & loose[1:]
+    axes.plot(energy, np.where(either, frequency, np.nan), color=style.VERMILION, lw=width * 1.3, zorder=3)
+
+
+def _grazing_inset(axes: Axes, branch: BranchFile, first: int) -> None:
+    """The neighbourhood of grazing: up to where the frequency has grown by a fifth, or the folds are passed."""
+    energy, frequency = branch.data["energy"], branch.data["frequency"]
+    folds = [i for i, k in enumerate(branch.kinds) if k == "fold-energy"]
+    last = max(folds, default=first)
+    last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
+    last = min(max(last, first + 3), len(energy) - 1)
+    window = slice(max(first - 1, 0), last + 1)
+    inset = axes.inset_axes([0.13, 0.50, 0.36, 0.40])
+    _line(inset, branch, 0.9)
+    at = [i for i in folds if window.start <= i <= last]
+    inset.plot(energy[at], frequency[at], "o", ms=2.5, mfc="white", mec=style.BLACK, mew=0.6, zorder=4)
+    low, high = energy[window].min(), energy[window].max()
+    span = high - low
+    inset.set(xlim=(low - 0.15 * span, high + 0.1 * span))
+    rise = np.ptp(frequency[window])
+    inset.set(ylim=(frequency[window].min() - 0.1 * rise, frequency[window].max()))
+    inset.tick_params(labelsize=5, pad=1.5)
+    inset.locator_params(axis="both", nbins=3)
+    inset.set_title("grazing", fontsize=6, pad=1.5)
+
+
+def _shade(axes: Axes, branch: BranchFile) -> None:
+    """Regions as bands of energy, labelled at the top; left out where they overlap (internal resonances)."""
+    energy, region = branch.data["energy"], branch.data["region"]
+    spans = [(energy[region == k].min(), energy[region == k].max()) if np.any(region == k) else None for k in (1, 2, 3, 4)]
+    if spans[2] is None:
+        return
+    for k, span in enumerate(spans):
+        if span is None:
+            continue
+        low = spans[k - 1][1] if k and spans[k - 1] else span[0]
+        axes.axvspan(low, max(span[1], low), color=_SHADES[k], lw=0, zorder=0)
+        if max(span[1], low) > low:
+            middle = np.sqrt(low * max(span[1], low))
+            axes.text(middle, 0.985, _REGIONS[k], ha="center", va="top", fontsize=6.5, color=style.GREY,
+                      transform=axes.get_xaxis_transform())  # fmt: skip
+    axes.set_xlim(energy.min(), energy.max())
+
+
+def _scale(values: np.ndarray) -> str:
+    return "log" if values.max() > 3 * values.min() else "linear"

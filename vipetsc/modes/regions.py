@@ -1,0 +1,81 @@
+"""Regions I-IV of a backbone, found from the branch itself, and the power laws of its slope."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SMOOTH_LIMIT = 0.95
+"""Fraction of the time in contact from which the clearance counts as negligible (region IV)."""
+
+
+SETTLED = 0.5
+"""Growth of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III)."""
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """df/dE = factor E^exponent over ``points`` points; ``adjusted_r2`` of the line in log-log."""
+
+    exponent: float
+    factor: float
+    adjusted_r2: float
+    points: int
+
+
+def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Region 1-4 of every point of a branch (points,), in the order of the branch.
+
+    I: no contact. II: grazing, from the first contact over the peak of the slope until its steep fall has ended:
+    until the local exponent d ln(df/dE)/d ln E grows by less than ``SETTLED`` per e-fold of energy. III: vibro-impact. IV: smooth limit, from where a
+    contact is closed for 95 % of the time on. A branch on which the slope keeps changing sign (internal
+    resonances) has its peak after its last energy fold. Without an exponent that settles, II lasts.
+
+    Parameters
+    ----------
+    energy, slope
+        J and Hz/J.
+    episodes, closed
+        Contact episodes of the arc, and the fraction of the time with a contact closed.
+    """
+    region = np.ones(len(energy), np.int8)
+    touched = np.nonzero(episodes > 0)[0]
+    if not touched.size:
+        return region
+    first = touched[0]
+    region[first:] = 2
+    folds = np.nonzero(np.diff(np.sign(np.diff(energy[first:]))) != 0)[0]
+    start = first + (folds[-1] + 2 if folds.size else 0)
+    tail = slice(start, None)
+    usable = np.isfinite(slope[tail]) & (slope[tail] > 0)
+    if usable.sum() < 5 or not usable.all():
+        return region
+    start += int(np.argmax(slope[tail]))
+    if len(energy) - start < 5:
+        return region
+    exponent = np.gradient(np.log(slope[start:]), np.log(energy[start:]))
+    growth = np.gradient(exponent, np.log(energy[start:]))
+    settled = np.nonzero(growth[1:] <= SETTLED)[0]
+    if settled.size:
+        region[start + 1 + settled[0] :] = 3
+        smooth = np.nonzero(closed[start + 1 + settled[0] :] >= SMOOTH_LIMIT)[0]
+        if smooth.size:
+            region[start + 1 + settled[0] + smooth[0] :] = 4
+    return region
+
+
+def power_law(energy: np.ndarray, slope: np.ndarray) -> PowerLaw | None:
+    """The straight line through ln(slope) over ln(energy), None for fewer than 4 usable points."""
+    usable = np.isfinite(slope) & (slope > 0) & (energy > 0)
+    count = int(usable.sum())
+    if count < 4:
+        return None
+    x, y = np.log(energy[usable]), np.log(slope[usable])
+    exponent, constant = np.polyfit(x, y, 1)
+    unexplained = float(np.sum((y - exponent * x - constant) ** 2))
+    total = float(np.sum((y - y.mean()) ** 2))
+    if total == 0:
+        return None
+    r2 = 1 - (unexplained / (count - 2)) / (total / (count - 1))
+    return PowerLaw(float(exponent), float(np.exp(constant)), float(r2), count)
