@@ -49,8 +49,11 @@ class BranchFile:
 def draw_backbone(paths: Sequence[Path], target: Path) -> Path:
     """Draw the branches in ``paths`` (one page, a column a branch) into ``target``; returns it."""
     target.parent.mkdir(parents=True, exist_ok=True)
+    branches = [BranchFile.read(Path(p)) for p in paths]
     with style.look():
-        return save(backbone([BranchFile.read(Path(p)) for p in paths]), target)
+        if not all(len(b.kinds) for b in branches):
+            return save(style.without_data("no point of the branch was found"), target)
+        return save(backbone(branches), target)
 
 
 def backbone(branches: Sequence[BranchFile]) -> Figure:
@@ -59,7 +62,7 @@ def backbone(branches: Sequence[BranchFile]) -> Figure:
     width = style.COLUMN if count == 1 else style.PAGE
     with_orbits = any(b.orbits for b in branches)
     figure = style.new_figure(width, 5.6 if with_orbits else 3.8)
-    heights = (1.5, 1.0, 1.25) if with_orbits else (1.5, 1.0)
+    heights = (1.5, 1.0, 0.95) if with_orbits else (1.5, 1.0)
     rows = figure.subfigures(len(heights), count, squeeze=False, height_ratios=heights)
     for column, branch in enumerate(branches):
         label = chr(ord("a") + column)
@@ -88,7 +91,9 @@ def frequency_energy(axes: Axes, branch: BranchFile) -> None:
         axes.plot([], [], color=style.VERMILION, label="unstable")
     touched = np.nonzero(branch.data["contacts"] > 0)[0]
     monotone = np.ptp(frequency) > 0 and (few or not touched.size)
-    axes.legend(loc="lower right" if monotone else "best", fontsize=6)
+    inside = few and touched.size > 0
+    axes.legend(loc="upper left" if inside else "lower right" if monotone else "best", fontsize=5.5,
+                bbox_to_anchor=(0, 0.93) if inside else None)  # fmt: skip
     if touched.size and few:
         _grazing_inset(axes, branch, touched[0])
 
@@ -117,17 +122,14 @@ def portraits(place: object, branch: BranchFile) -> None:
         u, v = branch.orbits["displacement"][k], branch.orbits["velocity"][k]
         for dof, colour in zip(range(min(u.shape[1], 2)), (style.BLUE, style.VERMILION), strict=False):
             closed = np.append(np.arange(len(u)), 0)
-            axes[k].plot(u[closed, dof] / np.abs(u).max(), v[closed, dof] / np.abs(v).max(), color=colour, lw=0.8)
+            axes[k].plot(u[closed, dof] / np.abs(u).max(), v[closed, dof] / np.abs(v).max(), color=colour, lw=0.8, ls="--" if dof else "-")
         region = branch.data["region"][min(regular, key=lambda i: abs(i - _place(branch, branch.orbits["energy"][k])))]
         axes[k].set_title(f"{_REGIONS[region - 1]}\n{branch.orbits['energy'][k]:.2g} J", loc="center", fontsize=7)
         axes[k].set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
-        axes[k].set_xlabel(r"$u$/max")
         if k:
             axes[k].set_yticklabels([])
     axes[0].set_ylabel(r"$\dot u$/max")
-    axes[0].plot([], [], color=style.BLUE, label="mass 1")
-    axes[0].plot([], [], color=style.VERMILION, label="mass 2")
-    place.legend(loc="lower center", ncols=2, fontsize=6, bbox_to_anchor=(0.5, -0.02))
+    place.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
 
 
 def _place(branch: BranchFile, energy: float) -> int:
@@ -152,7 +154,7 @@ def _grazing_inset(axes: Axes, branch: BranchFile, first: int) -> None:
     last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
     last = min(max(last, first + 3), len(energy) - 1)
     window = slice(max(first - 1, 0), last + 1)
-    inset = axes.inset_axes([0.13, 0.50, 0.36, 0.40])
+    inset = axes.inset_axes([0.56, 0.13, 0.42, 0.46])
     _line(inset, branch, 0.9)
     at = [i for i in folds if window.start <= i <= last]
     inset.plot(energy[at], frequency[at], "o", ms=2.5, mfc="white", mec=style.BLACK, mew=0.6, zorder=4)

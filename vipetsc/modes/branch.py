@@ -81,7 +81,7 @@ class Branch:
     def fits(self) -> dict[str, dict[str, float]]:
         """Power laws of the slope in regions II (its falling part), III and IV."""
         energy, slope, region = (self.column(n) for n in ("energy", "slope", "region"))
-        regular = np.array([p.kind == "regular" for p in self.points])
+        regular = np.array([p.kind == "regular" for p in self.points], bool)
         found = {}
         for number, label in ((2, "II"), (3, "III"), (4, "IV")):
             inside = np.nonzero((region == number) & regular)[0]

@@ -140,5 +140,5 @@ class Grazing(Chart):
         """See ``Chart.derivative``."""
         d = np.diag(np.append(np.full(len(xi) - 1, self.size), self.period))
         d[self.index, :-1] = -self.row * self.size
-        d[self.index, self.index] = self.sign * self.clearance * 2 * abs(xi[self.index])
+        d[self.index, self.index] = self.sign * self.clearance * 2 * max(abs(xi[self.index]), 1e-9)
         return d

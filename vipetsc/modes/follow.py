@@ -15,14 +15,19 @@ from vipetsc.modes.audit import Watch, is_jump, suspects
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
 from vipetsc.modes.options import NnmCase, NnmTable
-from vipetsc.modes.orbit import FiniteDifferences, Flow, FlowError
+from vipetsc.modes.newmark import Newmark
+from vipetsc.modes.orbit import Compiled, FiniteDifferences, Flow, FlowError
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.portrait import portrait
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import Locator
 from vipetsc.modes.switching import switch
 from vipetsc.modes.system import System
+from vipetsc.modes.tsrk import Tsrk
 from vipetsc.store import provenance
+
+FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Compiled, Tsrk, Newmark)}
+"""The flows by their names in case files."""
 
 SAVE_EVERY = 500
 """Points between two writings of a growing branch."""
@@ -94,7 +99,7 @@ def follow(
 
 def corrector_of(options: NnmTable, system: System) -> Corrector:
     """Flow, map and solver as the options have them."""
-    flow = Flow.named(options.flow)(system)
+    flow = FLOWS[options.flow](system)
     if options.jacobian == "differences":
         flow = FiniteDifferences(flow)
     name = options.map
