@@ -21,7 +21,7 @@ def impacts(run: RunFile, analysis: h5py.File | None) -> Figure:
     raster, bars = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": (4, 1)})
     speed = np.abs(log["approach_velocity"])
     norm = style.log_norm(speed.max(), 2)
-    for side, marker, shift in ((1, 6, 0.09), (-1, 7, -0.09)):
+    for side, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
         chosen = log["side"] == side
         image = raster.scatter(log["onset"][chosen], log["site"][chosen] + shift, 14, speed[chosen], marker=marker,
                                lw=0, norm=norm, cmap="viridis_r", rasterized=True)  # fmt: skip

@@ -244,7 +244,8 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
         axes.annotate("", (0.5, 1.05), (n + 0.5, 1.05), arrowprops={
             "arrowstyle": "<->", "color": style.GREY, "lw": 0.7, "connectionstyle": "arc3,rad=0.06"})  # fmt: skip
     axes.annotate("drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left", va="center",
-                  fontsize=7, color=style.BLUE, arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
+                  fontsize=7, color=style.BLUE,
+                  arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
     last = -np.inf
     for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
         axes.add_patch(Rectangle((site + 1 - 0.003 * n, 0), max(0.006 * n, 1), 1, fc=style.VERMILION, lw=0))

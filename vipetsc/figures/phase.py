@@ -46,6 +46,8 @@ def phase(run: RunFile, analysis: h5py.File | None) -> Figure:
         after = _trajectory(axes, x, y, time, first, norm)
         axes.set(xlabel=f"${symbol}$ (mm)", ylabel=rf"$\dot{{{symbol}}}$ (m/s)")
         style.letter(axes, f"({key}) {title}, cell {cell}")
+    wide = max(panels[2].get_xlim()[1], 1.15e3 * run.clearances[site])
+    panels[2].set_xlim(-wide, wide)
     for wall in (-1, 1):
         panels[2].axvline(wall * run.clearances[site] * 1e3, color=style.VERMILION, lw=0.8, ls=(0, (4, 2)))
     panels[2].annotate("clearance", (run.clearances[site] * 1e3, 1), (-2, -2), xycoords=("data", "axes fraction"),
@@ -54,7 +56,7 @@ def phase(run: RunFile, analysis: h5py.File | None) -> Figure:
     if np.isfinite(first):
         figure.colorbar(after, ax=panels, label="Time (s)", pad=0.01)
     else:
-        figure.suptitle("No contact at this site", fontsize=7, color=style.GREY)
+        panels[2].text(0.5, 0.03, "no contact", ha="center", color=style.GREY, transform=panels[2].transAxes)
     return figure
 
 
