@@ -78,6 +78,13 @@ def test_published_drive_frequencies_and_speeds():
     assert contact_stiffness(1e8, 0.005, 0.3) == pytest.approx(2e8 * np.sqrt(0.005) / 2.73)
 
 
+def test_long_waves_travel_at_the_static_speed():
+    """At kappa = 0: the square root of the cell's stiffness in series over its mass."""
+    series = 1 / (1 / 2e4 + 2 / 1e4)
+    assert bloch(four_band(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(series / 0.015), rel=1e-6)
+    assert bloch(diatomic(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(9e4 / 0.09), rel=1e-6)
+
+
 @pytest.mark.parametrize("cell", [four_band(), four_band("calibrated"), diatomic()])
 def test_waves_at_a_frequency_lie_on_the_branch(cell):
     _, frequency, speed = max_group_velocity(cell, 2)

@@ -63,9 +63,12 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
             top, bottom = sorted((a, b), key=lambda i: -place[i][1])
             drop = ROOM if inside and top == cell.host else HALF
             _spring(axes, (xa, place[top][1] - drop), (xb, place[bottom][1] + HALF), text)
-        else:
+        elif abs(ya - yb) < 0.1:
             _route(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
             level += 0.55
+        else:
+            short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
+            _spring(axes, tuple(np.array([xa, ya]) + short), tuple(np.array([xb, yb]) - short), text)
     for i, (x, y) in place.items():
         if not (inside and i in (cell.host, cell.resonator)):
             _mass(axes, x, y, i, cell.masses[i], cell)
@@ -134,7 +137,8 @@ def _mass(axes: Axes, x: float, y: float, index: int, mass: float, cell: UnitCel
     look = {"boxstyle": "round,pad=0,rounding_size=0.08", "fc": colour, "ec": style.BLACK, "lw": 0.7, "zorder": 3}
     axes.add_patch(FancyBboxPatch((x - HALF, y - HALF), 2 * HALF, 2 * HALF, **look))
     axes.text(x, y, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
-    axes.text(x, y - HALF - 0.08, _si(1e3 * mass, "g"), ha="center", va="top", fontsize=6.5, zorder=4)
+    # Beside the mass's lower left corner, clear of what hangs below it and of the spring on its left.
+    axes.text(x - HALF - 0.05, y - HALF, _si(1e3 * mass, "g"), ha="right", va="center", fontsize=6.5, zorder=4)
 
 
 def _host_with_resonator(axes: Axes, centre: tuple[float, float], cell: UnitCell) -> None:
@@ -169,18 +173,10 @@ def _contact_link(axes: Axes, host: tuple[float, float], resonator: tuple[float,
     """A bowed double arrow between the pair, for a resonator that other masses hold too."""
     axes.annotate("", resonator, host, zorder=2, arrowprops={
         "arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)),
-        "shrinkA": 16, "shrinkB": 16, "connectionstyle": "arc3,rad=0.45"})  # fmt: skip
+        "shrinkA": 9, "shrinkB": 9, "connectionstyle": "arc3,rad=0.45"})  # fmt: skip
     middle = (host[0] + resonator[0]) / 2, (host[1] + resonator[1]) / 2
-    axes.annotate(
-        "contact, Δ",
-        middle,
-        (0, -26),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize=6.5,
-        color=style.VERMILION,
-    )
+    axes.annotate("contact, Δ", middle, (-16, 0), textcoords="offset points", ha="right", va="center",
+                  fontsize=6.5, color=style.VERMILION)  # fmt: skip
 
 
 def _spring(
@@ -240,15 +236,13 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
                 Rectangle((wall, -0.25), 0.02 * n, 1.5, fc="white", ec=style.GREY, hatch="//////", lw=0.0)
             )
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
-    elif chain.ends == "periodic":
-        axes.annotate("", (0.5, 1.05), (n + 0.5, 1.05), arrowprops={
-            "arrowstyle": "<->", "color": style.GREY, "lw": 0.7, "connectionstyle": "arc3,rad=0.06"})  # fmt: skip
     axes.annotate("drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left", va="center",
                   fontsize=7, color=style.BLUE,
                   arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
     last = -np.inf
     for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
-        axes.add_patch(Rectangle((site + 1 - 0.003 * n, 0), max(0.006 * n, 1), 1, fc=style.VERMILION, lw=0))
+        width = max(0.006 * n, 1)
+        axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
         # Labels need about a tenth of the strip each; neighbouring sites go without.
         if site - last > 0.085 * n:
             axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
