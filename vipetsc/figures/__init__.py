@@ -5,12 +5,14 @@ from importlib import import_module
 _HOMES = {
     "bands": "vipetsc.figures.bands",
     "draw": "vipetsc.figures.registry",
+    "draw_bands": "vipetsc.figures.registry",
+    "names": "vipetsc.figures.registry",
     "run_figures": "vipetsc.figures.registry",
     "save": "vipetsc.figures.registry",
     "look": "vipetsc.figures.style",
 }
 
-__all__ = ["bands", "draw", "look", "run_figures", "save"]
+__all__ = ["bands", "draw", "draw_bands", "look", "names", "run_figures", "save"]
 
 
 def __getattr__(name: str) -> object:
