@@ -85,9 +85,7 @@ def _json(parser: argparse.ArgumentParser) -> None:
 def _plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", type=Path, metavar="PATH", help="a run's folder, or its run.h5")
     parser.add_argument("--fig", action="append", metavar="NAME", help="only this figure; may be repeated")
-    parser.add_argument(
-        "--format", action="append", choices=("png", "pdf"), help="png if left out; may be repeated"
-    )
+    parser.add_argument("--format", action="append", choices=("png", "pdf"), help="png if left out; may be repeated")
 
 
 def _load(options: argparse.Namespace, comm: MPI.Comm) -> Case:
@@ -158,10 +156,13 @@ def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
     def report() -> str:
         table = bands_table(case.unit_cell())
         if options.out is not None:
-            from vipetsc.figures import draw_bands
+            from vipetsc.figures import look, save
+            from vipetsc.figures.bands import bands as band_diagram
 
             options.out.mkdir(parents=True, exist_ok=True)
-            picture = draw_bands(case.unit_cell(), options.out / "bands.png")
+            with look():
+                figure = band_diagram(case.unit_cell(), case.drive.frequency)
+                picture = save(figure, options.out / "bands.png")
             write_text(options.out / "bands.json", json.dumps(table, indent=2) + "\n")
             table["picture"] = str(picture)
         return json.dumps(table, indent=2) if options.json else bands_table(case.unit_cell(), as_text=True)
@@ -172,19 +173,26 @@ def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Pictures of a finished run again, from its files."""
-    from vipetsc.figures import draw, names
+    from vipetsc.figures import draw, run_figures
+    from vipetsc.records import RunFile
     from vipetsc.studies.analysis import analyse
 
     folder = options.path.parent if options.path.name == "run.h5" else options.path
 
     def check() -> None:
-        unknown = set(options.fig or []) - set(names())
+        unknown = set(options.fig or []) - set(run_figures)
         if unknown:
-            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(names())}")
-        if not (folder / "run.h5").exists():
+            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(run_figures)}")
+        run, analysis = folder / "run.h5", folder / "analysis.h5"
+        if not run.exists():
             raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
-        if not (folder / "analysis.h5").exists():
-            analyse(folder / "run.h5", folder / "analysis.h5")
+        try:
+            with RunFile(run):
+                pass
+        except (OSError, ValueError, KeyError) as error:
+            raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
+        if not analysis.exists() or analysis.stat().st_mtime < run.stat().st_mtime:
+            analyse(run, analysis)
 
     on_root(comm, check)
     formats = tuple(options.format or ("png",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -28,9 +29,12 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         else:
             text = "".join(traceback.format_exception(kind, error, trace))
             sys.stderr.write(f"vipetsc: {where}{text}")
+        sys.stdout.flush()
         sys.stderr.flush()
         if comm.size > 1:
             comm.Abort(1)
+        # Without the usual farewell: HDF5 crashes in its own after a full disk.
+        os._exit(1)
 
     sys.excepthook = hook
 

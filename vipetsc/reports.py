@@ -156,9 +156,7 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
             version = getattr(importlib.import_module(module), "__version__", "yes")
             check(True, module, version, "")
         except ImportError:
-            check(
-                False, module, "", f"pip install --constraint scripts/constraints.txt {module.replace('_', '-')}"
-            )
+            check(False, module, "", f"pip install --constraint scripts/constraints.txt {module.replace('_', '-')}")
     try:
         from vipetsc.dynamics import native
 

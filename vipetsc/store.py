@@ -7,6 +7,7 @@ a kill, only ever meets whole ones. ``run.h5`` follows netCDF-4's conventions (d
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import platform
@@ -60,6 +61,11 @@ def written_aside(path: Path) -> Iterator[Path]:
     try:
         yield aside
         os.replace(aside, path)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise OSError(
+            error.errno, f"{path} could not be written; make room and go on with --resume: {error.strerror}"
+        ) from error
     except BaseException:
         aside.unlink(missing_ok=True)
         raise
@@ -129,14 +135,12 @@ class RunFolder:
     def write_part(self, number: int, part: dict[str, np.ndarray] | None) -> None:
         """Write this rank's share of a part; None writes nothing. All ranks must call it."""
         if part is not None:
-            with written_aside(self._part(number, self.comm.rank)) as aside, aside.open("wb") as file:
-                np.savez(file, **part)
+            _save(self._part(number, self.comm.rank), part)
         self.comm.Barrier()
 
     def write_state(self, number: int, state: dict[str, np.ndarray]) -> None:
         """Write this rank's checkpoint after part ``number``; the part is complete on all ranks by then."""
-        with written_aside(self._state(number, self.comm.rank)) as aside, aside.open("wb") as file:
-            np.savez(file, **state)
+        _save(self._state(number, self.comm.rank), state)
         self._state(number - 2, self.comm.rank).unlink(missing_ok=True)
 
     def last_state(self) -> int:
@@ -187,8 +191,14 @@ class RunFolder:
             first = sum(shares[: writers.rank])
             driver = {"driver": "mpio", "comm": writers} if writers.size > 1 else {}
             target = self.path / ".run.h5.part"
-            with h5py.File(target, "w", **driver) as file:
-                self._fill(file, case, cells, first, sum(shares), parts, about, writers)
+            try:
+                with h5py.File(target, "w", **driver) as file:
+                    self._fill(file, case, cells, first, sum(shares), parts, about, writers)
+            except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
+                target.unlink(missing_ok=True)
+                raise OSError(
+                    f"{self.run_file} could not be written; make room and go on with --resume: {error}"
+                ) from error
             writers.Barrier()
             if writers.rank == 0:
                 os.replace(target, self.run_file)
@@ -223,9 +233,7 @@ class RunFolder:
             coordinates.put(f"energy/{name}", ("time",), energies[name], "J", text)
         text = "energy dissipated at each site"
         coordinates.put("energy/dissipated_by_site", ("time", "site"), by_site, "J", text)
-        coordinates.put(
-            "sites/cell", ("site",), np.asarray(case.contacts.sites, np.int64), "1", "cell of the site"
-        )
+        coordinates.put("sites/cell", ("site",), np.asarray(case.contacts.sites, np.int64), "1", "cell of the site")
         clearances = np.asarray(case.contacts.clearance or [], float)
         coordinates.put("sites/clearance", ("site",), clearances, "m", "clearance of the site")
         for name, (unit, text) in _IMPACTS.items():
@@ -298,6 +306,14 @@ def _write_share(dataset: h5py.Dataset, where: Any, values: np.ndarray, writers:
         return
     with dataset.collective:
         dataset[where] = values
+
+
+def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    # Through memory: a zip file that meets a full disk half way complains again when it is forgotten.
+    packed = io.BytesIO()
+    np.savez(packed, **arrays)
+    with written_aside(path) as aside:
+        aside.write_bytes(packed.getbuffer())
 
 
 def _difference(old: str, new: str) -> str:

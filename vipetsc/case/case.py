@@ -214,9 +214,7 @@ def _resolved(sections: dict[str, Any]) -> dict[str, dict]:
     tables["contacts"] |= {"sites": sites, "clearance": list(clearance)}
     if contacts.stiffness is None and contacts.modulus is not None:
         stiffness = contact_stiffness(contacts.modulus, contacts.radius, contacts.poisson)
-        tables["contacts"] = {
-            k: v for k, v in tables["contacts"].items() if k not in ("modulus", "radius", "poisson")
-        }
+        tables["contacts"] = {k: v for k, v in tables["contacts"].items() if k not in ("modulus", "radius", "poisson")}
         tables["contacts"]["stiffness"] = float(stiffness)
 
     if drive.wavenumber is not None:

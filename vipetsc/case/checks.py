@@ -42,9 +42,7 @@ def cross_problems(sections: dict[str, Any], bad: set[str]) -> list[Problem]:
             check(value is None or lattice.preset == "four-band", key, value, "only the four-band preset has it")
         wrong = cell_problems(*lattice.cell.parts()) if lattice.cell else []
         problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
-        cell = (
-            None if both or wrong or any(p.key.startswith("lattice.") for p in problems) else unit_cell_of(lattice)
-        )
+        cell = None if both or wrong or any(p.key.startswith("lattice.") for p in problems) else unit_cell_of(lattice)
 
     if sound("lattice.cells", "contacts.sites"):
         sites = sites_of(lattice, contacts)

@@ -22,9 +22,7 @@ def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
     for band in found:
         colour = BRANCHES[(band.number - 1) % len(BRANCHES)]
         left.plot(kappa / np.pi, point.frequency[:, band.number - 1] / 1e3, color=colour)
-        right.plot(
-            point.group_velocity[:, band.number - 1], point.frequency[:, band.number - 1] / 1e3, color=colour
-        )
+        right.plot(point.group_velocity[:, band.number - 1], point.frequency[:, band.number - 1] / 1e3, color=colour)
     top = 1.08 * found[-1].high / 1e3
     for axes in (left, right):
         for low, high in gaps(found):

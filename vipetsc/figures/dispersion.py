@@ -65,9 +65,7 @@ def _sums(axes: Axes, cell: UnitCell, frequency: np.ndarray, spectra: dict, driv
         total = spectrum.sum(axis=0)
         largest = max(largest, total.max())
         label = PANELS[name].split()[0].lower()
-        axes.plot(
-            np.maximum(total, 1e-300), frequency / 1e3, color=colours.get(name, style.BLACK), lw=0.7, label=label
-        )
+        axes.plot(np.maximum(total, 1e-300), frequency / 1e3, color=colours.get(name, style.BLACK), lw=0.7, label=label)
     axes.axhline(driven / 1e3, color=style.BLACK, lw=0.6, ls=":")
     largest = largest or 1.0
     axes.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")

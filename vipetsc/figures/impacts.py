@@ -26,9 +26,7 @@ def impacts(run: RunFile, analysis: h5py.File | None) -> Figure:
         image = raster.scatter(log["onset"][chosen], log["site"][chosen] + shift, 14, speed[chosen], marker=marker,
                                lw=0, norm=norm, cmap="viridis_r", rasterized=True)  # fmt: skip
     raster.set_yticks(np.arange(1, len(sites) + 1), [f"{c}" for c in sites])
-    raster.set(
-        xlabel="Time (s)", ylabel="Contact site (cell)", xlim=run.time[[0, -1]], ylim=(0.4, len(sites) + 0.6)
-    )
+    raster.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=run.time[[0, -1]], ylim=(0.4, len(sites) + 0.6))
     raster.grid(axis="y", color=style.PALE, lw=0.5)
     raster.set_axisbelow(True)
     figure.colorbar(image, ax=raster, label="Approach speed (m/s)", pad=0.01, extend="min")

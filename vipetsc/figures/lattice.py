@@ -232,9 +232,7 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
         axes.vlines(np.arange(1, n) + 0.5, 0, 1, color="white", lw=0.5)
     if chain.ends == "fixed":
         for wall in (0.5 - 0.02 * n, n + 0.5):
-            axes.add_patch(
-                Rectangle((wall, -0.25), 0.02 * n, 1.5, fc="white", ec=style.GREY, hatch="//////", lw=0.0)
-            )
+            axes.add_patch(Rectangle((wall, -0.25), 0.02 * n, 1.5, fc="white", ec=style.GREY, hatch="//////", lw=0.0))
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
     axes.annotate("drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left", va="center",
                   fontsize=7, color=style.BLUE,

@@ -75,9 +75,7 @@ def _trajectory(
     before = int(np.searchsorted(time, first))
     points = np.stack([x, y], axis=1)
     segments = np.stack([points[:-1], points[1:]], axis=1)
-    lines = LineCollection(
-        segments[before:], array=time[before:-1], norm=norm, cmap="viridis", lw=0.4, rasterized=True
-    )
+    lines = LineCollection(segments[before:], array=time[before:-1], norm=norm, cmap="viridis", lw=0.4, rasterized=True)
     axes.add_collection(lines)
     axes.plot(x[: before + 1], y[: before + 1], color=style.GREY, lw=0.4, rasterized=True)
     for set_limits, values in ((axes.set_xlim, x), (axes.set_ylim, y)):

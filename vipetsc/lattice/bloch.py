@@ -111,9 +111,7 @@ def waves_at(cell: UnitCell, frequency: float, points: int = 721) -> list[tuple[
         for i in np.nonzero(offset[:-1, b] * offset[1:, b] <= 0)[0]:
             if offset[i, b] == 0 and i > 0:
                 continue
-            root = brentq(
-                lambda x, b=b: _frequency(cell, b + 1, x) - frequency, kappa[i], kappa[i + 1], xtol=1e-13
-            )
+            root = brentq(lambda x, b=b: _frequency(cell, b + 1, x) - frequency, kappa[i], kappa[i + 1], xtol=1e-13)
             speed = float(abs(bloch(cell, root).group_velocity[b]))
             waves.append((b + 1, root, speed))
     return waves

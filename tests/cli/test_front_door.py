@@ -1,0 +1,309 @@
+"""The command line as a user types it: exit codes, refusals, faults, kill and resume."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import assert_same_bits, clean_environment, datasets
+
+SMALL = """
+[lattice]
+preset = "four-band"
+cells = 24
+[contacts]
+sites = [6, 12, 13]
+clearance = 2e-4
+[drive]
+amplitude = 24.33
+cycles = 6
+[time]
+end = 0.06
+"""
+QUICK = ("--set", "output.figures=false")
+
+
+@pytest.fixture
+def case(tmp_path) -> Path:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, case, tmp_path, ranks):
+    ended = vipetsc(ranks, "run", case, "--out", tmp_path / "out")
+    assert ended.returncode == 0, ended.stderr
+    assert "complete: 301 samples" in ended.stdout
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["complete"]
+    assert summary["ranks"] == max(ranks, 1)
+    assert summary["case"]["contacts"]["sites"] == [6, 12, 13]
+    assert summary["statistics"]["ledger_error"] < 1e-8
+    assert summary["petsc_version"]
+    files = {p.name for p in (tmp_path / "out").iterdir()}
+    assert files == {"run.h5", "summary.json", "case.toml", "analysis.h5", "figures"}
+    pictures = {p.name: p.stat().st_size for p in (tmp_path / "out" / "figures").glob("*.png")}
+    wanted = {"spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
+    assert {f"{name}.png" for name in wanted} <= pictures.keys()
+    assert min(pictures.values()) > 5000
+
+
+def test_no_verb_is_the_builtin_case(vipetsc, tmp_path):
+    ended = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "runs" / "four-band" / "run.h5").exists()
+    again = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
+    assert again.returncode == 2
+    assert "--force" in again.stderr
+    forced = vipetsc(0, "--set", "time.end=0.01", *QUICK, "--force", cwd=tmp_path)
+    assert forced.returncode == 0, forced.stderr
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_everything_wrong_with_a_case_is_said_at_once(vipetsc, tmp_path, ranks):
+    path = tmp_path / "bad.toml"
+    path.write_text(
+        """
+        [lattice]
+        preset = "fourband"
+        cels = 3
+        [contacts]
+        sites = [3, 3, 400]
+        clearance = 0.0
+        restitution = 1.5
+        [drive]
+        amplitude = "big"
+        [time]
+        sample_interval = 1.0
+        [drvie]
+        """
+    )
+    ended = vipetsc(ranks, "run", path, "--out", tmp_path / "out")
+    assert ended.returncode == 2
+    for text in (
+        "lattice.preset = 'fourband'", "did you mean 'four-band'", "lattice.cels = 3", "did you mean lattice.cells",
+        "[400]", "named twice", "contacts.clearance = 0.0", "contacts.restitution = 1.5", "drive.amplitude = 'big'",
+        "drvie", "did you mean drive",
+    ):  # fmt: skip
+        assert ended.stderr.count(text) == 1, text
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("run", "nowhere.toml"), "nowhere.toml: No such file"),
+        (("run", "--set", "time.end"), "write section.key=value"),
+        (("run", "--set", "time.sample_interval=0.01"), "too coarse for the bands"),
+        (("run", "--set", "lattice.cell.masses=[1.0, -1.0]"), "lattice.cell"),
+        (("run", "--force", "--resume"), "exclude each other"),
+        (("fly",), "invalid choice: 'fly'"),
+        (("plot", "nowhere"), "holds no run.h5"),
+        (("run", "--resume", "--out", "new"), "no unfinished run"),
+    ],
+)
+def test_bad_input_is_exit_code_2_and_writes_nothing(vipetsc, tmp_path, arguments, text):
+    ended = vipetsc(0, *arguments, cwd=tmp_path)
+    assert ended.returncode == 2
+    assert text in ended.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_case_that_is_not_toml(vipetsc, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_bytes(b"\x89HDF\r\n\x1a\n\xff\xfe")
+    ended = vipetsc(0, "validate", path)
+    assert ended.returncode == 2
+    assert "not a TOML file" in ended.stderr
+
+
+def test_a_folder_that_is_not_a_run_is_never_replaced(vipetsc, case, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.tex").write_text("years of work")
+    for force in ((), ("--force",)):
+        ended = vipetsc(0, "run", case, "--out", out, *force)
+        assert ended.returncode == 2
+        assert "not a run's" in ended.stderr
+    assert [p.name for p in out.iterdir()] == ["thesis.tex"]
+
+
+def test_a_run_file_that_is_not_ours(vipetsc, tmp_path):
+    (tmp_path / "run.h5").write_text("not HDF5 at all")
+    ended = vipetsc(0, "plot", tmp_path)
+    assert ended.returncode == 2
+    assert "run.h5" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_a_frequency_in_a_gap_is_a_warning(vipetsc, tmp_path):
+    ended = vipetsc(0, "validate", "--set", "drive.frequency=650.0")
+    assert ended.returncode == 0
+    assert "no pass band" in ended.stdout
+
+
+def test_validate_prints_what_follows_from_the_case(vipetsc):
+    ended = vipetsc(0, "validate")
+    assert ended.returncode == 0
+    for text in ("3214.90-3644.75", "Om = 1023.27", "v_g = 428.68", "4421", "75, 106, 138, 169, 200"):
+        assert text in ended.stdout
+
+
+def test_bands_as_json_and_picture(vipetsc, tmp_path):
+    ended = vipetsc(0, "bands", "--json", "--set", "lattice.reading=printed", "--out", tmp_path / "bands")
+    assert ended.returncode == 0, ended.stderr
+    table = json.loads(ended.stdout)
+    edges = [(round(b["low"], 2), round(b["high"], 2)) for b in table["bands"]]
+    assert edges == [(0.0, 836.47), (947.07, 1414.21), (2331.09, 3162.28), (3271.55, 3669.65)]
+    assert len(table["gaps"]) == 3
+    assert (tmp_path / "bands" / "bands.png").stat().st_size > 5000
+
+
+def test_doctor(vipetsc):
+    ended = vipetsc(2, "doctor")
+    assert ended.returncode == 0, ended.stdout
+    assert "all is well" in ended.stdout
+
+
+def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
+    ended = vipetsc(0, "run", case, "--out", tmp_path / "out", *QUICK, "--", "-ts_rk_type", "5dp", "-log_view")
+    assert ended.returncode == 0, ended.stderr
+    assert "TSFunctionEval" in ended.stdout
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["statistics"]["method"] == "5dp"
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_path, ranks):
+    """Explicit Euler without step control feeds energy in: the guard ends the run and keeps what is good."""
+    out = tmp_path / "out"
+    euler = ("--", "-ts_rk_type", "1fe", "-ts_adapt_type", "none")
+    sets = ("--set", "lattice.cells=40", "--set", "contacts.sites=[10]", "--set", "time.end=0.5")
+    ended = vipetsc(ranks, "run", "--out", out, *sets, *QUICK, *euler)
+    assert ended.returncode == 1, ended.stdout + ended.stderr
+    status = json.loads((out / "summary.json").read_text())["status"]
+    for text in ("runs away", "at t = ", "nearest site 1 in cell 10", "last good sample: t = "):
+        assert text in status
+    run = datasets(out / "run.h5")
+    assert 1 < len(run["time"]) < 2500
+    assert all(abs(run["velocity"][k]).max() < 1e3 for k in range(len(run["time"])))
+
+
+def begin(case: Path, out: Path, ranks: int, *more: str) -> subprocess.Popen:
+    launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
+    command = [*launcher, sys.executable, "-m", "vipetsc", "run", str(case), "--out", str(out), *QUICK, *more]
+    return subprocess.Popen(
+        command, env=clean_environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    )
+
+
+def await_checkpoints(process: subprocess.Popen, out: Path, ranks: int, number: int) -> None:
+    while process.poll() is None:
+        states = [p for p in (out / "parts").glob("state-*.npz") if int(p.stem.split("-")[1]) >= number]
+        if len(states) >= max(ranks, 1):
+            return
+        time.sleep(0.005)
+    raise AssertionError(process.communicate()[1].decode())
+
+
+LONG = ("--set", "time.end=1.0")
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, number):
+    whole = vipetsc(ranks, "run", case, "--out", tmp_path / "whole", *QUICK, *LONG)
+    assert whole.returncode == 0, whole.stderr
+    out = tmp_path / "out"
+    process = begin(case, out, ranks, *LONG)
+    await_checkpoints(process, out, ranks, 2)
+    if number == signal.SIGKILL:
+        os.killpg(process.pid, number)
+    else:
+        process.send_signal(number)
+    process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert not (out / "run.h5").exists()
+    refused = vipetsc(ranks, "run", case, "--out", out, *QUICK, *LONG)
+    assert refused.returncode == 2
+    assert "--resume" in refused.stderr
+    other = vipetsc(ranks, "run", case, "--out", out, *QUICK, *LONG, "--set", "drive.amplitude=20.0", "--resume")
+    assert other.returncode == 2
+    assert "amplitude = 20.0" in other.stderr
+    resumed = vipetsc(ranks, "run", case, "--out", out, *QUICK, *LONG, "--resume")
+    assert resumed.returncode == 0, resumed.stderr
+    assert_same_bits(datasets(tmp_path / "whole" / "run.h5"), datasets(out / "run.h5"))
+    assert not (out / "parts").exists()
+
+
+def test_one_killed_rank_ends_all_and_loses_nothing(vipetsc, case, tmp_path):
+    out = tmp_path / "out"
+    process = begin(case, out, 2, *LONG)
+    await_checkpoints(process, out, 2, 1)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    os.kill(int(children[-1]), signal.SIGKILL)
+    process.communicate(timeout=60)
+    assert process.returncode != 0
+    wrong = vipetsc(0, "run", case, "--out", out, *QUICK, *LONG, "--resume")
+    assert wrong.returncode == 2
+    assert "mpirun -n 2" in wrong.stderr
+    resumed = vipetsc(2, "run", case, "--out", out, *QUICK, *LONG, "--resume")
+    assert resumed.returncode == 0, resumed.stderr
+
+
+FULL_DISK = """
+import resource, sys
+from mpi4py import MPI
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
+from vipetsc.__main__ import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("limit", [300_000, 440_000])
+def test_a_disk_that_fills_ends_all_and_loses_nothing(vipetsc, case, tmp_path, ranks, limit):
+    """No file may grow beyond the limit: the first part does not fit, or the parts do and run.h5 does not."""
+    out = tmp_path / "out"
+    first = vipetsc(ranks, "run", case, "--out", out, *QUICK)
+    assert first.returncode == 0, first.stderr
+    before = (out / "run.h5").read_bytes()
+    script = tmp_path / "full.py"
+    script.write_text(FULL_DISK)
+    command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, str(script), str(limit)]
+    command += ["run", str(case), "--out", str(out), "--force", *QUICK]
+    full = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+    assert full.returncode == 1, full.stdout + full.stderr
+    assert "Traceback" not in full.stderr
+    assert "File too large" in full.stderr
+    assert (out / "run.h5").read_bytes() == before
+    resumed = vipetsc(ranks, "run", case, "--out", out, "--resume", *QUICK)
+    assert resumed.returncode == 0, resumed.stderr
+    assert (out / "run.h5").stat().st_size == len(before)
+
+
+FAILS_ON_ONE_RANK = """
+from mpi4py import MPI
+from vipetsc.parallel import install_abort_hook
+install_abort_hook()
+if MPI.COMM_WORLD.rank == 1:
+    raise RuntimeError("rank 1 cannot go on")
+MPI.COMM_WORLD.Barrier()
+"""
+
+
+def test_a_rank_that_raises_ends_all(tmp_path):
+    script = tmp_path / "fails.py"
+    script.write_text(FAILS_ON_ONE_RANK)
+    command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, str(script)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+    assert ended.returncode == 1
+    assert "rank 1: " in ended.stderr
+    assert "cannot go on" in ended.stderr

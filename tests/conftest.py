@@ -1,0 +1,84 @@
+"""Small cases and shared folders; signals and threads as the front door sets them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import petsc4py
+
+petsc4py.init(["pytest", "-no_signal_handler"])
+
+from mpi4py import MPI
+
+import h5py
+import numpy as np
+import pytest
+
+from vipetsc.case import Case
+
+
+@pytest.fixture
+def folder():
+    """A temporary folder that all ranks share."""
+    comm = MPI.COMM_WORLD
+    path = comm.bcast(tempfile.mkdtemp(prefix="vipetsc-") if comm.rank == 0 else None)
+    yield Path(path)
+    comm.Barrier()
+    if comm.rank == 0:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def small_case(**sections) -> Case:
+    """A four-band lattice of 24 cells in which contacts begin early; sections update the table."""
+    table = {
+        "name": "small",
+        "lattice": {"preset": "four-band", "cells": 24},
+        "contacts": {"sites": [6, 12, 13], "clearance": 2e-4},
+        "drive": {"amplitude": 24.33, "cycles": 6},
+        "time": {"end": 0.08},
+    }
+    for name, values in sections.items():
+        table[name] = table.get(name, {}) | values
+    return Case.from_table(table)
+
+
+def datasets(path: Path) -> dict[str, np.ndarray]:
+    """Every dataset of an HDF5 file by its path."""
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[...]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
+    """Two files' datasets agree in every bit; NaN equals NaN."""
+    assert first.keys() == second.keys()
+    for name, values in first.items():
+        assert values.shape == second[name].shape, name
+        assert values.tobytes() == second[name].tobytes(), name
+
+
+def clean_environment() -> dict[str, str]:
+    """The environment without what this process's own MPI put into it: a child may then be an mpirun."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "PRTE", "OMPI_UNIVERSE"))}
+    return kept | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+
+
+@pytest.fixture
+def vipetsc():
+    """Call the program as a user types it: ``vipetsc(ranks, "run", ...)`` returns the ended process."""
+
+    def call(ranks: int, *arguments: object, timeout: float = 120, **options) -> subprocess.CompletedProcess:
+        launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
+        command = [*launcher, sys.executable, "-m", "vipetsc", *map(str, arguments)]
+        options = {"capture_output": True, "text": True, "env": clean_environment()} | options
+        return subprocess.run(command, timeout=timeout, check=False, **options)
+
+    return call

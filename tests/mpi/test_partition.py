@@ -1,0 +1,92 @@
+"""The same bits on any number of ranks: samples, impact log, ledger; gathered and parallel files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.case import Case
+from vipetsc.dynamics import simulate
+
+
+def runs_alike(folder: Path, case: Case, **options) -> None:
+    """Simulate ``case`` on all ranks and on rank 0 alone: every dataset has the same bits."""
+    comm = MPI.COMM_WORLD
+    together = simulate(case, folder / "together", comm, **options)
+    alone = simulate(case, folder / f"alone-{comm.rank}", MPI.COMM_SELF)
+    assert together.complete
+    assert alone.complete
+    first, second = datasets(folder / "together" / "run.h5"), datasets(folder / f"alone-{comm.rank}" / "run.h5")
+    assert_same_bits(first, second)
+    assert len(first["impacts/site"]) > 0
+    for name in ("episodes", "steps", "rejected", "landings", "switches", "ledger_error", "work", "dissipated"):
+        assert together.statistics[name] == alone.statistics[name], name
+
+
+@pytest.mark.parallel([1, 2, 3, 4])
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+def test_same_bits_with_sites_on_the_borders(folder, ends, law):
+    # On 2, 3 and 4 ranks, 24 cells are cut after 12; 8, 16; 6, 12, 18.
+    sites = [6, 7, 12, 13, 16, 17]
+    case = small_case(lattice={"ends": ends}, contacts={"law": law, "sites": sites}, time={"end": 0.04})
+    runs_alike(folder, case)
+
+
+@pytest.mark.parallel([2, 3])
+def test_same_bits_diatomic_and_driven_in_the_middle(folder):
+    table = {
+        "lattice": {"preset": "diatomic", "cells": 31},
+        "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},
+        "drive": {"amplitude": 3.0, "cycles": 10, "cell": 16, "mass": 2},
+        "time": {"end": 0.05},
+    }
+    runs_alike(folder, Case.from_table(table))
+
+
+@pytest.mark.parallel([3, 4])
+def test_ranks_without_cells_take_part(folder):
+    case = small_case(lattice={"cells": 2}, contacts={"sites": [1, 2], "clearance": 5e-5}, time={"end": 0.02})
+    runs_alike(folder, case)
+    parallel = small_case(
+        lattice={"cells": 2},
+        contacts={"sites": [1, 2], "clearance": 5e-5},
+        time={"end": 0.02},
+        output={"writer": "parallel"},
+    )
+    runs_alike(folder / "written-in-parallel", parallel)
+
+
+@pytest.mark.parallel([2, 3])
+def test_parallel_writing_gives_the_gathered_file(folder):
+    output = {"window": [3, 20], "every": 2, "stride": 3}
+    for writer in ("gather", "parallel"):
+        simulate(small_case(output=output | {"writer": writer}), folder / writer)
+    gathered, parallel = (datasets(folder / w / "run.h5") for w in ("gather", "parallel"))
+    assert_same_bits(gathered, parallel)
+    assert gathered["cell"].tolist() == list(range(3, 21, 2))
+
+
+@pytest.mark.parallel([1, 2])
+def test_native_and_python_right_hand_sides_give_the_same_bits(folder):
+    for native in (True, False):
+        result = simulate(small_case(time={"end": 0.04}), folder / str(native), native=native)
+        assert result.statistics["right_hand_side"] == ("native" if native else "python")
+    assert_same_bits(*(datasets(folder / str(n) / "run.h5") for n in (True, False)))
+
+
+@pytest.mark.parallel(2)
+def test_the_whole_builtin_run_has_the_same_bits(folder):
+    case = Case.builtin()
+    comm = MPI.COMM_WORLD
+    result = simulate(case, folder / "two", comm)
+    if comm.rank == 0:
+        simulate(case, folder / "one", MPI.COMM_SELF)
+        one, two = datasets(folder / "one" / "run.h5"), datasets(folder / "two" / "run.h5")
+        assert_same_bits(one, two)
+        assert [int((one["impacts/site"] == s).sum()) for s in range(1, 6)] == [50, 43, 33, 37, 18]
+    assert result.statistics["ledger_error"] < 1e-8
