@@ -37,9 +37,7 @@ def cells(draw):
     masses = tuple(draw(st.lists(positive, min_size=n, max_size=n)))
     springs = [Spring(i, i + 1, draw(positive)) for i in range(n - 1)]
     ends = st.integers(0, n - 1)
-    springs += [
-        Spring(draw(ends), draw(ends), draw(positive), next_cell=True) for _ in range(draw(st.integers(1, 2)))
-    ]
+    springs += [Spring(draw(ends), draw(ends), draw(positive), next_cell=True) for _ in range(draw(st.integers(1, 2)))]
     host = draw(ends)
     return UnitCell(masses, tuple(springs), host, (host + 1) % n)
 
@@ -173,9 +171,7 @@ def test_burst_begins_and_ends_at_rest_and_peaks(envelope, peak):
     assert np.all(force[(t <= 0) | (t >= burst.duration)] == 0)
     assert np.abs(force).max() == pytest.approx(3 * peak, rel=5e-3)
     middle = 0.3 * burst.duration
-    assert burst.force(middle) == pytest.approx(
-        3 * peak / 2 * (1 - np.cos(2 * np.pi * 0.3)) * np.sin(100 * middle)
-    )
+    assert burst.force(middle) == pytest.approx(3 * peak / 2 * (1 - np.cos(2 * np.pi * 0.3)) * np.sin(100 * middle))
 
 
 def test_wave_scale_is_linear_in_the_drive():

@@ -65,9 +65,7 @@ def test_energies_obey_parseval(nt, n, seed):
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    st.integers(2, 60), st.integers(1, 5), st.integers(0, 99), st.lists(st.floats(1, 40), max_size=5, unique=True)
-)
+@given(st.integers(2, 60), st.integers(1, 5), st.integers(0, 99), st.lists(st.floats(1, 40), max_size=5, unique=True))
 def test_parts_are_a_partition(nt, n, seed, inner):
     edges = np.array([0.0, *sorted(inner), np.inf])
     signal = noise((nt, n), seed)
@@ -102,9 +100,7 @@ def test_a_tone_stays_in_its_part():
 def test_parts_name_bands_and_gaps():
     parts = Parts.of(pass_bands(four_band("calibrated")))
     assert parts.names == ("band 1", "gap 1", "band 2", "gap 2", "band 3", "gap 3", "band 4", "above")
-    assert np.allclose(
-        parts.edges[1:-1], [612.25, 681.48, 1414.21, 2267.36, 3162.28, 3214.90, 3644.75], atol=0.006
-    )
+    assert np.allclose(parts.edges[1:-1], [612.25, 681.48, 1414.21, 2267.36, 3162.28, 3214.90, 3644.75], atol=0.006)
     assert [parts.names[i] for i in np.nonzero(parts.above(1023.27))[0]] == ["band 3", "band 4"]
     assert not Parts.of(pass_bands(diatomic())).above(5520.0).any()
     merged = Parts.of([Band(1, 0.0, 2.0), Band(2, 1.0, 3.0), Band(3, 5.0, 6.0)])
