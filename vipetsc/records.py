@@ -39,7 +39,7 @@ class RunFile:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.file = h5py.File(self.path, "r")
-        missing = [name for name in ("time", "cell", "velocity", "energy") if name not in self.file]
+        missing = [name for name in ("time", "cell", "energy") if name not in self.file]
         if missing or "case" not in self.file.attrs:
             self.file.close()
             raise ValueError(f"{self.path} is not a run of vipetsc: it has no {', '.join(missing) or 'case'}")

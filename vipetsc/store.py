@@ -213,7 +213,7 @@ class RunFolder:
         coordinates.add("dof", np.arange(1, case.unit_cell().dofs + 1), "1", "mass within the cell, from 1")
         coordinates.add("site", np.arange(1, len(case.contacts.sites) + 1), "1", "contact site, from 1")
         coordinates.add("episode", np.arange(1, len(impacts["site"]) + 1), "1", "contact episode, by onset")
-        _write_share(file["cell"], own, cells, writers)
+        _write_share(file["cell"], own, cells)
         at = "time"
         if len(field_times) != len(times):
             coordinates.add("field_time", field_times, "s", "time of the recorded fields")
@@ -227,7 +227,7 @@ class RunFolder:
             with np.load(self._part(number, rank)) as part:
                 count = part[case.output.fields[0]].shape[0] if case.output.fields else 0
                 for name in case.output.fields:
-                    _write_share(file[name], (slice(sample, sample + count), own), part[name], writers)
+                    _write_share(file[name], (slice(sample, sample + count), own), part[name])
                 sample += count
         for name, text in _LEDGER.items():
             coordinates.put(f"energy/{name}", ("time",), energies[name], "J", text)
@@ -298,13 +298,9 @@ class Coordinates:
         dataset.attrs["long_name"] = text
 
 
-def _write_share(dataset: h5py.Dataset, where: Any, values: np.ndarray, writers: MPI.Comm) -> None:
-    """Write one rank's share; collectively when several write, and a rank without cells takes part too."""
-    if writers.size == 1:
-        if values.size:
-            dataset[where] = values
-        return
-    with dataset.collective:
+def _write_share(dataset: h5py.Dataset, where: Any, values: np.ndarray) -> None:
+    """Write one rank's share. Independently: h5py leaves out empty selections, on which collective writing hangs."""
+    if values.size:
         dataset[where] = values
 
 

@@ -42,7 +42,7 @@ def test_same_bits_diatomic_and_driven_in_the_middle(folder):
     table = {
         "lattice": {"preset": "diatomic", "cells": 31},
         "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},
-        "drive": {"amplitude": 3.0, "cycles": 10, "cell": 16, "mass": 2},
+        "drive": {"amplitude": 40.0, "cycles": 10, "cell": 16, "mass": 2},
         "time": {"end": 0.05},
     }
     runs_alike(folder, Case.from_table(table))

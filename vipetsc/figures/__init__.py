@@ -6,12 +6,14 @@ _HOMES = {
     "bands": "vipetsc.figures.bands",
     "draw": "vipetsc.figures.registry",
     "draw_backbone": "vipetsc.figures.backbone",
+    "draw_bands": "vipetsc.figures.registry",
+    "names": "vipetsc.figures.registry",
     "run_figures": "vipetsc.figures.registry",
     "save": "vipetsc.figures.registry",
     "look": "vipetsc.figures.style",
 }
 
-__all__ = ["bands", "draw", "draw_backbone", "look", "run_figures", "save"]
+__all__ = ["bands", "draw", "draw_backbone", "draw_bands", "look", "names", "run_figures", "save"]
 
 
 def __getattr__(name: str) -> object:

@@ -30,8 +30,8 @@ def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
         if frequency is not None:
             axes.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
     for band in found:
-        left.annotate(f"{band.number}", (1.0, (band.low + band.high) / 2e3), (-3, 0), textcoords="offset points",
-                      ha="right", va="center", color=BRANCHES[(band.number - 1) % len(BRANCHES)])  # fmt: skip
+        left.annotate(f"{band.number}", (1.0, (band.low + band.high) / 2e3), (3, 0), textcoords="offset points",
+                      ha="left", va="center", color=BRANCHES[(band.number - 1) % len(BRANCHES)])  # fmt: skip
     left.set(xlim=(0, 1), ylim=(0, top), xlabel="Wavenumber κ (π rad/cell)", ylabel="Angular frequency ω (krad/s)")
     right.set(xlabel="Group velocity dω/dκ (cells/s)")
     right.axvline(0, color=style.GREY, lw=0.5)

@@ -42,7 +42,9 @@ def dispersion(run: RunFile, analysis: h5py.File | None) -> Figure:
         axes.set(xlabel="Wavenumber κ (π rad/cell)", xlim=(0, wavenumber[-1] / np.pi), ylim=(0, top / 1e3))
         style.letter(axes, f"({'abc'[i]}) {PANELS[name]}")
     maps[0].set_ylabel("Angular frequency ω (krad/s)")
-    figure.colorbar(image, ax=maps, label="Mean kinetic energy per bin (J)", location="right", pad=0.01, extend="min")
+    figure.colorbar(
+        image, ax=[*maps, side], label="Mean kinetic energy per bin (J)", location="right", pad=0.01, extend="min"
+    )
     _sums(side, cell, frequency[kept], spectra, run.model.drive.frequency)
     style.letter(side, f"({'abc'[len(shown)]}) Sum over κ")
     return figure
@@ -69,4 +71,4 @@ def _sums(axes: Axes, cell: UnitCell, frequency: np.ndarray, spectra: dict, driv
     axes.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")
     axes.annotate("drive", (1, driven / 1e3), (-2, 2), xycoords=("axes fraction", "data"),
                   textcoords="offset points", ha="right", va="bottom", fontsize=6.5)  # fmt: skip
-    axes.legend(loc="upper right", bbox_to_anchor=(1.0, 1.0))
+    axes.legend(loc="lower right")

@@ -21,16 +21,16 @@ def impacts(run: RunFile, analysis: h5py.File | None) -> Figure:
     raster, bars = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": (4, 1)})
     speed = np.abs(log["approach_velocity"])
     norm = style.log_norm(speed.max(), 2)
-    for side, marker, shift in ((1, 6, 0.04), (-1, 7, -0.04)):
+    for side, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
         chosen = log["side"] == side
         image = raster.scatter(log["onset"][chosen], log["site"][chosen] + shift, 14, speed[chosen], marker=marker,
                                lw=0, norm=norm, cmap="viridis_r", rasterized=True)  # fmt: skip
     raster.set_yticks(np.arange(1, len(sites) + 1), [f"{c}" for c in sites])
-    raster.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=run.time[[0, -1]], ylim=(len(sites) + 0.6, 0.4))
+    raster.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=run.time[[0, -1]], ylim=(0.4, len(sites) + 0.6))
     raster.grid(axis="y", color=style.PALE, lw=0.5)
     raster.set_axisbelow(True)
     figure.colorbar(image, ax=raster, label="Approach speed (m/s)", pad=0.01, extend="min")
-    style.letter(raster, f"(a) {len(speed)} contact episodes  (▲ side +, ▼ side −)")
+    style.letter(raster, f"(a) {len(speed)} contact episodes (▲ positive side, ▼ negative side)")
 
     place = log["site"].astype(int) - 1
     loss = np.bincount(place, np.nan_to_num(log["loss"]), len(sites))

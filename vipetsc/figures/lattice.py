@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import h5py
 import numpy as np
 from matplotlib.axes import Axes
@@ -36,8 +38,8 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     inside = _held_inside(cell)
     place = _places(cell, inside)
     half = {i: WIDE if inside and i == cell.host else HALF for i in place}
-    left = min(x - half[i] for i, (x, _) in place.items()) - 1.1
-    right = max(x + half[i] for i, (x, _) in place.items()) + 1.1
+    left = min(x - half[i] for i, (x, _) in place.items()) - 0.9
+    right = max(x + half[i] for i, (x, _) in place.items()) + 1.5
     level = ROOM + 0.45
     for spring in cell.springs:
         a, b, text = spring.start, spring.end, _si(spring.stiffness, "N/m")
@@ -50,8 +52,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
                 if blocked:
                     _route(axes, [(x, y + HALF), (x, level), (wall, level)], text)
                 else:
-                    _spring(axes, (x + side * edge, y), (wall, y), text if side > 0 else "")
-            level += 0.5 * any(len(set(p)) < 2 for p in ())
+                    _lead(axes, (x + side * edge, y), (wall, y), text if side > 0 else "")
             continue
         (xa, ya), (xb, yb) = sorted((place[a], place[b]))
         between = any(xa < p < xb and abs(q - ya) < 0.1 for p, q in place.values())
@@ -62,9 +63,12 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
             top, bottom = sorted((a, b), key=lambda i: -place[i][1])
             drop = ROOM if inside and top == cell.host else HALF
             _spring(axes, (xa, place[top][1] - drop), (xb, place[bottom][1] + HALF), text)
-        else:
+        elif abs(ya - yb) < 0.1:
             _route(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
             level += 0.55
+        else:
+            short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
+            _spring(axes, tuple(np.array([xa, ya]) + short), tuple(np.array([xb, yb]) - short), text)
     for i, (x, y) in place.items():
         if not (inside and i in (cell.host, cell.resonator)):
             _mass(axes, x, y, i, cell.masses[i], cell)
@@ -74,10 +78,10 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
         _contact_link(axes, place[cell.host], place[cell.resonator])
     low = min(y for _, y in place.values()) - ROOM - 0.55
     high = max(level, ROOM + 0.5)
-    for wall in (left + 0.25, right - 0.25):
+    for wall in (left, right):
         axes.plot([wall, wall], [low + 0.15, high - 0.1], color=style.GREY, lw=0.6, ls=(0, (4, 3)))
-    axes.text(left + 0.32, low + 0.1, "one cell", color=style.GREY, fontsize=6.5, va="bottom")
-    axes.set(xlim=(left - 0.1, right + 0.1), ylim=(low, high), aspect="equal")
+    axes.text(left + 0.07, low + 0.1, "one cell", color=style.GREY, fontsize=6.5, va="bottom")
+    axes.set(xlim=(left - 0.5, right + 0.5), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
 
 
@@ -130,20 +134,11 @@ def _places(cell: UnitCell, inside: bool) -> dict[int, tuple[float, float]]:
 
 def _mass(axes: Axes, x: float, y: float, index: int, mass: float, cell: UnitCell) -> None:
     colour = {cell.host: style.SKY, cell.resonator: style.ORANGE}.get(index, style.PALE)
-    axes.add_patch(
-        FancyBboxPatch(
-            (x - HALF, y - HALF),
-            2 * HALF,
-            2 * HALF,
-            boxstyle="round,pad=0,rounding_size=0.08",
-            fc=colour,
-            ec=style.BLACK,
-            lw=0.7,
-            zorder=3,
-        )  # fmt: skip
-    )
+    look = {"boxstyle": "round,pad=0,rounding_size=0.08", "fc": colour, "ec": style.BLACK, "lw": 0.7, "zorder": 3}
+    axes.add_patch(FancyBboxPatch((x - HALF, y - HALF), 2 * HALF, 2 * HALF, **look))
     axes.text(x, y, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
-    axes.text(x, y - HALF - 0.08, _si(1e3 * mass, "g"), ha="center", va="top", fontsize=6.5, zorder=4)
+    # Beside the mass's lower left corner, clear of what hangs below it and of the spring on its left.
+    axes.text(x - HALF - 0.05, y - HALF, _si(1e3 * mass, "g"), ha="right", va="center", fontsize=6.5, zorder=4)
 
 
 def _host_with_resonator(axes: Axes, centre: tuple[float, float], cell: UnitCell) -> None:
@@ -166,7 +161,8 @@ def _host_with_resonator(axes: Axes, centre: tuple[float, float], cell: UnitCell
     axes.text(x, y, f"$m_{{{cell.resonator + 1}}}$", ha="center", va="center", zorder=6)
     axes.annotate("Δ", (x + reach + GAP / 2, y + 0.36), (x + reach + GAP / 2, y + ROOM + 0.2), ha="center",
                   fontsize=7, color=style.VERMILION, zorder=7,
-                  arrowprops={"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6, "shrinkA": 0, "shrinkB": 0})  # fmt: skip
+                  arrowprops={"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6,
+                              "shrinkA": 0, "shrinkB": 0})  # fmt: skip
     axes.text(x, y - ROOM - 0.08, f"$m_{{{cell.host + 1}}}$ {_si(1e3 * cell.masses[cell.host], 'g')},  "
               f"$m_{{{cell.resonator + 1}}}$ {_si(1e3 * cell.masses[cell.resonator], 'g')}\n"
               f"inner spring {_si(stiffness, 'N/m')}",
@@ -176,19 +172,11 @@ def _host_with_resonator(axes: Axes, centre: tuple[float, float], cell: UnitCell
 def _contact_link(axes: Axes, host: tuple[float, float], resonator: tuple[float, float]) -> None:
     """A bowed double arrow between the pair, for a resonator that other masses hold too."""
     axes.annotate("", resonator, host, zorder=2, arrowprops={
-        "arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)), "shrinkA": 16, "shrinkB": 16,
-        "connectionstyle": "arc3,rad=0.45"})  # fmt: skip
+        "arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)),
+        "shrinkA": 9, "shrinkB": 9, "connectionstyle": "arc3,rad=0.45"})  # fmt: skip
     middle = (host[0] + resonator[0]) / 2, (host[1] + resonator[1]) / 2
-    axes.annotate(
-        "contact, Δ",
-        middle,
-        (0, -26),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize=6.5,
-        color=style.VERMILION,
-    )
+    axes.annotate("contact, Δ", middle, (-16, 0), textcoords="offset points", ha="right", va="center",
+                  fontsize=6.5, color=style.VERMILION)  # fmt: skip
 
 
 def _spring(
@@ -215,11 +203,21 @@ def _spring(
                   ha="left" if upright else "center", va="center" if upright else "bottom")  # fmt: skip
 
 
+def _lead(axes: Axes, start: tuple[float, float], wall: tuple[float, float], text: str) -> None:
+    """The way out of the cell: the spring to the next one if it has a ``text``, else the last one's end."""
+    if text:
+        _spring(axes, start, wall, text)
+    else:
+        axes.plot([start[0], wall[0]], [start[1], wall[1]], color=style.BLACK, lw=0.7, zorder=2)
+    beyond = wall[0] + (0.4 if wall[0] > start[0] else -0.4)
+    axes.plot([wall[0], beyond], [wall[1], wall[1]], color=style.BLACK, lw=0.7, ls=(0, (1, 1.5)), zorder=2)
+
+
 def _route(axes: Axes, corners: list[tuple[float, float]], text: str) -> None:
     """A spring that goes round the masses in its way: a line through ``corners``, zigzag on the longest leg."""
-    lengths = [np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in zip(corners, corners[1:], strict=False)]
+    lengths = [np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(corners)]
     longest = int(np.argmax(lengths))
-    for i, (a, b) in enumerate(zip(corners, corners[1:], strict=False)):
+    for i, (a, b) in enumerate(itertools.pairwise(corners)):
         if i == longest:
             _spring(axes, a, b, text)
         else:
@@ -236,21 +234,20 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
         for wall in (0.5 - 0.02 * n, n + 0.5):
             axes.add_patch(Rectangle((wall, -0.25), 0.02 * n, 1.5, fc="white", ec=style.GREY, hatch="//////", lw=0.0))
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
-    elif chain.ends == "periodic":
-        axes.annotate("", (0.5, 1.05), (n + 0.5, 1.05), arrowprops={
-            "arrowstyle": "<->", "color": style.GREY, "lw": 0.7, "connectionstyle": "arc3,rad=0.06"})  # fmt: skip
-    axes.annotate("drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left", va="center", fontsize=7,
-                  color=style.BLUE, arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
+    axes.annotate("drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left", va="center",
+                  fontsize=7, color=style.BLUE,
+                  arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
     last = -np.inf
     for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
-        axes.add_patch(Rectangle((site + 1 - 0.003 * n, 0), max(0.006 * n, 1), 1, fc=style.VERMILION, lw=0))
+        width = max(0.006 * n, 1)
+        axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
         # Labels need about a tenth of the strip each; neighbouring sites go without.
         if site - last > 0.085 * n:
             axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
             axes.text(
                 site + 1,
                 -0.2,
-                f"{clearance * 1e3:.3g}",
+                f"{clearance * 1e3:#.3g}",
                 ha="center",
                 va="top",
                 fontsize=6.5,

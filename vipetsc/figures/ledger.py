@@ -21,13 +21,15 @@ def ledger(run: RunFile, analysis: h5py.File | None) -> Figure:
     figure = style.new_figure(style.COLUMN, 3.3)
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (2.2, 1)})
     prefix, scale = _scaled(work)
+    # Both swing at twice the drive's frequency, which no page can resolve; means over two periods can be seen.
+    window = int(np.ceil(4 * np.pi / run.model.drive.frequency / (time[1] - time[0])))
     stored = e["kinetic"] + e["spring"] + e["contact"]
     curves = (
         ("work of the drive", e["work"], style.BLACK, "-"),
         ("kinetic + potential", stored, style.BLUE, "-"),
         ("dissipated", e["dissipated"], style.VERMILION, "-"),
-        ("kinetic", _smooth(e["kinetic"]), style.SKY, "-"),
-        ("springs", _smooth(e["spring"]), style.GREEN, (0, (3, 1.5))),
+        ("kinetic, mean", _mean_over(e["kinetic"], window), style.SKY, "-"),
+        ("springs, mean", _mean_over(e["spring"], window), style.GREEN, (0, (3, 1.5))),
         ("contacts", e["contact"], style.PURPLE, "-"),
     )
     for label, values, colour, dashes in curves:
@@ -54,5 +56,7 @@ def _scaled(value: float) -> tuple[str, float]:
     return "p", 1e12
 
 
-def _smooth(values: np.ndarray) -> np.ndarray:
-    return values
+def _mean_over(values: np.ndarray, samples: int) -> np.ndarray:
+    """Running mean over ``samples``, over fewer at the ends."""
+    window = np.ones(min(samples, len(values)))
+    return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")

@@ -8,9 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from scipy.interpolate import CubicHermiteSpline
 
 from vipetsc.figures import style
 from vipetsc.records import RunFile
+
+REFINE = 4  # points drawn for each sample
 
 
 def phase(run: RunFile, analysis: h5py.File | None) -> Figure:
@@ -22,8 +25,11 @@ def phase(run: RunFile, analysis: h5py.File | None) -> Figure:
     at = run.nearest(cell)
     if run.cells[at] != cell:
         return style.without_data(f"Phase portraits: cell {cell}, the first site, was not recorded")
+    if not {"displacement", "velocity"} <= run.file.keys():
+        return style.without_data("Phase portraits: they need displacement and velocity, and one was not recorded")
     pair = run.model.chain.cell
-    u, v, time = run.displacement[:, at] * 1e3, run.velocity[:, at], run.field_time
+    u, v, time = _refined(run.displacement[:, at], run.velocity[:, at], run.field_time)
+    u = 1e3 * u
     h, r = pair.host, pair.resonator
     onsets = run.impacts["onset"][run.impacts["site"] == site + 1]
     first = onsets.min() if len(onsets) else np.inf
@@ -34,21 +40,33 @@ def phase(run: RunFile, analysis: h5py.File | None) -> Figure:
     portraits = (
         (u[:, h], v[:, h], "Host", "u_h"),
         (u[:, r], v[:, r], "Resonator", "u_r"),
-        (u[:, r] - u[:, h], v[:, r] - v[:, h], "Resonator − host", "w"),
+        (u[:, r] - u[:, h], v[:, r] - v[:, h], "Relative motion", "w"),
     )
     for axes, key, (x, y, title, symbol) in zip(panels, "abc", portraits, strict=True):
         after = _trajectory(axes, x, y, time, first, norm)
         axes.set(xlabel=f"${symbol}$ (mm)", ylabel=rf"$\dot{{{symbol}}}$ (m/s)")
         style.letter(axes, f"({key}) {title}, cell {cell}")
+    wide = max(panels[2].get_xlim()[1], 1.15e3 * run.clearances[site])
+    panels[2].set_xlim(-wide, wide)
     for wall in (-1, 1):
         panels[2].axvline(wall * run.clearances[site] * 1e3, color=style.VERMILION, lw=0.8, ls=(0, (4, 2)))
     panels[2].annotate("clearance", (run.clearances[site] * 1e3, 1), (-2, -2), xycoords=("data", "axes fraction"),
-                       textcoords="offset points", ha="right", va="top", fontsize=6.5, color=style.VERMILION)  # fmt: skip
+                       textcoords="offset points", ha="right", va="top", fontsize=6.5,
+                       color=style.VERMILION)  # fmt: skip
     if np.isfinite(first):
-        figure.colorbar(after, ax=panels, label="Time after first contact (s)", pad=0.01)
+        figure.colorbar(after, ax=panels, label="Time (s)", pad=0.01)
     else:
-        figure.suptitle("No contact at this site", fontsize=7, color=style.GREY)
+        panels[2].text(0.5, 0.03, "no contact", ha="center", color=style.GREY, transform=panels[2].transAxes)
     return figure
+
+
+def _refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Displacement, velocity and time on a finer grid, so that fast turns at the stops are not polygons."""
+    if len(time) < 2:
+        return u, v, time
+    fine = np.interp(np.arange((len(time) - 1) * REFINE + 1) / REFINE, np.arange(len(time)), time)
+    motion = CubicHermiteSpline(time, u, v, axis=0)
+    return motion(fine), motion(fine, 1), fine
 
 
 def _trajectory(

@@ -12,12 +12,14 @@ import h5py
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
+from vipetsc.figures.bands import bands
 from vipetsc.figures.dispersion import dispersion
 from vipetsc.figures.impacts import impacts
 from vipetsc.figures.lattice import unit_cell
 from vipetsc.figures.ledger import ledger
 from vipetsc.figures.phase import phase
 from vipetsc.figures.spacetime import spacetime
+from vipetsc.lattice import UnitCell
 from vipetsc.records import RunFile
 
 # The dearest first, so that ranks which share the work finish together.
@@ -70,6 +72,17 @@ def draw(
             figure = run_figures[name](run, analysis)
             written += [save(figure, folder / "figures" / f"{name}.{kind}") for kind in formats]
     return written
+
+
+def names() -> tuple[str, ...]:
+    """The names of all pictures of a run."""
+    return tuple(run_figures)
+
+
+def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
+    """Draw the dispersion diagram of ``cell`` into ``path``; ``frequency`` in rad/s marks a drive."""
+    with style.look():
+        return save(bands(cell, frequency), Path(path))
 
 
 def save(figure: Figure, path: Path) -> Path:

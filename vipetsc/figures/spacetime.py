@@ -14,8 +14,8 @@ DECADES = 5
 
 def spacetime(run: RunFile, analysis: h5py.File | None) -> Figure:
     """Kinetic energy of every cell over time with the sites marked, beside the wavenumber content."""
-    if analysis is None or len(analysis["time"]) < 2:
-        return style.without_data("Kinetic energy: the run has not been analysed")
+    if analysis is None or "time" not in analysis or len(analysis["time"]) < 2:
+        return style.without_data("Kinetic energy: needs the analysis of a run with two samples or more")
     time, cells = analysis["time"][...], analysis["cell"][...]
     several = "wavenumber_content" in analysis
     figure = style.new_figure(style.PAGE if several else style.COLUMN, 2.5)

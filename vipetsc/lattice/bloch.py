@@ -42,7 +42,8 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     as the limit from kappa > 0 where omega = 0.
     """
     kappa = np.asarray(kappa, float)
-    at = np.where(np.abs(kappa) < 1e-7, 1e-7, kappa)
+    # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs the acoustic branch's own.
+    at = np.where(np.abs(kappa) < 3e-4, 3e-4, kappa)
     root = 1 / np.sqrt(np.asarray(cell.masses))
     scale = root[:, None] * root[None, :]
     squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)

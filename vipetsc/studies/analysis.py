@@ -13,6 +13,7 @@ from scipy import fft
 from vipetsc.lattice import pass_bands
 from vipetsc.records import RunFile
 from vipetsc.spectra import (
+    TAPER,
     Parts,
     dispersion,
     front_arrival,
@@ -59,13 +60,16 @@ def analyse(run_path: str | Path, out_path: str | Path) -> None:
 
 
 def _measure(run: RunFile, out: h5py.File) -> None:
+    out.attrs["format_version"] = FORMAT_VERSION
+    out.attrs["case"] = run.file.attrs["case"]
+    out.attrs["status"] = run.file.attrs.get("status", "")
+    if "velocity" not in run.file:
+        out.attrs["left_out"] = "everything: the velocity was not recorded"
+        return
     velocity = run.velocity if run.velocity.nbytes > IN_MEMORY else run.velocity[...]
     nt, cells = velocity.shape[:2]
     thinning = -(-nt * cells // MAP_SIZE)
     thin = slice(None, None, thinning)
-    out.attrs["format_version"] = FORMAT_VERSION
-    out.attrs["case"] = run.file.attrs["case"]
-    out.attrs["status"] = run.file.attrs.get("status", "")
     out.attrs["thinning"] = thinning
     left_out = []
 
@@ -109,7 +113,14 @@ def _put_dispersions(run: RunFile, velocity: np.ndarray, out: h5py.File) -> list
             left_out.append(f"{name}: fewer than two of its cells were recorded")
             continue
         spectrum = dispersion(
-            velocity, run.masses, run.field_interval, cells=window, lengths=lengths, highest=highest
+            velocity,
+            run.masses,
+            run.field_interval,
+            cells=window,
+            # A wave that crosses the border of a window would smear over all wavenumbers.
+            tapers=(TAPER, TAPER if name == "dispersion" else 0.5),
+            lengths=lengths,
+            highest=highest,
         ).folded()
         if "frequency" not in out:
             _put(out, "frequency", spectrum.frequency, "rad/s", "angular frequency")

@@ -1,0 +1,225 @@
+"""The lattice against closed forms, itself by other routes, and the published numbers."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vipetsc.lattice import (
+    Bilinear,
+    Chain,
+    Contact,
+    ContactLaw,
+    Hertz,
+    Spring,
+    ToneBurst,
+    UnitCell,
+    bloch,
+    contact_stiffness,
+    diatomic,
+    four_band,
+    log_clearances,
+    max_group_velocity,
+    pass_bands,
+    spread_sites,
+)
+from vipetsc.lattice.bloch import gaps, waves_at
+from vipetsc.lattice.cell import cell_problems
+
+KAPPA = np.linspace(0, np.pi, 41)
+
+
+@st.composite
+def cells(draw):
+    """A connected cell: a line of masses, a resonator now and then, one or two springs to the next cell."""
+    n = draw(st.integers(2, 5))
+    positive = st.floats(0.1, 10)
+    masses = tuple(draw(st.lists(positive, min_size=n, max_size=n)))
+    springs = [Spring(i, i + 1, draw(positive)) for i in range(n - 1)]
+    ends = st.integers(0, n - 1)
+    springs += [Spring(draw(ends), draw(ends), draw(positive), next_cell=True) for _ in range(draw(st.integers(1, 2)))]
+    host = draw(ends)
+    return UnitCell(masses, tuple(springs), host, (host + 1) % n)
+
+
+def test_diatomic_bands_have_their_closed_form():
+    """Host chain with a resonator: (A - m1 w2)(k - m2 w2) = k^2 with A = 2k(1 - cos kappa) + k."""
+    m1, m2, k = 0.01, 0.08, 9e4
+    a = 2 * k * (1 - np.cos(KAPPA)) + k
+    mean, product = (a / m1 + k / m2) / 2, (a * k - k**2) / (m1 * m2)
+    upper = mean + np.sqrt(mean**2 - product)
+    expected = np.sqrt(np.stack([product / upper, upper], axis=-1))
+    assert np.allclose(bloch(diatomic(), KAPPA).frequency, expected, rtol=1e-9, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("cell", "edges"),
+    [
+        (four_band(), [0, 836.47, 947.07, 1414.21, 2331.09, 3162.28, 3271.55, 3669.65]),
+        (four_band("calibrated"), [0, 612.25, 681.48, 1414.21, 2267.36, 3162.28, 3214.90, 3644.75]),
+        (diatomic(), [0, 946.27, 3181.98, 6725.29]),
+    ],
+)
+def test_pass_bands_and_gaps_are_the_published_ones(cell, edges):
+    found = pass_bands(cell)
+    assert [x for b in found for x in (b.low, b.high)] == pytest.approx(edges, abs=0.006)
+    assert np.ravel(gaps(found)) == pytest.approx(edges[1:-1], abs=0.006)
+
+
+def test_published_drive_frequencies_and_speeds():
+    optical = bloch(diatomic(), 5 * np.pi / 9)
+    assert optical.frequency[1] == pytest.approx(5520.026, abs=1e-3)
+    assert optical.group_velocity[1] == pytest.approx(1587, abs=0.5)
+    assert max_group_velocity(four_band(), 2)[1] == pytest.approx(1206.34, abs=0.01)
+    _, frequency, speed = max_group_velocity(four_band("calibrated"), 2)
+    assert (frequency, speed) == (pytest.approx(1023.2717, abs=1e-3), pytest.approx(428.7, abs=0.05))
+    assert contact_stiffness(1e8, 0.005, 0.3) == pytest.approx(2e8 * np.sqrt(0.005) / 2.73)
+
+
+def test_long_waves_travel_at_the_static_speed():
+    """At kappa = 0: the square root of the cell's stiffness in series over its mass."""
+    series = 1 / (1 / 2e4 + 2 / 1e4)
+    assert bloch(four_band(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(series / 0.015), rel=1e-6)
+    assert bloch(diatomic(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(9e4 / 0.09), rel=1e-6)
+
+
+@pytest.mark.parametrize("cell", [four_band(), four_band("calibrated"), diatomic()])
+def test_waves_at_a_frequency_lie_on_the_branch(cell):
+    _, frequency, speed = max_group_velocity(cell, 2)
+    ((band, kappa, found),) = waves_at(cell, frequency)
+    assert band == 2
+    assert found == pytest.approx(speed, rel=1e-6)
+    assert bloch(cell, kappa).frequency[1] == pytest.approx(frequency, rel=1e-12)
+    low, high = gaps(pass_bands(cell))[0]
+    assert waves_at(cell, (low + high) / 2) == []
+
+
+@settings(max_examples=40, deadline=None)
+@given(cells(), st.floats(-np.pi, np.pi))
+def test_stiffness_is_hermitian_and_not_negative(cell, kappa):
+    k = cell.stiffness_matrix(kappa)
+    assert np.array_equal(k, k.conj().T)
+    assert np.linalg.eigvalsh(k).min() > -1e-9 * np.abs(k).max()
+    assert np.allclose(cell.stiffness_matrix(0.0) @ np.ones(cell.dofs), 0, atol=1e-9)
+    assert np.allclose(bloch(cell, kappa).frequency, bloch(cell, -kappa).frequency, atol=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(cells(), st.floats(0.3, 2.8))
+def test_bloch_vectors_solve_the_problem_and_group_velocity_is_the_slope(cell, kappa):
+    point = bloch(cell, kappa)
+    m = np.diag(cell.masses)
+    assert np.allclose(point.vectors.conj().T @ m @ point.vectors, np.eye(cell.dofs), atol=1e-9)
+    residual = cell.stiffness_matrix(kappa) @ point.vectors - m @ point.vectors * point.frequency**2
+    assert np.abs(residual).max() < 1e-8
+    # Where branches meet, a difference quotient crosses from one to the other.
+    squared = np.sort(point.frequency**2)
+    apart = np.diff(squared).min() > 1e-2 and squared[0] > 1e-2
+    if apart:
+        h = 1e-5
+        slope = (bloch(cell, kappa + h).frequency - bloch(cell, kappa - h).frequency) / (2 * h)
+        assert np.allclose(point.group_velocity, slope, atol=1e-5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(cells(), st.integers(3, 9))
+def test_a_periodic_chain_has_the_bloch_frequencies(cell, n):
+    chain = Chain(cell, n, "periodic")
+    root = 1 / np.sqrt(chain.masses())
+    squared = np.linalg.eigvalsh(chain.stiffness_matrix().toarray() * root[:, None] * root)
+    expected = np.sort(bloch(cell, 2 * np.pi * np.arange(n) / n).frequency.ravel() ** 2)
+    assert np.allclose(squared, expected, atol=1e-8)
+
+
+@settings(max_examples=25, deadline=None)
+@given(cells(), st.integers(2, 6))
+def test_ends_hold_or_let_go(cell, n):
+    fixed, free = (Chain(cell, n, ends).stiffness_matrix().toarray() for ends in ("fixed", "free"))
+    assert np.array_equal(fixed, fixed.T)
+    assert np.allclose(free.sum(axis=1), 0, atol=1e-9)
+    left, right = cell.wall_stiffness
+    walls = np.zeros(n * cell.dofs)
+    walls[: cell.dofs] += left
+    walls[-cell.dofs :] += right
+    assert np.allclose(fixed - free, np.diag(walls), atol=1e-9)
+
+
+def test_cell_problems_are_all_named():
+    springs = (Spring(0, 0, 1.0), Spring(0, 5, -1.0))
+    keys = [key for key, _ in cell_problems((1.0, -1.0), springs, 1, 1)]
+    assert sorted(keys) == sorted(
+        ["masses[2]", "springs[1]", "springs[2].stiffness", "springs[2]", "contact", "springs"]
+    )
+    with pytest.raises(ValueError, match="must be positive"):
+        UnitCell((1.0, 0.0), (Spring(0, 1, 1.0, True),), 0, 1)
+    assert cell_problems(diatomic().masses, diatomic().springs, 0, 1) == []
+
+
+def test_sites_and_clearances():
+    assert [c + 1 for c in spread_sites(75, 200, 5)] == [75, 106, 138, 169, 200]
+    clearances = log_clearances(10**-2.65, 10**-2.75, 5)
+    assert clearances[0] == pytest.approx(10**-2.65)
+    assert np.allclose(np.diff(np.log10(clearances)), -0.025)
+
+
+@pytest.mark.parametrize(("envelope", "peak"), [("paper", 2.0), ("hann", 1.0)])
+def test_burst_begins_and_ends_at_rest_and_peaks(envelope, peak):
+    burst = ToneBurst(3.0, 100.0, 30, envelope)
+    t = np.linspace(-0.1, burst.duration + 0.1, 200_001)
+    force = burst.force(t)
+    assert burst.duration == pytest.approx(0.6 * np.pi)
+    assert np.all(force[(t <= 0) | (t >= burst.duration)] == 0)
+    assert np.abs(force).max() == pytest.approx(3 * peak, rel=5e-3)
+    middle = 0.3 * burst.duration
+    assert burst.force(middle) == pytest.approx(3 * peak / 2 * (1 - np.cos(2 * np.pi * 0.3)) * np.sin(100 * middle))
+
+
+def test_wave_scale_is_linear_in_the_drive():
+    chain, burst = Chain(four_band(), 60), ToneBurst(1.0, 1206.34, 30)
+    one = chain.wave_scale(burst)
+    assert one > 0
+    assert chain.wave_scale(ToneBurst(1e-3, 1206.34, 30)) == pytest.approx(1e-3 * one, rel=1e-12)
+    assert chain.wave_scale(ToneBurst(1.0, 1206.34, 30, "hann")) == pytest.approx(one / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("law", [Hertz, Bilinear])
+def test_force_is_the_slope_of_the_potential(law):
+    contact, d = Contact(law, 1e6), 2e-3
+    w = np.array([-3e-3, -2.2e-3, -1e-3, 0.0, 1e-3, 2.2e-3, 3e-3])
+    h = 1e-8
+    slope = (contact.potential(w + h, d) - contact.potential(w - h, d)) / (2 * h)
+    assert np.allclose(contact.force(w, d), slope, rtol=1e-6, atol=1e-9)
+    stiff = (contact.force(w + h, d) - contact.force(w - h, d)) / (2 * h)
+    assert np.allclose(contact.force_gradient(w, d), stiff, rtol=1e-6)
+    assert ContactLaw.named(law.name) is law
+    with pytest.raises(KeyError):
+        ContactLaw.named("glue")
+
+
+@given(
+    st.floats(-5e-3, 5e-3),
+    st.floats(1e-4, 4e-3),
+    st.floats(-2, 2),
+    st.floats(0.01, 3),
+    st.sampled_from([Hertz, Bilinear]),
+)
+def test_contact_is_odd_and_restoring(w, d, rate, approach, law):
+    contact = Contact(law, 1e6, 0.7)
+    force = contact.force(w, d, rate, approach)
+    assert contact.force(-w, d, -rate, -approach) == -force
+    elastic = contact.force(w, d)
+    assert elastic * w >= 0
+    assert (elastic == 0) == (abs(w) <= d)
+    assert contact.potential(w, d) == contact.potential(-w, d)
+
+
+def test_restitution_takes_energy_out():
+    contact = Contact(Hertz, 1e6, 0.7)
+    for side in (1, -1):
+        assert contact.dissipation_factor(side * 2.0, side * 2.0) == pytest.approx(1.45)  # approaching: g > 1
+        assert contact.dissipation_factor(-side * 2.0, side * 2.0) == pytest.approx(0.55)  # leaving: g < 1
+    assert Contact(Hertz, 1e6, 1.0).dissipation_factor(5.0, 0.1) == 1
+    assert contact.dissipation_factor(-1.0, 0.1) < 0
+    assert Contact(Hertz, 1e6, 0.7, adhesion="clip").dissipation_factor(-1.0, 0.1) == 0
+    floored = Contact(Hertz, 1e6, 0.7, approach_floor=0.5)
+    assert floored.dissipation_factor(1.0, -1e-12) == pytest.approx(1 - 0.9)
