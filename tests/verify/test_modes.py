@@ -1,0 +1,329 @@
+"""Nonlinear normal modes against theory: grazing energies, limits, folds, stability, benchmark."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vipetsc.lattice import Bilinear, Chain, Contact, Hertz, contact_stiffness, four_band
+from vipetsc.modes.audit import Watch, is_jump, suspects
+from vipetsc.modes.chart import Relative
+from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
+from vipetsc.modes.newmark import Newmark
+from vipetsc.modes.orbit import Compiled, FiniteDifferences
+from vipetsc.modes.point import Point, linear_start
+from vipetsc.modes.portrait import resonance
+from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.special import Locator
+from vipetsc.modes.switching import switch
+from vipetsc.modes.system import SmoothSpring, System
+from vipetsc.modes.tsrk import Tsrk
+
+D = 10**-2.75
+IN_PHASE, OUT_OF_PHASE = 0, 1
+GRAZING = {OUT_OF_PHASE: 0.0293434562302, IN_PHASE: 0.0035442314356}
+
+
+def reduced(law=Bilinear, modulus: float = 1e8) -> System:
+    return System.reduced(four_band(), D, Contact(law, contact_stiffness(modulus, 0.005, 0.3)))
+
+
+def cubic() -> System:
+    springs = [(None, 0, 1.0), (0, 1, 1.0), (None, 1, 1.0)]
+    return System.assemble([1.0, 1.0], springs, smooth=[SmoothSpring(None, 0, cubic=0.5)])
+
+
+def follow(system: System, mode: int, start: float, flow=Compiled, shooting: str = "quarter", **control):
+    """Corrector, points and special points of a branch."""
+    corrector = Corrector(Shooting(flow(system), MAPS[shooting]))
+    first = linear_start(corrector, mode, start)
+    branch = Continuation(corrector, first, StepControl(**{"points": 20000} | control))
+    points, special = [branch.point], []
+    locator = Locator(corrector, control.get("chart", "relative"), grazing=True)
+    for point in branch:
+        special += locator.between(points[-1], point)
+        points.append(point)
+    return corrector, points, special
+
+
+def at_energy(corrector: Corrector, points: list[Point], energy: float) -> Point:
+    """The point of an increasing stretch of a branch at an energy, corrected there."""
+    i = max(k for k, p in enumerate(points[:-1]) if p.energy <= energy < points[k + 1].energy)
+    last = points[i]
+    for _ in range(8):  # Newton in the energy along the branch
+        share = (energy - last.energy) / last.rise
+        chart = Relative(corrector.problem.system, last.x, last.period)
+        xi = chart.encode(last.x, last.period)
+        tangent = np.linalg.solve(chart.derivative(xi), last.tangent)
+        row = tangent / np.linalg.norm(tangent)
+        attempt = corrector.solve(chart, xi + share * tangent, row, row @ (xi + share * tangent))
+        assert attempt.converged, attempt.history
+        null = np.linalg.svd(corrector.matrix(attempt.xi)[:-1])[2][-1]
+        last = Point.of(corrector.problem, attempt, chart, tangent=chart.derivative(attempt.xi) @ null)
+    assert last.energy == pytest.approx(energy, rel=1e-12)
+    return last
+
+
+@pytest.fixture(scope="module")
+def bilinear():
+    return follow(reduced(), OUT_OF_PHASE, 3e-4, energy=(1e-4, 1e9), chart="auto")
+
+
+@pytest.fixture(scope="module")
+def hertz():
+    return follow(reduced(Hertz), OUT_OF_PHASE, 3e-4, energy=(1e-4, 1e9), chart="auto")
+
+
+def of_kind(special: list[Point], kind: str) -> list[Point]:
+    return [p for p in special if p.kind == kind]
+
+
+def test_linear_modes_and_limits():
+    system = reduced()
+    assert system.linear_modes()[0] / (2 * np.pi) == pytest.approx([135.1209897, 474.2501016], rel=1e-9)
+    assert system.closed_frequencies() / (2 * np.pi) == pytest.approx([318.1562921, 10252.6169369], rel=1e-9)
+
+
+@pytest.mark.parametrize("branch", ["bilinear", "hertz"])
+def test_out_of_phase_branch(branch, request):
+    _, points, special = request.getfixturevalue(branch)
+    assert len(points) <= 400
+    assert points[-1].energy >= 1e9
+    assert max(p.residual for p in points) <= 1e-12
+    (graze,) = of_kind(special, "grazing")
+    assert graze.energy == pytest.approx(GRAZING[OUT_OF_PHASE], rel=1e-10)
+    assert all(p.multiplier == pytest.approx(1, abs=1e-9) for p in points if p.energy > 0.1)
+
+
+def test_bilinear_folds_and_stability(bilinear):
+    corrector, points, special = bilinear
+    folds = of_kind(special, "fold-energy")
+    assert len(folds) == 2
+    for fold in folds:
+        assert fold.half_traces[0] == pytest.approx(1, abs=1e-6)
+    first, second = (fold.index for fold in folds)
+    for p in points:
+        if first < p.index < second:
+            assert p.multiplier > 1.01
+        elif not first <= p.index <= second:
+            assert p.multiplier == pytest.approx(1, abs=1e-6)
+    # the folds do not depend on how the branch is stepped
+    _, _, again = follow(reduced(), OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.1), largest=0.05, chart="relative")
+    for fold, other in zip(folds, of_kind(again, "fold-energy"), strict=True):
+        assert other.energy == pytest.approx(fold.energy, rel=1e-9)
+        assert other.frequency == pytest.approx(fold.frequency, rel=1e-8)
+
+
+def test_bilinear_approaches_its_limit(bilinear):
+    """f_limit - f falls as E^(-1/2), the clearance over the amplitude."""
+    corrector, points, _ = bilinear
+    limit = corrector.problem.system.closed_frequencies()[1] / (2 * np.pi)
+    distance = [limit - at_energy(corrector, points, e).frequency for e in (1e6, 1e8)]
+    assert distance[0] / distance[1] == pytest.approx(10, rel=2e-3)
+
+
+def test_hertz_folds_only_at_200_mpa(hertz):
+    _, points, special = hertz
+    assert not of_kind(special, "fold-energy")
+    assert max(p.multiplier for p in points) == pytest.approx(1, abs=1e-6)
+    _, stiffer, special = follow(reduced(Hertz, 2e8), OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.1))
+    assert len(of_kind(special, "fold-energy")) == 2
+    assert max(p.multiplier for p in stiffer) > 1.01
+
+
+def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
+    """The quarter period from modal superposition: closed, then open, with one separation between."""
+    corrector, points, _ = bilinear
+    system = corrector.problem.system
+    point = at_energy(corrector, points, 1.0)
+    arc = corrector.problem.arc(point.x, point.period)
+    (event,) = arc.events
+    row = np.array([-1.0, 1.0])
+    sign = np.sign(row @ point.x)
+    kc = system.contacts[0].law.stiffness
+    stiff = system.stiffness + kc * np.outer(row, row)
+    rest = np.linalg.solve(stiff, kc * D * sign * row)
+    root = np.sqrt(system.masses)
+
+    def propagate(k, centre, u, v, t):
+        squared, modes = np.linalg.eigh(k / np.outer(root, root))
+        omega = np.sqrt(squared)
+        q, p = modes.T @ (root * (u - centre)), modes.T @ (root * v)
+        later = modes @ (np.cos(omega * t) * q + np.sin(omega * t) / omega * p)
+        rate = modes @ (-omega * np.sin(omega * t) * q + np.cos(omega * t) * p)
+        return later / root + centre, rate / root
+
+    u, v = propagate(stiff, rest, point.x, np.zeros(2), event[0])
+    assert sign * (row @ u) == pytest.approx(D, rel=1e-12)
+    u, _ = propagate(system.stiffness, np.zeros(2), u, v, point.period / 4 - event[0])
+    assert np.abs(u).max() <= 1e-12 * np.abs(point.x).max()
+
+
+@pytest.mark.parametrize("law", [Bilinear, Hertz])
+@pytest.mark.parametrize("flow", [Tsrk, Newmark])
+def test_other_flows_agree(flow, law, bilinear, hertz):
+    """TSRK is as exact as the compiled flow; Newmark has its own error, at the same amplitude."""
+    corrector, points, _ = bilinear if law is Bilinear else hertz
+    system = corrector.problem.system
+    other = Corrector(Shooting(flow(system), MAPS["quarter"]), tolerance=1e-12)
+    for energy in (0.1, 10.0, 1e4, 1e8):
+        point = at_energy(corrector, points, energy)
+        chart = Relative(system, point.x, point.period)
+        xi = chart.encode(point.x, point.period)
+        row = np.array([0.0, 1.0, 0.0])  # the same w
+        attempt = other.solve(chart, xi, row, row @ xi)
+        assert attempt.converged, attempt.history
+        found = Point.of(other.problem, attempt, chart)
+        accuracy = (1e-11, 1e-11) if flow is Tsrk else (1e-4, 1e-4)
+        assert found.energy == pytest.approx(point.energy, rel=accuracy[0])
+        assert found.frequency == pytest.approx(point.frequency, rel=accuracy[1])
+        assert found.episodes == point.episodes
+
+
+@pytest.mark.parametrize("law", [Bilinear, Hertz])
+def test_sensitivities(law):
+    """Variational equations against central differences, and symplectic, on an arc with many contacts."""
+    system = reduced(law)
+    start = np.array([3 * D, 1.2 * D, 0.1, -0.2])
+    flow = Compiled(system)
+    arc = flow.arc(start, 3e-3, 3e-3)
+    assert len(arc.events) >= 8
+    differences = FiniteDifferences(flow, 1e-7).arc(start, 3e-3, 3e-3).sensitivity
+    assert arc.sensitivity == pytest.approx(differences, rel=1e-4, abs=1e-4 * np.abs(arc.sensitivity).max())
+    m, zero = np.diag(system.masses), np.zeros((2, 2))
+    form = np.block([[zero, m], [-m, zero]])
+    size = np.abs(arc.sensitivity.T) @ np.abs(form) @ np.abs(arc.sensitivity)
+    assert np.all(np.abs(arc.sensitivity.T @ form @ arc.sensitivity - form) <= 1e-7 * size.max())
+
+
+def test_flow_conserves_energy_and_reverses():
+    system = reduced()
+    start = np.array([30 * D, 10 * D, 0.0, 0.0])
+    flow = Compiled(system)
+    arc = flow.arc(start, 7e-3, 7e-3)
+    assert len(arc.events) > 50
+    u, v = arc.end[:2], arc.end[2:]
+    assert system.energy(u, v) == pytest.approx(system.energy(start[:2], start[2:]), rel=1e-12)
+    back = flow.arc(np.append(u, -v), 7e-3, 7e-3)
+    assert np.abs(back.end[:2] - start[:2]).max() <= 1e-11 * np.abs(start).max()
+
+
+def test_short_contacts_inside_a_step_are_found():
+    """A pair of changes 1e-6 of the period apart, and a near miss that must not count."""
+    system = reduced()
+    omega, shapes = system.linear_modes()
+    shape = shapes[:, OUT_OF_PHASE] * D / abs(shapes[1, OUT_OF_PHASE] - shapes[0, OUT_OF_PHASE])
+    period = 2 * np.pi / omega[OUT_OF_PHASE]
+    for excess, changes in ((1e-12, 2), (-1e-12, 0)):
+        centre = np.append(np.zeros(2), omega[OUT_OF_PHASE] * (1 + excess) * shape)
+        arc = Compiled(system).arc(centre, period / 2, period)
+        assert len(arc.events) == changes
+
+
+def test_in_phase_through_the_first_tongues():
+    """The grazing cascade and the 5:1 and 7:1 resonances, without a jump; grazing at its own energy."""
+    corrector, points, special = follow(reduced(), IN_PHASE, 1e-3, frequency=(100.0, 333.0))
+    graze = of_kind(special, "grazing")[0]
+    assert graze.energy == pytest.approx(GRAZING[IN_PHASE], rel=1e-10)
+    assert max(p.residual for p in points) <= 1e-11
+    assert max(abs(a.episodes - b.episodes) for a, b in zip(points, points[1:], strict=False)) == 1
+    assert not list(suspects(points))
+    watch = Watch(corrector)
+    assert not [s for s in map(watch.see, points) if s]
+
+
+def test_without_guards_the_branch_jumps_and_the_detector_says_so():
+    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]))
+    start = linear_start(corrector, IN_PHASE, 3e-3)
+    control = StepControl(points=150, guards=Guards.off())
+    points = [start, *Continuation(corrector, start, control)]
+    assert max(p.residual for p in points) <= 1e-12  # no residual tells
+    found = [
+        (i, why)
+        for i, why in suspects(points)
+        if is_jump(corrector, points[i], points[i + 1], control)
+    ]
+    assert found
+    guarded = [start, *Continuation(corrector, start, StepControl(points=150))]
+    assert not list(suspects(guarded))
+
+
+def test_cubic_benchmark():
+    """Kerschen and Peeters (2009): linear frequencies, both modes to E = 1e6, the 3:1 and the 5:1 tongue."""
+    system = cubic()
+    assert system.linear_modes()[0] == pytest.approx([1.0, np.sqrt(3)], rel=1e-14)
+    corrector, points, special = follow(system, IN_PHASE, 1e-3, energy=(0.0, 1e6))
+    assert points[0].frequency == pytest.approx(1 / (2 * np.pi), rel=1e-3)
+    assert points[-1].energy > 1e6
+    assert max(p.residual for p in points) <= 1e-12
+    tips = {resonance(corrector.problem, p) for p in of_kind(special, "fold-energy")}
+    assert {3, 5} <= tips
+    _, points, _ = follow(system, OUT_OF_PHASE, 1e-3, energy=(0.0, 1e6))
+    assert points[-1].energy > 1e6
+    # mass 1 on its hardening spring alone: f ~ E^(1/4)
+    high = [p for p in points if p.energy > 1e4]
+    exponent = np.polyfit(np.log([p.energy for p in high]), np.log([p.frequency for p in high]), 1)[0]
+    assert exponent == pytest.approx(0.25, abs=0.01)
+
+
+@pytest.mark.parametrize("shooting", ["half", "whole"])
+def test_maps_agree(shooting, bilinear):
+    """The half and the whole period find the quarter's orbits, with the same multipliers."""
+    corrector, points, _ = bilinear
+    point = next(p for p in points if p.energy > 1.0)
+    unstable = max(points, key=lambda p: p.multiplier)
+    for p in (point, unstable):
+        other = Corrector(Shooting(corrector.problem.flow, MAPS[shooting]), tolerance=1e-11)
+        chart = Relative(corrector.problem.system, p.x, p.period)
+        xi = chart.encode(p.x, p.period)
+        row = np.append(p.x / np.linalg.norm(p.x), 0.0)
+        attempt = other.solve(chart, xi + 1e-7, row, row @ xi)
+        assert attempt.converged, attempt.history
+        found = Point.of(other.problem, attempt, chart)
+        assert found.frequency == pytest.approx(p.frequency, rel=1e-9)
+        assert found.multiplier == pytest.approx(p.multiplier, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["symmetry-breaking", "period-doubling"])
+def test_branch_switching(kind):
+    """The crossing branch starts at the special point and its orbits have lost the old symmetry."""
+    corrector, _, special = follow(cubic(), IN_PHASE, 1e-3, energy=(0.0, 4500.0), frequency=(0.0, 0.2229))
+    point = of_kind(special, kind)[0]
+    fresh, first = switch(corrector, point, amplitude=1e-3)
+    assert first.energy == pytest.approx(point.energy, rel=1e-3)
+    times = 2 if kind == "period-doubling" else 1
+    assert first.period == pytest.approx(times * point.period, rel=1e-3)
+    crossing = list(Continuation(fresh, first, StepControl(points=10)))
+    far = crossing[-1]
+    assert far.residual <= 1e-11
+    arc = fresh.problem.arc(far.x, far.period)
+    quarter = fresh.problem.flow.arc(arc.start, far.period / 4, far.period).end
+    n = fresh.problem.system.dofs
+    old = quarter[:n] if fresh.problem.map.start == "rest" else quarter[n:]
+    assert np.abs(old).max() > 1e-4 * np.abs(quarter).max()  # not the quarter-symmetric orbit
+
+
+@pytest.mark.parametrize("law", [Bilinear, Hertz])
+@pytest.mark.parametrize("mode", [0, 1])
+def test_three_cells_through_grazing(law, mode):
+    chain = Chain(four_band(), 3, "fixed", (0, 1, 2), (10**-2.65, 10**-2.7, 10**-2.75))
+    system = System.from_chain(chain, Contact(law, contact_stiffness(1e8, 0.005, 0.3)))
+    graze = system.grazing_energy(mode)
+    _, points, special = follow(system, mode, graze / 2, energy=(0.0, 1.05 * graze), points=400)
+    assert points[-1].energy > 1.05 * graze
+    assert of_kind(special, "grazing")[0].energy == pytest.approx(graze, rel=1e-10)
+    assert max(p.residual for p in points) <= 1e-12
+
+
+def test_failure_says_where_why_and_what_to_turn():
+    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]), max_newton=1)
+    start = linear_start(corrector, OUT_OF_PHASE, 2.9e-2)
+    points = []
+    with pytest.raises(ContinuationError) as caught:
+        for point in Continuation(corrector, start, StepControl(smallest=1e-6, first=1e-2)):
+            points.append(point)
+    text = str(caught.value)
+    assert points
+    assert f"E = {points[-1].energy:.9g} J" in text
+    assert "residuals of the last attempt" in text
+    assert "turn nnm." in text
