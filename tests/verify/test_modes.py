@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -96,7 +98,7 @@ def test_out_of_phase_branch(branch, request):
 
 
 def test_bilinear_folds_and_stability(bilinear):
-    corrector, points, special = bilinear
+    _, points, special = bilinear
     folds = of_kind(special, "fold-energy")
     assert len(folds) == 2
     for fold in folds:
@@ -226,7 +228,7 @@ def test_in_phase_through_the_first_tongues():
     graze = of_kind(special, "grazing")[0]
     assert graze.energy == pytest.approx(GRAZING[IN_PHASE], rel=1e-10)
     assert max(p.residual for p in points) <= 1e-11
-    assert max(abs(a.episodes - b.episodes) for a, b in zip(points, points[1:], strict=False)) == 1
+    assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
     assert not list(suspects(points))
     watch = Watch(corrector)
     assert not [s for s in map(watch.see, points) if s]
@@ -238,11 +240,7 @@ def test_without_guards_the_branch_jumps_and_the_detector_says_so():
     control = StepControl(points=150, guards=Guards.off())
     points = [start, *Continuation(corrector, start, control)]
     assert max(p.residual for p in points) <= 1e-12  # no residual tells
-    found = [
-        (i, why)
-        for i, why in suspects(points)
-        if is_jump(corrector, points[i], points[i + 1], control)
-    ]
+    found = [(i, why) for i, why in suspects(points) if is_jump(corrector, points[i], points[i + 1], control)]
     assert found
     guarded = [start, *Continuation(corrector, start, StepControl(points=150))]
     assert not list(suspects(guarded))

@@ -85,7 +85,9 @@ def frequency_energy(axes: Axes, branch: BranchFile) -> None:
     for kind, (mark, text) in _MARKS.items():
         at = [i for i, k in enumerate(branch.kinds) if k == kind]
         if at and few:
-            axes.plot(energy[at], frequency[at], mark, ms=3, mfc="white", mec=style.BLACK, mew=0.6, label=text, zorder=4)
+            axes.plot(
+                energy[at], frequency[at], mark, ms=3, mfc="white", mec=style.BLACK, mew=0.6, label=text, zorder=4
+            )
     axes.plot([], [], color=style.BLUE, label="stable")
     if np.any(branch.data["multiplier_max"] > UNSTABLE):
         axes.plot([], [], color=style.VERMILION, label="unstable")
@@ -122,7 +124,13 @@ def portraits(place: object, branch: BranchFile) -> None:
         u, v = branch.orbits["displacement"][k], branch.orbits["velocity"][k]
         for dof, colour in zip(range(min(u.shape[1], 2)), (style.BLUE, style.VERMILION), strict=False):
             closed = np.append(np.arange(len(u)), 0)
-            axes[k].plot(u[closed, dof] / np.abs(u).max(), v[closed, dof] / np.abs(v).max(), color=colour, lw=0.8, ls="--" if dof else "-")
+            axes[k].plot(
+                u[closed, dof] / np.abs(u).max(),
+                v[closed, dof] / np.abs(v).max(),
+                color=colour,
+                lw=0.8,
+                ls="--" if dof else "-",
+            )
         region = branch.data["region"][min(regular, key=lambda i: abs(i - _place(branch, branch.orbits["energy"][k])))]
         axes[k].set_title(f"{_REGIONS[region - 1]}\n{branch.orbits['energy'][k]:.2g} J", loc="center", fontsize=7)
         axes[k].set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
@@ -171,7 +179,9 @@ def _grazing_inset(axes: Axes, branch: BranchFile, first: int) -> None:
 def _shade(axes: Axes, branch: BranchFile) -> None:
     """Regions as bands of energy, labelled at the top; left out where they overlap (internal resonances)."""
     energy, region = branch.data["energy"], branch.data["region"]
-    spans = [(energy[region == k].min(), energy[region == k].max()) if np.any(region == k) else None for k in (1, 2, 3, 4)]
+    spans = [
+        (energy[region == k].min(), energy[region == k].max()) if np.any(region == k) else None for k in (1, 2, 3, 4)
+    ]
     if spans[2] is None:
         return
     for k, span in enumerate(spans):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,7 +15,7 @@ from vipetsc.modes.shooting import Corrector
 def suspects(points: list[Point], guards: Guards | None = None) -> Iterator[tuple[int, str]]:
     """Steps of a branch that violate a guard: (place of the left point, which guard and by how much)."""
     guards = guards or Guards()
-    for i, (a, b) in enumerate(zip(points, points[1:], strict=False)):
+    for i, (a, b) in enumerate(itertools.pairwise(points)):
         change = half_trace_change(a, b)
         if abs(a.episodes - b.episodes) > guards.contacts:
             yield i, f"contacts {a.episodes} -> {b.episodes}"

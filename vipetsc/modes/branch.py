@@ -41,6 +41,7 @@ _COUNTS = {
     "contacts": "contact episodes in the arc that is shot",
     "newton": "Newton steps",
     "number": "number of the regular point, or of the one after a special point",
+    "resonance": "k of the k:1 internal resonance at an energy fold; 0 elsewhere",
     "region": "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 not told",
 }
 
@@ -108,10 +109,23 @@ class Branch:
         traces = ["half_trace"] if self.dofs == 2 else [f"half_trace_{i}" for i in pairs]
         initial = [f"x{i + 1}" for i in range(self.dofs)]
         table.writerow(
-            ["energy", "frequency", "period", *initial, *traces, "multiplier_max", "slope", "contacts", "region", "kind"]
+            [
+                "energy",
+                "frequency",
+                "period",
+                *initial,
+                *traces,
+                "multiplier_max",
+                "slope",
+                "contacts",
+                "region",
+                "kind",
+            ]
         )
         for p, region in zip(self.points, self.column("region"), strict=True):
-            half_traces = [repr(complex(c)) if np.iscomplexobj(p.half_traces) else repr(float(c)) for c in p.half_traces]
+            half_traces = [
+                repr(complex(c)) if np.iscomplexobj(p.half_traces) else repr(float(c)) for c in p.half_traces
+            ]
             numbers = [repr(float(v)) for v in (p.energy, p.frequency, p.period, *p.x)]
             table.writerow(
                 [*numbers, *half_traces, repr(p.multiplier), repr(float(p.slope)), p.episodes, int(region), p.kind]
@@ -186,6 +200,7 @@ class Branch:
                 index=int(data["number"][i]),
                 step=float(data["step"][i]),
                 kind=KINDS[data["kind"][i]],
+                resonance=int(data["resonance"][i]),
             )
             for i in range(len(data["point"]))
         ]

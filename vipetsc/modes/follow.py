@@ -18,7 +18,7 @@ from vipetsc.modes.options import NnmCase, NnmTable
 from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.orbit import Compiled, FiniteDifferences, Flow, FlowError
 from vipetsc.modes.point import Point, linear_start
-from vipetsc.modes.portrait import portrait
+from vipetsc.modes.portrait import portrait, resonance
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import Locator
 from vipetsc.modes.switching import switch
@@ -152,7 +152,7 @@ def grow(
     try:
         for point in points:
             if options.locate:
-                branch.points += locator.between(last, point)
+                branch.points += [_labelled(p, corrector.problem) for p in locator.between(last, point)]
             branch.points.append(point)
             branch.next_step = points.step
             if listener is not None:
@@ -193,6 +193,13 @@ def _start(options: NnmTable, corrector: Corrector, system: System, mode: int) -
         energy = graze / 100 if math.isfinite(graze) else 1e-3
         energy = max(energy, options.energy[0] * 1.001)
     return linear_start(corrector, mode - 1, energy)
+
+
+def _labelled(point: Point, problem: Shooting) -> Point:
+    """Energy folds, where tongues begin and end, carry their resonance."""
+    if point.kind != "fold-energy":
+        return point
+    return replace(point, resonance=resonance(problem, point))
 
 
 def _turned(point: Point) -> Point:

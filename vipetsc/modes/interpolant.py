@@ -41,7 +41,7 @@ def _extremum(c, low, high):
     sign = _slope(c, low) if low > 0.0 else _start_slope(c)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if middle == low or middle == high:
+        if middle in (low, high):
             break
         if _slope(c, middle) * sign > 0.0:
             low = middle
@@ -55,7 +55,7 @@ def _crossing(c, low, high):
     """First root between low (negative or zero) and high (positive)."""
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if middle == low or middle == high:
+        if middle in (low, high):
             break
         if _value(c, middle) > 0.0:
             high = middle

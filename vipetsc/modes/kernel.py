@@ -215,7 +215,9 @@ def flow(y, duration, rtol, loose, pace, reach, inverse_mass, stiffness, rows, l
         low, high, target = 0.0, h, place * h
         if verdict == 2:
             for _ in range(40):
-                _step(y, out, k, target, rtol, loose, pace, inverse_mass, stiffness, rows, law, spring_rows, springs, side)
+                _step(
+                    y, out, k, target, rtol, loose, pace, inverse_mass, stiffness, rows, law, spring_rows, springs, side
+                )
                 rates(out, dy, inverse_mass, stiffness, rows, law, spring_rows, springs, side)
                 _relative(out, dy, rows[which], b)
                 if sign * b[1] > 0.0:

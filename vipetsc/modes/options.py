@@ -62,8 +62,8 @@ class SystemTable(Section):
 
     masses: list[Positive] = Field(min_length=1)
     springs: list[LinearSpringTable] = Field(min_length=1)
-    smooth: list[SmoothSpringTable] = []
-    contacts: list[PairTable] = []
+    smooth: list[SmoothSpringTable] = Field([])
+    contacts: list[PairTable] = Field([])
 
 
 class GuardsTable(Section):
@@ -104,8 +104,8 @@ class NnmTable(Section):
     max_newton: int = Field(7, ge=1)
     locate: bool = True
     locate_grazing: bool = True
-    orbits_at: list[Positive] = []
-    switch: list[Literal["symmetry-breaking", "period-doubling", "branch-point"]] = []
+    orbits_at: list[Positive] = Field([])
+    switch: list[Literal["symmetry-breaking", "period-doubling", "branch-point"]] = Field([])
     switch_points: int = Field(100, ge=1)
     switch_amplitude: Positive = 1e-3
     guards: GuardsTable = GuardsTable()
@@ -171,7 +171,9 @@ class NnmCase(Section):
         stiffness = c.stiffness
         if stiffness is None:
             preset = PRESETS[self.lattice.preset or "four-band"].contacts
-            values = [getattr(c, k) if getattr(c, k) is not None else preset[k] for k in ("modulus", "radius", "poisson")]
+            values = [
+                getattr(c, k) if getattr(c, k) is not None else preset[k] for k in ("modulus", "radius", "poisson")
+            ]
             stiffness = float(contact_stiffness(*values))
         return Contact(ContactLaw.named(c.law), stiffness)
 

@@ -20,7 +20,8 @@ class Point:
     ``energy`` in J, ``residual`` scaled, ``half_traces`` (n - 1,), ``multiplier`` the largest modulus,
     ``episodes`` contact episodes of the arc, ``closed`` the fraction of the time with a contact closed,
     ``tangent`` d(x, period) (n + 1,) of any length, ``slope`` df/dE in Hz/J along it, ``newton`` steps, ``step``
-    the arclength that led here, ``kind`` regular or the name of a special point.
+    the arclength that led here, ``kind`` regular or the name of a special point,
+    ``resonance`` k of the k:1 tongue that an energy fold belongs to (0: not told).
     """
 
     x: np.ndarray
@@ -38,6 +39,7 @@ class Point:
     index: int = 0
     step: float = 0.0
     kind: str = "regular"
+    resonance: int = 0
 
     @property
     def frequency(self) -> float:

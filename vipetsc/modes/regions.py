@@ -75,7 +75,7 @@ def power_law(energy: np.ndarray, slope: np.ndarray) -> PowerLaw | None:
     exponent, constant = np.polyfit(x, y, 1)
     unexplained = float(np.sum((y - exponent * x - constant) ** 2))
     total = float(np.sum((y - y.mean()) ** 2))
-    if total == 0:
+    if total == 0 or abs(constant) > 500:  # no power law in range: a vertical piece of the branch
         return None
     r2 = 1 - (unexplained / (count - 2)) / (total / (count - 1))
     return PowerLaw(float(exponent), float(np.exp(constant)), float(r2), count)

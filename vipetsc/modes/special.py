@@ -40,9 +40,7 @@ def kinds(corrector: Corrector) -> list[SpecialPoint]:
         levels[0.0] = "period-doubling"
     for level, kind in levels.items():
         for i in range(corrector.problem.system.dofs - 1):
-            found.append(
-                SpecialPoint(kind, lambda p, i=i, level=level: float(np.real(p.half_traces[i])) - level, 1e-6)
-            )
+            found.append(SpecialPoint(kind, lambda p, i=i, level=level: float(np.real(p.half_traces[i])) - level, 1e-6))
     return found
 
 

@@ -12,9 +12,7 @@ from vipetsc.modes.point import Point
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 
 
-def switch(
-    corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: int = 1
-) -> tuple[Corrector, Point]:
+def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: int = 1) -> tuple[Corrector, Point]:
     """A corrector and a first point, with its tangent, on the branch that crosses at ``point``.
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
@@ -43,14 +41,19 @@ def switch(
         chart = Relative(problem.system, x, period, rest=problem.map.start == "rest")
         xi = chart.encode(x, period)
         scale = problem.residual_scale(chart.size, chart.period)
-        matrix = problem.jacobian(problem.arc(x, period)) @ chart.derivative(xi) / scale
+        arc = problem.arc(x, period)
+        if np.abs(problem.residual(arc)).max() > 1e-6 * scale:
+            continue  # not an orbit of this map: the doubled period's quarter
+        matrix = problem.jacobian(arc) @ chart.derivative(xi) / scale
         values, directions = np.linalg.svd(matrix)[1:]
         tried.append(f"{name} {values[-1] / values[0]:.1e}")
         if values[-1] > 1e-5 * values[0]:
             continue
         base = np.append(x * 0, 0.0)
         if point.tangent is not None:
-            later = replace(point, x=point.x + 1e-6 * point.tangent[:-1], period=point.period + 1e-6 * point.tangent[-1])
+            later = replace(
+                point, x=point.x + 1e-6 * point.tangent[:-1], period=point.period + 1e-6 * point.tangent[-1]
+            )
             base = chart.encode(_re_expressed(corrector.problem, later, problem), times * later.period) - xi
         new = directions[-2:].T @ directions[-2:] @ base  # the old branch within the null plane
         flat = directions[-2:] @ new

@@ -38,7 +38,7 @@ class Tsrk(Flow):
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """See ``Flow.arc``."""
-        n, system = self.system.dofs, self.system
+        n = self.system.dofs
         y = np.ascontiguousarray(np.hstack([np.asarray(start, float)[:, None], np.eye(2 * n)]))
         rows, law = self._arrays[2], self._arrays[3]
         w = rows @ start[:n]
@@ -62,7 +62,9 @@ class Tsrk(Flow):
                 events.append((t, which, sense, 1 if onset else -1))
                 self._side[which] = sense if onset else 0
                 self._adaptive.restartStep()
-        return self.finish(start, y[:, 0].copy(), y[:, 1:].copy(), duration, np.array(events).reshape(-1, 4), closed, steps)
+        return self.finish(
+            start, y[:, 0].copy(), y[:, 1:].copy(), duration, np.array(events).reshape(-1, 4), closed, steps
+        )
 
     def _solver(self, method: str, adapt: str) -> PETSc.TS:
         ts = PETSc.TS().create(PETSc.COMM_SELF)
