@@ -163,6 +163,9 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
         if options.resume:
             if not kept.exists():
                 raise FolderError(f"{folder}: holds no branches to resume; leave out --resume")
+            begun = NnmCase.load(kept)
+            if begun.physics() != case.physics():
+                raise FolderError(f"{folder}: --resume needs the system, map and flow that {kept} was begun with")
         elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not options.force:
             raise FolderError(f"{folder}: exists; --force replaces the branches in it, --resume goes on with them")
         folder.mkdir(parents=True, exist_ok=True)

@@ -102,7 +102,7 @@ class Branch:
         write_text(folder / f"branch-{self.name}.csv", self.to_csv())
 
     def to_csv(self) -> str:
-        """The branch as CSV text: energy, frequency, period, initial values, stability, slope, contacts, region, kind."""
+        """The branch as CSV text, a row a point; numbers in full precision."""
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
         pairs = range(1, self.dofs)

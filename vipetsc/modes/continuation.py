@@ -50,7 +50,8 @@ class StepControl:
     """How a branch is followed.
 
     ``first``, ``smallest`` and ``largest`` steps are in units of the chart (relative changes); the branch ends
-    outside ``energy`` (J), outside ``frequency`` (Hz) or after ``points`` points. ``chart`` is ``relative``, ``logarithmic``,
+    outside ``energy`` (J), outside ``frequency`` (Hz) or after ``points`` points. ``chart`` is ``relative``,
+    ``logarithmic``,
     ``grazing`` or ``auto`` (grazing near a contact at the arc's start, relative elsewhere).
     """
 
@@ -68,7 +69,8 @@ class StepControl:
 class Continuation:
     """Iterates over the points of a branch, from ``start`` in the direction of growing or falling energy.
 
-    Each point is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended. The
+    Each point is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended, ``finished``
+    whether it left its range. The
     iterator's whole state is its last point and the next step, so that a stored branch can be resumed.
 
     Raises
@@ -90,22 +92,26 @@ class Continuation:
         if start.tangent is None:
             self.point = replace(start, tangent=first_tangent(corrector, start, direction))
         self.step = control.first if step is None else step
-        self.ending = "not finished"
+        self.ending, self.finished = "not finished", False
         self.rejected: list[str] = []
 
     def __iter__(self) -> Iterator[Point]:
         for _ in range(self.control.points):
             self.point = self._next()
+            self.finished = self._outside()
             yield self.point
-            low, high = self.control.energy
-            slow, fast = self.control.frequency
-            if not low <= self.point.energy <= high:
-                self.ending = f"left the energy range {low:g} to {high:g} J"
+            if self.finished:
                 return
-            if not slow <= self.point.frequency <= fast:
-                self.ending = f"left the frequency range {slow:g} to {fast:g} Hz"
-                return
-        self.ending = f"{self.control.points} points reached: raise nnm.points to go on"
+        self.ending = f"{self.control.points} points reached: raise nnm.points and resume to go on"
+
+    def _outside(self) -> bool:
+        """Whether the branch has left its range; says so in ``ending``."""
+        for name, value, unit_name in (("energy", self.point.energy, "J"), ("frequency", self.point.frequency, "Hz")):
+            low, high = getattr(self.control, name)
+            if not low <= value <= high:
+                self.ending = f"left the {name} range {low:g} to {high:g} {unit_name}"
+                return True
+        return False
 
     def chart(self, point: Point) -> Chart:
         """The unknowns used for the step that leaves ``point``."""
@@ -235,6 +241,7 @@ def failure(last: Point, why: str, attempt: Attempt | None, control: StepControl
         "the bran": "nnm.guards.turn",
     }.get(why[:8], "nnm.max_newton or nnm.tolerance")
     return (
-        f"step below {control.smallest:g} after point {last.index} (E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): "
+        f"step below {control.smallest:g} after point {last.index} "
+        f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): "
         f"{why}; residuals of the last attempt: {history}; turn nnm.smallest_step or {knob}"
     )

@@ -14,8 +14,8 @@ import numpy as np
 from vipetsc.modes.audit import Watch, is_jump, suspects
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
-from vipetsc.modes.options import NnmCase, NnmTable
 from vipetsc.modes.newmark import Newmark
+from vipetsc.modes.options import NnmCase, NnmTable
 from vipetsc.modes.orbit import Compiled, FiniteDifferences, Flow, FlowError
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.portrait import portrait, resonance
@@ -77,6 +77,7 @@ def follow(
     path = folder / f"branch-{name}.h5"
     if resume and path.exists():
         branch = Branch.read(path)
+        branch.case = case.to_toml()
         if branch.complete:
             return [branch]
     try:
@@ -140,6 +141,8 @@ def grow(
         If it cannot go on; the branch holds the points found so far.
     """
     control = control_of(options)
+    done = max(len(branch.regular()) - 1, 0)
+    control = replace(control, points=max(control.points - done, 0))
     points = Continuation(corrector, start, control, direction, branch.next_step or None)
     locator = Locator(corrector, options.chart, options.locate_grazing)
     watch = Watch(corrector)
@@ -165,8 +168,9 @@ def grow(
                 save()
             last = point
     finally:
-        branch.findings += list(_jumps(branch, corrector, control))
-    branch.ending, branch.complete = stopped or points.ending, True
+        jumps = _jumps(branch, corrector, control)
+        branch.findings += [jump for jump in jumps if jump not in branch.findings]
+    branch.ending, branch.complete = stopped or points.ending, stopped is not None or points.finished
 
 
 def _jumps(branch: Branch, corrector: Corrector, control: StepControl) -> Iterator[str]:

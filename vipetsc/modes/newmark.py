@@ -44,7 +44,7 @@ def _forces(u, stiffness, rows, law, spring_rows, springs, force, tangent):
 
 @njit("i8(f8[:,::1], f8, i8, f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1])", cache=True)
 def _newmark(y, duration, steps, inverse_mass, stiffness, rows, law, spring_rows, springs, gaps):
-    """Advance ``y`` (2n, 1 + m) in place; ``gaps`` (steps + 1, contacts) takes w; returns 0, or 1 without convergence."""
+    """Advance ``y`` (2n, 1 + m) in place; ``gaps`` (steps + 1, contacts) takes w; returns 0 if it converged."""
     n, columns = y.shape[0] // 2, y.shape[1]
     h = duration / steps
     force, tangent = np.empty(n), np.empty((n, n))

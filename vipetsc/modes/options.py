@@ -81,7 +81,8 @@ class NnmTable(Section):
     ``system``: ``reduced`` (the paper's model of the cell's contact pair), ``chain`` (the lattice with its sites)
     or ``own`` (``[nnm.own]``). ``modes`` are linear modes (1-based, lowest first). ``energy`` in J and
     ``frequency`` in Hz bound the branch; ``direction`` is where energy goes first. ``orbits_at`` lists energies
-    in J whose orbits are stored beside those of the regions; ``switch`` follows the branches that cross at these kinds of special
+    in J whose orbits are stored beside those of the regions; ``switch`` follows the branches that cross at these kinds
+    of special
     points, ``switch_points`` points each.
     """
 
@@ -164,6 +165,11 @@ class NnmCase(Section):
     def to_toml(self) -> str:
         """The resolved case as TOML; reading it back gives the same case."""
         return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
+
+    def physics(self) -> tuple:
+        """What a branch that is resumed must keep: the system, the shooting map and the flow."""
+        nnm = self.nnm
+        return self.lattice, self.contacts, nnm.system, nnm.own, nnm.map, nnm.flow, nnm.jacobian
 
     def contact(self) -> Contact:
         """The contact law without dissipation; stiffness from the paper's material where none is given."""

@@ -106,7 +106,8 @@ def linear_start(corrector: Corrector, mode: int, energy: float) -> Point:
     if not attempt.converged:
         history = " ".join(f"{r:.1e}" for r in attempt.history)
         raise ValueError(
-            f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J ({attempt.reason}; residuals {history}): "
+            f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J "
+            f"({attempt.reason}; residuals {history}): "
             "lower nnm.start_energy"
         )
     return Point.of(problem, attempt, chart)

@@ -28,7 +28,8 @@ def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed:
     """Region 1-4 of every point of a branch (points,), in the order of the branch.
 
     I: no contact. II: grazing, from the first contact over the peak of the slope until its steep fall has ended:
-    until the local exponent d ln(df/dE)/d ln E grows by less than ``SETTLED`` per e-fold of energy. III: vibro-impact. IV: smooth limit, from where a
+    until the local exponent d ln(df/dE)/d ln E grows by less than ``SETTLED`` per e-fold of energy.
+    III: vibro-impact. IV: smooth limit, from where a
     contact is closed for 95 % of the time on. A branch on which the slope keeps changing sign (internal
     resonances) has its peak after its last energy fold. Without an exponent that settles, II lasts.
 

@@ -63,7 +63,8 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
         if not attempt.converged:
             history = " ".join(f"{r:.1e}" for r in attempt.history)
             raise ContinuationError(
-                f"no convergence on the crossing branch at E = {point.energy:.9g} J ({attempt.reason}; residuals {history}): "
+                f"no convergence on the crossing branch at E = {point.energy:.9g} J "
+                f"({attempt.reason}; residuals {history}): "
                 "lower nnm.switch_amplitude"
             )
         direction = null_vector(fresh.matrix(attempt.xi)[:-1])
@@ -71,7 +72,8 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
         tangent = chart.derivative(attempt.xi) @ direction
         return fresh, Point.of(problem, attempt, chart, tangent=tangent)
     raise ContinuationError(
-        f"no branch crosses at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz: smallest singular values {', '.join(tried)}"
+        f"no branch crosses at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz: "
+        f"smallest singular values {', '.join(tried)}"
     )
 
 

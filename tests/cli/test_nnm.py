@@ -1,0 +1,74 @@
+"""The verb nnm as a user types it: files, exit codes, refusal, resumption."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.conftest import assert_same_bits, datasets
+
+CASE = """
+[lattice]
+preset = "four-band"
+reading = "printed"
+[contacts]
+law = "bilinear"
+modulus = 1e8
+[nnm]
+modes = [2]
+energy = [0.0, 1.0]
+locate_grazing = false
+"""
+
+
+@pytest.fixture
+def case(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(CASE)
+    return path
+
+
+def test_branch_files_picture_and_refusal(vipetsc, case, tmp_path):
+    out = tmp_path / "out"
+    done = vipetsc(0, "nnm", case, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "fold-energy: 2" in done.stdout
+    assert "Newton" in done.stderr  # the live table
+    names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
+    assert names == {
+        "case.toml",
+        "branch-out-of-phase.h5",
+        "branch-out-of-phase.csv",
+        "figures/branch-out-of-phase.png",
+    }
+    again = vipetsc(0, "nnm", case, "--out", out)
+    assert again.returncode == 2
+    assert "--force" in again.stderr
+    assert vipetsc(0, "nnm", case, "--out", out, "--force").returncode == 0
+
+
+def test_resumed_branch_is_the_uninterrupted_one(vipetsc, case, tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert vipetsc(0, "nnm", case, "--out", whole, "--set", "nnm.points=80").returncode == 0
+    assert vipetsc(0, "nnm", case, "--out", parts, "--set", "nnm.points=30").returncode == 0
+    assert vipetsc(0, "nnm", case, "--out", parts, "--set", "nnm.points=80", "--resume").returncode == 0
+    first, second = (datasets(p / "branch-out-of-phase.h5") for p in (whole, parts))
+    assert_same_bits(first, second)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [("nnm.modes=[7]", "2 modes"), ("nnm.flow=rk4", "nnm.flow"), ("nmn.flow=1", "did you mean nnm")],
+)
+def test_bad_cases_write_nothing(vipetsc, case, tmp_path, change, message):
+    done = vipetsc(0, "nnm", case, "--out", tmp_path / "out", "--set", change)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
+    out = tmp_path / "out"
+    done = vipetsc(2, "nnm", case, "--out", out, "--set", "nnm.smallest_step=1e-3")
+    assert done.returncode == 1
+    assert "turn nnm.smallest_step" in done.stdout
+    assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5

@@ -1,0 +1,214 @@
+"""The parts of the modes by themselves: systems, charts, stability, regions, cases, files, picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vipetsc.case import CaseError
+from vipetsc.lattice import Bilinear, Contact, Hertz, contact_stiffness, diatomic, four_band
+from vipetsc.modes.branch import Branch
+from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
+from vipetsc.modes.continuation import Continuation, StepControl
+from vipetsc.modes.options import NnmCase
+from vipetsc.modes.orbit import Compiled
+from vipetsc.modes.point import linear_start
+from vipetsc.modes.portrait import portrait
+from vipetsc.modes.regions import power_law, regions
+from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.stability import stability
+from vipetsc.modes.system import ContactPair, SmoothSpring, System
+
+D = 10**-2.75
+LAW = Contact(Bilinear, contact_stiffness(1e8, 0.005, 0.3))
+
+
+def reduced() -> System:
+    return System.reduced(four_band(), D, LAW)
+
+
+def test_reduced_model_of_the_paper():
+    system = reduced()
+    assert system.masses == pytest.approx([0.0025, 0.0025])
+    assert system.stiffness == pytest.approx(np.array([[2.2e4, -2e3], [-2e3, 2e3]]))
+
+
+def test_reduced_model_of_another_cell():
+    system = System.reduced(diatomic(), D, LAW)
+    assert system.stiffness == pytest.approx(np.array([[2 * 9e4 + 9e4, -9e4], [-9e4, 9e4]]))
+
+
+def test_forces_are_the_energy_gradient():
+    law = Contact(Hertz, 3e6)
+    pairs = (ContactPair(None, 0, 0.1, law), ContactPair(0, 2, 0.05, law))
+    smooth = (SmoothSpring(1, 2, cubic=3.0, quadratic=-1.0), SmoothSpring(None, 1, cubic=2.0))
+    system = System.assemble([1.0, 2.0, 3.0], [(None, 0, 5.0), (0, 1, 7.0), (1, 2, 11.0)], pairs, smooth)
+    u, step, zero = np.array([0.3, -0.2, 0.5]), 1e-6, np.zeros(3)
+    gradient = [
+        (system.energy(u + step * e, zero) - system.energy(u - step * e, zero)) / (2 * step) for e in np.eye(3)
+    ]
+    assert system.forces(u) == pytest.approx(gradient, rel=1e-7)
+    assert not system.odd
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"masses": [1.0, -1.0]}, "masses"),
+        ({"contacts": (ContactPair(0, 1, -1.0, LAW),)}, "clearance"),
+        ({"contacts": (ContactPair(0, 2, 1.0, LAW),)}, "not a pair"),
+        ({"contacts": (ContactPair(0, 1, 1.0, Contact(Hertz, 1.0, 0.7)),)}, "restitution"),
+    ],
+)
+def test_unsound_systems_are_refused(change, message):
+    parts = {"masses": [1.0, 1.0], "springs": [(None, 0, 1.0), (0, 1, 1.0)]} | change
+    with pytest.raises(ValueError, match=message):
+        System.assemble(**parts)
+
+
+def test_quarter_map_needs_an_odd_system():
+    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, quadratic=0.1)])
+    with pytest.raises(ValueError, match="half"):
+        Shooting(Compiled(system), MAPS["quarter"])
+
+
+def test_half_map_of_an_asymmetric_system():
+    """x'' + x + a x^2 = 0: the second-order frequency 1 - 5/12 a^2 A^2 (Nayfeh and Mook 1979)."""
+    a, energy = 0.1, 1e-3
+    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, quadratic=a)])
+    corrector = Corrector(Shooting(Compiled(system), MAPS["half"]))
+    point = linear_start(corrector, 0, energy)
+    assert 2 * np.pi * point.frequency == pytest.approx(1 - 5 / 12 * a**2 * 2 * point.energy, abs=2e-9)
+    assert point.multiplier == 1
+
+
+@given(
+    x=st.tuples(*[st.floats(0.2, 5).flatmap(lambda v: st.sampled_from([v, -v]))] * 2),
+    period=st.floats(1e-4, 10),
+    kind=st.sampled_from([Relative, Logarithmic, Grazing]),
+)
+@settings(max_examples=60, deadline=None)
+def test_charts_encode_decode_and_differentiate(x, period, kind):
+    x = D * np.array(x)
+    if abs(abs(x[1] - x[0]) / D - 1) < 1e-3:
+        return  # the grazing chart is singular at grazing itself
+    chart: Chart = kind(reduced(), x, period)
+    xi = chart.encode(x, period)
+    again, same = chart.decode(xi)
+    assert again == pytest.approx(x, rel=1e-11, abs=1e-11 * D)
+    assert same == pytest.approx(period, rel=1e-13)
+    step = 1e-6
+    for i, column in enumerate(chart.derivative(xi).T):
+        move = np.zeros(3)
+        move[i] = step
+        forward, backward = (np.append(*chart.decode(xi + s * move)) for s in (1, -1))
+        difference = (forward - backward) / (2 * step)
+        assert column == pytest.approx(difference, rel=1e-5, abs=1e-5 * np.abs(column).max())
+
+
+@pytest.mark.parametrize("name", ["quarter", "half", "whole"])
+def test_multipliers_are_those_of_the_monodromy_matrix(name):
+    """At a linear orbit the multipliers are exp(+-i omega_1 T_2), whatever the map."""
+    system = reduced()
+    corrector = Corrector(Shooting(Compiled(system), MAPS[name]))
+    point = linear_start(corrector, 1, 1e-3)
+    found = stability(corrector.problem, corrector.problem.arc(point.x, point.period))
+    omega = system.linear_modes()[0]
+    expected = np.cos(2 * np.pi * omega[0] / omega[1])
+    assert found.multipliers.real == pytest.approx(expected, abs=1e-9)
+    assert found.stable
+
+
+def test_regions_and_power_law_of_a_made_up_branch():
+    energy = np.geomspace(1e-3, 1e6, 400)
+    touched = energy > 1e-2
+    slope = np.where(touched, 1e3 / energy + 1e4 * (energy / 1e-2) ** -6.0, 0.0)
+    closed = np.where(touched, 1 - 0.5 / (1 + np.log10(np.maximum(energy / 1e-2, 1)) ** 2), 0.0)
+    region = regions(energy, slope, touched.astype(int), closed)
+    assert np.all(np.diff(region) >= 0)
+    assert set(region) == {1, 2, 3, 4}
+    assert np.all((region == 1) == ~touched)
+    assert closed[region == 4].min() >= 0.95 > closed[region == 3].max()
+    law = power_law(energy[region == 4], slope[region == 4])
+    assert law.exponent == pytest.approx(-1, abs=1e-3)
+    assert law.adjusted_r2 > 0.9999
+
+
+def test_portrait_is_the_orbit_itself():
+    """The mirrored quarter agrees with a flow over the whole period."""
+    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]))
+    start = linear_start(corrector, 1, 0.02)
+    points = list(Continuation(corrector, start, StepControl(points=150, energy=(0, 0.5))))
+    point = points[-1]
+    orbit = portrait(corrector.problem, point, 40)
+    arc = corrector.problem.flow.arc(np.append(point.x, [0, 0]), orbit.time[33], point.period)
+    assert orbit.displacement[33] == pytest.approx(arc.end[:2], rel=1e-8)
+    assert orbit.velocity[33] == pytest.approx(arc.end[2:], rel=1e-8)
+
+
+def test_case_reports_everything_at_once():
+    table = {
+        "contacts": {"law": "bilinaer"},
+        "nnm": {"modes": [0], "larget_step": 1.0, "guards": {"turn": -1.0}},
+        "nmn": {},
+    }
+    with pytest.raises(CaseError) as caught:
+        NnmCase.from_table(table)
+    text = str(caught.value)
+    for part in ("contacts.law", "bilinear", "nnm.modes", "largest_step", "guards.turn", "did you mean nnm"):
+        assert part in text
+
+
+def test_case_round_trip_and_systems():
+    case = NnmCase.from_table({"name": "a", "lattice": {"reading": "printed"}, "contacts": {"law": "bilinear"}})
+    assert NnmCase.from_table(tomllib.loads(case.to_toml())) == case
+    assert case.system().contacts[0].clearance == pytest.approx(D)
+    assert [case.branch_name(m) for m in (1, 2)] == ["in-phase", "out-of-phase"]
+    with pytest.raises(CaseError, match="2 modes"):
+        NnmCase.from_table({"nnm": {"modes": [3]}})
+    with pytest.raises(CaseError, match="nnm.own"):
+        NnmCase.from_table({"nnm": {"system": "own"}})
+
+
+@pytest.fixture(scope="module")
+def short_branch() -> Branch:
+    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]))
+    start = linear_start(corrector, 1, 0.02)
+    growing = Continuation(corrector, start, StepControl(points=400, energy=(0, 1e4)))
+    points = [growing.point, *growing]
+    orbit = portrait(corrector.problem, points[-1], 40)
+    return Branch("out-of-phase", "name = 'x'", 2, points, 0.1, True, "done", ["a", "b"], [(points[-1], orbit)])
+
+
+def test_branch_file_round_trip(short_branch, tmp_path):
+    short_branch.write(tmp_path, {"ranks": 1})
+    again = Branch.read(tmp_path / "branch-out-of-phase.h5")
+    assert again.to_csv() == short_branch.to_csv()
+    assert (again.ending, again.complete, again.findings) == ("done", True, ["a", "b"])
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "branch-out-of-phase.csv").read_text())))
+    assert [float(r["energy"]) for r in rows] == [p.energy for p in short_branch.points]
+    assert list(rows[0])[-6:] == ["half_trace", "multiplier_max", "slope", "contacts", "region", "kind"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["branch-out-of-phase.csv", "branch-out-of-phase.h5"]
+
+
+def test_xarray_opens_the_branch(short_branch, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    short_branch.write(tmp_path, {})
+    with xarray.open_dataset(tmp_path / "branch-out-of-phase.h5", engine="h5netcdf") as data:
+        assert data.frequency.attrs["units"] == "Hz"
+        assert data.initial.dims == ("point", "dof")
+        assert float(data.energy[0]) == short_branch.points[0].energy
+
+
+def test_picture_from_the_file(short_branch, tmp_path):
+    from vipetsc.figures import draw_backbone
+
+    short_branch.write(tmp_path, {})
+    path = draw_backbone([tmp_path / "branch-out-of-phase.h5"], tmp_path / "figures" / "branch.png")
+    assert path.stat().st_size > 20000
