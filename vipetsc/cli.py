@@ -179,17 +179,23 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     for branch in branches:
         _say(comm, branch_table(branch))
 
-    def pictures() -> list[Path]:
+    _plot_branches(folder, ("png",), comm)
+    failed = comm.bcast(any(b.ending.startswith("failed") for b in branches))
+    return FAILED if failed else DONE
+
+
+def _plot_branches(folder: Path, formats: tuple[str, ...], comm: MPI.Comm) -> int:
+    """A picture of every branch in ``folder``."""
+
+    def draw() -> list[Path]:
         from vipetsc.figures import draw_backbone
 
         paths = sorted(folder.glob("branch-*.h5"))
-        return [draw_backbone([path], folder / "figures" / f"{path.stem}.png") for path in paths]
+        return [draw_backbone([p], folder / "figures" / f"{p.stem}.{kind}") for p in paths for kind in formats]
 
-    if comm.rank == 0:
-        for path in pictures():
-            _say(comm, f"  {path}")
-    failed = comm.bcast(any(b.ending.startswith("failed") for b in branches))
-    return FAILED if failed else DONE
+    for path in on_root(comm, draw):
+        _say(comm, f"  {path}")
+    return DONE
 
 
 def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
@@ -230,6 +236,8 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     from vipetsc.studies.analysis import analyse
 
     folder = options.path.parent if options.path.name == "run.h5" else options.path
+    if not (folder / "run.h5").exists() and any(folder.glob("branch-*.h5")):
+        return _plot_branches(folder, tuple(options.format or ("png",)), comm)
 
     def check() -> None:
         unknown = set(options.fig or []) - set(run_figures)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
 from mpi4py import MPI
+
+import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.modes.follow import follow_all

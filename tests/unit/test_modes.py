@@ -50,9 +50,7 @@ def test_forces_are_the_energy_gradient():
     smooth = (SmoothSpring(1, 2, cubic=3.0, quadratic=-1.0), SmoothSpring(None, 1, cubic=2.0))
     system = System.assemble([1.0, 2.0, 3.0], [(None, 0, 5.0), (0, 1, 7.0), (1, 2, 11.0)], pairs, smooth)
     u, step, zero = np.array([0.3, -0.2, 0.5]), 1e-6, np.zeros(3)
-    gradient = [
-        (system.energy(u + step * e, zero) - system.energy(u - step * e, zero)) / (2 * step) for e in np.eye(3)
-    ]
+    gradient = [(system.energy(u + step * e, zero) - system.energy(u - step * e, zero)) / (2 * step) for e in np.eye(3)]
     assert system.forces(u) == pytest.approx(gradient, rel=1e-7)
     assert not system.odd
 

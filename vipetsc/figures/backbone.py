@@ -34,6 +34,7 @@ class BranchFile:
     data: dict[str, np.ndarray]
     kinds: list[str]
     orbits: dict[str, np.ndarray]
+    flows: dict[str, dict[str, np.ndarray]]
 
     @classmethod
     def read(cls, path: Path) -> BranchFile:
@@ -43,7 +44,8 @@ class BranchFile:
             data = {name: file[name][...] for name in names}
             kinds = str(file["kind"].attrs["flag_meanings"]).split()
             orbits = {n: v[...] for n, v in file["orbits"].items()} if "orbits" in file else {}
-            return cls(str(file.attrs["name"]), data, [kinds[k] for k in data["kind"]], orbits)
+            flows = {f: {n: v[...] for n, v in g.items()} for f, g in file.get("flows", {}).items()}
+            return cls(str(file.attrs["name"]), data, [kinds[k] for k in data["kind"]], orbits, flows)
 
 
 def draw_backbone(paths: Sequence[Path], target: Path) -> Path:
@@ -61,8 +63,9 @@ def backbone(branches: Sequence[BranchFile]) -> Figure:
     count = len(branches)
     width = style.COLUMN if count == 1 else style.PAGE
     with_orbits = any(b.orbits for b in branches)
-    figure = style.new_figure(width, 5.6 if with_orbits else 3.8)
-    heights = (1.5, 1.0, 0.95) if with_orbits else (1.5, 1.0)
+    with_flows = any(b.flows for b in branches)
+    heights = (1.5, 1.0) + (1.0,) * with_flows + (0.95,) * with_orbits
+    figure = style.new_figure(width, 1.55 * sum(heights))
     rows = figure.subfigures(len(heights), count, squeeze=False, height_ratios=heights)
     for column, branch in enumerate(branches):
         label = chr(ord("a") + column)
@@ -70,8 +73,10 @@ def backbone(branches: Sequence[BranchFile]) -> Figure:
         frequency_energy(top, branch)
         style.letter(top, f"({label}) {branch.name}")
         slope(rows[1, column].subplots(), branch)
+        if with_flows:
+            flow_differences(rows[2, column].subplots(), branch)
         if with_orbits:
-            portraits(rows[2, column], branch)
+            portraits(rows[-1, column], branch)
     return figure
 
 
@@ -109,6 +114,20 @@ def slope(axes: Axes, branch: BranchFile) -> None:
     axes.plot(energy[moving], steep[moving], color=style.BLUE, lw=0.9)
     axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel=r"|d$f$/d$E$| (Hz/J)")
     axes.set_xlim(energy.min(), energy.max())
+
+
+def flow_differences(axes: Axes, branch: BranchFile) -> None:
+    """How far other flows are from the branch at the same amplitude: frequency (full) and energy (open marks)."""
+    if not branch.flows:
+        style.say(axes, "no other flow was compared")
+        return
+    for (name, found), colour in zip(branch.flows.items(), (style.VERMILION, style.GREEN, style.PURPLE), strict=False):
+        for key, face in (("frequency", colour), ("energy", "white")):
+            size = np.maximum(np.abs(found[f"{key}_difference"]), 1e-17)
+            axes.plot(found["energy"], size, "o", ms=2.2, mec=colour, mfc=face, mew=0.5, label=f"{name}: {key}")
+    axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel="relative difference")
+    axes.set_xlim(branch.data["energy"].min(), branch.data["energy"].max())
+    axes.legend(fontsize=5.5, ncols=2, loc="center right")
 
 
 def portraits(place: object, branch: BranchFile) -> None:

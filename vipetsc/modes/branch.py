@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from vipetsc.modes.compare import Comparison
 from vipetsc.modes.point import Point
 from vipetsc.modes.portrait import Portrait
 from vipetsc.modes.regions import power_law, regions
@@ -62,6 +63,7 @@ class Branch:
     ending: str = "not finished"
     findings: list[str] = field(default_factory=list)
     orbits: list[tuple[Point, Portrait]] = field(default_factory=list)
+    comparisons: list[Comparison] = field(default_factory=list)
 
     def regular(self) -> list[Point]:
         """The points of the continuation itself."""
@@ -164,6 +166,13 @@ class Branch:
             axes = ("orbit", "phase", "dof")
             for name, unit in (("displacement", "m"), ("velocity", "m/s")):
                 put.put(f"orbits/{name}", axes, np.array([getattr(o, name) for _, o in self.orbits]), unit, name)
+        for c in self.comparisons:
+            scale = f"compared_{c.name}"
+            put.add(scale, c.number, "1", f"number of the point compared with {c.name}")
+            put.put(f"flows/{c.name}/energy", (scale,), c.energy, "J", "energy of the branch")
+            for name in ("energy_difference", "frequency_difference"):
+                text = f"relative {name.replace('_', ' ')} of {c.name} at the same amplitude"
+                put.put(f"flows/{c.name}/{name}", (scale,), getattr(c, name), "1", text)
         attributes = {
             "name": self.name,
             "case": self.case,

@@ -13,6 +13,7 @@ import numpy as np
 
 from vipetsc.modes.audit import Watch, is_jump, suspects
 from vipetsc.modes.branch import Branch
+from vipetsc.modes.compare import compare
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
 from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.options import NnmCase, NnmTable
@@ -91,6 +92,7 @@ def follow(
         direction = -1 if options.direction == "down" else 1
         grow(branch, corrector, options, start, direction, listener, save=lambda: branch.write(folder, about))
         _store_orbits(branch, corrector.problem, options)
+        branch.comparisons = [compare(corrector, branch.regular(), FLOWS[f](system)) for f in options.compare]
     except (ContinuationError, FlowError, ValueError) as error:
         branch.ending = f"failed: {error}"
     branch.write(folder, about)
