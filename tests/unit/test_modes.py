@@ -170,7 +170,7 @@ def test_case_round_trip_and_systems():
     assert [case.branch_name(m) for m in (1, 2)] == ["in-phase", "out-of-phase"]
     with pytest.raises(CaseError, match="2 modes"):
         NnmCase.from_table({"nnm": {"modes": [3]}})
-    with pytest.raises(CaseError, match="nnm.own"):
+    with pytest.raises(CaseError, match=r"nnm.own"):
         NnmCase.from_table({"nnm": {"system": "own"}})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -232,6 +233,61 @@ def test_in_phase_through_the_first_tongues():
     assert not list(suspects(points))
     watch = Watch(corrector)
     assert not [s for s in map(watch.see, points) if s]
+
+
+def test_in_phase_through_every_odd_tongue_to_the_limit():
+    """At the tip of the k:1 tongue the resonator strikes (k + 1)/2 times in a quarter period, for every odd k."""
+    system = reduced()
+    corrector = Corrector(Shooting(Compiled(system), MAPS["quarter"]))
+    start = linear_start(corrector, IN_PHASE, 1e-3)
+    growing = Continuation(corrector, start, StepControl(energy=(0.0, 6e9), points=20000))
+    points = [growing.point, *growing]
+    assert growing.finished
+    assert max(p.residual for p in points) <= 3e-12
+    assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
+    assert not list(suspects(points))
+    limit = system.closed_frequencies()[0] / (2 * np.pi)
+    tail = [p for p in points[-30:] if p.energy > 1e8]
+    distance = np.array([(limit - p.frequency) * np.sqrt(p.energy) for p in tail])
+    assert np.ptp(distance) <= 1e-2 * abs(distance[0])  # f_limit - f ~ E^(-1/2)
+    labels, last = set(), points[0]
+    for point in points[1:]:
+        if last.rise < 0 < point.rise and point.episodes > 0:  # the inner end of a tongue
+            k = resonance(corrector.problem, point)
+            if point.episodes == (k + 1) // 2:
+                labels.add(k)
+        last = point
+    assert labels >= set(range(5, 31, 2))
+
+
+def test_degenerate_tangent_is_named():
+    """Two equal oscillators without coupling: every combination is an orbit, so the start is a branch point."""
+    system = System.assemble([1.0, 1.0], [(None, 0, 1.0), (None, 1, 1.0)])
+    corrector = Corrector(Shooting(Compiled(system), MAPS["half"]))
+    x = np.array([1.0, 0.5])
+    chart = Relative(system, x, 2 * np.pi)
+    xi = chart.encode(x, 2 * np.pi)
+    attempt = corrector.solve(chart, xi, np.array([1.0, 0.0, 0.0]), xi[0])
+    with pytest.raises(ContinuationError, match=r"degenerate tangent at E = 0.625 J"):
+        Continuation(corrector, Point.of(corrector.problem, attempt, chart), StepControl())
+
+
+def test_both_directions_give_the_same_curve():
+    """Down from above grazing returns through both folds to the linear mode, which the watch reports."""
+    system = reduced()
+    corrector, points, _ = follow(system, OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.5))
+    down = Continuation(corrector, points[-1], StepControl(points=2000, energy=(1e-3, 1.0)), step=1e-3)
+    down.point = dataclasses.replace(points[-1], tangent=-points[-1].tangent)
+    watch, back, said = Watch(corrector), [], None
+    for point in down:
+        back.append(point)
+        said = watch.see(point)
+        if said:
+            break
+    assert "returned to linear mode 2" in said
+    energies = np.array([p.energy for p in back])
+    assert np.sum(np.diff(np.sign(np.diff(energies))) != 0) == 2
+    assert back[-1].energy == pytest.approx(GRAZING[OUT_OF_PHASE], rel=0.02)
 
 
 def test_without_guards_the_branch_jumps_and_the_detector_says_so():

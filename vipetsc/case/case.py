@@ -101,7 +101,8 @@ class Case(Section):
         """The resolved case of a parsed TOML table; raises CaseError with everything that is wrong."""
         table, problems = with_overrides(table, overrides)
         kinds = {name: field.annotation for name, field in cls.model_fields.items()}
-        problems += [unknown_key(key, table[key], kinds) for key in table if key not in kinds]
+        # [nnm] in the same file belongs to the verb nnm, which checks it
+        problems += [unknown_key(key, table[key], [*kinds, "nnm"]) for key in table if key not in {*kinds, "nnm"}]
         table = _with_preset(table)
         name = table.get("name", "case")
         if not isinstance(name, str) or not name:

@@ -233,6 +233,8 @@ def _cross_problems(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTabl
         low, high = getattr(nnm, key)
         if not low < high:
             problems.append(Problem(f"nnm.{key}", [low, high], "must be [low, high]"))
+    if nnm.direction != "up" and nnm.energy[0] == 0:
+        problems.append(Problem("nnm.energy", nnm.energy, "going down needs a lowest energy above 0 (J)"))
     if nnm.smallest_step >= nnm.largest_step:
         problems.append(Problem("nnm.smallest_step", nnm.smallest_step, "must be below nnm.largest_step"))
     if nnm.system == "chain":
