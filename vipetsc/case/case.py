@@ -37,7 +37,6 @@ from vipetsc.lattice.contact import Contact, ContactLaw, contact_stiffness
 from vipetsc.lattice.drive import ToneBurst
 from vipetsc.lattice.presets import PRESETS
 
-
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
 
