@@ -24,13 +24,13 @@ import petsc4py
 
 petsc4py.init(["bench", "-no_signal_handler"])
 
+from mpi4py import MPI
+
 import numba
 import numpy as np
-from mpi4py import MPI
 from scipy.integrate import DOP853
 
 from vipetsc.case import Case, Model
-from vipetsc.dynamics.energy import Ledger
 from vipetsc.dynamics.impacts import ImpactTracker
 from vipetsc.dynamics.integrator import Integrator
 from vipetsc.dynamics.layout import Layout

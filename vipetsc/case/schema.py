@@ -154,7 +154,7 @@ class DriveTable(Section):
 class TimeTable(Section):
     """End in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
 
-    ``atol``: ``scaled`` is rtol times the displacement and the velocity of the drive's linear wave,
+    ``atol``: ``scaled`` is .1 rtol times the displacement and the velocity of the drive's linear wave,
     ``paper`` is 1e-9 times the amplitude, a number is used for displacements (m) and velocities (m/s).
     """
 

@@ -32,9 +32,10 @@ class Recorder:
         self.layout = layout
         output = case.output
         first, last = output.window or (1, layout.cells)
-        kept = np.arange(first - 1, last, output.every)
-        self.total = len(kept)
-        self.cells = kept[(kept >= layout.start) & (kept < layout.stop)]
+        # The first kept cell at or behind this rank's first, without a list of the whole lattice.
+        begin = first - 1 + output.every * max(-(-(layout.start - first + 1) // output.every), 0)
+        self.total = len(range(first - 1, last, output.every))
+        self.cells = np.arange(begin, min(last, layout.stop), output.every)
         begin = int(self.cells[0]) - layout.start if self.cells.size else 0
         self._pick = slice(begin, int(self.cells[-1]) - layout.start + 1 if self.cells.size else 0, output.every)
         self.fields = tuple(output.fields)

@@ -1,0 +1,140 @@
+"""Cases: strict, complete, resolved, and the same after a round trip."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vipetsc.case import Case, CaseError
+
+RUNS = Path(__file__).parents[2] / "runs"
+
+
+def problems(table: dict, *overrides: str) -> dict[str, str]:
+    with pytest.raises(CaseError) as caught:
+        Case.from_table(table, overrides)
+    return {p.key: str(p) for p in caught.value.problems}
+
+
+def test_the_builtin_case_is_the_papers():
+    case = Case.builtin()
+    assert case.contacts.sites == [75, 106, 138, 169, 200]
+    np.testing.assert_allclose(case.contacts.clearance, np.geomspace(10**-2.65, 10**-2.75, 5), rtol=1e-12)
+    assert case.contacts.stiffness == pytest.approx(5180269.459, rel=1e-9)
+    assert case.drive.frequency == pytest.approx(1023.27, abs=5e-3)
+    model = case.model()
+    assert model.speed == pytest.approx(428.7, abs=0.05)
+    assert model.end == pytest.approx(2 * np.pi * 30 / 1023.2717 + 300 / 428.682, rel=1e-6)
+    assert model.samples == 4421
+
+
+@pytest.mark.parametrize(("preset", "count", "sites"), [("four-band", 1, [100]), ("diatomic", 1, [150])])
+def test_single_sites_and_their_clearance(preset, count, sites):
+    case = Case.from_table({"lattice": {"preset": preset}, "contacts": {"sites": count}})
+    assert case.contacts.sites == sites
+    assert case.contacts.clearance == [pytest.approx({"four-band": 10**-2.75, "diatomic": 2e-4}[preset])]
+
+
+def test_diatomic_drive_by_wavenumber():
+    for wavenumber in ("5pi/9", "5*pi/9", 5 * np.pi / 9):
+        table = {"lattice": {"preset": "diatomic", "reading": "printed"}, "drive": {"wavenumber": wavenumber}}
+        assert Case.from_table(table).drive.frequency == pytest.approx(5520.026, abs=1e-3)
+
+
+@pytest.mark.parametrize("path", sorted(RUNS.glob("*.toml")), ids=lambda p: p.stem)
+def test_every_case_file_is_sound_and_survives_a_round_trip(path):
+    case = Case.load(path)
+    assert Case.from_toml(case.to_toml()) == case
+    assert case.model().samples > 1
+
+
+def test_tolerances_scale_with_the_drive():
+    weak, strong = (Case.builtin([f"drive.amplitude={a}"]).model() for a in (2.0**-10, 2.0**3))
+    assert strong.atol[0] == weak.atol[0] * 2**13
+    assert strong.atol[1] == strong.atol[0] * strong.drive.frequency
+    assert Case.builtin(["time.atol=paper"]).model().atol == (24.33e-9, 24.33e-9)
+
+
+def test_unknown_keys_name_the_nearest():
+    found = problems({"lattice": {"cels": 3}, "contcts": {}, "drive": {"amplitud": 1.0}})
+    assert "did you mean lattice.cells?" in found["lattice.cels"]
+    assert "did you mean contacts?" in found["contcts"]
+    assert "did you mean drive.amplitude?" in found["drive.amplitud"]
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("contacts.restitution=1.1", "contacts.restitution"),
+        ("contacts.clearance=0", "contacts.clearance"),
+        ("contacts.clearance=[1e-3]", "contacts.clearance"),
+        ("contacts.sites=[0]", "contacts.sites"),
+        ("contacts.sites=[301]", "contacts.sites"),
+        ("contacts.sites=[5, 5]", "contacts.sites"),
+        ("contacts.stiffness=-1", "contacts.stiffness"),
+        ("contacts.poisson=0.9", "contacts.poisson"),
+        ("drive.amplitude=0", "drive.amplitude"),
+        ("drive.amplitude=nan", "drive.amplitude"),
+        ("drive.band=5", "drive.band"),
+        ("drive.cycles=0", "drive.cycles"),
+        ("drive.cell=301", "drive.cell"),
+        ("drive.mass=5", "drive.mass"),
+        ("drive.wavenumber=4.0", "drive.wavenumber"),
+        ("lattice.cells=1", "lattice.cells"),
+        ("lattice.eta=1.5", "lattice.eta"),
+        ("time.rtol=0", "time.rtol"),
+        ("time.end=-1", "time.end"),
+        ("time.sample_interval=0.001", "time.sample_interval"),
+        ("time.engine=magic", "time.engine"),
+        ("output.window=[5, 4]", "output.window"),
+        ("name=''", "name"),
+    ],
+)
+def test_impossible_values_name_their_key(override, key):
+    found = problems({"lattice": {"preset": "four-band"}}, override)
+    assert key in found
+    assert len(found) == 1 or override.startswith("drive.wavenumber")
+
+
+def test_a_cell_of_ones_own_is_checked_whole():
+    found = problems(
+        {
+            "lattice": {
+                "cell": {
+                    "masses": [1.0, -2.0],
+                    "springs": [{"start": 1, "end": 3, "stiffness": 0.0}],
+                    "contact": [1, 1],
+                }
+            },
+            "drive": {"frequency": 10.0},
+        }
+    )
+    assert {"lattice.cell.masses[2]", "lattice.cell.springs[1]", "lattice.cell.contact", "lattice.cell.springs"} <= {
+        *found
+    }
+
+
+def test_a_frequency_in_a_gap_is_a_warning_only():
+    case = Case.builtin(["drive.frequency=650.0"])
+    assert any("no pass band" in w for w in case.warnings())
+    assert not Case.builtin().warnings()
+
+
+def test_errors_travel_between_ranks():
+    with pytest.raises(CaseError) as caught:
+        Case.builtin(["lattice.cels=3"])
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+@given(st.text(max_size=30), st.text(max_size=10))
+def test_any_override_is_taken_or_refused(key, value):
+    """Nonsense never escapes as anything but a CaseError."""
+    try:
+        Case.builtin([f"{key}={value}"])
+    except CaseError as error:
+        assert error.problems
