@@ -138,6 +138,13 @@ def test_regions_and_power_law_of_a_made_up_branch():
     assert law.adjusted_r2 > 0.9999
 
 
+def test_regions_without_contacts():
+    energy = np.geomspace(1e-3, 1e3, 50)
+    none, never = np.zeros(50, int), np.zeros(50)
+    assert set(regions(energy, np.zeros(50), none, never)) == {1}  # linear
+    assert set(regions(energy, 1 / energy, none, never)) == {0}  # smooth springs
+
+
 def test_portrait_is_the_orbit_itself():
     """The mirrored quarter agrees with a flow over the whole period."""
     corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]))

@@ -15,7 +15,7 @@ from vipetsc.figures import style
 from vipetsc.figures.registry import save
 
 UNSTABLE = 1.0 + 1e-6
-_REGIONS = ("I", "II", "III", "IV")
+_REGIONS = ("", "I", "II", "III", "IV")
 _SHADES = ("#FFFFFF", "#EEEEEE", "#FFFFFF", "#EEEEEE")
 _MARKS = {
     "fold-energy": ("o", "energy fold"),
@@ -40,7 +40,7 @@ class BranchFile:
     def read(cls, path: Path) -> BranchFile:
         """Raises OSError or KeyError if the file holds no branch."""
         with h5py.File(path) as file:
-            names = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind")
+            names = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
             data = {name: file[name][...] for name in names}
             kinds = str(file["kind"].attrs["flag_meanings"]).split()
             orbits = {n: v[...] for n, v in file["orbits"].items()} if "orbits" in file else {}
@@ -93,6 +93,8 @@ def frequency_energy(axes: Axes, branch: BranchFile) -> None:
             axes.plot(
                 energy[at], frequency[at], mark, ms=3, mfc="white", mec=style.BLACK, mew=0.6, label=text, zorder=4
             )
+    if not few:
+        _label_tongues(axes, branch)
     axes.plot([], [], color=style.BLUE, label="stable")
     if np.any(branch.data["multiplier_max"] > UNSTABLE):
         axes.plot([], [], color=style.VERMILION, label="unstable")
@@ -103,6 +105,17 @@ def frequency_energy(axes: Axes, branch: BranchFile) -> None:
                 bbox_to_anchor=(0, 0.93) if inside else None)  # fmt: skip
     if touched.size and few:
         _grazing_inset(axes, branch, touched[0])
+
+
+def _label_tongues(axes: Axes, branch: BranchFile, largest: int = 9) -> None:
+    """k:1 at the fold of highest energy of every tongue up to ``largest``:1; later ones crowd together."""
+    energy, frequency, k = (branch.data[n] for n in ("energy", "frequency", "resonance"))
+    for number in range(3, largest + 1, 2):
+        at = np.nonzero(k == number)[0]
+        if at.size:
+            tip = at[int(np.argmax(energy[at]))]
+            axes.annotate(f"{number}:1", (energy[tip], frequency[tip]), (4, -9), textcoords="offset points",
+                          fontsize=5.5, color=style.GREY)  # fmt: skip
 
 
 def slope(axes: Axes, branch: BranchFile) -> None:
@@ -151,7 +164,7 @@ def portraits(place: object, branch: BranchFile) -> None:
                 ls="--" if dof else "-",
             )
         region = branch.data["region"][min(regular, key=lambda i: abs(i - _place(branch, branch.orbits["energy"][k])))]
-        axes[k].set_title(f"{_REGIONS[region - 1]}\n{branch.orbits['energy'][k]:.2g} J", loc="center", fontsize=7)
+        axes[k].set_title(f"{_REGIONS[region]}\n{branch.orbits['energy'][k]:.2g} J", loc="center", fontsize=7)
         axes[k].set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
         if k:
             axes[k].set_yticklabels([])
@@ -210,7 +223,7 @@ def _shade(axes: Axes, branch: BranchFile) -> None:
         axes.axvspan(low, max(span[1], low), color=_SHADES[k], lw=0, zorder=0)
         if max(span[1], low) > low:
             middle = np.sqrt(low * max(span[1], low))
-            axes.text(middle, 0.985, _REGIONS[k], ha="center", va="top", fontsize=6.5, color=style.GREY,
+            axes.text(middle, 0.985, _REGIONS[k + 1], ha="center", va="top", fontsize=6.5, color=style.GREY,
                       transform=axes.get_xaxis_transform())  # fmt: skip
     axes.set_xlim(energy.min(), energy.max())
 

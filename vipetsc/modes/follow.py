@@ -217,7 +217,7 @@ def _store_orbits(branch: Branch, problem: Shooting, options: NnmTable) -> None:
     regular = [(i, p) for i, p in enumerate(branch.points) if p.kind == "regular"]
     region = branch.column("region")
     chosen = []
-    for number in (1, 2, 3, 4):
+    for number in range(5):
         inside = [p for i, p in regular if region[i] == number]
         if inside:
             chosen.append(inside[len(inside) // 2])

@@ -25,7 +25,7 @@ class PowerLaw:
 
 
 def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Region 1-4 of every point of a branch (points,), in the order of the branch.
+    """Region 1-4 of every point of a branch (points,), in its order; 0 for a nonlinear branch without contacts.
 
     I: no contact. II: grazing, from the first contact over the peak of the slope until its steep fall has ended:
     until the local exponent d ln(df/dE)/d ln E grows by less than ``SETTLED`` per e-fold of energy.
@@ -43,7 +43,8 @@ def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed:
     region = np.ones(len(energy), np.int8)
     touched = np.nonzero(episodes > 0)[0]
     if not touched.size:
-        return region
+        smooth = np.nanmax(np.abs(slope) * energy, initial=0.0) > 1e-6
+        return region * (0 if smooth else 1)
     first = touched[0]
     region[first:] = 2
     folds = np.nonzero(np.diff(np.sign(np.diff(energy[first:]))) != 0)[0]

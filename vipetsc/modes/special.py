@@ -54,7 +54,7 @@ class Locator:
     chart
         Name of the chart, as in ``StepControl``.
     grazing
-        Also locate every change of the number of contacts, by bisection (some 50 corrections each).
+        Also locate every change of the number of contacts, by bisection (some 40 corrections each).
     """
 
     def __init__(self, corrector: Corrector, chart: str = "relative", grazing: bool = False) -> None:
@@ -82,7 +82,7 @@ class Locator:
             if point is not None:
                 found.append((segment.place, replace(point, kind=special.kind)))
         if self.grazing and left.episodes != right.episodes:
-            point = segment.root(lambda p: 1.0 if p.episodes == right.episodes else -1.0, -1.0)
+            point = segment.root(lambda p: 1.0 if p.episodes == right.episodes else -1.0, -1.0, 1e-11)
             if point is not None:
                 found.append((segment.place, replace(point, kind="grazing")))
         return [point for _, point in sorted(found, key=lambda pair: pair[0])]
@@ -119,8 +119,8 @@ class Segment:
             self.corrector.problem, attempt, self.chart, tangent=tangent, index=self.right.index, step=place
         )
 
-    def root(self, test: Test, at_left: float) -> Point | None:
-        """The point where ``test`` vanishes, None if the corrector fails on the way."""
+    def root(self, test: Test, at_left: float, accuracy: float = 1e-14) -> Point | None:
+        """The point where ``test`` vanishes, to ``accuracy`` of the step; None if the corrector fails on the way."""
 
         def value(place: float) -> float:
             if place == 0:
@@ -128,7 +128,7 @@ class Segment:
             return test(self.right) if place == self.length else test(self.at(place))
 
         try:
-            self.place = brentq(value, 0.0, self.length, xtol=1e-14 * self.length, rtol=1e-14)
+            self.place = brentq(value, 0.0, self.length, xtol=accuracy * self.length, rtol=1e-14)
             return self.at(self.place)
         except (ArithmeticError, ValueError):
             return None
