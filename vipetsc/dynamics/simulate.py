@@ -157,8 +157,9 @@ class _Run:
         """``reason`` with the time, the place where the lattice moves fastest, and the last good sample."""
         layout = self.layout
         half = layout.dofs * layout.owned
-        speed = np.abs(self.integrator.state.array_r[half : 2 * half]).reshape(layout.dofs, layout.owned)
-        speed = np.where(np.isfinite(speed), speed, np.inf)
+        y = self.integrator.state.array_r
+        finite = np.isfinite(y[:half]) & np.isfinite(y[half : 2 * half])
+        speed = np.where(finite, np.abs(y[half : 2 * half]), np.inf).reshape(layout.dofs, layout.owned)
         cell = int(speed.max(axis=0).argmax()) if layout.owned else 0
         own = (float(speed.max()) if layout.owned else -1.0, layout.start + cell)
         _, fastest = max(self.comm.allgather(own))

@@ -1,0 +1,97 @@
+"""Files as their readers meet them: xarray, units, provenance, windows; runs that end early."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray
+
+from tests.conftest import datasets, small_case
+from vipetsc import Case, simulate
+from vipetsc.dynamics import integrator
+from vipetsc.studies.analysis import analyse
+
+
+def test_every_file_opens_in_xarray_with_units(folder):
+    simulate(small_case(), folder / "run")
+    analyse(folder / "run" / "run.h5", folder / "run" / "analysis.h5")
+    groups = {"run.h5": [None, "energy", "sites", "impacts"], "analysis.h5": [None, "bands"]}
+    for name, members in groups.items():
+        for group in members:
+            with xarray.open_dataset(folder / "run" / name, engine="h5netcdf", group=group) as data:
+                assert data.variables
+                for key, variable in data.variables.items():
+                    assert variable.attrs.get("units"), (name, group, key)
+    with xarray.open_dataset(folder / "run" / "run.h5", engine="h5netcdf") as run:
+        assert run.velocity.dims == ("time", "cell", "dof")
+        assert run.velocity.sel(cell=24, dof=4).sizes == {"time": run.sizes["time"]}
+        assert Case.from_toml(run.attrs["case"]) == small_case()
+        assert {"vipetsc_version", "petsc_version", "mpi_version", "ranks", "command", "status"} <= run.attrs.keys()
+
+
+def test_windows_and_strides_are_parts_of_the_whole(folder):
+    simulate(small_case(), folder / "whole")
+    output = {"window": [3, 17], "every": 4, "stride": 5, "fields": ["velocity"]}
+    simulate(small_case(output=output), folder / "part")
+    whole, part = (datasets(folder / name / "run.h5") for name in ("whole", "part"))
+    assert part["cell"].tolist() == [3, 7, 11, 15]
+    np.testing.assert_array_equal(part["velocity"], whole["velocity"][::5, 2:17:4])
+    np.testing.assert_array_equal(part["field_time"], whole["time"][::5])
+    np.testing.assert_array_equal(part["energy/kinetic"], whole["energy/kinetic"])
+    assert "displacement" not in part
+
+
+def test_impact_log_is_complete_and_ordered(folder):
+    simulate(small_case(), folder / "run")
+    run = datasets(folder / "run" / "run.h5")
+    log = {k.split("/")[1]: v for k, v in run.items() if k.startswith("impacts/")}
+    assert np.all(np.diff(log["onset"]) >= 0)
+    ended = np.isfinite(log["separation"])
+    assert ended.sum() >= len(ended) - 3
+    assert np.all(log["separation"][ended] > log["onset"][ended])
+    assert np.all(log["side"] * log["approach_velocity"] > 0)
+    assert np.all(log["indentation"] > 0)
+    assert np.all(log["force"] > 0)
+    losses = np.bincount(log["site"] - 1, weights=log["loss"], minlength=3)
+    np.testing.assert_allclose(losses, run["energy/dissipated_by_site"][-1], rtol=1e-6, atol=1e-12)
+    # Between samples the force cannot exceed the logged one.
+    w = run["displacement"][..., 2] - run["displacement"][..., 1]
+    for site, cell in enumerate((6, 12, 13)):
+        inside = np.abs(w[:, cell - 1]) - run["sites/clearance"][site]
+        assert inside.max() <= log["indentation"][log["site"] == site + 1].max() * (1 + 1e-6)
+
+
+def test_a_stalled_run_says_when_and_where_and_keeps_its_samples(folder, monkeypatch):
+    monkeypatch.setattr(integrator, "MOST_TRIALS", 24)
+    result = simulate(small_case(), folder / "run")
+    assert not result.complete
+    assert not result.resumable
+    for text in ("stalled", "at t = ", "nearest site 1 in cell 6", "last good sample"):
+        assert text in result.sentence
+    run = datasets(folder / "run" / "run.h5")
+    assert 10 < len(run["time"]) < small_case().model().samples
+    assert np.isfinite(run["velocity"]).all()
+    summary = json.loads((folder / "run" / "summary.json").read_text())
+    assert not summary["complete"]
+    assert summary["status"] == result.sentence
+
+
+def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
+    """A mass that turns NaN in the middle of a run: the samples before it stay."""
+    advance = integrator.Integrator.advance
+
+    def poisoned(self, target):
+        going = advance(self, target)
+        if target > 0.0301:
+            self.state.array[3] = np.nan
+        return going
+
+    monkeypatch.setattr(integrator.Integrator, "advance", poisoned)
+    result = simulate(small_case(), folder / "run")
+    assert "not finite" in result.sentence
+    assert "cell 4, nearest site 1 in cell 6" in result.sentence
+    run = datasets(folder / "run" / "run.h5")
+    assert run["time"][-1] == pytest.approx(0.03)
+    assert np.isfinite(run["displacement"]).all()
