@@ -11,7 +11,10 @@ SMOOTH_LIMIT = 0.95
 
 
 SETTLED = 0.5
-"""Growth of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III)."""
+"""Change of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III)."""
+
+STEEP = -2.0
+"""Local exponents below this still belong to the fall from the grazing peak; no limit law is so steep."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +31,8 @@ def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed:
     """Region 1-4 of every point of a branch (points,), in its order; 0 for a nonlinear branch without contacts.
 
     I: no contact. II: grazing, from the first contact over the peak of the slope until its steep fall has ended:
-    until the local exponent d ln(df/dE)/d ln E grows by less than ``SETTLED`` per e-fold of energy.
-    III: vibro-impact. IV: smooth limit, from where a
-    contact is closed for 95 % of the time on. A branch on which the slope keeps changing sign (internal
+    until the local exponent d ln(df/dE)/d ln E changes by less than ``SETTLED`` per e-fold of energy and is above
+    ``STEEP``. III: vibro-impact. IV: smooth limit, from where a contact is closed for 95 % of the time on. A branch on which the slope keeps changing sign (internal
     resonances) has its peak after its last energy fold. Without an exponent that settles, II lasts.
 
     Parameters
@@ -58,7 +60,7 @@ def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed:
         return region
     exponent = np.gradient(np.log(slope[start:]), np.log(energy[start:]))
     growth = np.gradient(exponent, np.log(energy[start:]))
-    settled = np.nonzero(growth[1:] <= SETTLED)[0]
+    settled = np.nonzero((np.abs(growth[1:]) <= SETTLED) & (exponent[1:] >= STEEP))[0]
     if settled.size:
         region[start + 1 + settled[0] :] = 3
         smooth = np.nonzero(closed[start + 1 + settled[0] :] >= SMOOTH_LIMIT)[0]
