@@ -82,3 +82,20 @@ def vipetsc():
         return subprocess.run(command, timeout=timeout, check=False, **options)
 
     return call
+
+
+@pytest.fixture
+def petsc_options():
+    """Set PETSc options for one test."""
+    from petsc4py import PETSc
+
+    options, given = PETSc.Options(), set()
+
+    def put(**values: object) -> None:
+        for name, value in values.items():
+            options[name] = value
+            given.add(name)
+
+    yield put
+    for name in given:
+        options.delValue(name)

@@ -294,8 +294,8 @@ def test_the_linear_ridge_lies_on_the_bloch_branch(folder):
     )
     simulate(case, folder / "run")
     data = datasets(folder / "run" / "run.h5")
-    spectrum = fourier.dispersion(data["velocity"], case.model().sample_interval, case.unit_cell().masses)
-    wavenumbers, ridge = fourier.ridge(spectrum)[:2]
+    spectrum = fourier.dispersion(data["velocity"], case.unit_cell().masses, case.model().sample_interval)
+    wavenumbers, ridge = fourier.ridge(spectrum)
     branch = bloch(case.unit_cell(), np.abs(wavenumbers)).frequency[:, 1]
     assert len(wavenumbers) > 10
     assert np.max(np.abs(ridge / branch - 1)) < 1e-3
@@ -318,3 +318,18 @@ def test_a_floor_on_the_approach_velocity_is_counted(folder):
     counted = simulate(small_case(contacts={"approach_floor": 0.3}), folder / "run").statistics
     log = datasets(folder / "run" / "run.h5")["impacts/approach_velocity"]
     assert counted["floored"] == np.sum(np.abs(log) < 0.3) > 0
+
+
+def test_fixed_steps_converge_with_the_order_of_the_method(folder, petsc_options):
+    """-ts_adapt_type none -ts_dt H: halving H divides the error of 3bs by 2^3, with bilinear contacts in the run."""
+    simulate(small_case(contacts={"law": "bilinear"}, time={"rtol": 1e-13, "end": 0.03}), folder / "exact")
+    exact = datasets(folder / "exact" / "run.h5")
+    errors = []
+    for step in (4e-6, 2e-6, 1e-6):
+        petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=step)
+        simulate(small_case(contacts={"law": "bilinear"}, time={"end": 0.03}), folder / f"{step}")
+        run = datasets(folder / f"{step}" / "run.h5")
+        assert len(run["impacts/onset"]) == len(exact["impacts/onset"]) > 0
+        errors.append(np.linalg.norm(run["velocity"] - exact["velocity"]) / np.linalg.norm(exact["velocity"]))
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all(orders > 2.5), orders

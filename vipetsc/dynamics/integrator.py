@@ -62,7 +62,8 @@ class Integrator:
     stop
         Looked at after every step; a request on any rank ends ``advance`` on all.
 
-    PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor.
+    PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor, first step; with
+    ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
     """
 
     def __init__(
@@ -83,7 +84,9 @@ class Integrator:
         self.saved = self.state.duplicate()
         self.ts = self._create_ts(model, layout, native)
         self._first_step = 0.002 / model.drive.frequency
-        self.step = self.free_step = 0.05 / model.drive.frequency
+        options = PETSc.Options()
+        self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
+        self._fixed = options.getString("ts_adapt_type", "basic") == "none"
         self._buffer = np.empty(2)
         self._stop = stop or StopRequest()
         self._any_open = False
@@ -157,7 +160,7 @@ class Integrator:
             self.ts.restartStep()
             return True
         # A step cut short to meet a sample says little about the longest one possible.
-        if suggestion < 4 * h or suggestion > self.step:
+        if not self._fixed and (suggestion < 4 * h or suggestion > self.step):
             self.step = suggestion
         self.counts.steps += 1
         end = target if parts == 1 else self.time + h
@@ -225,8 +228,8 @@ class Integrator:
         was_free = not self._any_open
         self.counts.switches += tracker.switch(self.time, self.state)
         shortest = self.comm.allreduce(tracker.contact_time(), MPI.MIN)
-        self._any_open = np.isfinite(shortest)
-        if self._any_open:
+        self._any_open = bool(np.isfinite(shortest))
+        if self._any_open and not self._fixed:
             if was_free:
                 self.free_step = self.step
             self.step = min(self.step, self._first_share * shortest)
@@ -234,6 +237,11 @@ class Integrator:
             self.step = self.free_step
         tracker.observe(self.time, self.state, tracker.start)
         self.ts.restartStep()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
+        for thing in (self.ts, self.state, self.saved):
+            thing.destroy()
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs to go on with the same bits, this rank's share."""

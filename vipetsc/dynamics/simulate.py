@@ -189,6 +189,7 @@ class _Run:
             if comm.rank == 0:
                 home.finish(about | {"case": self.case.model_dump(by_alias=True)})
             comm.Barrier()
+        self.integrator.destroy()
         return Result(complete, resumable, sentence, statistics, home.path)
 
     def _all_cells(self) -> np.ndarray:
