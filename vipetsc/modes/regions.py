@@ -32,8 +32,9 @@ def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed:
 
     I: no contact. II: grazing, from the first contact over the peak of the slope until its steep fall has ended:
     until the local exponent d ln(df/dE)/d ln E changes by less than ``SETTLED`` per e-fold of energy and is above
-    ``STEEP``. III: vibro-impact. IV: smooth limit, from where a contact is closed for 95 % of the time on. A branch on which the slope keeps changing sign (internal
-    resonances) has its peak after its last energy fold. Without an exponent that settles, II lasts.
+    ``STEEP``. III: vibro-impact. IV: smooth limit, from where a contact is closed for 95 % of the time on. A
+    branch on which the slope keeps changing sign (internal resonances) has its peak after its last energy fold.
+    Without an exponent that settles, II lasts.
 
     Parameters
     ----------
