@@ -83,7 +83,10 @@ def _json(parser: argparse.ArgumentParser) -> None:
 
 
 def _plot(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", type=Path, metavar="PATH", help="a run's folder, or its run.h5")
+    parser.add_argument(
+        "path", type=Path, nargs="+", metavar="PATH", help="a run's folder or its run.h5; or folders of branches,"
+        " whose branches of one name share a page"
+    )  # fmt: skip
     parser.add_argument("--fig", action="append", metavar="NAME", help="only this figure; may be repeated")
     parser.add_argument("--format", action="append", choices=("png", "pdf"), help="png if left out; may be repeated")
 
@@ -179,19 +182,24 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     for branch in branches:
         _say(comm, branch_table(branch))
 
-    _plot_branches(folder, ("png",), comm)
+    _plot_branches([folder], ("png",), comm)
     failed = comm.bcast(any(b.ending.startswith("failed") for b in branches))
     return FAILED if failed else DONE
 
 
-def _plot_branches(folder: Path, formats: tuple[str, ...], comm: MPI.Comm) -> int:
-    """A picture of every branch in ``folder``."""
+def _plot_branches(folders: list[Path], formats: tuple[str, ...], comm: MPI.Comm) -> int:
+    """A picture of every branch in the first folder, beside the branches of that name in the others."""
 
     def draw() -> list[Path]:
         from vipetsc.figures import draw_backbone
 
-        paths = sorted(folder.glob("branch-*.h5"))
-        return [draw_backbone([p], folder / "figures" / f"{p.stem}.{kind}") for p in paths for kind in formats]
+        drawn = []
+        stem = "branches" if len(folders) > 1 else "branch"
+        for path in sorted(folders[0].glob("branch-*.h5")):
+            together = [folder / path.name for folder in folders if (folder / path.name).exists()]
+            target = folders[0] / "figures" / path.stem.replace("branch", stem, 1)
+            drawn += [draw_backbone(together, target.with_suffix(f".{kind}")) for kind in formats]
+        return drawn
 
     for path in on_root(comm, draw):
         _say(comm, f"  {path}")
@@ -235,9 +243,13 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     from vipetsc.records import RunFile
     from vipetsc.studies.analysis import analyse
 
-    folder = options.path.parent if options.path.name == "run.h5" else options.path
-    if not (folder / "run.h5").exists() and any(folder.glob("branch-*.h5")):
-        return _plot_branches(folder, tuple(options.format or ("png",)), comm)
+    formats = tuple(options.format or ("png",))
+    if all(any(path.glob("branch-*.h5")) and not (path / "run.h5").exists() for path in options.path):
+        return _plot_branches(options.path, formats, comm)
+    if len(options.path) > 1:
+        raise FolderError(f"{' '.join(map(str, options.path))}: only folders of branches can share a page")
+    (path,) = options.path
+    folder = path.parent if path.name == "run.h5" else path
 
     def check() -> None:
         unknown = set(options.fig or []) - set(run_figures)
@@ -255,7 +267,6 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
             analyse(run, analysis)
 
     on_root(comm, check)
-    formats = tuple(options.format or ("png",))
     drawn = comm.gather(draw(folder, options.fig, formats=formats, share=(comm.rank, comm.size)))
     for path in sorted(str(p) for paths in drawn or [] for p in paths):
         _say(comm, path)

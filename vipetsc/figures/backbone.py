@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ class BranchFile:
     """What the figure needs of a ``branch-<name>.h5``: arrays over points, orbits (may be empty)."""
 
     name: str
+    law: str
     data: dict[str, np.ndarray]
     kinds: list[str]
     orbits: dict[str, np.ndarray]
@@ -45,7 +47,8 @@ class BranchFile:
             kinds = str(file["kind"].attrs["flag_meanings"]).split()
             orbits = {n: v[...] for n, v in file["orbits"].items()} if "orbits" in file else {}
             flows = {f: {n: v[...] for n, v in g.items()} for f, g in file.get("flows", {}).items()}
-            return cls(str(file.attrs["name"]), data, [kinds[k] for k in data["kind"]], orbits, flows)
+            law = tomllib.loads(file.attrs["case"]).get("contacts", {}).get("law", "") if "case" in file.attrs else ""
+            return cls(str(file.attrs["name"]), law, data, [kinds[k] for k in data["kind"]], orbits, flows)
 
 
 def draw_backbone(paths: Sequence[Path], target: Path) -> Path:
@@ -71,7 +74,7 @@ def backbone(branches: Sequence[BranchFile]) -> Figure:
         label = chr(ord("a") + column)
         top = rows[0, column].subplots()
         frequency_energy(top, branch)
-        style.letter(top, f"({label}) {branch.name}")
+        style.letter(top, f"({label}) {branch.name}" + f", {branch.law}" * (count > 1 and bool(branch.law)))
         slope(rows[1, column].subplots(), branch)
         if with_flows:
             flow_differences(rows[2, column].subplots(), branch)
@@ -98,6 +101,8 @@ def frequency_energy(axes: Axes, branch: BranchFile) -> None:
     axes.plot([], [], color=style.BLUE, label="stable")
     if np.any(branch.data["multiplier_max"] > UNSTABLE):
         axes.plot([], [], color=style.VERMILION, label="unstable")
+    if _scale(frequency) == "log":
+        axes.set_ylim(top=1.8 * frequency.max())  # room for the regions' numerals
     touched = np.nonzero(branch.data["contacts"] > 0)[0]
     monotone = np.ptp(frequency) > 0 and (few or not touched.size)
     inside = few and touched.size > 0
