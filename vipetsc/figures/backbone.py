@@ -112,15 +112,16 @@ def frequency_energy(axes: Axes, branch: BranchFile) -> None:
         _grazing_inset(axes, branch, touched[0])
 
 
-def _label_tongues(axes: Axes, branch: BranchFile, largest: int = 9) -> None:
-    """k:1 at the fold of highest energy of every tongue up to ``largest``:1; later ones crowd together."""
+def _label_tongues(axes: Axes, branch: BranchFile, largest: int = 5) -> None:
+    """Write k:1 at the fold of highest frequency of every tongue up to ``largest``:1; later ones crowd together."""
     energy, frequency, k = (branch.data[n] for n in ("energy", "frequency", "resonance"))
+    axes.margins(y=0.08)
     for number in range(3, largest + 1, 2):
         at = np.nonzero(k == number)[0]
         if at.size:
-            tip = at[int(np.argmax(energy[at]))]
-            axes.annotate(f"{number}:1", (energy[tip], frequency[tip]), (4, -9), textcoords="offset points",
-                          fontsize=5.5, color=style.GREY)  # fmt: skip
+            tip = at[int(np.argmax(frequency[at]))]
+            axes.annotate(f"{number}:1", (energy[tip], frequency[tip]), (1, 3), textcoords="offset points",
+                          fontsize=5.5, color=style.GREY, ha="center")  # fmt: skip
 
 
 def slope(axes: Axes, branch: BranchFile) -> None:
@@ -199,7 +200,7 @@ def _grazing_inset(axes: Axes, branch: BranchFile, first: int) -> None:
     last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
     last = min(max(last, first + 3), len(energy) - 1)
     window = slice(max(first - 1, 0), last + 1)
-    inset = axes.inset_axes([0.56, 0.13, 0.42, 0.46])
+    inset = axes.inset_axes([0.55, 0.1, 0.41, 0.36])
     _line(inset, branch, 0.9)
     at = [i for i in folds if window.start <= i <= last]
     inset.plot(energy[at], frequency[at], "o", ms=2.5, mfc="white", mec=style.BLACK, mew=0.6, zorder=4)
