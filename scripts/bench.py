@@ -171,18 +171,48 @@ if MPI.COMM_WORLD.rank == 0:
 """
 
 
-def large(folder: Path, rounds: int) -> dict:
-    """A million cells on one and on two ranks, in turn."""
-    runs: dict[int, list[dict]] = {1: [], 2: []}
+TRIAD = """
+import json, time
+import numpy as np
+from mpi4py import MPI
+comm = MPI.COMM_WORLD
+a, b, c = (np.ones(8_000_000) for _ in range(3))
+np.add(a, b, out=c)
+comm.Barrier()
+begin = time.perf_counter()
+for _ in range(60):
+    np.add(a, b, out=c)
+comm.Barrier()
+seconds = time.perf_counter() - begin
+if comm.rank == 0:
+    print(json.dumps({"gb_per_second": comm.size * 60 * 3 * a.nbytes / seconds / 1e9}))
+"""
+
+
+def on_ranks(ranks: int, code: str, *arguments: str) -> dict:
+    """What ``code`` prints last, as JSON, when run on ``ranks``."""
     # This process has its own MPI: the mpirun it starts must not inherit that.
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
+    command = ["mpirun", "-n", str(ranks), sys.executable, "-c", code, *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return json.loads(ended.stdout.strip().splitlines()[-1])
+
+
+def large(folder: Path, rounds: int) -> dict:
+    """A million cells on one and on two ranks, in turn, beside what the memory itself gains from two."""
+    runs: dict[int, list[dict]] = {1: [], 2: []}
     for _ in range(rounds):
         for ranks, found in runs.items():
-            command = ["mpirun", "-n", str(ranks), sys.executable, "-c", LARGE, str(folder / f"large-{ranks}")]
-            ended = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-            found.append(json.loads(ended.stdout.strip().splitlines()[-1]))
-    speedup = statistics.median(one["wall"] / two["wall"] for one, two in zip(runs[1], runs[2], strict=True))
-    return {"runs": runs[1] + runs[2], "speedup_on_two_ranks": speedup}
+            memory = on_ranks(ranks, TRIAD)
+            found.append(on_ranks(ranks, LARGE, str(folder / f"large-{ranks}")) | memory)
+    pairs = list(zip(runs[1], runs[2], strict=True))
+    return {
+        "runs": runs[1] + runs[2],
+        "speedup_on_two_ranks": statistics.median(one["wall"] / two["wall"] for one, two in pairs),
+        "memory_speedup_on_two_ranks": statistics.median(
+            two["gb_per_second"] / one["gb_per_second"] for one, two in pairs
+        ),
+    }
 
 
 def main() -> None:
@@ -205,7 +235,8 @@ def main() -> None:
         for run in found["large"]["runs"]:
             print(f"1e6 cells, {run['ranks']} rank(s): {run['steps']} steps, {run['wall']:.1f} s, "
                   f"{run['peak_gib_a_rank']:.2f} GiB a rank")  # fmt: skip
-        print(f"two ranks are {found['large']['speedup_on_two_ranks']:.2f} times faster")
+        gain, memory = (found["large"][f"{name}speedup_on_two_ranks"] for name in ("", "memory_"))
+        print(f"two ranks are {gain:.2f} times faster; bare memory traffic (c = a + b): {memory:.2f} times")
     found["provenance"] = provenance(MPI.COMM_WORLD)
     write_text(folder / "latest.json", json.dumps(found, indent=2) + "\n")
 
