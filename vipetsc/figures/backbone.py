@@ -146,7 +146,8 @@ def flow_differences(axes: Axes, branch: BranchFile) -> None:
             axes.plot(found["energy"], size, "o", ms=2.2, mec=colour, mfc=face, mew=0.5, label=f"{name}: {key}")
     axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel="relative difference")
     axes.set_xlim(branch.data["energy"].min(), branch.data["energy"].max())
-    axes.legend(fontsize=5.5, ncols=2, loc="center right")
+    axes.set_ylim(top=10.0)  # room for the legend
+    axes.legend(fontsize=5.5, ncols=2, loc="upper right")
 
 
 def portraits(place: object, branch: BranchFile) -> None:
