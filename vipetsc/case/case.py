@@ -27,6 +27,7 @@ from vipetsc.case.schema import (
     Section,
     TimeTable,
     read_section,
+    read_toml,
     unknown_key,
     with_overrides,
 )
@@ -81,12 +82,7 @@ class Case(Section):
     @classmethod
     def load(cls, path: str | Path, overrides: Iterable[str] = ()) -> Case:
         """The case in file ``path`` with ``a.b=value`` overrides; raises CaseError or OSError."""
-        path = Path(path)
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise CaseError([Problem(str(path), None, f"not a TOML file ({error})")]) from None
-        return cls.from_table({"name": path.stem} | table, overrides, str(path))
+        return cls.from_table(read_toml(path), overrides, str(path))
 
     @classmethod
     def from_toml(cls, text: str) -> Case:

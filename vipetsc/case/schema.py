@@ -8,6 +8,7 @@ import re
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -179,6 +180,16 @@ class OutputTable(Section):
     stride: int = Field(1, ge=1)
     writer: Literal["auto", "gather", "parallel"] = "auto"
     figures: bool = True
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The table in a TOML file, named after the file if it has no name; raises CaseError or OSError."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CaseError([Problem(str(path), None, f"not a TOML file ({error})")]) from None
+    return {"name": path.stem} | table
 
 
 def unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:

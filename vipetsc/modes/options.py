@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,6 +20,7 @@ from vipetsc.case.schema import (
     Problem,
     Section,
     read_section,
+    read_toml,
     unknown_key,
     with_overrides,
 )
@@ -125,12 +125,7 @@ class NnmCase(Section):
     @classmethod
     def load(cls, path: str | Path, overrides: Iterable[str] = ()) -> NnmCase:
         """The case in file ``path`` with ``a.b=value`` overrides; raises CaseError or OSError."""
-        path = Path(path)
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise CaseError([Problem(str(path), None, f"not a TOML file ({error})")]) from None
-        return cls.from_table({"name": path.stem} | table, overrides, str(path))
+        return cls.from_table(read_toml(path), overrides, str(path))
 
     @classmethod
     def from_table(cls, table: dict[str, Any], overrides: Iterable[str] = (), source: str = "case") -> NnmCase:
