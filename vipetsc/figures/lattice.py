@@ -40,7 +40,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     half = {i: WIDE if inside and i == cell.host else HALF for i in place}
     left = min(x - half[i] for i, (x, _) in place.items()) - 0.9
     right = max(x + half[i] for i, (x, _) in place.items()) + 1.5
-    level = ROOM + 0.45
+    level, highest = ROOM + 0.6, ROOM
     for spring in cell.springs:
         a, b, text = spring.start, spring.end, _si(spring.stiffness, "N/m")
         if inside and {a, b} == {cell.host, cell.resonator} and not spring.next_cell:
@@ -51,6 +51,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
                 blocked = any(side * (p - x) > 0 and abs(q - y) < 0.1 for p, q in place.values())
                 if blocked:
                     _route(axes, [(x, y + HALF), (x, level), (wall, level)], text)
+                    highest = level
                 else:
                     _lead(axes, (x + side * edge, y), (wall, y), text if side > 0 else "")
             continue
@@ -65,7 +66,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
             _spring(axes, (xa, place[top][1] - drop), (xb, place[bottom][1] + HALF), text)
         elif abs(ya - yb) < 0.1:
             _route(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
-            level += 0.55
+            highest, level = level, level + 0.55
         else:
             short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
             _spring(axes, tuple(np.array([xa, ya]) + short), tuple(np.array([xb, yb]) - short), text)
@@ -77,7 +78,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     else:
         _contact_link(axes, place[cell.host], place[cell.resonator])
     low = min(y for _, y in place.values()) - ROOM - 0.55
-    high = max(level, ROOM + 0.5)
+    high = highest + 0.5
     for wall in (left, right):
         axes.plot([wall, wall], [low + 0.15, high - 0.1], color=style.GREY, lw=0.6, ls=(0, (4, 3)))
     axes.text(left + 0.07, low + 0.1, "one cell", color=style.GREY, fontsize=6.5, va="bottom")
