@@ -12,7 +12,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     arguments = sys.argv[1:] if arguments is None else arguments
-    own, _, petsc = (arguments, None, []) if "--" not in arguments else _split(arguments)
+    at = arguments.index("--") if "--" in arguments else len(arguments)
+    own, petsc = arguments[:at], arguments[at + 1 :]
 
     import petsc4py
 
@@ -24,11 +25,6 @@ def main(arguments: list[str] | None = None) -> int:
     from vipetsc import cli
 
     return cli.main(own)
-
-
-def _split(arguments: list[str]) -> tuple[list[str], str, list[str]]:
-    at = arguments.index("--")
-    return arguments[:at], "--", arguments[at + 1 :]
 
 
 if __name__ == "__main__":

@@ -12,9 +12,10 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.case import Case, CaseError
+from vipetsc.files import write_text
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.reports import bands_table, doctor_table, run_table, validate_table
-from vipetsc.store import FolderError, write_text
+from vipetsc.store import FolderError
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -64,13 +65,23 @@ def _parser() -> Parser:
 
 def _case(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("case", nargs="?", metavar="CASE", help="case file (TOML); the built-in case if left out")
+    _overrides(parser)
+
+
+def _overrides(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one value; may be repeated"
     )
 
 
+def _out(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="output folder; one in runs/ named after the case if left out"
+    )
+
+
 def _folder(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, metavar="DIR", help="output folder; runs/<case> if left out")
+    _out(parser)
     parser.add_argument("--force", action="store_true", help="replace the run in the output folder")
 
 
@@ -121,9 +132,7 @@ def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
         _say(comm, f"vipetsc: warning: {warning}", sys.stderr)
     folder = options.out or Path("runs") / case.name
     stop = StopRequest().install()
-    result = simulate(
-        case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True
-    )  # fmt: skip
+    result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
     _say(comm, run_table(result))
     if result.resumable:
         return FAILED
@@ -145,7 +154,7 @@ def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
 
 def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
-    from vipetsc.modes.follow import follow_all
+    from vipetsc.modes.follow import follow_all, prepare_folder
     from vipetsc.modes.options import NnmCase
     from vipetsc.modes.report import BranchLog, branch_table
 
@@ -161,23 +170,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     case = on_root(comm, read)
     folder = options.out or Path("runs") / case.name
 
-    def prepare() -> None:
-        kept = folder / "case.toml"
-        if options.resume:
-            if not kept.exists():
-                raise FolderError(f"{folder}: holds no branches to resume; leave out --resume")
-            begun = NnmCase.load(kept)
-            if begun.physics() != case.physics():
-                raise FolderError(f"{folder}: --resume needs the system, map and flow that {kept} was begun with")
-        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not options.force:
-            raise FolderError(f"{folder}: exists; --force replaces the branches in it, --resume goes on with them")
-        folder.mkdir(parents=True, exist_ok=True)
-        if options.force:
-            for old in folder.glob("branch-*.*"):
-                old.unlink()
-        write_text(kept, case.to_toml())
-
-    on_root(comm, prepare)
+    on_root(comm, lambda: prepare_folder(case, folder, options.force, options.resume))
     branches = follow_all(case, folder, comm, options.resume, BranchLog(sys.stderr))
     for branch in branches:
         _say(comm, branch_table(branch))
@@ -219,19 +212,17 @@ def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Pass bands, gaps and group velocities of a case's cell; a table and a picture."""
     case = _load(options, comm)
 
-    def report() -> str:
-        table = bands_table(case.unit_cell())
-        if options.out is not None:
-            from vipetsc.figures import look, save
-            from vipetsc.figures.bands import bands as band_diagram
+    folder = options.out or Path("runs") / f"{case.name}-bands"
 
-            options.out.mkdir(parents=True, exist_ok=True)
-            with look():
-                figure = band_diagram(case.unit_cell(), case.drive.frequency)
-                picture = save(figure, options.out / "bands.png")
-            write_text(options.out / "bands.json", json.dumps(table, indent=2) + "\n")
-            table["picture"] = str(picture)
-        return json.dumps(table, indent=2) if options.json else bands_table(case.unit_cell(), as_text=True)
+    def report() -> str:
+        from vipetsc.figures import draw_bands
+
+        cell = case.unit_cell()
+        folder.mkdir(parents=True, exist_ok=True)
+        table = bands_table(cell) | {"picture": str(draw_bands(cell, folder / "bands.png", case.drive.frequency))}
+        text = json.dumps(table, indent=2)
+        write_text(folder / "bands.json", text + "\n")
+        return text if options.json else f"{bands_table(cell, as_text=True)}\n  {table['picture']}"
 
     _say(comm, on_root(comm, report))
     return DONE
@@ -282,15 +273,13 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def _branches(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("case", metavar="CASE", help="case file (TOML) with a section [nnm]")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one value; may be repeated"
-    )
+    _overrides(parser)
 
 
 VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
     "run": (run, "one simulation, its analysis and pictures", (_case, _folder, _resume)),
     "validate": (validate, "check a case; print band edges, frequency, end time, size and cost", (_case,)),
-    "bands": (bands, "pass bands, gaps and group velocities of a cell", (_case, _folder, _json)),
+    "bands": (bands, "pass bands, gaps and group velocities of a cell", (_case, _out, _json)),
     "nnm": (nnm, "nonlinear normal modes: frequency-energy branches", (_branches, _folder, _resume)),
     "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),
     "doctor": (doctor, "versions and what is missing", ()),

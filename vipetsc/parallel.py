@@ -22,6 +22,8 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
     """Let a rank that raises end all ranks, with one message; otherwise the others wait for it for ever."""
 
     def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        if comm.rank and getattr(error, "from_root", False):
+            time.sleep(2)  # rank 0 raised the same: its message is enough, and it ends this rank
         where = f"rank {comm.rank}: " if comm.size > 1 else ""
         if isinstance(error, OSError):
             # A full disk or a missing right is the machine's matter: the trace would hide the message.
@@ -49,6 +51,7 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
             error = caught
     value, error = comm.bcast((value, error))
     if error is not None:
+        error.from_root = True
         raise error
     return value
 

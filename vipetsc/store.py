@@ -13,8 +13,6 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ import numpy as np
 
 import vipetsc
 from vipetsc.case import Case
+from vipetsc.files import write_text, written_aside
 
 FORMAT_VERSION = 1
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
@@ -54,29 +53,6 @@ class FolderError(ValueError):
     """An output folder that cannot be used as asked."""
 
 
-@contextmanager
-def written_aside(path: Path) -> Iterator[Path]:
-    """A temporary path that replaces ``path`` when the block succeeds and vanishes when it fails."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        yield aside
-        os.replace(aside, path)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise OSError(
-            error.errno, f"{path} could not be written; make room and go on with --resume: {error.strerror}"
-        ) from error
-    except BaseException:
-        aside.unlink(missing_ok=True)
-        raise
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write ``text`` whole or not at all."""
-    with written_aside(path) as aside:
-        aside.write_text(text, encoding="utf-8")
-
-
 def provenance(comm: MPI.Comm) -> dict[str, Any]:
     """Versions, ranks and command, as every output carries them."""
     return {
@@ -90,6 +66,35 @@ def provenance(comm: MPI.Comm) -> dict[str, Any]:
         "ranks": comm.size,
         "command": " ".join(["vipetsc", *sys.argv[1:]]),
     }
+
+
+def claim_folder(path: Path, force: bool, foreign: tuple[str, ...], begun: str = "") -> None:
+    """Make ``path`` an output folder; what is in it is ours to replace only with ``force``.
+
+    Parameters
+    ----------
+    path
+        The folder, made if it is not there.
+    force
+        Whether results of the same kind may be replaced.
+    foreign
+        Patterns of files that show that the folder holds results of another kind.
+    begun
+        What else a user can do about unfinished results in it.
+
+    Raises
+    ------
+    FolderError
+        If it is a file, holds anything but our results of this kind, or holds those and ``force`` is off.
+    """
+    if path.exists() and not path.is_dir():
+        raise FolderError(f"{path}: is a file, not a folder; choose another --out")
+    if path.is_dir() and any(path.iterdir()):
+        if not (path / "case.toml").exists() or any(any(path.glob(pattern)) for pattern in foreign):
+            raise FolderError(f"{path}: holds files that are not a run's of this kind; choose another --out")
+        if not force:
+            raise FolderError(f"{path}: exists; {begun}--force replaces what is in it, --out chooses another")
+    path.mkdir(parents=True, exist_ok=True)
 
 
 class RunFolder:
@@ -119,15 +124,8 @@ class RunFolder:
                 lines = _difference(kept.read_text(encoding="utf-8"), text)
                 raise FolderError(f"{self.path}: --resume needs the case it was begun with; differing: {lines}")
             return
-        if self.path.exists() and not self.path.is_dir():
-            raise FolderError(f"{self.path}: is a file, not a folder; choose another --out")
-        if self.path.is_dir() and any(self.path.iterdir()):
-            if not kept.exists():
-                raise FolderError(f"{self.path}: holds files that are not a run's; choose another --out")
-            if not force:
-                begun = "--resume goes on with the unfinished run in it, " if self.parts.is_dir() else ""
-                raise FolderError(f"{self.path}: exists; {begun}--force replaces the run, --out chooses another")
-        self.path.mkdir(parents=True, exist_ok=True)
+        begun = "--resume goes on with the unfinished run in it, " if self.parts.is_dir() else ""
+        claim_folder(self.path, force, ("branch-*.h5",), begun)
         shutil.rmtree(self.parts, ignore_errors=True)
         self.parts.mkdir()
         write_text(kept, text)
@@ -308,8 +306,12 @@ def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
     # Through memory: a zip file that meets a full disk half way complains again when it is forgotten.
     packed = io.BytesIO()
     np.savez(packed, **arrays)
-    with written_aside(path) as aside:
-        aside.write_bytes(packed.getbuffer())
+    try:
+        with written_aside(path) as aside:
+            aside.write_bytes(packed.getbuffer())
+    except OSError as error:
+        message = f"{path} could not be written; make room and go on with --resume: {error.strerror}"
+        raise OSError(error.errno, message) from error
 
 
 def _difference(old: str, new: str) -> str:

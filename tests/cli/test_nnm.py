@@ -72,3 +72,18 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     assert done.returncode == 1
     assert "turn nnm.smallest_step" in done.stdout
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
+
+
+def test_branches_and_runs_never_share_a_folder(vipetsc, tmp_path):
+    """--force replaces results of its own kind only."""
+    run, branches = tmp_path / "run", tmp_path / "branches"
+    for folder, evidence in ((run, "run.h5"), (branches, "branch-mode-1.h5")):
+        folder.mkdir()
+        (folder / "case.toml").write_text("")
+        (folder / evidence).write_text("results")
+    for arguments in (("nnm", "runs/nnm-cubic.toml", "--out", run), ("run", "--out", branches)):
+        ended = vipetsc(0, *arguments, "--force")
+        assert ended.returncode == 2
+        assert "of this kind" in ended.stderr
+    assert (run / "run.h5").read_text() == "results"
+    assert (branches / "branch-mode-1.h5").read_text() == "results"

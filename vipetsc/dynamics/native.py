@@ -42,8 +42,8 @@ def _pointer(typing_context, address):
 def compile_callback() -> numba.core.ccallback.CFunc:
     """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *block)``, compiled or taken from numba's cache.
 
-    ``block`` is the address of the kernel's words; the last three of its header are the block's own address,
-    its length, and a word that receives array pointers. Raises AttributeError where PETSc hides its symbols.
+    ``block`` is the address of the kernel's words; the header holds their number and a slot that receives array
+    pointers. Raises AttributeError where PETSc hides its symbols.
     """
     library = petsc_library()
     for name in _CALLS:

@@ -56,11 +56,6 @@ class Recorder:
         """Whether a part should be taken now."""
         return len(self._ledger) == self.length
 
-    @property
-    def pending(self) -> int:
-        """Samples not yet taken."""
-        return len(self._ledger)
-
     def record(self, number: int, t: float, state: PETSc.Vec, energies: Energies) -> None:
         """Keep sample ``number``, taken at time t."""
         layout = self.layout

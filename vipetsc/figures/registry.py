@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,6 +18,7 @@ from vipetsc.figures.lattice import unit_cell
 from vipetsc.figures.ledger import ledger
 from vipetsc.figures.phase import phase
 from vipetsc.figures.spacetime import spacetime
+from vipetsc.files import written_aside
 from vipetsc.lattice import UnitCell
 from vipetsc.records import RunFile
 
@@ -87,10 +87,6 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
 
 def save(figure: Figure, path: Path) -> Path:
     """Write ``figure`` to ``path`` in the format of its suffix, under another name first."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        figure.savefig(partial, format=path.suffix[1:], dpi=style.DPI)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with written_aside(path) as aside:
+        figure.savefig(aside, format=path.suffix[1:], dpi=style.DPI)
     return path

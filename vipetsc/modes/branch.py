@@ -12,11 +12,12 @@ from typing import Any
 import h5py
 import numpy as np
 
+from vipetsc.files import write_text, written_aside
 from vipetsc.modes.compare import Comparison
 from vipetsc.modes.point import Point
 from vipetsc.modes.portrait import Portrait
 from vipetsc.modes.regions import power_law, regions
-from vipetsc.store import Coordinates, write_text, written_aside
+from vipetsc.store import Coordinates
 
 KINDS = (
     "regular",

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from vipetsc.files import write_text
 from vipetsc.modes.audit import Watch, is_jump, suspects
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.compare import compare
@@ -25,7 +26,7 @@ from vipetsc.modes.special import Locator
 from vipetsc.modes.switching import switch
 from vipetsc.modes.system import System
 from vipetsc.modes.tsrk import Tsrk
-from vipetsc.store import provenance
+from vipetsc.store import FolderError, claim_folder, provenance
 
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Compiled, Tsrk, Newmark)}
 """The flows by their names in case files."""
@@ -34,6 +35,21 @@ SAVE_EVERY = 500
 """Points between two writings of a growing branch."""
 
 Listener = Callable[[Branch, Point], None]
+
+
+def prepare_folder(case: NnmCase, folder: Path, force: bool, resume: bool) -> None:
+    """Make ``folder`` ready for the branches of ``case`` (rank 0 only); raises FolderError if it is not ours."""
+    kept = folder / "case.toml"
+    if resume:
+        if not kept.exists():
+            raise FolderError(f"{folder}: holds no branches to resume; leave out --resume")
+        if NnmCase.load(kept).physics() != case.physics():
+            raise FolderError(f"{folder}: --resume needs the system, map and flow that {kept} was begun with")
+    else:
+        claim_folder(folder, force, ("run.h5", "parts"), "--resume goes on with the branches in it, ")
+        for old in folder.glob("branch-*.*"):
+            old.unlink()
+    write_text(kept, case.to_toml())
 
 
 def follow_all(

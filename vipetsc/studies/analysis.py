@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import h5py
 import numpy as np
 from scipy import fft
 
+from vipetsc.files import written_aside
 from vipetsc.lattice import pass_bands
 from vipetsc.records import RunFile
 from vipetsc.spectra import (
@@ -49,14 +49,8 @@ def analyse(run_path: str | Path, out_path: str | Path) -> None:
     OSError, ValueError
         If the run cannot be read or is not one of ours.
     """
-    out_path = Path(out_path)
-    partial = out_path.with_name(f".{out_path.name}.partial")
-    try:
-        with RunFile(run_path) as run, h5py.File(partial, "w") as out:
-            _measure(run, out)
-        os.replace(partial, out_path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with written_aside(Path(out_path)) as aside, RunFile(run_path) as run, h5py.File(aside, "w") as out:
+        _measure(run, out)
 
 
 def _measure(run: RunFile, out: h5py.File) -> None:
