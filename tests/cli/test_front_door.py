@@ -289,6 +289,17 @@ def test_a_disk_that_fills_ends_all_and_loses_nothing(vipetsc, case, tmp_path, r
     assert (out / "run.h5").stat().st_size == len(before)
 
 
+FAILS_ON_RANK_0_FOR_ALL = """
+from mpi4py import MPI
+from vipetsc.parallel import install_abort_hook, on_root
+install_abort_hook()
+
+def write():
+    raise PermissionError(13, "no right to write")
+
+on_root(MPI.COMM_WORLD, write)
+"""
+
 FAILS_ON_ONE_RANK = """
 from mpi4py import MPI
 from vipetsc.parallel import install_abort_hook
@@ -297,6 +308,15 @@ if MPI.COMM_WORLD.rank == 1:
     raise RuntimeError("rank 1 cannot go on")
 MPI.COMM_WORLD.Barrier()
 """
+
+
+def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
+    script = tmp_path / "fails.py"
+    script.write_text(FAILS_ON_RANK_0_FOR_ALL)
+    command = ["mpirun", "--oversubscribe", "-n", "3", sys.executable, str(script)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.count("no right to write") == 1
 
 
 def test_a_rank_that_raises_ends_all(tmp_path):
