@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "records": {"case", "lattice"},
     "files": set(),
     "figures": {"lattice", "spectra", "case", "records", "files"},
-    "dynamics": {"lattice", "case", "store", "parallel"},
+    "dynamics": {"lattice", "case", "records", "files", "store", "parallel"},
     "modes": {"lattice", "case", "store", "parallel", "files"},
     "studies": {"lattice", "spectra", "case", "records", "files", "dynamics", "modes", "store", "parallel"},
 }
