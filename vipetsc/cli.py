@@ -168,6 +168,8 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     folder = options.out or Path("runs") / plan.name
     result = make(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
     _say(comm, sweep_table(result))
+    if plan.figures and (folder / "ensemble.h5").exists():
+        _plot_study([folder], None, ("png",), comm)
     return DONE if result.complete else FAILED
 
 
@@ -250,8 +252,10 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     formats = tuple(options.format or ("png",))
     if all(any(path.glob("branch-*.h5")) and not (path / "run.h5").exists() for path in options.path):
         return _plot_branches(options.path, formats, comm)
+    if (options.path[0] / "ensemble.h5").exists():
+        return _plot_study(options.path, options.fig, formats, comm)
     if len(options.path) > 1:
-        raise FolderError(f"{' '.join(map(str, options.path))}: only folders of branches can share a page")
+        raise FolderError(f"{' '.join(map(str, options.path))}: only sweeps and folders of branches can share a page")
     (path,) = options.path
     folder = path.parent if path.name == "run.h5" else path
 
@@ -274,6 +278,25 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     drawn = comm.gather(draw(folder, options.fig, formats=formats, share=(comm.rank, comm.size)))
     for path in sorted(str(p) for paths in drawn or [] for p in paths):
         _say(comm, path)
+    return DONE
+
+
+def _plot_study(folders: list[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm) -> int:
+    """Pictures of sweeps, with branches beside them, into the first folder."""
+    from vipetsc.figures import draw_study, study_figures
+
+    def check() -> None:
+        unknown = set(names or []) - set(study_figures)
+        if unknown:
+            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(study_figures)}")
+        for folder in folders:
+            if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
+                raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
+
+    on_root(comm, check)
+    drawn = comm.gather(draw_study(folders, names, formats, (comm.rank, comm.size)))
+    for path in sorted(str(p) for paths in drawn or [] for p in paths):
+        _say(comm, f"  {path}")
     return DONE
 
 

@@ -132,6 +132,11 @@ class Sweep:
             raise CaseError(first.problems, self.name)
         return members
 
+    @property
+    def figures(self) -> bool:
+        """Whether the case asks for pictures, ``[output] figures``."""
+        return bool(self.table.get("output", {}).get("figures", True))
+
     def names(self) -> dict[str, str]:
         """A short name for every key that varies: its last part, or all of it where that is not unique."""
         keys = [key for axis in self.axes for key in axis.keys]

@@ -7,13 +7,26 @@ _HOMES = {
     "draw": "vipetsc.figures.registry",
     "draw_backbone": "vipetsc.figures.backbone",
     "draw_bands": "vipetsc.figures.registry",
+    "draw_study": "vipetsc.figures.studies",
     "names": "vipetsc.figures.registry",
     "run_figures": "vipetsc.figures.registry",
     "save": "vipetsc.figures.registry",
     "look": "vipetsc.figures.style",
+    "study_figures": "vipetsc.figures.studies",
 }
 
-__all__ = ["bands", "draw", "draw_backbone", "draw_bands", "look", "names", "run_figures", "save"]
+__all__ = [
+    "bands",
+    "draw",
+    "draw_backbone",
+    "draw_bands",
+    "draw_study",
+    "look",
+    "names",
+    "run_figures",
+    "save",
+    "study_figures",
+]
 
 
 def __getattr__(name: str) -> object:
