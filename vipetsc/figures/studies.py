@@ -12,7 +12,12 @@ from matplotlib.figure import Figure
 
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
+from vipetsc.figures.entropy import entropy, entropy_all
+from vipetsc.figures.entropy_time import entropy_history, entropy_maps
+from vipetsc.figures.explained import partition_explained
+from vipetsc.figures.partition import partition, reconstruction
 from vipetsc.figures.registry import save
+from vipetsc.figures.scattering import amplitudes, wavelets
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,20 @@ class Study:
 
 # Each draws what its data allow: pairs of a suffix for the file's name ("" for none) and a figure.
 StudyFigure = Callable[[Study], Iterator[tuple[str, Figure]]]
-study_figures: dict[str, StudyFigure] = {f.__name__: f for f in ()}
+study_figures: dict[str, StudyFigure] = {
+    f.__name__: f
+    for f in (
+        amplitudes,
+        wavelets,
+        partition,
+        partition_explained,
+        reconstruction,
+        entropy,
+        entropy_all,
+        entropy_maps,
+        entropy_history,
+    )
+}
 
 
 def draw_study(
