@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from vipetsc.case.sweep import coordinate
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
 from vipetsc.figures.series import AMPLITUDE, counted, in_pi, reading_of, suffix
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
 LOW, HIGH = 0.01, 1.0  # what a normalised curve runs between
+LABELS = 5  # most labels of the legend: three averages, another reading, the power law
 FACETS = ("reading", "wavenumber")
 SPAN = 4e-3, 40.0  # of the logarithmic axes: room for what is written above the peak
 
@@ -119,10 +121,16 @@ class Curves:
         return str(self.ensemble.values("reading")[place[self.others.index("reading")]])
 
     def wavenumber(self, place: tuple[int, ...]) -> str:
-        """The wavenumber as a fraction of pi; empty if it does not vary."""
-        if "wavenumber" not in self.others:
-            return ""
-        return f"κ* = {in_pi(self.ensemble.values('wavenumber')[place[self.others.index('wavenumber')]])}"
+        """The drive's wavenumber as a fraction of pi; empty if the sweep drives by frequency."""
+        if "wavenumber" in self.others:
+            return f"κ* = {in_pi(self.ensemble.values('wavenumber')[place[self.others.index('wavenumber')]])}"
+        shared = self.ensemble.sweep.table.get("drive", {}).get("wavenumber")
+        return "" if shared is None else f"κ* = {in_pi(coordinate([shared])[0])}"
+
+    def title(self, place: tuple[int, ...], wave: bool = True) -> str:
+        """The sweep, its reading and wavenumber in words."""
+        words = f"{self.reading(place)} reading", self.wavenumber(place) if wave else ""
+        return f"{self.ensemble.sweep.name}: {', '.join(filter(None, words))}"
 
     def elsewhere(self, place: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
         """The same place in the other readings."""
@@ -157,11 +165,8 @@ def stem(curves: Curves, place: tuple[int, ...], named: bool, kept: tuple[str, .
 
 
 def _entropy(curves: Curves, places: list[tuple[int, ...]], average: str) -> Figure:
-    figure = style.new_figure(style.PAGE * max(len(places), 3) / 6, 3.6)
-    panels, foot = figure.subfigures(2, 1, height_ratios=(15, 1))
-    words = (f"{curves.reading(places[0])} reading".capitalize(), curves.wavenumber(places[0]))
-    figure.suptitle(", ".join(filter(None, (*words, f"{AVERAGES[average]} mean entropy"))), fontsize=8)
-    grid = panels.subplots(2, len(places), sharey="row", squeeze=False)
+    figure, grid = _panels(2, len(places), 1.42, 0.38, LABELS)
+    _head(figure, f"{curves.title(places[0])}, {AVERAGES[average]} mean entropy")
     for column, place in enumerate(places):
         upper, lower = grid[:, column]
         style.letter(upper, curves.words(place))
@@ -185,10 +190,33 @@ def _entropy(curves: Curves, places: list[tuple[int, ...]], average: str) -> Fig
     grid[1, 0].set_ylabel("Normalised entropy")
     for axes in grid[1]:
         axes.set_xlabel("A (N)")
-    handles = dict(zip(*reversed(grid[0, -1].get_legend_handles_labels()), strict=True))
-    handles |= dict(zip(*reversed(grid[1, -1].get_legend_handles_labels()), strict=True))
-    foot.legend(handles.values(), handles.keys(), loc="center", ncols=len(handles))
+    pairs = [pair for axes in grid.flat for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in pairs}
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=_legend_columns(len(places)))
     return figure
+
+
+def _legend_columns(columns: int) -> int:
+    return 3 if columns > 4 else 2
+
+
+def _panels(rows: int, columns: int, height: float, gap: float = 0.1, labels: int = 0) -> tuple[Figure, np.ndarray]:
+    """A grid of panels of ``height`` inches, ``gap`` apart, and room for a legend of so many ``labels``.
+
+    Laid out by hand, since fitting dozens of panels takes long.
+    """
+    left, right, top, bottom = 0.52, 0.06, 0.45, 0.42 + 0.15 * -(-labels // _legend_columns(columns))
+    width = style.PAGE * max(columns, 4) / 6
+    tall = top + bottom + rows * height + (rows - 1) * gap
+    figure = style.new_figure(width, tall, fitted=False)
+    grid = figure.subplots(rows, columns, sharex="row", sharey="row", squeeze=False)
+    edges = left / width, bottom / tall, 1 - right / width, 1 - top / tall
+    figure.subplots_adjust(*edges, wspace=0.12, hspace=gap / height)
+    return figure, grid
+
+
+def _head(figure: Figure, text: str) -> None:
+    figure.suptitle(text, fontsize=8, y=1 - 0.05 / figure.get_figheight(), va="top")
 
 
 def _others(axes: Axes, curves: Curves, average: str, place: tuple[int, ...]) -> None:
@@ -203,7 +231,7 @@ def _points(axes: Axes, curve: Curve, colour: str, label: str, size: float = 2.2
     pale = tuple(0.5 + 0.5 * np.array(to_rgb(colour)))
     axes.errorbar(
         curve.amplitude, curve.value, curve.error, fmt="o-", color=colour, ecolor=pale, ms=size, mew=0, lw=0.6,
-        elinewidth=0.4, capsize=1.0, capthick=0.4, label=f"{label}, ± deviation over the cells",
+        elinewidth=0.4, capsize=1.0, capthick=0.4, label=f"{label}, ± std over the cells",
     )  # fmt: skip
 
 
@@ -213,7 +241,7 @@ def _law(axes: Axes, curve: Curve, fontsize: float) -> None:
     if not len(x):
         axes.text(0.04, 0.04, "no power law", transform=axes.transAxes, fontsize=fontsize, color=style.GREY)
         return
-    axes.plot(x, y, color=style.BLACK, lw=2.0, zorder=4, label="power law, adjusted R² log-log (nonlinear)")
+    axes.plot(x, y, color=style.BLACK, lw=2.0, zorder=4, label="power law, adjusted R² (of nonlinear fit)")
     fit = curve.fit
     text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
     axes.text(0.04, 0.97, text, transform=axes.transAxes, ha="left", va="top", fontsize=fontsize)
@@ -239,11 +267,8 @@ def entropy_all(study: Study) -> Iterator[tuple[str, Figure]]:
 
 
 def _entropy_all(curves: Curves, rows: list[list[tuple[int, ...]]], average: str) -> Figure:
-    columns = len(rows[0])
-    figure = style.new_figure(style.PAGE * max(columns, 3) / 6, 0.6 + 1.25 * len(rows))
-    title = f"{curves.reading(rows[0][0])} reading, {AVERAGES[average]} mean entropy".capitalize()
-    figure.suptitle(title, fontsize=8)
-    grid = figure.subplots(len(rows), columns, sharex=True, sharey=True, squeeze=False)
+    figure, grid = _panels(len(rows), len(rows[0]), 1.15)
+    _head(figure, f"{curves.title(rows[0][0], False)}, {AVERAGES[average]} mean entropy")
     for r, row in enumerate(rows):
         for c, place in enumerate(row):
             axes, curve = grid[r, c], curves.curve(average, place)
@@ -256,6 +281,8 @@ def _entropy_all(curves: Curves, rows: list[list[tuple[int, ...]]], average: str
             _law(axes, curve, 5.5)
             _logarithmic(axes, curve)
         grid[r, 0].set_ylabel(curves.wavenumber(row[0]))
+        for axes in grid[r]:
+            axes.tick_params(labelbottom=r == len(rows) - 1)
     for axes in grid[-1]:
         axes.set_xlabel("A (N)")
     return figure

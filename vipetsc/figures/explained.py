@@ -47,7 +47,8 @@ def _explained(series: Series) -> Figure:
 
     figure = style.new_figure(style.PAGE, 4.6)
     figure.suptitle(f"{series.title}; medium amplitude, {member.amplitude:g} N", fontsize=8)
-    grid = figure.add_gridspec(BINS_SHOWN, 3, width_ratios=(1.15, 1, 1.05))
+    # The empty column leaves room for the arrows.
+    grid = figure.add_gridspec(BINS_SHOWN, 4, width_ratios=(1.15, 0.25, 1, 1.05))
     half = BINS_SHOWN // 2
     above, below = figure.add_subplot(grid[:half, 0]), figure.add_subplot(grid[half:, 0])
     above.plot(cells, signal, color=style.BLACK, lw=0.4)
@@ -60,12 +61,13 @@ def _explained(series: Series) -> Figure:
     maps: list[Axes] = []
     # Bins rise upwards, as in the wavelet domain.
     for row, b in enumerate(reversed(bins)):
-        trace, energy = figure.add_subplot(grid[row, 1]), figure.add_subplot(grid[row, 2])
+        trace, energy = figure.add_subplot(grid[row, 2]), figure.add_subplot(grid[row, 3])
         trace.plot(cells, parts[b], color=colours[b], lw=0.5)
         trace.set(xlim=cells[[0, -1]], ylim=(-1.1 * largest, 1.1 * largest))
         trace.yaxis.tick_right()
         image = style.draw_map(energy, snapshots, cells, field[b].T, norm, "inferno")
         mark_sites(energy, member, "y")
+        energy.set_ylabel("Cell")
         energy.axvline(time, color="white", lw=0.6)
         for axes, letter, what in ((trace, "c", "Velocity (m/s)"), (energy, "d", "Energy")):
             style.letter(axes, f"({letter}.{ROMAN[row]}) {what} of $K_{{{b + 1}}}$")

@@ -61,10 +61,14 @@ def look() -> Iterator[None]:
         yield
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of ``width`` x ``height`` inches that needs no display and no pyplot."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0.03, hspace=0.03)
+def new_figure(width: float, height: float, fitted: bool = True) -> Figure:
+    """An empty figure of ``width`` x ``height`` inches that needs no display and no pyplot.
+
+    Panels are ``fitted`` to it unless they are placed by hand.
+    """
+    figure = Figure(figsize=(width, height), layout="constrained" if fitted else None)
+    if fitted:
+        figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0.03, hspace=0.03)
     FigureCanvasAgg(figure)
     return figure
 
