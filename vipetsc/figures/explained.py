@@ -100,4 +100,4 @@ def _domain(
         axes.text(0.985, 0.5 * (low + high) / np.pi, f"{b + 1}", transform=axes.get_yaxis_transform(), ha="right",
                   va="center", fontsize=5.5, fontweight="bold", color=colours[b])  # fmt: skip
     axes.set(xlabel="Cell", ylabel="κ (π rad/cell)", ylim=(0, 1))
-    style.letter(axes, "(b) Wavelet transform |X|, bins")
+    style.letter(axes, "(b) Wavelets |X| and bins")
