@@ -38,6 +38,9 @@ from vipetsc.lattice.contact import Contact, ContactLaw, contact_stiffness
 from vipetsc.lattice.drive import ToneBurst
 from vipetsc.lattice.presets import PRESETS
 
+STUDIES = ("nnm", "design")
+"""Sections of the same file that belong to the verbs of their names, which check them."""
+
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
 
@@ -100,8 +103,8 @@ class Case(Section):
         """The resolved case of a parsed TOML table; raises CaseError with everything that is wrong."""
         table, problems = with_overrides(table, overrides)
         kinds = {name: field.annotation for name, field in cls.model_fields.items()}
-        # [nnm] in the same file belongs to the verb nnm, which checks it
-        problems += [unknown_key(key, table[key], [*kinds, "nnm"]) for key in table if key not in {*kinds, "nnm"}]
+        known = {*kinds, *STUDIES}
+        problems += [unknown_key(key, table[key], known) for key in table if key not in known]
         table = _with_preset(table)
         name = table.get("name", "case")
         if not isinstance(name, str) or not name:
