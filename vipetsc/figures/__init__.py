@@ -7,13 +7,15 @@ _HOMES = {
     "draw": "vipetsc.figures.registry",
     "draw_backbone": "vipetsc.figures.backbone",
     "draw_bands": "vipetsc.figures.registry",
+    "draw_design": "vipetsc.figures.design",
+    "design_figures": "vipetsc.figures.design",
     "names": "vipetsc.figures.registry",
     "run_figures": "vipetsc.figures.registry",
     "save": "vipetsc.figures.registry",
     "look": "vipetsc.figures.style",
 }
 
-__all__ = ["bands", "draw", "draw_backbone", "draw_bands", "look", "names", "run_figures", "save"]
+__all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> object:
