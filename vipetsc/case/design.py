@@ -79,6 +79,10 @@ class DesignCase(Section):
         table, problems = with_overrides(table, overrides)
         known = {"name", "design", *BESIDE}
         problems += [unknown_key(key, table[key], known) for key in table if key not in known]
+        lattice = table.get("lattice", {})
+        if isinstance(lattice, dict) and ("cell" in lattice or lattice.get("preset", "four-band") != "four-band"):
+            found = lattice.get("preset", "a cell of one's own")
+            problems.append(Problem("lattice", found, "only the four-band preset has a lambda and an eta to search"))
         name = table.get("name", "design")
         if not isinstance(name, str) or not name:
             problems.append(Problem("name", name, "must be a non-empty string"))
