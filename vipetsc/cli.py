@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from mpi4py import MPI
 
@@ -14,9 +15,10 @@ import vipetsc
 from vipetsc.case import Case, CaseError
 from vipetsc.files import write_text
 from vipetsc.parallel import StopRequest, on_root
-from vipetsc.reports import bands_table, doctor_table, run_table, validate_table
+from vipetsc.reports import bands_table, doctor_table, run_table, sweep_table, validate_table
 from vipetsc.store import FolderError
 
+T = TypeVar("T")
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 
 
@@ -108,12 +110,17 @@ def _load(options: argparse.Namespace, comm: MPI.Comm) -> Case:
     def read() -> Case:
         if options.case is None:
             return Case.builtin(options.set)
-        try:
-            return Case.load(options.case, options.set)
-        except OSError as error:
-            raise FolderError(f"{options.case}: {error.strerror}; a case file (TOML) is needed") from None
+        return _read(options.case, lambda path: Case.load(path, options.set))
 
     return on_root(comm, read)
+
+
+def _read(path: str, load: Callable[[str], T]) -> T:
+    """What ``load`` makes of the case file ``path``; raises FolderError if it cannot be read."""
+    try:
+        return load(path)
+    except OSError as error:
+        raise FolderError(f"{path}: {error.strerror}; a case file (TOML) is needed") from None
 
 
 def _say(comm: MPI.Comm, text: str, file=None) -> None:
@@ -152,6 +159,20 @@ def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
             _say(comm, f"  {path}")
 
 
+def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Every combination in the section [sweep] of a case; goes on where it was stopped."""
+    from vipetsc.case import Sweep
+    from vipetsc.studies.sweep import sweep as make
+
+    plan = on_root(comm, lambda: _read(options.case, lambda path: Sweep.load(path, options.set)))
+    folder = options.out or Path("runs") / plan.name
+    result = make(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
+    _say(comm, sweep_table(result))
+    if plan.figures and (folder / "ensemble.h5").exists():
+        _plot_study([folder], None, ("png",), comm)
+    return DONE if result.complete else FAILED
+
+
 def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
     from vipetsc.modes.follow import follow_all, prepare_folder
@@ -161,13 +182,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     if options.force and options.resume:
         raise FolderError("--force and --resume exclude each other: begin anew, or go on")
 
-    def read() -> NnmCase:
-        try:
-            return NnmCase.load(options.case, options.set)
-        except OSError as error:
-            raise FolderError(f"{options.case}: {error.strerror}; a case file (TOML) is needed") from None
-
-    case = on_root(comm, read)
+    case = on_root(comm, lambda: _read(options.case, lambda path: NnmCase.load(path, options.set)))
     folder = options.out or Path("runs") / case.name
 
     on_root(comm, lambda: prepare_folder(case, folder, options.force, options.resume))
@@ -274,8 +289,10 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     formats = tuple(options.format or ("png",))
     if all(any(path.glob("branch-*.h5")) and not (path / "run.h5").exists() for path in options.path):
         return _plot_branches(options.path, formats, comm)
+    if (options.path[0] / "ensemble.h5").exists():
+        return _plot_study(options.path, options.fig, formats, comm)
     if len(options.path) > 1:
-        raise FolderError(f"{' '.join(map(str, options.path))}: only folders of branches can share a page")
+        raise FolderError(f"{' '.join(map(str, options.path))}: only sweeps and folders of branches can share a page")
     (path,) = options.path
     folder = path.parent if path.name in ("run.h5", "design.h5") else path
     if (folder / "design.h5").exists():
@@ -303,11 +320,35 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE
 
 
+def _plot_study(folders: list[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm) -> int:
+    """Pictures of sweeps, with branches beside them, into the first folder."""
+    from vipetsc.figures import draw_study, study_figures
+
+    def check() -> None:
+        unknown = set(names or []) - set(study_figures)
+        if unknown:
+            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(study_figures)}")
+        for folder in folders:
+            if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
+                raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
+
+    on_root(comm, check)
+    drawn = comm.gather(draw_study(folders, names, formats, (comm.rank, comm.size)))
+    for path in sorted(str(p) for paths in drawn or [] for p in paths):
+        _say(comm, f"  {path}")
+    return DONE
+
+
 def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Versions, MPI, HDF5 and ranks; what is missing and how to get it."""
     text, healthy = doctor_table(comm)
     _say(comm, text)
     return DONE if healthy else FAILED
+
+
+def _swept(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("case", metavar="CASE", help="case file (TOML) with a section [sweep]")
+    _overrides(parser)
 
 
 def _branches(parser: argparse.ArgumentParser) -> None:
@@ -319,6 +360,7 @@ VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
     "run": (run, "one simulation, its analysis and pictures", (_case, _folder, _resume)),
     "validate": (validate, "check a case; print band edges, frequency, end time, size and cost", (_case,)),
     "bands": (bands, "pass bands, gaps and group velocities of a cell", (_case, _out, _json)),
+    "sweep": (sweep, "every combination in [sweep]; goes on where it was", (_swept, _folder)),
     "nnm": (nnm, "nonlinear normal modes: frequency-energy branches", (_branches, _folder, _resume)),
     "design": (design, "the (lambda, eta) search of the four-band cell", (_case, _folder)),
     "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from mpi4py import MPI
 
+import numpy as np
 from tqdm import tqdm
 
 T = TypeVar("T")
@@ -54,6 +55,28 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
         error.from_root = True
         raise error
     return value
+
+
+class SharedCounter:
+    """A count that all ranks of ``comm`` draw from, one-sided: no rank has to wait on another to hand out work."""
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        self._window = MPI.Win.Allocate(8 if comm.rank == 0 else 0, 8, comm=comm)
+        if comm.rank == 0:
+            np.frombuffer(self._window.tomemory(), np.int64)[:] = 0
+        comm.Barrier()
+
+    def draw(self, step: int = 1) -> int:
+        """The count before ``step`` is added to it."""
+        value, step = np.empty(1, np.int64), np.array([step], np.int64)
+        self._window.Lock(0, MPI.LOCK_SHARED)
+        self._window.Fetch_and_op(step, value, 0, 0, MPI.SUM)
+        self._window.Unlock(0)
+        return int(value[0])
+
+    def free(self) -> None:
+        """Give the window back; all ranks must call it."""
+        self._window.Free()
 
 
 class StopRequest:

@@ -26,6 +26,7 @@ ENERGIES = ("kinetic", "spring", "contact", "work", "dissipated")
 class RunFile:
     """What a finished or interrupted run left: SI units, cells and sites counted from 1.
 
+    Made from the path of ``run.h5``, or from the file already open (closing this closes it).
     Use it as a context manager; fields are HDF5 datasets (t, cell, dof), read where they are sliced.
 
     Raises
@@ -36,9 +37,10 @@ class RunFile:
         If it is not one of ours.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self.file = h5py.File(self.path, "r")
+    def __init__(self, path: str | Path | h5py.File) -> None:
+        opened = isinstance(path, h5py.File)
+        self.path = Path(path.filename if opened else path)
+        self.file = path if opened else h5py.File(self.path, "r")
         missing = [name for name in ("time", "cell", "energy") if name not in self.file]
         if missing or "case" not in self.file.attrs:
             self.file.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import shutil
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from vipetsc.store import GATHER_LIMIT, provenance
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
+    from vipetsc.studies.sweep import SweepResult
 
 # Time of one step of the default method per mass and per step, measured on one 2020s core.
 _STEP_SECONDS, _STEP_SECONDS_PER_MASS = 2e-5, 7e-8
@@ -56,6 +58,28 @@ def bands_table(cell: UnitCell, as_text: bool = False) -> Any:
         )
     lines += [f" gap {low:9.2f} {high:9.2f}" for low, high in gaps(bands)]
     return "\n".join(lines)
+
+
+def sweep_table(result: SweepResult) -> str:
+    """How a sweep ended: counts, time, what failed."""
+    complete, scaled, failed = (result.count(status) for status in range(3))
+    rows = [
+        (
+            "members",
+            f"{len(result.outcomes)}: {complete} simulated, {scaled} scaled from a linear run, {failed} failed",
+        ),
+        ("made now", f"{result.made} in {result.seconds:.1f} s"),
+        ("ranks busy", ", ".join(f"{100 * share:.0f} %" for share in result.busy)),
+    ]
+    missing = sum(o is None for o in result.outcomes)
+    if missing:
+        rows.append(("missing", f"{missing}; stopped on request, the same command goes on"))
+    else:
+        rows.append(("leaves", str(result.folder / "ensemble.h5")))
+    with open(result.folder / "index.json", encoding="utf-8") as file:
+        places = [(row["place"], row["reason"]) for row in json.load(file)["members"] if row["status"] == "failed"]
+    rows += [("failed", f"member {place}: {reason}") for place, reason in places[:10]]
+    return _table(rows)
 
 
 def validate_table(case: Case, ranks: int) -> str:

@@ -13,6 +13,8 @@ import os
 import platform
 import shutil
 import sys
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +163,10 @@ class RunFolder:
         with np.load(self._state(number, self.comm.rank)) as file:
             return dict(file)
 
+    def read_part(self, number: int, rank: int) -> AbstractContextManager[Mapping[str, np.ndarray]]:
+        """Part ``number`` as ``rank`` wrote it, to be used in a ``with`` statement."""
+        return np.load(self._part(number, rank))
+
     def _part(self, number: int, rank: int) -> Path:
         return self.parts / f"part-{number:06d}-{rank}.npz"
 
@@ -222,7 +228,7 @@ class RunFolder:
         sample = 0
         rank = writers.rank
         for number in range(parts):
-            with np.load(self._part(number, rank)) as part:
+            with self.read_part(number, rank) as part:
                 count = part[case.output.fields[0]].shape[0] if case.output.fields else 0
                 for name in case.output.fields:
                     _write_share(file[name], (slice(sample, sample + count), own), part[name])
@@ -244,7 +250,7 @@ class RunFolder:
         gathered: dict[str, list[np.ndarray]] = {}
         wanted = {"time", "field_time", "dissipated_by_site", *_LEDGER, *(f"impact_{n}" for n in _IMPACTS)}
         for number in range(parts):
-            with np.load(self._part(number, 0)) as part:
+            with self.read_part(number, 0) as part:
                 for key in wanted:
                     gathered.setdefault(key, []).append(part[key])
         joined = {key: np.concatenate(arrays) for key, arrays in gathered.items()}

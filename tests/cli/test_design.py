@@ -139,7 +139,7 @@ def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
 
 
 def test_results_of_other_kinds_are_never_replaced(vipetsc, case, tmp_path):
-    for evidence in ("run.h5", "branch-mode-1.h5"):
+    for evidence in ("run.h5", "branch-mode-1.h5", "index.json"):
         folder = tmp_path / evidence.split(".")[0]
         folder.mkdir()
         (folder / "case.toml").write_text("")

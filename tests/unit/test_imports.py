@@ -10,7 +10,7 @@ import pytest
 import vipetsc
 
 ROOT = Path(vipetsc.__file__).parent
-SERIAL = ("lattice", "spectra", "figures", "case", "records", "files", "studies")
+SERIAL = ("lattice", "spectra", "figures", "case", "records", "ensembles", "files", "studies")
 FORBIDDEN = {"petsc4py", "mpi4py"}
 
 # What each part of the package may import of the rest, besides itself.
@@ -19,11 +19,23 @@ MAY_IMPORT = {
     "spectra": {"lattice"},
     "case": {"lattice"},
     "records": {"case", "lattice"},
+    "ensembles": {"case"},
     "files": set(),
-    "figures": {"lattice", "spectra", "case", "records", "files"},
-    "dynamics": {"lattice", "case", "store", "parallel"},
+    "figures": {"lattice", "spectra", "case", "records", "ensembles", "files"},
+    "dynamics": {"lattice", "case", "records", "files", "store", "parallel"},
     "modes": {"lattice", "case", "store", "parallel", "files"},
-    "studies": {"lattice", "spectra", "case", "records", "files", "dynamics", "modes", "store", "parallel"},
+    "studies": {
+        "lattice",
+        "spectra",
+        "case",
+        "records",
+        "ensembles",
+        "files",
+        "dynamics",
+        "modes",
+        "store",
+        "parallel",
+    },
 }
 
 

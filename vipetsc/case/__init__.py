@@ -2,5 +2,6 @@
 
 from vipetsc.case.case import Case, Model
 from vipetsc.case.schema import CaseError, Problem
+from vipetsc.case.sweep import Member, Sweep
 
-__all__ = ["Case", "CaseError", "Model", "Problem"]
+__all__ = ["Case", "CaseError", "Member", "Model", "Problem", "Sweep"]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from vipetsc.case.checks import cross_problems, sites_of, unit_cell_of
+from vipetsc.case.checks import cross_problems, sites_of, too_coarse, unit_cell_of
 from vipetsc.case.schema import (
     CaseError,
     ClearanceSpan,
@@ -38,11 +38,10 @@ from vipetsc.lattice.contact import Contact, ContactLaw, contact_stiffness
 from vipetsc.lattice.drive import ToneBurst
 from vipetsc.lattice.presets import PRESETS
 
-STUDIES = ("nnm", "design")
-"""Sections of the same file that belong to the verbs of their names, which check them."""
-
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
+# Sections of the same file that belong to verbs of their own, which check them.
+ELSEWHERE = ("nnm", "sweep", "design")
 
 
 @dataclass(frozen=True)
@@ -103,8 +102,8 @@ class Case(Section):
         """The resolved case of a parsed TOML table; raises CaseError with everything that is wrong."""
         table, problems = with_overrides(table, overrides)
         kinds = {name: field.annotation for name, field in cls.model_fields.items()}
-        known = {*kinds, *STUDIES}
-        problems += [unknown_key(key, table[key], known) for key in table if key not in known]
+        valid = [*kinds, *ELSEWHERE]
+        problems += [unknown_key(key, table[key], valid) for key in table if key not in valid]
         table = _with_preset(table)
         name = table.get("name", "case")
         if not isinstance(name, str) or not name:
@@ -117,7 +116,14 @@ class Case(Section):
         problems += cross_problems(sections, {p.key for p in problems})
         if problems:
             raise CaseError(problems, source)
-        return cls(name=name, **_resolved(sections))
+        resolved = _resolved(sections)
+        samples = sections["time"].samples
+        if samples is not None:
+            cell = unit_cell_of(sections["lattice"])
+            problems = too_coarse(cell, resolved["time"]["sample_interval"], "time.samples", samples)
+            if problems:
+                raise CaseError(problems, source)
+        return cls(name=name, **resolved)
 
     def to_toml(self) -> str:
         """The resolved case as TOML; reading it back gives the same case."""
@@ -236,12 +242,15 @@ def _resolved(sections: dict[str, Any]) -> dict[str, dict]:
     tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in ("wavenumber", "band", "at")}
     tables["drive"]["frequency"] = frequency
 
-    interval = time.sample_interval
-    if interval == "auto":
-        interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
     end = time.end
     if end == "traverse":
         end = 2 * np.pi * drive.cycles / frequency + lattice.cells / _speed(cell, frequency)
+    interval = time.sample_interval
+    if time.samples is not None:
+        interval = end / (time.samples - 1)
+        del tables["time"]["samples"]
+    elif interval == "auto":
+        interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
     tables["time"] |= {"sample_interval": float(interval), "end": float(end)}
     return tables
 

@@ -53,6 +53,8 @@ def cross_problems(sections: dict[str, Any], bad: set[str]) -> list[Problem]:
             outside,
             f"outside the lattice; cells count from 1 to {lattice.cells}",
         )
+        doubled = isinstance(contacts.sites, Span) and None not in (contacts.sites.last, contacts.sites.spacing)
+        check(not doubled, "contacts.sites.spacing", None, "give last or spacing, not both")
         twice = sorted({c for c in sites if sites.count(c) > 1})
         check(not twice, "contacts.sites", twice, "named twice; a cell carries one contact pair")
         needs_span = isinstance(contacts.sites, int) and contacts.sites > 0 and lattice.preset is None
@@ -91,9 +93,10 @@ def cross_problems(sections: dict[str, Any], bad: set[str]) -> list[Problem]:
     if cell:
         check(drive.mass <= cell.dofs, "drive.mass", drive.mass, f"the cell has {cell.dofs} masses")
         if sound("time.sample_interval") and time.sample_interval != "auto":
-            nyquist = np.pi / pass_bands(cell)[-1].high
-            remedy = f"too coarse for the bands; the top band's Nyquist interval is {nyquist:.4g} s"
-            check(time.sample_interval < nyquist, "time.sample_interval", time.sample_interval, remedy)
+            problems += too_coarse(cell, time.sample_interval, "time.sample_interval", time.sample_interval)
+    if sound("time.sample_interval", "time.samples"):
+        both = time.samples is not None and time.sample_interval != "auto"
+        check(not both, "time.samples", time.samples, "give it or time.sample_interval, not both")
     if sound("time.sample_interval", "time.end") and time.sample_interval != "auto" and time.end != "traverse":
         check(time.end >= time.sample_interval, "time.end", time.end, "shorter than one sample interval")
     if output.window is not None and sound("lattice.cells"):
@@ -103,9 +106,20 @@ def cross_problems(sections: dict[str, Any], bad: set[str]) -> list[Problem]:
     return problems
 
 
+def too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
+    """The problem of samples every ``interval`` s, asked for by ``key``, that miss the bands' frequencies."""
+    nyquist = np.pi / pass_bands(cell)[-1].high
+    if interval < nyquist:
+        return []
+    seen = "" if interval == value else f"an interval of {interval:.4g} s is "
+    return [Problem(key, value, f"{seen}too coarse for the bands; the top band's Nyquist interval is {nyquist:.4g} s")]
+
+
 def sites_of(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
     """Sites as 1-based cells."""
     sites = contacts.sites
+    if isinstance(sites, Span) and sites.last is None:
+        return [sites.first + (sites.spacing or 1) * i for i in range(sites.count)]
     if isinstance(sites, Span):
         return [c + 1 for c in spread_sites(sites.first, sites.last, sites.count)]
     if isinstance(sites, int):

@@ -45,7 +45,7 @@ class CaseError(ValueError):
         return type(self), (self.problems, self.source)
 
 
-def _number(value: Any) -> Any:
+def number(value: Any) -> Any:
     """Wavenumbers may be written as multiples of pi: "5pi/9"."""
     match = isinstance(value, str) and re.fullmatch(r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*(\d+))?\s*", value)
     if not match:
@@ -61,7 +61,7 @@ def _not_zero(value: float) -> float:
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Wavenumber = Annotated[float, BeforeValidator(_number), Field(gt=0, le=np.pi)]
+Wavenumber = Annotated[float, BeforeValidator(number), Field(gt=0, le=np.pi)]
 
 
 class Section(BaseModel):
@@ -109,10 +109,11 @@ class LatticeTable(Section):
 
 
 class Span(Section):
-    """``count`` sites evenly from cell ``first`` to cell ``last`` (1-based)."""
+    """``count`` sites evenly from cell ``first`` to cell ``last`` (1-based), or every ``spacing``-th from ``first``."""
 
     first: int
-    last: int
+    last: int | None = None
+    spacing: int | None = Field(None, ge=1)
     count: int = Field(ge=1)
 
 
@@ -155,6 +156,8 @@ class DriveTable(Section):
 class TimeTable(Section):
     """End in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
 
+    ``samples`` is their number from 0 to the end, in place of an interval.
+
     ``atol``: ``scaled`` is .1 rtol times the displacement and the velocity of the drive's linear wave,
     ``paper`` is 1e-9 times the amplitude, a number is used for displacements (m) and velocities (m/s).
     """
@@ -165,6 +168,7 @@ class TimeTable(Section):
     rtol: Annotated[float, Field(ge=1e-14, le=1e-2)] = 1e-10
     atol: Positive | Literal["scaled", "paper"] = "scaled"
     sample_interval: Positive | Literal["auto"] = "auto"
+    samples: int | None = Field(None, ge=2)
 
 
 class OutputTable(Section):

@@ -35,12 +35,12 @@ class Result:
     resumable: bool
     sentence: str
     statistics: dict[str, Any]
-    folder: Path
+    folder: Path | None
 
 
 def simulate(
     case: Case,
-    folder: str | Path,
+    folder: str | Path | RunFolder,
     comm: MPI.Comm = MPI.COMM_WORLD,
     *,
     force: bool = False,
@@ -57,9 +57,9 @@ def simulate(
         A resolved case.
     folder
         Output folder; must not exist unless ``force`` (replaces the run in it) or ``resume`` (goes on with an
-        unfinished one, to the same bits).
+        unfinished one, to the same bits). A ``RunMemory`` keeps the run in memory.
     comm
-        The ranks that share the lattice.
+        The ranks that share the lattice; those of a ``RunMemory`` are its own.
     native
         Register the right-hand side natively (default) or through Python.
     stop
@@ -74,7 +74,8 @@ def simulate(
     """
     begin = time.perf_counter(), time.process_time()
     model = case.model()
-    home = RunFolder(Path(folder), comm)
+    home = folder if isinstance(folder, RunFolder) else RunFolder(Path(folder), comm)
+    comm = home.comm
     on_root(comm, lambda: home.prepare(case, force, resume))
     run = _Run(case, model, home, native, stop, Progress(comm, model.end, "s", show=progress))
     if resume:

@@ -1,20 +1,41 @@
-"""Measures on sampled fields, in plain numpy and scipy: Fourier spectra and band energies."""
+"""Measures on sampled fields, in plain numpy and scipy: Fourier, wavelets, band energies, entropy, power laws."""
 
 from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, part_kinetic_energy, split
+from vipetsc.spectra.entropy import Entropy, entropy, local_entropy
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
+from vipetsc.spectra.partition import Partition, partition
+from vipetsc.spectra.power_law import Fit, PowerLaw, from_peak, normalised, power_law
+from vipetsc.spectra.wavelet import BINS, Bank, Nodes, filter_bank, inverse, padded_length, transform
 
 __all__ = [
+    "BINS",
     "TAPER",
+    "Bank",
     "Dispersion",
+    "Entropy",
+    "Fit",
+    "Nodes",
+    "Partition",
     "Parts",
+    "PowerLaw",
     "dispersion",
+    "entropy",
+    "filter_bank",
+    "from_peak",
     "front_arrival",
     "ibtet",
+    "inverse",
     "kinetic_energy",
+    "local_entropy",
+    "normalised",
+    "padded_length",
     "part_energies",
     "part_kinetic_energy",
+    "partition",
+    "power_law",
     "ridge",
     "split",
     "taper",
+    "transform",
     "wavenumber_content",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import h5py
 import numpy as np
 from scipy import fft
 
+from vipetsc.case import Case
 from vipetsc.files import written_aside
 from vipetsc.lattice import pass_bands
 from vipetsc.records import RunFile
@@ -22,11 +25,18 @@ from vipetsc.spectra import (
     part_energies,
     wavenumber_content,
 )
+from vipetsc.studies.datasets import put
+from vipetsc.studies.wavelets import SNAPSHOTS, put_wavelets
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 IN_MEMORY = 2**30  # bytes of velocity that are read at once; larger fields are read mass by mass
 MAP_SIZE = 20_000_000  # values of a (t, cell) map that are written; longer records are thinned out in time
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
+
+
+# What is measured of one run, and of every run of a sweep; "maps" are the space-time maps of the other measures.
+FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "maps")
+REDUCED = ("entropy", "bands")
 
 
 @dataclass(frozen=True)
@@ -37,52 +47,79 @@ class Arrival:
     reason: str
 
 
-def analyse(run_path: str | Path, out_path: str | Path) -> None:
-    """Measure the run in ``run_path`` and write ``out_path``, complete or not at all.
+def analyse(
+    run: RunFile | str | Path, out_path: str | Path, measures: Sequence[str] = FULL, arrival: float | None = None
+) -> None:
+    """Measure ``run`` and write ``out_path``, complete or not at all.
 
     Kinetic energy in space-time, wavenumber content, dispersion of the whole record and of the cells before
-    and after the first site, energies of the pass bands and gaps, and the inter-band transfer. What a run
-    cannot give (no sites, a single cell) is left out and named in the attribute ``left_out``.
+    and after the first site, wavenumber partition, entropy, energies of the pass bands and gaps, and the
+    inter-band transfer. What a run cannot give (no sites, a single cell) is left out and named in the
+    attribute ``left_out``.
+
+    Parameters
+    ----------
+    run
+        An open run, or the path of ``run.h5``.
+    measures
+        Which of ``FULL``; "maps" are the space-time maps of what else is named.
+    arrival
+        The paper's t_hat in s, the time of the largest host velocity at the first site in the linear run. By
+        default it is estimated from the group velocity: half the burst and the way to the site.
 
     Raises
     ------
     OSError, ValueError
         If the run cannot be read or is not one of ours.
     """
-    with written_aside(Path(out_path)) as aside, RunFile(run_path) as run, h5py.File(aside, "w") as out:
-        _measure(run, out)
+    with ExitStack() as stack:
+        aside = stack.enter_context(written_aside(Path(out_path)))
+        if not isinstance(run, RunFile):
+            run = stack.enter_context(RunFile(run))
+        out = stack.enter_context(h5py.File(aside, "w"))
+        _measure(run, out, frozenset(measures), arrival)
 
 
-def _measure(run: RunFile, out: h5py.File) -> None:
+def describe(out: h5py.File, case: Case, status: str) -> None:
+    """Root attributes of an analysis: the resolved case and how its run ended."""
     out.attrs["format_version"] = FORMAT_VERSION
-    out.attrs["case"] = run.file.attrs["case"]
-    out.attrs["status"] = run.file.attrs.get("status", "")
+    out.attrs["case"] = case.to_toml()
+    out.attrs["status"] = status
+
+
+def _measure(run: RunFile, out: h5py.File, measures: frozenset[str], arrival: float | None) -> None:
+    describe(out, run.case, run.file.attrs.get("status", ""))
     if "velocity" not in run.file:
         out.attrs["left_out"] = "everything: the velocity was not recorded"
         return
     velocity = run.velocity if run.velocity.nbytes > IN_MEMORY else run.velocity[...]
     nt, cells = velocity.shape[:2]
-    thinning = -(-nt * cells // MAP_SIZE)
+    thinning = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
     thin = slice(None, None, thinning)
     out.attrs["thinning"] = thinning
     left_out = []
 
-    _put(out, "time", run.field_time[thin], "s", "time")
-    _put(out, "cell", run.cells, "1", "cell")
-    kinetic = kinetic_energy(velocity, run.masses)
-    _put(out, "kinetic_energy", kinetic[thin], "J", "kinetic energy of a cell", "time", "cell")
-    if cells > 1:
+    put(out, "time", run.field_time[thin], "s", "time")
+    put(out, "cell", run.cells, "1", "cell")
+    kinetic = kinetic_energy(velocity, run.masses) if {"kinetic", "bands"} & measures else None
+    if "kinetic" in measures:
+        put(out, "kinetic_energy", kinetic[thin], "J", "kinetic energy of a cell", "time", "cell")
+    if cells > 1 and "wavenumber" in measures:
         wavenumber, content = wavenumber_content(velocity, run.masses)
-        _put(out, "wavenumber", wavenumber / run.spacing, "rad/cell", "wavenumber")
+        put(out, "wavenumber", wavenumber / run.spacing, "rad/cell", "wavenumber")
         long_name = "kinetic energy per wavenumber bin"
-        _put(out, "wavenumber_content", content[thin], "J", long_name, "time", "wavenumber")
-    else:
-        left_out.append("wavenumber_content: a single cell was recorded")
+        put(out, "wavenumber_content", content[thin], "J", long_name, "time", "wavenumber")
     if nt < 2:
-        left_out.append("dispersion, bands, ibtet: fewer than two samples were recorded")
+        left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
-        left_out += _put_dispersions(run, velocity, out)
-        _put_bands(run, velocity, kinetic, out, thin)
+        if "dispersion" in measures:
+            left_out += _put_dispersions(run, velocity, out)
+        if "bands" in measures:
+            _put_bands(run, velocity, kinetic, out, thin)
+        if cells > 1 and {"partition", "entropy"} & measures:
+            left_out += put_wavelets(run, velocity, out, measures, arrival)
+    if cells == 1:
+        left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
     out.attrs["left_out"] = "; ".join(left_out)
 
 
@@ -117,10 +154,10 @@ def _put_dispersions(run: RunFile, velocity: np.ndarray, out: h5py.File) -> list
             highest=highest,
         ).folded()
         if "frequency" not in out:
-            _put(out, "frequency", spectrum.frequency, "rad/s", "angular frequency")
+            put(out, "frequency", spectrum.frequency, "rad/s", "angular frequency")
         where = name.removeprefix("dispersion").strip("_")
         long_name = "mean kinetic energy per bin" + (f", cells {where} the first site" if where else "")
-        _put(out, name, spectrum.energy, "J", long_name, "wavenumber", "frequency")
+        put(out, name, spectrum.energy, "J", long_name, "wavenumber", "frequency")
     return left_out
 
 
@@ -131,13 +168,18 @@ def _put_bands(run: RunFile, velocity: np.ndarray, kinetic: np.ndarray, out: h5p
     above = parts.above(run.model.drive.frequency)
     arrival = _arrival(run, kinetic)
     bands = out.create_group("bands")
-    _put(bands, "edge", np.arange(len(parts.edges)), "1", "edge of a part")
-    _put(bands, "part", np.arange(1, len(parts.names) + 1), "1", "part of the frequency axis")
-    _put(bands, "edges", parts.edges, "rad/s", "edges of the pass bands and gaps", "edge")
-    _put(bands, "energy", energy[:, thin], "J", "kinetic energy of a part", "part", "time")
-    _put(bands, "above", above.astype(np.int8), "1", "1 for a pass band above the driven one", "part")
+    put(bands, "edge", np.arange(len(parts.edges)), "1", "edge of a part")
+    put(bands, "part", np.arange(1, len(parts.names) + 1), "1", "part of the frequency axis")
+    put(bands, "edges", parts.edges, "rad/s", "edges of the pass bands and gaps", "edge")
+    put(bands, "energy", energy[:, thin], "J", "kinetic energy of a part", "part", "time")
+    put(bands, "above", above.astype(np.int8), "1", "1 for a pass band above the driven one", "part")
     bands["energy"].attrs["parts"] = list(parts.names)
-    share = _put(out, "ibtet", ibtet(energy, above, arrival.sample), "1", "inter-band energy transfer")
+    put(bands, "total", kinetic.sum(axis=1)[thin], "J", "kinetic energy", "time")
+    whole = energy[:, arrival.sample :].sum(axis=0)
+    moving = whole > 0
+    shares = (energy[:, arrival.sample :][:, moving] / whole[moving]).mean(axis=1)
+    put(bands, "share", shares, "1", "mean share of a part after the wave's arrival", "part")
+    share = put(out, "ibtet", ibtet(energy, above, arrival.sample), "1", "inter-band energy transfer")
     share.attrs["start"] = run.field_time[arrival.sample]
     share.attrs["starts_when"] = arrival.reason
 
@@ -149,14 +191,3 @@ def _arrival(run: RunFile, kinetic: np.ndarray) -> Arrival:
     site = run.nearest(run.site_cells[run.leading_site])
     reason = f"the kinetic energy of cell {run.cells[site]} first exceeds 1 % of its largest value"
     return Arrival(front_arrival(kinetic[:, site]), reason)
-
-
-def _put(group: h5py.Group, name: str, values: object, units: str, long_name: str, *dims: str) -> h5py.Dataset:
-    """Write ``values`` over the named dimensions; without any, an array becomes a dimension scale itself."""
-    data = group.create_dataset(name, data=values)
-    data.attrs["units"], data.attrs["long_name"] = units, long_name
-    if not dims and data.ndim:
-        data.make_scale(name)
-    for axis, dim in enumerate(dims):
-        data.dims[axis].attach_scale(group[dim] if dim in group else group.file[dim])
-    return data

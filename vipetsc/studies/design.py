@@ -41,7 +41,7 @@ def design(case: DesignCase, folder: str | Path, force: bool = False) -> str:
         If ``folder`` holds anything else, or a search and ``force`` is off.
     """
     folder, options = Path(folder), case.design
-    claim_folder(folder, force, ("run.h5", "parts", "branch-*.h5"))
+    claim_folder(folder, force, ("run.h5", "parts", "branch-*.h5", "index.json"))
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
     found = {r: search(r, options.lam.values(), options.eta.values(), wavenumber) for r in options.readings}
     paper = {r: search(r, *PAPER, wavenumber) for r in options.readings}

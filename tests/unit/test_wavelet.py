@@ -1,0 +1,175 @@
+"""Wavelets in space against closed forms, direct sums and each other; partitions against the physical energy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from vipetsc.spectra import BINS, Nodes, filter_bank, inverse, kinetic_energy, padded_length, partition, transform
+from vipetsc.spectra.wavelet import constant, wavenumbers
+
+
+def noise(shape, seed=0):
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def packet(kappa, cells=600, centre=300.0, width=40.0, phase=0.0):
+    x = np.arange(cells) - centre
+    return np.exp(-0.5 * (x / width) ** 2) * np.cos(kappa * x - phase)
+
+
+@pytest.mark.parametrize("kc", [6.0, 12.0])
+def test_transform_is_the_convolution_with_the_wavelet_in_space(kc):
+    """Nodes whose band ends below pi have the closed form of a Gaussian packet, rest on either side."""
+    kappa = np.pi / 60 * np.array([1, 2, 7, 13, 20])
+    signal = noise(50)
+    x = transform(signal, kappa, kc)
+    distance = np.arange(50)[:, None] - np.arange(50)
+    for row, k in zip(x, kappa, strict=True):
+        wave = np.exp(-0.5 * (k * distance / kc) ** 2 + 1j * k * distance) * k / kc / np.sqrt(2 * np.pi)
+        expected = np.sqrt(kc / k) * wave @ signal
+        # At kc = 6 the cut at eta = 0 takes exp(-18) off the wavelet.
+        assert np.abs(row[:50] - expected).max() < (1e-12 if kc == 12 else 1e-7) * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("length", [64, 75])
+@pytest.mark.parametrize("kc", [6.0, 12.0])
+def test_transform_is_the_direct_sum_over_the_periodised_wavelet(length, kc):
+    kappa = np.array([0.05, 0.4, 1.5, 3.0, np.pi, 4.0])
+    signal = noise(40)
+    eta = 2 * np.pi * np.arange(1, length // 2 + 1) / length
+    half = np.where(np.isclose(eta, np.pi), 0.5, 1.0)
+    place = np.arange(length)
+    expected = np.zeros((len(kappa), length), dtype=complex)
+    for i, k in enumerate(kappa):
+        gauss = half * np.exp(-0.5 * (kc * eta / k - kc) ** 2) * np.sqrt(kc / k)
+        wavelet = (gauss * np.exp(1j * eta * place[:, None])).sum(axis=1) / length
+        for y, value in enumerate(signal):
+            expected[i] += value * wavelet[(place - y) % length]
+    assert np.abs(transform(signal, kappa, kc, length) - expected).max() < 1e-12
+
+
+@pytest.mark.parametrize("kc", [6.0, 12.0])
+def test_bank_is_transform_binning_and_inverse(kc):
+    signal = noise((2, 90))
+    nodes = Nodes.log(kc)
+    for length in (None, 251):
+        bank = filter_bank(90, kc, length=length)
+        parts = inverse(transform(signal, nodes.kappa, kc, bank.length), nodes, kc)
+        assert parts.shape == (BINS, 2, bank.length)
+        assert np.abs(parts[..., :90] - bank.split(signal)).max() < 1e-12
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(2, 200), st.sampled_from([6.0, 12.0]), st.integers(0, 99), st.floats(-1e3, 1e3))
+def test_dual_parts_sum_to_any_signal(cells, kc, seed, mean):
+    signal = noise(cells, seed) + mean
+    bank = filter_bank(cells, kc, "dual")
+    assert np.abs(bank.split(signal).sum(axis=0) - signal).max() < 1e-12 * max(np.abs(signal).max(), 1)
+    assert np.all(bank.transfer >= 0)
+    assert np.all(bank.transfer <= 1)
+
+
+@pytest.mark.parametrize("kc", [6.0, 12.0])
+def test_analytic_bank_sums_to_one_where_the_nodes_reach(kc):
+    bank = filter_bank(600, kc)
+    eta, total = wavenumbers(bank.length), bank.transfer.sum(axis=0)
+    assert np.abs(total[(eta > np.pi / 60 * 1.6)] - 1).max() < 0.01
+    assert total[0] == 0
+    coarse = filter_bank(600, kc, voices=0.65 * kc).transfer.sum(axis=0)
+    assert np.abs(coarse[(eta > np.pi / 60 * 1.6)] - 1).max() < 0.01
+
+
+def test_constant_is_the_integral():
+    for kc in (6.0, 12.0):
+        expected, _ = quad(
+            lambda s, kc=kc: np.exp(-((s - kc) ** 2)) / s, 1e-3, kc + 8, points=[kc], epsabs=0, epsrel=1e-13
+        )
+        assert constant(kc) == pytest.approx(expected, rel=1e-12)
+
+
+def test_nodes_span_the_log_grid():
+    nodes = Nodes.log(6.0, 4.0)
+    assert nodes.kappa[[0, -1]] == pytest.approx([np.pi / 60, np.pi * 5 / 3])
+    assert np.diff(np.log(nodes.kappa)) == pytest.approx(np.full(len(nodes.kappa) - 1, nodes.weight))
+    assert nodes.weight <= np.log(2) / 4
+    of = Nodes.log(6.0).bins()
+    kappa = Nodes.log(6.0).kappa
+    assert set(of) == set(range(BINS))
+    assert np.all(of[kappa > np.pi] == BINS - 1)
+    inside = kappa <= np.pi
+    assert np.all(kappa[inside] >= of[inside] * np.pi / 12 - 1e-12)
+    assert np.all(kappa[inside] <= (of[inside] + 1) * np.pi / 12 + 1e-12)
+
+
+def test_padding_keeps_periodic_images_apart():
+    """Twice the length changes nothing on the lattice, for wavelets whose band ends below pi."""
+    kappa = np.pi / 60 * np.array([1, 5, 30])
+    signal = noise(200)
+    length = padded_length(200, 12.0)
+    near, far = (transform(signal, kappa, 12.0, n)[:, :200] for n in (length, 2 * length))
+    assert np.abs(near - far).max() < 1e-13
+
+
+def moving_packet(times=21):
+    return np.array([packet(5 * np.pi / 9, centre=200 + 10 * t, phase=3 * t) for t in range(times)])
+
+
+def test_a_packet_lands_in_bins_7_and_8():
+    """Bins 7 and 8 meet at 7 pi/12 above the packet's 5 pi/9; its content lies between pi/2 and 2 pi/3."""
+    signal = packet(5 * np.pi / 9)
+    content = np.abs(np.fft.rfft(signal)) ** 2
+    eta = wavenumbers(600)
+    assert content[(eta >= np.pi / 2) & (eta < 2 * np.pi / 3)].sum() > 0.99 * content.sum()
+    share = partition(signal[None], 1.0).energy[:, 0]
+    assert share[6:8].sum() / share.sum() > 0.85
+
+
+def test_analytic_parts_reconstruct_a_packet_within_one_percent():
+    found = partition(moving_packet(), 0.01)
+    assert found.error.max() < 0.01
+    assert partition(moving_packet(), 0.01, normalisation="dual").error.max() < 1e-12
+
+
+@pytest.mark.parametrize("normalisation", ["analytic", "dual"])
+def test_partition_accounts_for_its_energies(normalisation):
+    velocity, masses = noise((37, 80, 2)), np.array([0.01, 0.08])
+    velocity[0] = 0
+    found = partition(velocity, masses, normalisation=normalisation, fields=True)
+    assert found.field.shape == (12, 37, 80)
+    assert np.allclose(found.field.sum(axis=2), found.energy, rtol=1e-12)
+    assert np.allclose(found.kinetic, kinetic_energy(velocity, masses).sum(axis=1), rtol=1e-12)
+    parts = filter_bank(80, 6.0, normalisation).split(velocity[5].T)
+    assert np.allclose(found.energy[:, 5], 0.5 * np.einsum("j,bjc->b", masses, parts**2), rtol=1e-10)
+    assert found.reconstructed[5] == pytest.approx(0.5 * masses @ (parts.sum(axis=0) ** 2).sum(axis=1), rel=1e-12)
+    assert found.error[0] == found.cross_share[0] == 0
+    assert np.allclose(found.cross_share[1:], 1 - found.energy.sum(axis=0)[1:] / found.kinetic[1:])
+    assert partition(velocity, masses).field is None
+
+
+def test_neighbouring_bins_share_much_of_a_packet():
+    """The bins overlap at kc = 6: the energies of the parts leave out most of the whole."""
+    share = partition(moving_packet(), 1.0, normalisation="dual").cross_share
+    assert np.all((share > 0.4) & (share < 0.8))
+
+
+def test_partition_does_not_depend_on_chunks():
+    velocity = noise((40, 30))
+    whole = partition(velocity, 2.0, fields=True)
+    late = partition(velocity[33:], 2.0, fields=True)
+    assert np.array_equal(whole.field[:, 33:], late.field)
+    assert np.array_equal(whole.energy[:, 33:], late.energy)
+
+
+def test_bad_requests_are_named():
+    with pytest.raises(ValueError, match="voices"):
+        Nodes.log(12.0, 4.0)
+    with pytest.raises(ValueError, match="admissible"):
+        transform(noise(10), [1.0], 2.0)
+    with pytest.raises(ValueError, match="length"):
+        transform(noise(10), [1.0], 6.0, 9)
+    with pytest.raises(ValueError, match="normalisation"):
+        filter_bank(10, 6.0, "other")
+    with pytest.raises(ValueError, match="masses"):
+        partition(noise((3, 10, 2)), [1.0])

@@ -1,0 +1,74 @@
+"""The pictures of finished sweeps by name, and the drawing of them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from vipetsc.ensembles import EnsembleFile
+from vipetsc.figures import style
+from vipetsc.figures.registry import save
+
+
+@dataclass(frozen=True)
+class Study:
+    """What pictures are drawn from: finished sweeps, and folders of frequency-energy branches."""
+
+    ensembles: tuple[EnsembleFile, ...]
+    branches: tuple[Path, ...] = ()
+
+
+# Each draws what its data allow: pairs of a suffix for the file's name ("" for none) and a figure.
+StudyFigure = Callable[[Study], Iterator[tuple[str, Figure]]]
+study_figures: dict[str, StudyFigure] = {f.__name__: f for f in ()}
+
+
+def draw_study(
+    folders: Sequence[Path],
+    names: Sequence[str] | None = None,
+    formats: Sequence[str] = ("png",),
+    share: tuple[int, int] = (0, 1),
+) -> list[Path]:
+    """Draw the sweeps (and branches) in ``folders`` into ``figures/`` of the first of them.
+
+    Parameters
+    ----------
+    names
+        Which of ``study_figures``; by default all that the data allow.
+    share
+        (rank, size): draw every ``size``-th of them from ``rank`` on, so that ranks can share the work.
+
+    Returns
+    -------
+    list of Path
+        The files written, each complete or not there at all.
+
+    Raises
+    ------
+    KeyError
+        For a name that is not in ``study_figures``; says the nearest one.
+    OSError, ValueError
+        If a file cannot be read, or a picture not written.
+    """
+    wanted = list(study_figures if names is None else names)
+    for name in wanted:
+        if name not in study_figures:
+            near = difflib.get_close_matches(name, study_figures, 1, 0) or list(study_figures)
+            raise KeyError(f"no figure {name!r}; did you mean {near[0]!r}? There are {', '.join(study_figures)}")
+    target, written = folders[0] / "figures", []
+    target.mkdir(exist_ok=True)
+    rank, size = share
+    with ExitStack() as stack:
+        stack.enter_context(style.look())
+        sweeps = tuple(stack.enter_context(EnsembleFile(f)) for f in folders if (f / "ensemble.h5").exists())
+        study = Study(sweeps, tuple(f for f in folders if any(f.glob("branch-*.h5"))))
+        for name in wanted[rank::size]:
+            for suffix, figure in study_figures[name](study):
+                stem = f"{name}-{suffix}" if suffix else name
+                written += [save(figure, target / f"{stem}.{kind}") for kind in formats]
+    return written

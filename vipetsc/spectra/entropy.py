@@ -1,0 +1,180 @@
+"""Space-wavenumber entropy of a lattice's velocity, and its averages over a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from scipy import fft
+
+from vipetsc.spectra.wavelet import padded_length, wavenumbers, window
+
+NODES = 60
+CHUNK = 8
+FLOOR = 0.01
+"""Points below this fraction of the largest weight are masked."""
+
+Mask = Literal["record", "snapshot"]
+
+
+@dataclass(frozen=True)
+class Entropy:
+    """Entropy in bits of the distribution P = S / sum S of S = |X|^2 over the wavenumber nodes.
+
+    Attributes
+    ----------
+    local
+        H (t, cell), 0 where nothing moves.
+    weight
+        W = sum over the nodes of S (t, cell), in the signal's unit squared.
+    snapshot
+        H (t), the mean of ``local`` over the cells with weights W; 0 at rest.
+    energy_weighted
+        Mean of ``snapshot`` over the samples from ``start`` on.
+    masked
+        Mean of ``local`` over all points from ``start`` on with W > 1 % of its largest value.
+    joint
+        Entropy of S / sum of S over cells and nodes together, per snapshot, averaged from ``start`` on.
+    error
+        Standard deviation over the cells of the masked time mean: each cell's mean over its unmasked samples.
+    """
+
+    local: np.ndarray
+    weight: np.ndarray
+    snapshot: np.ndarray
+    energy_weighted: float
+    masked: float
+    joint: float
+    error: float
+
+
+def entropy(
+    velocity: np.ndarray, start: int = 0, *, kc: float = 12.0, nodes: int = NODES, mask: Mask = "record"
+) -> Entropy:
+    """Entropy of ``velocity`` (t, cell) with wavelets at the ``nodes`` wavenumbers i pi/nodes, i = 1, 2, ...
+
+    Parameters
+    ----------
+    velocity
+        (t, cell) in m/s; an HDF5 dataset will do, a few snapshots at a time are read.
+    start
+        Sample from which the averages are taken, that of the linear wave's arrival at the first site.
+    mask
+        Whether a point is held against the largest weight of the "record" from ``start`` on, or of its "snapshot".
+
+    Raises
+    ------
+    ValueError
+        For an unknown ``mask``, no sample from ``start`` on, or a velocity that is not finite.
+    """
+    if mask not in ("record", "snapshot"):
+        raise ValueError(f"mask = {mask!r}: record or snapshot")
+    nt = len(velocity)
+    if not 0 <= start < nt:
+        raise ValueError(f"start = {start}: outside the {nt} samples")
+    local, weight = local_entropy(velocity, kc=kc, nodes=nodes)
+    snapshot, joint = _over_cells(local, weight)
+    masked, error = _masked(local[start:], weight[start:], mask)
+    return Entropy(local, weight, snapshot, float(snapshot[start:].mean()), masked, float(joint[start:].mean()), error)
+
+
+def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES) -> tuple[np.ndarray, np.ndarray]:
+    """H (t, cell) in bits and W (t, cell) of ``velocity`` (t, cell), a few snapshots at a time.
+
+    Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude.
+    """
+    nt, cells = velocity.shape
+    local, weight = np.empty((nt, cells)), np.empty((nt, cells))
+    for first in range(0, nt, CHUNK):
+        rows = slice(first, min(first + CHUNK, nt))
+        signal = np.asarray(velocity[rows], dtype=float)
+        largest = np.abs(signal).max(axis=1)
+        if not np.all(np.isfinite(largest)):
+            raise ValueError(f"velocity: not finite in samples {first} to {rows.stop - 1}")
+        exponent = np.frexp(largest)[1]
+        signal = np.ldexp(signal, -exponent[:, None])
+        total, spread = np.zeros(signal.shape), np.zeros(signal.shape)
+        for octave in _octaves(cells, kc, nodes):
+            spectrum = fft.rfft(signal, octave.length)
+            for low, high, filters in octave.filters:
+                x = np.zeros((len(signal), len(filters), octave.length), dtype=complex)
+                np.multiply(spectrum[:, None, low:high], filters, out=x[..., low:high])
+                _accumulate(fft.ifft(x, overwrite_x=True), total, spread)
+        _entropies(total, spread, local[rows])
+        weight[rows] = np.ldexp(total, 2 * exponent[:, None])
+    return local, weight
+
+
+@dataclass(frozen=True)
+class _Octave:
+    """Nodes that share a padded ``length``; for groups of them the band (low, high) and the filters in it."""
+
+    length: int
+    filters: tuple[tuple[int, int, np.ndarray], ...]
+
+
+@lru_cache(maxsize=8)
+def _octaves(cells: int, kc: float, nodes: int) -> tuple[_Octave, ...]:
+    """All nodes, those within an octave together: the lowest of them sets the padding for all."""
+    kappa = np.pi * np.arange(1, nodes + 1) / nodes
+    octaves = []
+    for number in range(int(np.log2(nodes)) + 1):
+        members = kappa[2**number - 1 : 2 ** (number + 1) - 1]
+        length = padded_length(cells, kc, members[0])
+        filters = np.sqrt(kc / members)[:, None] * window(members, kc, wavenumbers(length))
+        if length % 2 == 0:
+            filters[:, -1] *= 0.5
+        groups = []
+        for first in range(0, len(members), 4):
+            some = filters[first : first + 4]
+            inside = np.flatnonzero(some.max(axis=0) > np.finfo(float).eps * some.max())
+            low, high = int(inside[0]), int(inside[-1]) + 1
+            groups.append((low, high, np.ascontiguousarray(some[:, low:high])))
+        octaves.append(_Octave(length, tuple(groups)))
+    return tuple(octaves)
+
+
+@njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", cache=True, fastmath={"contract"})
+def _accumulate(x, total, spread):
+    """Add S and S log2 S of the nodes of ``x`` (t, kappa, x) to ``total`` and ``spread`` (t, cell)."""
+    for t in range(x.shape[0]):
+        for k in range(x.shape[1]):
+            for c in range(total.shape[1]):
+                z = x[t, k, c]
+                s = z.real * z.real + z.imag * z.imag
+                total[t, c] += s
+                spread[t, c] += s * np.log2(s + 1e-300)
+
+
+@njit("void(f8[:,::1], f8[:,::1], f8[:,::1])", cache=True)
+def _entropies(total, spread, local):
+    """H = log2 W - (1/W) sum S log2 S, kept from rounding below zero."""
+    for t in range(total.shape[0]):
+        for c in range(total.shape[1]):
+            w = total[t, c]
+            local[t, c] = max(np.log2(w) - spread[t, c] / w, 0.0) if w > 0.0 else 0.0
+
+
+def _over_cells(local: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Energy-weighted mean (t) of H, and the joint entropy (t): that mean plus the entropy of W / sum W."""
+    largest = weight.max(axis=1, keepdims=True)
+    share = np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0)
+    share /= np.maximum(share.sum(axis=1, keepdims=True), 1.0)
+    mean = np.einsum("tc,tc->t", share, local)
+    position = -np.sum(share * np.log2(share, out=np.zeros_like(share), where=share > 0), axis=1)
+    return mean, mean + position
+
+
+def _masked(local: np.ndarray, weight: np.ndarray, mask: Mask) -> tuple[float, float]:
+    """Mean of H where the weight exceeds the floor, and the deviation over the cells of its mean over time."""
+    largest = weight.max(axis=1, keepdims=True) if mask == "snapshot" else weight.max()
+    loud = weight > FLOOR * largest
+    if not loud.any():
+        return 0.0, 0.0
+    count = loud.sum(axis=0)
+    sums = np.where(loud, local, 0.0).sum(axis=0)
+    heard = count > 0
+    return float(sums.sum() / count.sum()), float(np.std(sums[heard] / count[heard]))

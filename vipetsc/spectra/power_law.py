@@ -1,0 +1,135 @@
+"""Power laws y = a x^b by a straight line through the logarithms and by nonlinear least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import curve_fit
+from scipy.special import stdtrit
+
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Fit:
+    """y = ``factor`` x^``exponent``, the adjusted R^2 and the 95 % confidence intervals (low, high) of both.
+
+    R^2 is that of the logarithms for the log-log line, and of the values themselves for the nonlinear fit.
+    """
+
+    factor: float
+    exponent: float
+    r2_adjusted: float
+    factor_interval: tuple[float, float]
+    exponent_interval: tuple[float, float]
+
+    def __call__(self, x: ArrayLike) -> np.ndarray:
+        """The law at ``x``."""
+        return self.factor * np.asarray(x, dtype=float) ** self.exponent
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """Both fits through the same ``points``."""
+
+    log_log: Fit
+    nonlinear: Fit
+    points: int
+
+
+def r2_adjusted(y: ArrayLike, fitted: ArrayLike, parameters: int = 2) -> float:
+    """1 - (1 - R^2)(n - 1)/(n - p) of a fit with p ``parameters``, the constant among them; NaN if y is constant."""
+    y, fitted = np.asarray(y, dtype=float), np.asarray(fitted, dtype=float)
+    scatter = np.sum((y - y.mean()) ** 2)
+    if scatter == 0:
+        return float("nan")
+    return float(1 - np.sum((y - fitted) ** 2) / scatter * (len(y) - 1) / (len(y) - parameters))
+
+
+def _interval(value: float, deviation: float, freedom: int) -> tuple[float, float]:
+    half = float(stdtrit(freedom, 0.5 + LEVEL / 2)) * deviation
+    return value - half, value + half
+
+
+def power_law(x: ArrayLike, y: ArrayLike) -> PowerLaw:
+    """Fit y = a x^b to points (n), both ways.
+
+    The log-log line weighs relative errors alike; the nonlinear fit weighs errors alike and starts from it.
+    Student's t with n - 2 degrees of freedom gives the intervals.
+
+    Raises
+    ------
+    ValueError
+        For fewer than 3 points, fewer than 2 different x, or values that are not positive and finite.
+    """
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    if x.shape != y.shape or x.ndim != 1:
+        raise ValueError(f"power law: x {x.shape} and y {y.shape} are not two lists of the same length")
+    if len(x) < 3 or np.ptp(x) == 0:
+        raise ValueError(f"power law: {len(x)} points at {len(np.unique(x))} places; 3 at 2 places are needed")
+    if not (np.all(x > 0) and np.all(y > 0) and np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
+        raise ValueError("power law: x and y must be positive and finite")
+    freedom = len(x) - 2
+    # Centred and scaled, so that neither fit depends on the units of x and y.
+    lx, ly = np.log(x), np.log(y)
+    cx, cy = lx.mean(), ly.mean()
+    u, v = lx - cx, ly - cy
+    slope = float(u @ v / (u @ u))
+    variance = float(np.sum((v - slope * u) ** 2)) / freedom
+    deviation = np.sqrt(variance / (u @ u))
+    at_one = cy - slope * cx
+    low, high = _interval(at_one, np.sqrt(variance / len(x) + (cx * deviation) ** 2), freedom)
+    line = Fit(
+        float(np.exp(at_one)),
+        slope,
+        r2_adjusted(v, slope * u),
+        (float(np.exp(low)), float(np.exp(high))),
+        _interval(slope, deviation, freedom),
+    )
+    return PowerLaw(line, _nonlinear(u, y / np.exp(cy), slope, cx, cy), len(x))
+
+
+def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float) -> Fit:
+    """Fit w = c exp(b u), c of order 1, and return it as y = a x^b with ln a = cy + ln c - b cx."""
+
+    def law(u: np.ndarray, c: float, b: float) -> np.ndarray:
+        return c * np.exp(b * u)
+
+    def slopes(u: np.ndarray, c: float, b: float) -> np.ndarray:
+        return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
+
+    (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=slopes, ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    freedom = len(u) - 2
+    # The factor's deviation by linear propagation from (c, b) to a.
+    factor = c * np.exp(cy - b * cx)
+    gradient = np.array([factor / c, -cx * factor])
+    return Fit(
+        float(factor),
+        float(b),
+        r2_adjusted(w, law(u, c, b)),
+        _interval(float(factor), float(np.sqrt(gradient @ covariance @ gradient)), freedom),
+        _interval(float(b), float(np.sqrt(covariance[1, 1])), freedom),
+    )
+
+
+def from_peak(x: ArrayLike, y: ArrayLike) -> PowerLaw:
+    """The power law of the points from the largest ``y`` on, in the order of x; raises as ``power_law``."""
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    order = np.argsort(x, kind="stable")
+    x, y = x[order], y[order]
+    if not y.size or np.isnan(y).any():
+        raise ValueError(f"power law: {y.size} points, {np.isnan(y).sum()} of them NaN; drop those first")
+    peak = int(np.argmax(y))
+    return power_law(x[peak:], y[peak:])
+
+
+def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
+    """A curve (n) scaled linearly so that it runs from ``low`` to ``high``; NaN stays, and a constant raises."""
+    y = np.asarray(y, dtype=float)
+    least, most = np.nanmin(y), np.nanmax(y)
+    if not most > least:
+        raise ValueError(f"normalised: the curve is constant, {least:g}")
+    share = (y - least) / (most - least)
+    return low * (1 - share) + high * share

@@ -1,0 +1,168 @@
+"""Morlet wavelets in space: transform, inverse per wavenumber bin, and the equivalent bank of FFT filters.
+
+The wavelet of the node kappa is Psi(kc eta / kappa), Psi(s) = exp(-(s - kc)^2 / 2), over the wavenumbers
+0 < eta <= pi alone (the paper's appendix A, its formulas made consistent). A real signal is twice the real part
+of what its positive wavenumbers make; eta = pi belongs to both signs and counts half on either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft
+
+LOWEST = np.pi / 60
+"""Lowest node in rad per cell; what lies below it belongs to the first bin."""
+
+BINS = 12
+VOICES = 64
+
+Normalisation = Literal["analytic", "dual"]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Wavenumbers ``kappa`` (node) in rad per cell on a log grid, and their common weight dkappa/kappa."""
+
+    kappa: np.ndarray
+    weight: float
+
+    @classmethod
+    def log(cls, kc: float, voices: float = VOICES) -> Nodes:
+        """From pi/60 to pi (1 + 4/kc), both included, with ``voices`` nodes an octave or a few more.
+
+        Raises ValueError below .65 kc voices, where the sum over the nodes would ripple.
+        """
+        if voices < 0.65 * kc:
+            raise ValueError(f"voices = {voices}: kc = {kc} needs at least {0.65 * kc:.3g} an octave")
+        ratio = np.pi * (1 + 4 / kc) / LOWEST
+        steps = int(np.ceil(voices * np.log2(ratio)))
+        kappa = LOWEST * ratio ** (np.arange(steps + 1) / steps)
+        return cls(kappa, float(np.log(ratio) / steps))
+
+    def bins(self, count: int = BINS) -> np.ndarray:
+        """Bin (node) of every node, from 0: edges k pi/count, all nodes above pi in the last."""
+        return np.minimum((self.kappa * count / np.pi).astype(int), count - 1)
+
+
+def window(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
+    """Psi(kc eta/kappa) (kappa, eta), zero for eta <= 0.
+
+    Raises ValueError for ``kc`` below 5: the uncorrected Morlet wavelet then has weight at eta = 0.
+    """
+    if kc < 5:
+        raise ValueError(f"kc = {kc}: the Morlet wavelet is admissible from 5 on")
+    eta = np.asarray(eta, dtype=float)
+    return np.where(eta > 0, np.exp(-0.5 * (kc * eta / np.asarray(kappa)[..., None] - kc) ** 2), 0.0)
+
+
+@lru_cache
+def constant(kc: float) -> float:
+    """C = integral of |Psi(kc e^x)|^2 over x, to rounding (the trapezoidal rule on a smooth bell)."""
+    x = np.linspace(np.log(1e-3), np.log(1 + 7 / kc), 4001)
+    return float(np.sum(np.exp(-((kc * np.exp(x) - kc) ** 2))) * (x[1] - x[0]))
+
+
+def padded_length(cells: int, kc: float, lowest: float = LOWEST) -> int:
+    """Transform length that keeps ``cells`` apart from their periodic images, the next that is fast.
+
+    Room is left for the wavelet of the node ``lowest`` (rad per cell), until its Gaussian envelope
+    exp(-(lowest x / kc)^2 / 2) is below rounding. Within the first ``cells`` the transform is then that of the
+    lattice with rest on either side. Nodes whose band meets pi are cut there and fall off as 1/x only: their
+    tails, below 1/(pi x), go round.
+    """
+    reach = np.sqrt(-2 * np.log(np.finfo(float).eps)) * kc / lowest
+    return fft.next_fast_len(cells + int(np.ceil(reach)), real=True)
+
+
+def wavenumbers(length: int) -> np.ndarray:
+    """Wavenumbers (k) in rad per cell of a real transform of ``length``."""
+    return 2 * np.pi * np.arange(length // 2 + 1) / length
+
+
+def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | None = None) -> np.ndarray:
+    """Complex wavelet transform X (..., kappa, x) of real signals (..., cell), X in the signal's unit.
+
+    X = sqrt(kc/kappa) IFFT[FFT(signal) Psi(kc eta/kappa)] on the line padded to ``length``, by default
+    ``padded_length`` of the lowest node. The lattice is its first ``cells`` columns; the rest is needed to
+    invert it: columns from the end on count backwards from cell 0.
+    """
+    kappa = np.asarray(kappa, dtype=float)
+    cells = signal.shape[-1]
+    length = padded_length(cells, kc, float(kappa.min())) if length is None else length
+    if length < cells:
+        raise ValueError(f"length = {length}: below the {cells} cells of the signal")
+    filters = np.sqrt(kc / kappa)[:, None] * window(kappa, kc, wavenumbers(length))
+    if length % 2 == 0:
+        filters[:, -1] *= 0.5
+    spectrum = np.zeros((*signal.shape[:-1], len(kappa), length), dtype=complex)
+    spectrum[..., : length // 2 + 1] = fft.rfft(signal, length)[..., None, :] * filters
+    return fft.ifft(spectrum, overwrite_x=True)
+
+
+def inverse(x: np.ndarray, nodes: Nodes, kc: float, bins: int = BINS) -> np.ndarray:
+    """Parts (bin, ..., x) of the signals whose transform at ``nodes`` is ``x`` (..., kappa, x), uncropped.
+
+    u_b = 2 Re (1/C) sum over the nodes of bin b of (dkappa/kappa) sqrt(kappa/kc) IFFT[FFT(X) Psi(kc eta/kappa)].
+    The parts sum to the signal but for its mean and the wavenumbers near and below pi/60 (see ``Bank``).
+    """
+    length = x.shape[-1]
+    weights = nodes.weight / constant(kc) * np.sqrt(nodes.kappa / kc)
+    filters = weights[:, None] * window(nodes.kappa, kc, wavenumbers(length))
+    if length % 2 == 0:
+        filters[:, -1] *= 2
+    spectrum = fft.fft(x)[..., : length // 2 + 1] * filters
+    of = nodes.bins(bins)
+    return np.stack([fft.irfft(spectrum[..., of == b, :].sum(axis=-2), length) for b in range(bins)])
+
+
+@dataclass(frozen=True)
+class Bank:
+    """The FFT filters that transform, binning and inverse amount to: a mask of bins does not vary along x.
+
+    ``transfer`` (bin, k) over the wavenumbers of the padded ``length``. "analytic" is
+    T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2: the sum over b is 1
+    within 1 % from about 1.3 pi/60 on, 1/2 at pi/60 and 0 at eta = 0. "dual" divides by that sum, so that the
+    parts add up to the signal to rounding. The quotient is kept to eta >= pi/60, where the sum is at least
+    about 1/2 and the grid reaches beyond pi above; below pi/60 it would share out the tails of far wavelets by
+    their number, so there, the mean included, the first bin has all.
+    """
+
+    transfer: np.ndarray
+    cells: int
+    length: int
+
+    def split(self, signal: np.ndarray) -> np.ndarray:
+        """Parts (bin, ..., cell) of real signals (..., cell), on the lattice alone."""
+        spectrum = fft.rfft(signal, self.length)
+        return np.stack([fft.irfft(t * spectrum, self.length)[..., : self.cells] for t in self.transfer])
+
+
+@lru_cache(maxsize=16)
+def filter_bank(
+    cells: int,
+    kc: float = 6.0,
+    normalisation: Normalisation = "analytic",
+    *,
+    bins: int = BINS,
+    voices: float = VOICES,
+    length: int | None = None,
+) -> Bank:
+    """The bank of ``bins`` filters for lattices of ``cells``, padded to ``length`` (``padded_length``)."""
+    if normalisation not in ("analytic", "dual"):
+        raise ValueError(f"normalisation = {normalisation!r}: analytic or dual")
+    length = padded_length(cells, kc) if length is None else length
+    nodes, eta = Nodes.log(kc, voices), wavenumbers(length)
+    gain = nodes.weight / constant(kc) * window(nodes.kappa, kc, eta) ** 2
+    of = nodes.bins(bins)
+    transfer = np.stack([gain[of == b].sum(axis=0) for b in range(bins)])
+    if normalisation == "dual":
+        low = eta < LOWEST
+        transfer[:, ~low] /= transfer[:, ~low].sum(axis=0)
+        transfer[:, low] = np.arange(bins)[:, None] == 0
+    transfer.flags.writeable = False
+    return Bank(transfer, cells, length)
