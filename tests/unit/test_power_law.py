@@ -81,6 +81,13 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
     assert np.mean(inside) == pytest.approx(0.95, abs=0.04)
 
 
+def test_a_fit_that_runs_away_is_nan():
+    """The last point alone stands out: the steeper the law, the smaller the squares."""
+    law = power_law([1.0, 2.0, 3.0, 3.01], [1e-3, 2e-6, 1e-9, 1.0])
+    assert np.isfinite(law.log_log.exponent)
+    assert np.isnan([law.nonlinear.exponent, law.nonlinear.r2_adjusted, *law.nonlinear.exponent_interval]).all()
+
+
 def test_the_peak_starts_the_decay():
     y = np.where(X < 1, 0.01, X**-0.7)
     order = np.random.default_rng(1).permutation(len(X))
