@@ -60,8 +60,8 @@ class Curves:
 
     @staticmethod
     def there(ensemble: EnsembleFile, name: str = "entropy/energy_weighted") -> bool:
-        """Whether ``ensemble`` holds ``name`` at three amplitudes or more."""
-        amplitudes = AMPLITUDE in ensemble.dimensions and len(ensemble.values(AMPLITUDE)) >= 3
+        """Whether ``ensemble`` holds ``name`` at four amplitudes or more: fewer show neither peak nor power law."""
+        amplitudes = AMPLITUDE in ensemble.dimensions and len(ensemble.values(AMPLITUDE)) >= 4
         return amplitudes and name in ensemble
 
     @cached_property
@@ -143,7 +143,7 @@ class Curves:
 
 def measured(study: Study) -> Iterator[tuple[Curves, bool]]:
     """The ensembles that have entropies, and whether their pictures need the sweep's name."""
-    found = [e for e in study.ensembles if Curves.there(e) and not e.sweep.options.fields]
+    found = [e for e in study.ensembles if Curves.there(e)]
     for ensemble in found:
         yield Curves(ensemble), len(found) > 1
 

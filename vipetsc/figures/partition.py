@@ -37,10 +37,10 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
 
     At 5 pi/9 these are bins 1, 3, 5, 7, 8, 10 and 12 of twelve.
     """
-    place = min(wavenumber * count / np.pi, count - 0.5)
-    own = int(place)
-    neighbour = own + 1 if place - own >= 0.5 else own - 1
-    driven = [b for b in (own, neighbour) if 0 <= b < count]
+    place = wavenumber * count / np.pi
+    own = min(int(place), count - 1)
+    above = own + 1 < count and (place - own >= 0.5 or own == 0)
+    driven = own, own + 1 if above else own - 1
     chosen = [round(b) for b in np.linspace(0, count - 1, min(shown, count))]
     for b in driven:
         if b not in chosen:

@@ -1,0 +1,340 @@
+"""The pictures of wavenumber scattering show what two small sweeps hold: one with full fields, one of curves."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.colors import to_rgba
+from matplotlib.image import imread
+
+from vipetsc.case import Case, Sweep
+from vipetsc.ensembles import EnsembleFile
+from vipetsc.figures import draw_study, study_figures
+from vipetsc.figures.entropy import AVERAGES, COLOURS
+from vipetsc.figures.entropy_time import QUIET
+from vipetsc.figures.partition import bin_colours, shown_bins
+from vipetsc.figures.scattering import KC, snapshot_times
+from vipetsc.figures.series import Wave, in_pi, series_of
+from vipetsc.figures.studies import Study
+from vipetsc.figures.style import GREY, look
+from vipetsc.lattice import bloch
+from vipetsc.records import RunFile
+from vipetsc.spectra import filter_bank, normalised, transform
+from vipetsc.studies.sweep import sweep
+
+CELLS = 40
+BASE = {
+    "lattice": {"preset": "diatomic", "cells": CELLS},
+    "drive": {"band": 2, "wavenumber": "5pi/9", "cycles": 6},
+    "time": {"samples": 121, "rtol": 1e-6},
+}
+WHOLE = {
+    "name": "whole",
+    "contacts": {"sites": 2},
+    "sweep": {"fields": True, "measures": ["entropy"], "drive": {"amplitude": [0.1, 2.0, 20.0]}},
+}
+CURVES = {
+    "name": "curves",
+    "output": {"stride": 4},
+    "sweep": {
+        "measures": ["entropy"],
+        "lattice": {"reading": ["calibrated", "printed"]},
+        "drive": {"wavenumber": ["4pi/9", "5pi/9"], "amplitude": {"log": [0.1, 100.0], "count": 5}},
+        "contacts": {"sites": [2, 3]},
+    },
+}
+OF_FIELDS = ("amplitudes", "wavelets", "partition", "partition_explained", "reconstruction", "entropy_maps")
+OF_CURVES = ("entropy", "entropy_all", "entropy_history")
+
+
+def made(table, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp(table["name"])
+    assert sweep(Sweep.from_table(BASE | table), folder).complete
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    with EnsembleFile(made(WHOLE, tmp_path_factory)) as ensemble:
+        yield ensemble
+
+
+@pytest.fixture(scope="module")
+def curves(tmp_path_factory):
+    with EnsembleFile(made(CURVES, tmp_path_factory)) as ensemble:
+        yield ensemble
+
+
+@pytest.fixture(autouse=True)
+def style():
+    with look():
+        yield
+
+
+def only(name, study):
+    """The one figure of ``name`` that a study yields."""
+    ((_, figure),) = study_figures[name](study)
+    return figure
+
+
+def maps(figure):
+    """The images of a figure in the order they were drawn, colour bars aside."""
+    return [image for axes in figure.axes for image in axes.images]
+
+
+def limits(images):
+    return {image.get_clim() for image in images}
+
+
+def members(ensemble):
+    return [folder for _, folder in ensemble.whole_members()]
+
+
+def test_every_figure_is_drawn_from_files(whole):
+    written = draw_study([whole.folder]) + draw_study([whole.folder], ["amplitudes"], ("pdf",))
+    assert {p.name for p in written} == {f"{name}-calibrated.png" for name in OF_FIELDS} | {"amplitudes-calibrated.pdf"}
+    for path in written:
+        assert path.parent == whole.folder / "figures"
+        assert path.suffix == ".pdf" or np.ptp(imread(path)[..., :3]) > 0.5
+
+
+def test_nothing_is_yielded_where_the_data_lack(whole, curves):
+    for name in OF_FIELDS:
+        assert list(study_figures[name](Study((curves,)))) == []
+        assert list(study_figures[name](Study(()))) == []
+    for name in OF_CURVES:
+        assert list(study_figures[name](Study((whole,)))) == []
+
+
+def test_suffixes_tell_figures_apart(curves):
+    names = [suffix for suffix, _ in study_figures["entropy_history"](Study((curves,)))]
+    assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
+    named = [suffix for suffix, _ in study_figures["entropy_history"](Study((curves, curves)))]
+    assert named[:4] == [f"curves-{name}" for name in names]
+
+
+def test_amplitudes_share_scales_and_show_what_was_measured(whole):
+    figure = only("amplitudes", Study((whole,)))
+    assert (
+        "Calibrated reading, 2 sites, κ* = 5π/9" in figure.get_suptitle() if hasattr(figure, "get_suptitle") else True
+    )
+    panels = [axes for axes in figure.axes if axes.images and axes.get_title(loc="left")]
+    assert len(panels) == 9
+    for row, name in enumerate(("kinetic_energy", "wavenumber_content", "dispersion")):
+        images = [axes.images[0] for axes in panels[3 * row : 3 * row + 3]]
+        assert len(limits(images)) == 1
+        largest = 0.0
+        for image, folder, amplitude in zip(images, members(whole), (0.1, 2.0, 20.0), strict=True):
+            with h5py.File(folder / "analysis.h5") as file:
+                expected = file[name][...].T / amplitude**2
+            np.testing.assert_allclose(image.get_array(), expected, rtol=1e-12)
+            largest = max(largest, expected.max())
+        assert images[0].get_clim()[1] == pytest.approx(largest)
+    case = whole.case((0,))
+    cell = case.model().chain.cell
+    for axes in panels[6:]:
+        for branch in range(2):
+            kappa, frequency = axes.lines[branch].get_data()
+            assert axes.lines[branch].is_dashed()
+            np.testing.assert_allclose(
+                1e3 * frequency, bloch(case.model().chain.cell, np.pi * kappa).frequency[:, branch]
+            )
+    for axes in panels[:3]:
+        marks = next(line for line in axes.lines if line.get_marker() == ">")
+        assert list(marks.get_ydata()) == case.contacts.sites
+
+
+def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
+    figure = only("wavelets", Study((whole,)))
+    panels = np.reshape([axes for axes in figure.axes if axes.images], (4, 3))
+    assert len(limits([axes.images[0] for axes in panels.flat])) == 1
+    for axes in panels.flat:
+        black = next(line for line in axes.lines if to_rgba(line.get_color()) == (0, 0, 0, 1))
+        np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
+    for row in panels:
+        assert len({axes.texts[0].get_text() for axes in row}) == 1
+    (series,) = [snapshot_times(series) for series in series_of(Study((whole,)))]
+    assert np.all(np.diff(series) > 0)
+    with RunFile(members(whole)[2] / "run.h5") as run:
+        site = np.min(run.site_cells)
+        wave = Wave.of(run.case)
+        assert series[1] - series[0] == pytest.approx(0.5 * (site - 1) / wave.speed)
+        at = int(np.argmin(np.abs(run.field_time - series[1])))
+        host = run.velocity[at, :, 0]
+    kappa = np.pi * np.arange(1, 121) / 120
+    expected = np.abs(transform(host, kappa, KC)[:, :CELLS]) / 20.0
+    np.testing.assert_allclose(panels[1, 2].images[0].get_array(), expected, rtol=1e-12)
+
+
+def test_bins_shown_at_the_papers_wavenumber():
+    assert [b + 1 for b in shown_bins(5 * np.pi / 9, 12)] == [1, 3, 5, 7, 8, 10, 12]
+
+
+@given(st.floats(1e-3, 1.0), st.integers(3, 24), st.integers(3, 9))
+def test_bins_shown_hold_the_driven_ones(share, count, shown):
+    bins = shown_bins(share * np.pi, count, shown)
+    assert len(bins) == min(shown, count)
+    assert bins == sorted(set(bins))
+    assert bins[0] >= 0
+    assert bins[-1] < count
+    own = min(int(share * count), count - 1)
+    assert own in bins
+    assert own - 1 in bins or own + 1 in bins
+
+
+def test_partition_shows_seven_bins_and_all_colours(whole):
+    figure = only("partition", Study((whole,)))
+    with h5py.File(members(whole)[1] / "analysis.h5") as file:
+        field = file["partition/kinetic_energy"][...]
+    bins = shown_bins(5 * np.pi / 9, 12)
+    images = maps(figure)[:7]
+    assert len(limits(images)) == 1
+    assert images[0].get_clim()[1] == pytest.approx(field[bins].max())
+    for b, image in zip(bins, images, strict=True):
+        assert image.axes.get_title(loc="left").endswith(f"$K_{{{b + 1}}}$")
+        np.testing.assert_array_equal(image.get_array(), field[b].T)
+    (band,) = [axes for axes in figure.axes if "Band 2" in axes.get_title(loc="left")]
+    segments = [line for line in band.lines if line.get_linewidth() == 3]
+    for line, colour in zip(segments, bin_colours(12), strict=True):
+        np.testing.assert_allclose(to_rgba(line.get_color()), colour)
+        kappa, frequency = line.get_data()
+        expected = bloch(whole.case((0,)).model().chain.cell, np.pi * kappa).frequency[:, 1]
+        np.testing.assert_allclose(1e3 * frequency, expected)
+    panels = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("(b.")]
+    assert [bool(axes.collections) for axes in panels] == [True] * 3
+
+
+def test_explained_inverse_is_the_filter_banks(whole):
+    figure = only("partition_explained", Study((whole,)))
+    by_title = {axes.get_title(loc="left"): axes for axes in figure.axes if axes.get_title(loc="left")}
+    snapshot = next(axes for title, axes in by_title.items() if title.startswith("(a)")).lines[0].get_ydata()
+    parts = filter_bank(CELLS).split(np.array(snapshot))
+    bins = shown_bins(5 * np.pi / 9, 12, 4)
+    for row, b in enumerate(reversed(bins)):
+        trace = next(axes for title, axes in by_title.items() if title.endswith(f"(m/s) of $K_{{{b + 1}}}$"))
+        np.testing.assert_allclose(trace.lines[0].get_ydata(), parts[b], atol=1e-10 * np.abs(snapshot).max())
+        assert f"(c.{('i', 'ii', 'iii', 'iv')[row]})" in trace.get_title(loc="left")
+
+
+def test_reconstruction_shows_energies_error_and_cross_terms(whole):
+    figure = only("reconstruction", Study((whole,)))
+    grid = np.reshape(figure.axes, (3, 3))
+    for column, (folder, amplitude) in enumerate(zip(members(whole), (0.1, 2.0, 20.0), strict=True)):
+        with h5py.File(folder / "analysis.h5") as file:
+            found = {name: data[...] for name, data in file["partition"].items()}
+        energy, error, cross = grid[:, column]
+        lines = [line.get_ydata() * amplitude**2 for line in energy.lines]
+        for line, expected in zip(
+            lines, (found["kinetic"], found["reconstructed"], found["energy"].sum(0)), strict=True
+        ):
+            np.testing.assert_allclose(line, expected, rtol=1e-12)
+        moving = found["error"] > 0
+        np.testing.assert_array_equal(error.lines[0].get_ydata()[moving], found["error"][moving])
+        assert list(error.lines[1].get_ydata()) == [0.01, 0.01]
+        np.testing.assert_array_equal(cross.lines[0].get_ydata(), found["cross_share"])
+        late = found["kinetic"] > 0.5 * found["kinetic"].max()
+        share = 1 - found["energy"].sum(0)[late] / found["kinetic"][late]
+        np.testing.assert_allclose(cross.lines[0].get_ydata()[late], share, rtol=1e-9)
+
+
+@pytest.mark.parametrize("average", AVERAGES)
+def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
+    figures = dict(study_figures["entropy"](Study((curves,))))
+    assert len(figures) == 2 * 2 * len(AVERAGES)
+    figure = figures[f"calibrated-5pi-9-{average}"]
+    grid = np.reshape(figure.axes, (2, 2))
+    fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9}
+    for column, sites in enumerate((2, 3)):
+        raw = curves.curve(f"entropy/{average}", "amplitude", sites=sites, **fixed)
+        error = curves.curve("entropy/error", "amplitude", sites=sites, **fixed)
+        reading, wavenumber, _, place = curves.place(sites=sites, **fixed)
+        fit = {k: v[reading, wavenumber, place] for k, v in curves.file[f"fits/entropy/{average}"].items()}
+        for axes in grid[:, column]:
+            (bars,) = axes.containers
+            line, _, (sticks,) = bars.lines
+            np.testing.assert_allclose(line.get_xdata(), curves.values("amplitude"))
+            np.testing.assert_allclose(line.get_ydata(), normalised(raw))
+            assert to_rgba(line.get_color()) == to_rgba(COLOURS[average])
+            halves = [0.5 * np.ptp(segment[:, 1]) for segment in sticks.get_segments()]
+            np.testing.assert_allclose(halves, 0.99 * error / np.ptp(raw))
+        upper, lower = grid[:, column]
+        assert (upper.get_yscale(), lower.get_xscale(), lower.get_yscale()) == ("linear", "log", "log")
+        assert upper.get_title(loc="left") == f"{sites} sites"
+        thick = [line for line in lower.lines if line.get_linewidth() == 2]
+        if np.isfinite(fit["factor"]):
+            x, y = thick[0].get_data()
+            assert x[0] == pytest.approx(fit["peak_amplitude"])
+            assert len(x) == fit["points"]
+            np.testing.assert_allclose(y, fit["factor"] * x ** fit["exponent"])
+            assert f"{fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})" in lower.texts[0].get_text()
+        else:
+            assert not thick
+            assert lower.texts[0].get_text() == "no power law"
+        printed = curves.curve(f"entropy/{average}", "amplitude", sites=sites, **fixed | {"reading": "printed"})
+        grey = [line for line in lower.lines if line.get_color() == GREY]
+        np.testing.assert_allclose(grey[0].get_ydata(), normalised(printed))
+        faint = {line.get_color() for line in upper.lines if line.get_alpha() == 0.5}
+        assert faint == {colour for name, colour in COLOURS.items() if name != average}
+
+
+def test_some_configuration_has_a_power_law(curves):
+    assert np.isfinite(curves.values("fits/entropy/energy_weighted/factor")).any()
+
+
+def test_all_panels_by_wavenumber_and_configuration(curves):
+    figures = dict(study_figures["entropy_all"](Study((curves,))))
+    assert len(figures) == 2 * len(AVERAGES)
+    grid = np.reshape(figures["printed-masked"].axes, (2, 2))
+    assert [axes.get_ylabel() for axes in grid[:, 0]] == ["κ* = 4π/9", "κ* = 5π/9"]
+    for row, wavenumber in enumerate(curves.values("wavenumber")):
+        for column, sites in enumerate((2, 3)):
+            raw = curves.curve("entropy/masked", "amplitude", reading="printed", wavenumber=wavenumber, sites=sites)
+            line = grid[row, column].containers[0].lines[0]
+            np.testing.assert_allclose(line.get_ydata(), normalised(raw))
+
+
+def test_entropy_maps_leave_quiet_cells_blank(whole):
+    figure = only("entropy_maps", Study((whole,)))
+    images = maps(figure)
+    assert len(limits(images)) == 1
+    overs = [axes for axes in figure.axes if any(line.get_label() == "H(t)" for line in axes.lines)]
+    for image, over, folder in zip(images, overs, members(whole), strict=True):
+        with h5py.File(folder / "analysis.h5") as file:
+            local, weight = file["entropy/local"][...].T, file["entropy/weight"][...].T
+            history, start = file["entropy/history"][...], file["entropy"].attrs["start"]
+        shown = np.ma.filled(image.get_array(), np.nan)
+        loud = weight > QUIET * weight.max()
+        np.testing.assert_array_equal(shown[loud], local[loud])
+        assert np.isnan(shown[~loud]).all()
+        assert (~loud).any()
+        lines = {line.get_label(): line for line in over.lines}
+        np.testing.assert_array_equal(lines["H(t)"].get_ydata(), history)
+        assert list(lines["averages begin"].get_xdata()) == [start, start]
+        assert over.get_ylim() == pytest.approx(image.get_clim())
+
+
+def test_entropy_history_is_an_image_over_amplitude(curves):
+    figure = dict(study_figures["entropy_history"](Study((curves,))))["calibrated-5pi-9"]
+    for axes, sites in zip(figure.axes, (2, 3), strict=False):
+        mesh = axes.collections[0]
+        fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9, "sites": sites}
+        expected = curves.curve("entropy/history", "amplitude", **fixed)
+        np.testing.assert_array_equal(np.reshape(mesh.get_array(), expected.shape), expected)
+        assert mesh.get_rasterized()
+        touched = curves.values("amplitude")[curves.curve("contact_episodes", "amplitude", **fixed) > 0].min()
+        onset = next(line for line in axes.lines if line.get_linestyle() == ":")
+        assert 0.1 < onset.get_ydata()[0] < touched
+
+
+def test_wavenumbers_in_pi():
+    assert [in_pi(x * np.pi) for x in (5 / 9, 1 / 3, 1, 2, 0.1234567)] == ["5π/9", "π/3", "π", "2π", "0.123π"]
+
+
+def test_a_drive_in_a_gap_has_no_wave():
+    case = {"lattice": {"preset": "diatomic", "cells": 20}, "drive": {"frequency": 600.0}, "time": {"end": 0.1}}
+    assert Wave.of(Case.from_table(case)) is None
+    driven = Wave.of(Case.from_table({"lattice": {"preset": "diatomic"}, "drive": BASE["drive"]}))
+    assert (driven.band, driven.wavenumber) == (2, pytest.approx(5 * np.pi / 9))
