@@ -139,9 +139,7 @@ def test_amplitudes_share_scales_and_show_what_was_measured(whole):
         for branch in range(2):
             kappa, frequency = axes.lines[branch].get_data()
             assert axes.lines[branch].is_dashed()
-            np.testing.assert_allclose(
-                1e3 * frequency, bloch(case.model().chain.cell, np.pi * kappa).frequency[:, branch]
-            )
+            np.testing.assert_allclose(1e3 * frequency, bloch(cell, np.pi * kappa).frequency[:, branch])
     for axes in panels[:3]:
         marks = next(line for line in axes.lines if line.get_marker() == ">")
         assert list(marks.get_ydata()) == case.contacts.sites

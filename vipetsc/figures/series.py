@@ -58,10 +58,14 @@ class WholeRun:
 
 @dataclass(frozen=True)
 class Series:
-    """One configuration at a low, a medium and a high amplitude; ``suffix`` tells it from the others of a study."""
+    """One configuration at a low, a medium and a high amplitude.
+
+    ``suffix`` tells it from the others of a study; ``words`` are the values of what else the sweep varies.
+    """
 
     suffix: str
     runs: tuple[WholeRun, WholeRun, WholeRun]
+    words: tuple[str, ...] = ()
 
     @property
     def case(self) -> Case:
@@ -75,9 +79,9 @@ class Series:
 
     @property
     def title(self) -> str:
-        """Reading, sites and wavenumber in words."""
+        """Reading, sites and wavenumber in words, and what else the sweep varies."""
         sites = len(self.case.contacts.sites)
-        parts = [f"{self.case.lattice.reading.capitalize()} reading", counted(sites, "site")]
+        parts = [f"{self.case.lattice.reading.capitalize()} reading", *self.words, counted(sites, "site")]
         return ", ".join(parts + ([f"κ* = {in_pi(self.wave.wavenumber)}"] if self.wave else []))
 
     def headings(self) -> Iterator[tuple[int, WholeRun, str]]:
@@ -97,7 +101,8 @@ def series_of(study: Study, *needed: str) -> Iterator[Series]:
             with ExitStack() as stack:
                 runs = tuple(_opened(stack, *pair) for pair in places)
                 if all("velocity" in r.run.file and all(name in r.analysis for name in needed) for r in runs):
-                    yield Series(suffix(ensemble, places[0][0], len(found) > 1), runs)
+                    place = places[0][0]
+                    yield Series(suffix(ensemble, place, len(found) > 1), runs, _words(ensemble, place))
 
 
 def _trios(ensemble: EnsembleFile) -> list[tuple[tuple[tuple[int, ...], Path], ...]]:
@@ -138,6 +143,13 @@ def suffix(
         if name != AMPLITUDE and told and (kept is None or name in kept):
             parts.append(_word(name, values[index]))
     return "-".join(parts)
+
+
+def _words(ensemble: EnsembleFile, place: tuple[int, ...]) -> tuple[str, ...]:
+    """Values at ``place`` of the dimensions that a title does not name otherwise."""
+    named = (AMPLITUDE, "reading", "wavenumber", "sites")
+    varied = [(n, ensemble.values(n)[i]) for n, i in zip(ensemble.dimensions, place, strict=True) if n not in named]
+    return tuple(value if isinstance(value, str) else f"{name} {value:g}" for name, value in varied)
 
 
 def _word(name: str, value: Any) -> str:
