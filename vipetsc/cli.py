@@ -280,6 +280,15 @@ def _plot_design(folder: Path, names: list[str] | None, formats: tuple[str, ...]
     return DONE
 
 
+def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
+    from vipetsc.studies.again import analyse_again
+
+    for path in analyse_again(options.path, comm):
+        _say(comm, f"  {path}")
+    return DONE
+
+
 def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Pictures of a finished run again, from its files."""
     from vipetsc.figures import draw, run_figures
@@ -346,6 +355,10 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE if healthy else FAILED
 
 
+def _runs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", type=Path, nargs="+", metavar="PATH", help="folder of a run or of a sweep, or a run.h5")
+
+
 def _swept(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("case", metavar="CASE", help="case file (TOML) with a section [sweep]")
     _overrides(parser)
@@ -363,6 +376,7 @@ VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
     "sweep": (sweep, "every combination in [sweep]; goes on where it was", (_swept, _folder)),
     "nnm": (nnm, "nonlinear normal modes: frequency-energy branches", (_branches, _folder, _resume)),
     "design": (design, "the (lambda, eta) search of the four-band cell", (_case, _folder)),
+    "analyse": (analyse, "measures of runs already made, from their files", (_runs,)),
     "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),
     "doctor": (doctor, "versions and what is missing", ()),
 }

@@ -205,3 +205,27 @@ def test_full_fields_on_request(vipetsc, case, tmp_path):
     assert measured["partition/energy"].shape[0] == 12
     assert measured["entropy/local"].shape == (301, 40)
     assert measured["partition/kinetic"] == pytest.approx(measured["kinetic_energy"].sum(axis=1), rel=1e-12)
+
+
+def test_measures_again_from_files(vipetsc, case, tmp_path):
+    out = tmp_path / "out"
+    keys = (
+        "--set",
+        "sweep.fields=true",
+        "--set",
+        "sweep.drive.amplitude=[0.1, 5.0]",
+        "--set",
+        "sweep.contacts.sites=[2]",
+    )
+    assert vipetsc(0, "sweep", case, "--out", out, *keys).returncode == 0
+    before = {p: datasets(p) for p in [*out.glob("*/analysis.h5"), out / "ensemble.h5"]}
+    for path in before:
+        path.unlink()
+    ended = vipetsc(2, "analyse", out)
+    assert ended.returncode == 0, ended.stderr
+    assert len(before) == 3
+    for path, found in before.items():
+        assert_same_bits(found, datasets(path))
+    nothing = vipetsc(0, "analyse", tmp_path)
+    assert nothing.returncode == 2
+    assert "holds no run.h5" in nothing.stderr
