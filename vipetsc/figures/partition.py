@@ -24,7 +24,7 @@ SHOWN = 7
 DECADES = 4
 LEVEL = 0.003  # of the loudest bin: where the contours lie
 FIELD = "partition/kinetic_energy"
-BLUR = 3.0, 6.0  # snapshots and cells over which the carrier's beat is smoothed before contours are drawn
+BLUR = 0.006, 0.01  # of all snapshots and cells: the carrier's beat is smoothed out before contours are drawn
 
 
 def bin_colours(count: int) -> np.ndarray:
@@ -102,13 +102,15 @@ def _contours(axes: Axes, member: WholeRun, colours: np.ndarray) -> None:
     """Every bin where its energy exceeds ``LEVEL`` of the loudest bin's, filled and outlined in its colour."""
     field, cells = member.analysis[FIELD], member.analysis["cell"][...]
     time = member.analysis["partition/snapshot"][...]
-    smooth = [gaussian_filter(field[b], BLUR, mode="nearest")[:, ::2] for b in range(len(field))]
+    step = max(1, len(cells) // 300)
+    widths = [share * length for share, length in zip(BLUR, (len(time), len(cells)), strict=True)]
+    smooth = [gaussian_filter(field[b], widths, mode="nearest")[:, ::step] for b in range(len(field))]
     largest = max(float(s.max()) for s in smooth)
     # The loudest lie beneath, so that what is scattered out of them is seen.
     for b in sorted(range(len(smooth)), key=lambda b: -smooth[b].sum()):
         if smooth[b].max() > LEVEL * largest > 0:
-            axes.contourf(time, cells[::2], smooth[b].T, [LEVEL * largest, np.inf], colors=[colours[b]], alpha=0.35)
-            axes.contour(time, cells[::2], smooth[b].T, [LEVEL * largest], colors=[colours[b]], linewidths=0.6)
+            axes.contourf(time, cells[::step], smooth[b].T, [LEVEL * largest, np.inf], colors=[colours[b]], alpha=0.35)
+            axes.contour(time, cells[::step], smooth[b].T, [LEVEL * largest], colors=[colours[b]], linewidths=0.6)
     mark_sites(axes, member, "y", style.GREY)
     axes.set(xlim=time[[0, -1]], ylim=cells[[0, -1]])
 

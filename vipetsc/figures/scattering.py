@@ -151,7 +151,8 @@ def _wavelets(series: Series) -> Figure:
             image = style.draw_map(axes, member.run.cells, kappa / np.pi, fields[column][row], norm, "magma_r")
             axes.axhline(series.wave.wavenumber / np.pi, color=style.BLACK, lw=0.7)
             mark_sites(axes, member, "x", style.GREY)
-            axes.text(0.97, 0.94, f"t = {shown[column][row]:.3g} s", transform=axes.transAxes, ha="right", va="top")
+            axes.text(0.97, 0.94, f"t = {shown[column][row]:.3g} s", transform=axes.transAxes, ha="right", va="top",
+                      bbox={"facecolor": "white", "alpha": 0.6, "lw": 0, "pad": 1.0})  # fmt: skip
             text = f"({'abc'[column]}.{ROMAN[row]}) {name}"
             style.letter(axes, text if row else f"{heading}\n{text}")
     grid[0, 0].set(ylim=(0, 1))
