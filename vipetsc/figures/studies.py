@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
 from vipetsc.figures.registry import save
+from vipetsc.figures.transfer import transfer
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,12 @@ class Study:
 
 # Each draws what its data allow: pairs of a suffix for the file's name ("" for none) and a figure.
 StudyFigure = Callable[[Study], Iterator[tuple[str, Figure]]]
-study_figures: dict[str, StudyFigure] = {f.__name__: f for f in ()}
+study_figures: dict[str, StudyFigure] = {
+    f.__name__: f
+    for f in (
+        transfer,
+    )  # fmt: skip
+}
 
 
 def draw_study(
