@@ -92,7 +92,7 @@ class EnsembleFile:
         return json.loads((self.folder / "index.json").read_text(encoding="utf-8"))
 
     def member(self, place: tuple[int, ...]) -> Path:
-        """Folder of the member at ``place``: ``run.h5``, ``analysis.h5``, ``summary.json``; ``folder`` if it has none."""
+        """Folder of the member at ``place``: ``run.h5``, ``analysis.h5``, ``summary.json``; else ``folder``."""
         row = self.index["members"][int(np.ravel_multi_index(place, self.sweep.shape))]
         return self.folder / row["id"]
 

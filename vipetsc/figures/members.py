@@ -40,12 +40,11 @@ def title(case: Case) -> str:
     return f"{law_name(case)}, {case.lattice.reading}, {configuration(case)}, {case.drive.amplitude:.4g} N"
 
 
-def stem(case: Case, *, amplitude: bool = True) -> str:
-    """A file name's part that tells the members of a study apart: law, reading, configuration, amplitude."""
-    parts = [case.contacts.law, case.lattice.reading]
-    sites = len(case.contacts.sites)
-    parts.append(f"{sites}-site{'s' if sites != 1 else ''}")
-    parts.append(f"{case.drive.cycles:g}-cycles")
-    if amplitude:
-        parts.append(f"{case.drive.amplitude:.4g}N")
-    return "-".join(parts)
+def configuration_stem(case: Case) -> str:
+    """Reading and configuration in a file's name, such as "calibrated-5-sites-30-cycles"."""
+    return f"{case.lattice.reading}-{configuration(case)}".replace(",", "").replace(" ", "-")
+
+
+def stem(case: Case) -> str:
+    """A member in a file's name: law, reading, configuration, amplitude."""
+    return f"{case.contacts.law}-{configuration_stem(case)}-{case.drive.amplitude:.4g}N"

@@ -12,8 +12,13 @@ from matplotlib.figure import Figure
 
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
+from vipetsc.figures.band_energies import band_energies
+from vipetsc.figures.regimes import phase_regimes
 from vipetsc.figures.registry import save
 from vipetsc.figures.transfer import transfer
+from vipetsc.figures.transfer_backbone import ibtet_backbone
+from vipetsc.figures.transfer_curves import ibtet
+from vipetsc.figures.transfer_dispersions import transfer_dispersions
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,12 @@ study_figures: dict[str, StudyFigure] = {
     f.__name__: f
     for f in (
         transfer,
-    )  # fmt: skip
+        transfer_dispersions,
+        band_energies,
+        ibtet,
+        ibtet_backbone,
+        phase_regimes,
+    )
 }
 
 

@@ -28,7 +28,7 @@ ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
 
 
 def transfer(study: Study) -> Iterator[tuple[str, Figure]]:
-    """Energy in space-time, whole and by pass band; dispersion and spectra before and behind the sites; a member each."""
+    """For every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for run, analysis in transfer_members(study):
         if "velocity" in run.file and {"kinetic_energy", *SEGMENTS} <= analysis.keys():
             yield stem(run.case), nine_panels(run, analysis)
