@@ -92,9 +92,9 @@ def _curve(axes: Axes, portraits: Sequence[Portrait], curve: TransferCurve | Non
     for number, portrait in enumerate(portraits, 1):
         at = portrait.case.drive.amplitude, portrait.ibtet
         axes.plot(*at, "o", color=RED, ms=4, zorder=3)
-        axes.annotate(str(number), at, (0, 5), textcoords="offset points", ha="center", fontsize=7.5, color=RED)
+        axes.annotate(str(number), at, (4, 3), textcoords="offset points", ha="left", fontsize=7.5, color=RED)
     axes.set(xscale="log", yscale="log", xlabel="Amplitude of the drive (N)", ylabel="Inter-band transfer (1)")
-    axes.margins(y=0.12)
+    axes.margins(x=0.08, y=0.12)
     style.letter(axes, "Transfer to higher bands")
 
 

@@ -66,13 +66,14 @@ def _superposition(axes: Axes, group: h5py.Group) -> None:
     # Region I goes on to the left: below the first point of the branch its slope is zero as well.
     whole = np.append(left, place), about["floor"] + np.append(0.0, scaled)
     axes.plot(*whole, color=style.GREY, lw=2.2, alpha=0.55, label="slope + floor")
-    bare = np.where(scaled > 0, scaled, np.nan)
-    axes.plot(place, bare, color=style.BLACK, lw=0.8, ls=(0, (4, 2)), label="slope df/dE")
+    bare, text = np.where(scaled > 0, scaled, np.nan), f"slope, $E^{{{about['slope_exponent']:.2f}}}$ there"
+    axes.plot(place, bare, color=style.BLACK, lw=0.8, ls=(0, (4, 2)), label=text)
     axes.plot(energy, ibtet, "-o", color=style.BLUE, ms=2.6, mfc="white", mew=0.6, lw=0.6, label="lattice")
     axes.plot(energy[fitted], ibtet[fitted], "o", color=RED, ms=2.8, label="in region III")
     law = about["factor"] * energy[fitted] ** about["exponent"]
-    axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4,
-              label=f"$E^{{{about['exponent']:.2f}}}$, adj. $R^2$ {about['r2_adjusted']:.3f} (slope $E^{{{about['slope_exponent']:.2f}}}$)")  # fmt: skip
+    exponent, adjusted = about["exponent"], about["r2_adjusted"]
+    text = f"$E^{{{exponent:.2f}}}$, adj. $R^2$ {adjusted:.3f}"
+    axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4, label=text)
     axes.set(xscale="log", yscale="log", xlabel="Normalised energy (J)")
     axes.set_xlim(left, 2 * energy.max())
     axes.set_ylim(0.25 * about["floor"], 4.0)

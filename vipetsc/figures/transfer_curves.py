@@ -66,7 +66,7 @@ def _curves(ensemble: EnsembleFile) -> Iterator[TransferCurve]:
 
 
 def ibtet(study: Study) -> Iterator[tuple[str, Figure]]:
-    """Transfer against amplitude, the paper's Fig. Ejump, one page a reading: laws in columns, linear and log-log scales in rows."""
+    """The paper's Fig. Ejump, one page a reading: laws in columns, linear and log-log scales in rows."""
     pages: dict[str, list[TransferCurve]] = {}
     for curve in transfer_curves(study):
         pages.setdefault(curve.case.lattice.reading, []).append(curve)
