@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from vipetsc.case import Case
 from vipetsc.figures import style
@@ -79,7 +80,7 @@ def _page(portraits: Sequence[Portrait], curve: TransferCurve | None) -> Figure:
         _portrait(axes, portrait, number)
     for axes in panels[len(portraits) :]:
         axes.set_axis_off()
-    keys = [panels[-1].plot([], [], color=c, label=n)[0] for c, n in ((RED, "host"), (style.BLUE, "resonator"))]
+    keys = [Line2D([], [], color=c, label=n) for c, n in ((RED, "host"), (style.BLUE, "resonator"))]
     spare = len(portraits) < len(panels)
     title = f"{PERIODS} periods of the drive\nabout the largest $|w|$" if spare else None
     panels[-1].legend(handles=keys, loc="center" if spare else "upper right", title=title, title_fontsize=6.5)

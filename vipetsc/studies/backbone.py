@@ -71,21 +71,26 @@ class Slope:
 
 @dataclass(frozen=True)
 class Initiation:
-    """What the linear wave needs to touch the first site: ``amplitude`` in N, ``energy`` (drive's work) in J."""
+    """What the linear wave needs to touch the first site: ``amplitude`` in N, ``energy`` (drive's work) in J.
+
+    ``onset`` in N touches any site; it is lower where sites behind the first have smaller clearances.
+    """
 
     amplitude: float
     energy: float
+    onset: float
 
     @classmethod
-    def of(cls, envelope: float, clearance: float, work: float) -> Initiation:
-        """From the linear run at 1 N: largest w in m at the first site, and the drive's work in J.
+    def of(cls, envelope: np.ndarray, clearance: np.ndarray, first: int, work: float) -> Initiation:
+        """From the linear run at 1 N: largest w (site) in m, and the drive's work in J; ``first`` is a site.
 
         Until the first contact the lattice is linear, so w grows with the amplitude and the work with its
-        square; the smallest amplitude that touches is ``clearance`` / ``envelope``. The envelope is that of
+        square; the smallest amplitude that touches a site is ``clearance`` / ``envelope``. The envelope is that of
         w^2 + (w'/Om)^2, so it does not depend on where the samples fall.
         """
-        amplitude = clearance / envelope
-        return cls(amplitude, work * amplitude**2)
+        touching = np.asarray(clearance) / envelope
+        amplitude = float(touching[first])
+        return cls(amplitude, work * amplitude**2, float(touching.min()))
 
 
 @dataclass(frozen=True)
@@ -151,7 +156,7 @@ def initiation_of(ensemble: EnsembleFile, case: Case) -> Initiation:
         work = float(run.energies["work"][-1])
     sites = np.asarray(case.contacts.sites)
     first = int(np.argmin(np.abs(sites - case.drive.cell)))
-    return Initiation.of(float(wave.envelope[sites[first] - 1]), case.contacts.clearance[first], work)
+    return Initiation.of(wave.envelope[sites - 1], np.asarray(case.contacts.clearance), first, work)
 
 
 def relate(ensemble: EnsembleFile, branches: Sequence[Path]) -> Path | None:
@@ -236,6 +241,7 @@ def _fill(group: h5py.Group, found: Alignment, initiation: Initiation, floor: fl
         "grazing_energy": slope.grazing,
         "initiation_amplitude": initiation.amplitude,
         "initiation_energy": initiation.energy,
+        "onset_amplitude": initiation.onset,
         "floor": floor,
         "divisor": found.divisor,
         "exponent": found.law.exponent,
