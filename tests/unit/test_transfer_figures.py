@@ -142,6 +142,8 @@ def test_backbone_is_aligned_exactly(reduced):
         case, _ = next(ensemble.curves())
         start = initiation_of(ensemble, case)
         work = ensemble.curve("work", "amplitude", law="hertz")
+        touched = ensemble.curve("contact_episodes", "amplitude", law="hertz") > 0
+    np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)
     assert about["initiation_energy"] == start.energy and about["onset_amplitude"] == start.amplitude
     # Work grows with the amplitude's square until the first contact comes back to the drive.
     assert start.energy / start.amplitude**2 == pytest.approx(work[0], rel=1e-6)

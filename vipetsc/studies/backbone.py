@@ -60,7 +60,7 @@ class Slope:
         if not touched.size or touched[0] == 0:
             raise ValueError(f"{path}: the branch does not pass from region I to II; follow it to higher energy")
         regular = kind == 0
-        law, reading = table["contacts"]["law"], table["lattice"]["reading"]
+        law, reading = table.get("contacts", {}).get("law", ""), table.get("lattice", {}).get("reading", "")
         grazing = float(energy[touched[0] - 1])
         return cls(law, reading, energy[regular], slope[regular], region[regular], grazing)
 
@@ -188,6 +188,9 @@ def relate(ensemble: EnsembleFile, branches: Sequence[Path]) -> Path | None:
             own = [s for s in own if s.reading == reading] or own
             episodes, ibtet = ensemble.values("contact_episodes")[index], ensemble.values("ibtet")[index]
             untouched = ibtet[episodes == 0]
+            if name in file:
+                left_out.append(f"{name}: another curve has the same law, reading, sites and cycles")
+                continue
             if not own or not untouched.size:
                 left_out.append(f"{name}: " + ("no member without contact" if own else f"no branch of the law {law}"))
                 continue
