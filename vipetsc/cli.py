@@ -66,7 +66,7 @@ def _parser() -> Parser:
 
 
 def _case(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("case", nargs="?", metavar="CASE", help="case file (TOML); the built-in case if left out")
+    parser.add_argument("case", nargs="?", metavar="CASE", help="case file (TOML); the built-in one if left out")
     _overrides(parser)
 
 
@@ -84,7 +84,7 @@ def _out(parser: argparse.ArgumentParser) -> None:
 
 def _folder(parser: argparse.ArgumentParser) -> None:
     _out(parser)
-    parser.add_argument("--force", action="store_true", help="replace the run in the output folder")
+    parser.add_argument("--force", action="store_true", help="replace the results in the output folder")
 
 
 def _resume(parser: argparse.ArgumentParser) -> None:
@@ -97,8 +97,8 @@ def _json(parser: argparse.ArgumentParser) -> None:
 
 def _plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "path", type=Path, nargs="+", metavar="PATH", help="a run's folder or its run.h5; or folders of branches,"
-        " whose branches of one name share a page"
+        "path", type=Path, nargs="+", metavar="PATH", help="folder of a run or a search, or its run.h5, design.h5;"
+        " or folders of branches, whose branches of one name share a page"
     )  # fmt: skip
     parser.add_argument("--fig", action="append", metavar="NAME", help="only this figure; may be repeated")
     parser.add_argument("--format", action="append", choices=("png", "pdf"), help="png if left out; may be repeated")
@@ -243,6 +243,52 @@ def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE
 
 
+def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """The (lambda, eta) search of the four-band cell: ``design.h5``, its pictures, a table of the optima."""
+    from vipetsc.case.design import DesignCase
+
+    def seek() -> str:
+        from vipetsc.figures import draw_design
+        from vipetsc.studies.design import design
+
+        try:
+            case = DesignCase.load(options.case, options.set)
+        except OSError as error:
+            raise FolderError(f"{options.case}: {error.strerror}; a case file (TOML) is needed") from None
+        folder = options.out or Path("runs") / case.name
+        table = design(case, folder, options.force)
+        return "\n".join([table, *(f"  {path}" for path in draw_design(folder))])
+
+    _say(comm, on_root(comm, seek))
+    return DONE
+
+
+def _plot_design(folder: Path, names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm) -> int:
+    """Pictures of the search in ``folder`` again."""
+    from vipetsc.figures import design_figures, draw_design
+
+    def redraw() -> str:
+        unknown = set(names or []) - set(design_figures)
+        if unknown:
+            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(design_figures)}")
+        try:
+            return "\n".join(map(str, draw_design(folder, names, formats)))
+        except (OSError, KeyError) as error:
+            raise FolderError(f"{folder / 'design.h5'}: is not a search of vipetsc ({error})") from None
+
+    _say(comm, on_root(comm, redraw))
+    return DONE
+
+
+def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
+    from vipetsc.studies.again import analyse_again
+
+    for path in analyse_again(options.path, comm):
+        _say(comm, f"  {path}")
+    return DONE
+
+
 def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Pictures of a finished run again, from its files."""
     from vipetsc.figures import draw, run_figures
@@ -257,7 +303,9 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     if len(options.path) > 1:
         raise FolderError(f"{' '.join(map(str, options.path))}: only sweeps and folders of branches can share a page")
     (path,) = options.path
-    folder = path.parent if path.name == "run.h5" else path
+    folder = path.parent if path.name in ("run.h5", "design.h5") else path
+    if (folder / "design.h5").exists():
+        return _plot_design(folder, options.fig, formats, comm)
 
     def check() -> None:
         unknown = set(options.fig or []) - set(run_figures)
@@ -309,6 +357,10 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE if healthy else FAILED
 
 
+def _runs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", type=Path, nargs="+", metavar="PATH", help="folder of a run or of a sweep, or a run.h5")
+
+
 def _swept(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("case", metavar="CASE", help="case file (TOML) with a section [sweep]")
     _overrides(parser)
@@ -325,6 +377,8 @@ VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
     "bands": (bands, "pass bands, gaps and group velocities of a cell", (_case, _out, _json)),
     "sweep": (sweep, "every combination in [sweep]; goes on where it was", (_swept, _folder)),
     "nnm": (nnm, "nonlinear normal modes: frequency-energy branches", (_branches, _folder, _resume)),
+    "design": (design, "the (lambda, eta) search of the four-band cell", (_case, _folder)),
+    "analyse": (analyse, "measures of runs already made, from their files", (_runs,)),
     "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),
     "doctor": (doctor, "versions and what is missing", ()),
 }

@@ -127,7 +127,7 @@ class RunFolder:
                 raise FolderError(f"{self.path}: --resume needs the case it was begun with; differing: {lines}")
             return
         begun = "--resume goes on with the unfinished run in it, " if self.parts.is_dir() else ""
-        claim_folder(self.path, force, ("branch-*.h5",), begun)
+        claim_folder(self.path, force, ("branch-*.h5", "design.h5"), begun)
         shutil.rmtree(self.parts, ignore_errors=True)
         self.parts.mkdir()
         write_text(kept, text)

@@ -24,7 +24,18 @@ MAY_IMPORT = {
     "figures": {"lattice", "spectra", "case", "records", "ensembles", "files"},
     "dynamics": {"lattice", "case", "records", "files", "store", "parallel"},
     "modes": {"lattice", "case", "store", "parallel", "files"},
-    "studies": {"lattice", "spectra", "case", "records", "ensembles", "files", "dynamics", "modes", "store", "parallel"},
+    "studies": {
+        "lattice",
+        "spectra",
+        "case",
+        "records",
+        "ensembles",
+        "files",
+        "dynamics",
+        "modes",
+        "store",
+        "parallel",
+    },
 }
 
 

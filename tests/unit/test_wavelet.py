@@ -6,7 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from vipetsc.spectra import BINS, Nodes, filter_bank, inverse, kinetic_energy, padded_length, partition, transform
+from vipetsc.spectra import (
+    BINS,
+    Nodes,
+    filter_bank,
+    inverse,
+    kinetic_energy,
+    local_entropy,
+    padded_length,
+    partition,
+    transform,
+)
 from vipetsc.spectra.wavelet import constant, wavenumbers
 
 
@@ -154,12 +164,27 @@ def test_neighbouring_bins_share_much_of_a_packet():
     assert np.all((share > 0.4) & (share < 0.8))
 
 
-def test_partition_does_not_depend_on_chunks():
+class Record:
+    """A dataset that refuses to be read by more than a few snapshots at a time."""
+
+    def __init__(self, values):
+        self.values, self.shape = values, values.shape
+
+    def __len__(self):
+        return len(self.values)
+
+    def __getitem__(self, rows):
+        assert rows.stop - rows.start <= 32
+        return self.values[rows]
+
+
+def test_records_are_read_in_chunks_that_do_not_matter():
     velocity = noise((40, 30))
-    whole = partition(velocity, 2.0, fields=True)
+    whole = partition(Record(velocity), 2.0, fields=True)
     late = partition(velocity[33:], 2.0, fields=True)
     assert np.array_equal(whole.field[:, 33:], late.field)
     assert np.array_equal(whole.energy[:, 33:], late.energy)
+    assert np.array_equal(local_entropy(Record(velocity))[0][33:], local_entropy(velocity[33:])[0])
 
 
 def test_bad_requests_are_named():

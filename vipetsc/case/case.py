@@ -41,7 +41,7 @@ from vipetsc.lattice.presets import PRESETS
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
 # Sections of the same file that belong to verbs of their own, which check them.
-ELSEWHERE = ("nnm", "sweep")
+ELSEWHERE = ("nnm", "sweep", "design")
 
 
 @dataclass(frozen=True)

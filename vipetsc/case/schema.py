@@ -6,10 +6,10 @@ import copy
 import difflib
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -280,7 +280,15 @@ def _is_tag(part: Any) -> bool:
 
 
 def _owner(kind: type[Section], loc: list) -> type[Section]:
-    nested = {"cell": CellTable, "springs": SpringTable, "sites": Span, "clearance": ClearanceSpan}
+    """The section that a path of keys below ``kind`` leads to."""
     for part in loc:
-        kind = nested.get(part, kind)
+        fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
+        kind = next(_sections_in(fields.get(part)), kind)
     return kind
+
+
+def _sections_in(annotation: Any) -> Iterator[type[Section]]:
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _sections_in(argument)

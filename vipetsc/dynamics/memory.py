@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -16,6 +17,8 @@ from vipetsc.case import Case
 from vipetsc.files import written_aside
 from vipetsc.records import RunFile
 from vipetsc.store import RunFolder
+
+_NUMBERS = itertools.count()
 
 
 class RunMemory(RunFolder):
@@ -57,7 +60,8 @@ class RunMemory(RunFolder):
 
     def run(self, case: Case) -> RunFile:
         """The finished run as a file in memory (rank 0 only), with the fields that ``case`` names."""
-        file = h5py.File("run.h5", "w", driver="core", backing_store=False)
+        # HDF5 tells open files apart by their names, in memory too.
+        file = h5py.File(f"memory-{next(_NUMBERS)}/run.h5", "w", driver="core", backing_store=False)
         self._write(file, case)
         return RunFile(file)
 

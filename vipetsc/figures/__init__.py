@@ -4,9 +4,11 @@ from importlib import import_module
 
 _HOMES = {
     "bands": "vipetsc.figures.bands",
+    "design_figures": "vipetsc.figures.design",
     "draw": "vipetsc.figures.registry",
     "draw_backbone": "vipetsc.figures.backbone",
     "draw_bands": "vipetsc.figures.registry",
+    "draw_design": "vipetsc.figures.design",
     "draw_study": "vipetsc.figures.studies",
     "names": "vipetsc.figures.registry",
     "run_figures": "vipetsc.figures.registry",
@@ -17,9 +19,11 @@ _HOMES = {
 
 __all__ = [
     "bands",
+    "design_figures",
     "draw",
     "draw_backbone",
     "draw_bands",
+    "draw_design",
     "draw_study",
     "look",
     "names",

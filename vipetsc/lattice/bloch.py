@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ class BlochPoint:
     """Solution of the Bloch problem; leading axes are those of ``wavenumber`` (rad per cell).
 
     ``frequency`` (..., band) in rad/s, ``vectors`` (..., dof, band) mass-normalised, ``group_velocity``
-    (..., band) in cells/s.
+    (..., band) in cells/s. Of several cells, the axis of cells comes first.
     """
 
     wavenumber: np.ndarray
@@ -35,24 +36,33 @@ class Band:
     high: float
 
 
-def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
+def bloch(cell: UnitCell | Sequence[UnitCell], kappa: ArrayLike) -> BlochPoint:
     """Frequencies, eigenvectors and group velocities of ``cell`` at wavenumbers ``kappa`` (rad per cell).
 
     Solves (K(kappa) - omega^2 M) u = 0; the group velocity is d omega/d kappa = u* K' u / (2 omega), taken
-    as the limit from kappa > 0 where omega = 0.
+    as the limit from kappa > 0 where omega = 0. Several cells of as many masses each are solved together.
     """
     kappa = np.asarray(kappa, float)
     # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs the acoustic branch's own.
     at = np.where(np.abs(kappa) < 3e-4, 3e-4, kappa)
-    root = 1 / np.sqrt(np.asarray(cell.masses))
-    scale = root[:, None] * root[None, :]
-    squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)
+    if isinstance(cell, UnitCell):
+        masses = np.asarray(cell.masses)
+    else:
+        masses = np.stack([c.masses for c in cell]).reshape(len(cell), *(1,) * kappa.ndim, -1)
+    root = 1 / np.sqrt(masses)
+    scale = root[..., :, None] * root[..., None, :]
+    squared, vectors = np.linalg.eigh(_each(UnitCell.stiffness_matrix, cell, kappa) * scale)
     frequency = np.sqrt(np.maximum(squared, 0))
-    near_squared, near = np.linalg.eigh(cell.stiffness_matrix(at) * scale)
-    slope = _stiffness_slope(cell, at) * scale
-    rise = np.einsum("...ij,...ik,...kj->...j", near.conj(), slope, near).real
+    near_squared, near = np.linalg.eigh(_each(UnitCell.stiffness_matrix, cell, at) * scale)
+    slope = _each(_stiffness_slope, cell, at) * scale
+    rise = np.einsum("...ij,...ij->...j", near.conj(), slope @ near).real
     group_velocity = rise / (2 * np.sqrt(np.maximum(near_squared, np.finfo(float).tiny)))
-    return BlochPoint(kappa, frequency, vectors * root[:, None], group_velocity)
+    return BlochPoint(kappa, frequency, vectors * root[..., :, None], group_velocity)
+
+
+def _each(matrix: Callable, cell: UnitCell | Sequence[UnitCell], kappa: np.ndarray) -> np.ndarray:
+    """``matrix(cell, kappa)`` of one cell, or of several along a first axis."""
+    return matrix(cell, kappa) if isinstance(cell, UnitCell) else np.stack([matrix(c, kappa) for c in cell])
 
 
 def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def prepare_folder(case: NnmCase, folder: Path, force: bool, resume: bool) -> No
         if NnmCase.load(kept).physics() != case.physics():
             raise FolderError(f"{folder}: --resume needs the system, map and flow that {kept} was begun with")
     else:
-        claim_folder(folder, force, ("run.h5", "parts"), "--resume goes on with the branches in it, ")
+        claim_folder(folder, force, ("run.h5", "parts", "design.h5"), "--resume goes on with the branches in it, ")
         for old in folder.glob("branch-*.*"):
             old.unlink()
     write_text(kept, case.to_toml())

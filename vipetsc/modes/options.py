@@ -28,7 +28,7 @@ from vipetsc.lattice import Chain, Contact, ContactLaw, contact_stiffness, log_c
 from vipetsc.lattice.presets import PRESETS
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
-BESIDE = {"drive", "time", "output", "sweep"}
+BESIDE = {"drive", "time", "output", "sweep", "design"}
 """Sections of a lattice run that may stand in the same file; ``nnm`` does not read them."""
 
 

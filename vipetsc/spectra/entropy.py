@@ -13,7 +13,7 @@ from scipy import fft
 from vipetsc.spectra.wavelet import padded_length, wavenumbers, window
 
 NODES = 60
-CHUNK = 8
+CHUNK = 4
 FLOOR = 0.01
 """Points below this fraction of the largest weight are masked."""
 
@@ -99,9 +99,9 @@ def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES)
         total, spread = np.zeros(signal.shape), np.zeros(signal.shape)
         for octave in _octaves(cells, kc, nodes):
             spectrum = fft.rfft(signal, octave.length)
-            for low, high, filters in octave.filters:
-                x = np.zeros((len(signal), len(filters), octave.length), dtype=complex)
-                np.multiply(spectrum[:, None, low:high], filters, out=x[..., low:high])
+            for low, filters in octave.filters:
+                x = np.empty((len(signal), len(filters), octave.length), dtype=complex)
+                _filter(spectrum, filters, low, x)
                 _accumulate(fft.ifft(x, overwrite_x=True), total, spread)
         _entropies(total, spread, local[rows])
         weight[rows] = np.ldexp(total, 2 * exponent[:, None])
@@ -110,10 +110,10 @@ def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES)
 
 @dataclass(frozen=True)
 class _Octave:
-    """Nodes that share a padded ``length``; for groups of them the band (low, high) and the filters in it."""
+    """Nodes that share a padded ``length``; for groups of them the band's first row and the filters from there on."""
 
     length: int
-    filters: tuple[tuple[int, int, np.ndarray], ...]
+    filters: tuple[tuple[int, np.ndarray], ...]
 
 
 @lru_cache(maxsize=8)
@@ -132,30 +132,64 @@ def _octaves(cells: int, kc: float, nodes: int) -> tuple[_Octave, ...]:
             some = filters[first : first + 4]
             inside = np.flatnonzero(some.max(axis=0) > np.finfo(float).eps * some.max())
             low, high = int(inside[0]), int(inside[-1]) + 1
-            groups.append((low, high, np.ascontiguousarray(some[:, low:high])))
+            groups.append((low, np.ascontiguousarray(some[:, low:high])))
         octaves.append(_Octave(length, tuple(groups)))
     return tuple(octaves)
 
 
-@njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", cache=True, fastmath={"contract"})
-def _accumulate(x, total, spread):
-    """Add S and S log2 S of the nodes of ``x`` (t, kappa, x) to ``total`` and ``spread`` (t, cell)."""
+@njit("void(c16[:,::1], f8[:,::1], i8, c16[:,:,::1])", cache=True)
+def _filter(spectrum, filters, low, x):
+    """Spectra ``x`` (t, kappa, k) of the wavelet transforms; ``filters`` (kappa, band) start at row ``low``."""
     for t in range(x.shape[0]):
         for k in range(x.shape[1]):
-            for c in range(total.shape[1]):
+            x[t, k, :low] = 0.0
+            for i in range(filters.shape[1]):
+                x[t, k, low + i] = spectrum[t, low + i] * filters[k, i]
+            x[t, k, low + filters.shape[1] :] = 0.0
+
+
+@njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", cache=True, error_model="numpy", fastmath={"contract"})
+def _accumulate(x, total, spread):
+    """Add S and S log2 S of the nodes of ``x`` (t, kappa, x) to ``total`` and ``spread`` (t, cell).
+
+    The logarithm is written out so that the loop is vectorised, four times as fast as calls of log2: S = 2^e m
+    with sqrt(1/2) <= m < sqrt(2), ln m = 2 u + u z R(z), u = (m - 1)/(m + 1), z = u^2, with Remez's R of the
+    fdlibm library (error below 2^-58).
+    """
+    cells = total.shape[1]
+    power, mantissa = np.empty(cells), np.empty(cells)
+    bits, mantissa_bits = power.view(np.int64), mantissa.view(np.int64)
+    for t in range(x.shape[0]):
+        for k in range(x.shape[1]):
+            for c in range(cells):
                 z = x[t, k, c]
-                s = z.real * z.real + z.imag * z.imag
-                total[t, c] += s
-                spread[t, c] += s * np.log2(s + 1e-300)
+                power[c] = z.real * z.real + z.imag * z.imag + 1e-300
+            for c in range(cells):
+                e = (bits[c] - 0x3FE6A09E667F3BCD) >> 52
+                mantissa_bits[c] = bits[c] - (e << 52)
+                u = (mantissa[c] - 1.0) / (mantissa[c] + 1.0)
+                z = u * u
+                r = 1.479819860511658591e-01
+                r = r * z + 1.531383769920937332e-01
+                r = r * z + 1.818357216161805012e-01
+                r = r * z + 2.222219843214978396e-01
+                r = r * z + 2.857142874366239149e-01
+                r = r * z + 3.999999999940941908e-01
+                r = r * z + 6.666666666666735130e-01
+                total[t, c] += power[c]
+                spread[t, c] += power[c] * (e + 1.4426950408889634 * (2.0 * u + u * z * r))
 
 
 @njit("void(f8[:,::1], f8[:,::1], f8[:,::1])", cache=True)
 def _entropies(total, spread, local):
-    """H = log2 W - (1/W) sum S log2 S, kept from rounding below zero."""
+    """H = log2 W - (1/W) sum S log2 S, kept from rounding below zero; W and H are 0 where S stands at its floor."""
     for t in range(total.shape[0]):
         for c in range(total.shape[1]):
             w = total[t, c]
-            local[t, c] = max(np.log2(w) - spread[t, c] / w, 0.0) if w > 0.0 else 0.0
+            if w > 1e-290:
+                local[t, c] = max(np.log2(w) - spread[t, c] / w, 0.0)
+            else:
+                total[t, c] = local[t, c] = 0.0
 
 
 def _over_cells(local: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -53,11 +53,13 @@ def _interval(value: float, deviation: float, freedom: int) -> tuple[float, floa
     return value - half, value + half
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def power_law(x: ArrayLike, y: ArrayLike) -> PowerLaw:
     """Fit y = a x^b to points (n), both ways.
 
     The log-log line weighs relative errors alike; the nonlinear fit weighs errors alike and starts from it.
-    Student's t with n - 2 degrees of freedom gives the intervals.
+    Student's t with n - 2 degrees of freedom gives the intervals. A nonlinear fit without a minimum, whose
+    exponent runs away to leave a single point standing, is all NaN.
 
     Raises
     ------
@@ -100,7 +102,12 @@ def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float)
     def slopes(u: np.ndarray, c: float, b: float) -> np.ndarray:
         return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
-    (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=slopes, ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
+    try:
+        (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=slopes, **tolerances)
+    except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
+        nan = float("nan")
+        return Fit(nan, nan, nan, (nan, nan), (nan, nan))
     freedom = len(u) - 2
     # The factor's deviation by linear propagation from (c, b) to a.
     factor = c * np.exp(cy - b * cx)

@@ -88,9 +88,12 @@ class Members:
     of all, ``summary.json``; ``linear/<id>/`` the linear runs.
     """
 
-    def __init__(self, folder: Path, options: SweepTable, team: MPI.Comm, stop: StopRequest) -> None:
-        self.folder, self.options, self.team, self.stop = folder, options, team, stop
-        self.measures = FULL if options.fields else REDUCED
+    def __init__(self, folder: Path, options: SweepTable | None, team: MPI.Comm, stop: StopRequest) -> None:
+        self.folder, self.options, self.team, self.stop = folder, options or SweepTable(), team, stop
+        options = self.options
+        asked = {"entropy": "entropy", "transfer": "bands"}
+        reduced = tuple(m for m in REDUCED if m in (asked[name] for name in options.measures))
+        self.measures = FULL if options.fields else reduced
         self._wanted = {"measures": sorted(options.measures), "fields": options.fields}
 
     def linear_folder(self, case: Case) -> Path:
@@ -142,7 +145,7 @@ class Members:
             folder.mkdir(exist_ok=True)
             home.save(folder / "run.h5", kept)
             with home.run(measured) as run:
-                analyse(run, folder / "analysis.h5", self._measures(), self._arrival(case, wave))
+                analyse(run, folder / "analysis.h5", self.measures, self.arrival(case, wave))
             self._finish(folder, case, about)
 
         on_root(self.team, measure)
@@ -154,7 +157,7 @@ class Members:
         self._check(result)
 
         def measure() -> None:
-            analyse(folder / "run.h5", folder / "analysis.h5", self._measures(), self._arrival(case, wave))
+            analyse(folder / "run.h5", folder / "analysis.h5", self.measures, self.arrival(case, wave))
             self._finish(folder, case, self.summary(case))
 
         on_root(self.team, measure)
@@ -189,7 +192,7 @@ class Members:
         if not shared.exists():
             home = _filled(part, cells)
             with home.run(_keeping(unit, ["velocity"])) as run:
-                analyse(run, shared, self._measures(), self._arrival(case, wave))
+                analyse(run, shared, self.measures, self.arrival(case, wave))
         folder.mkdir(exist_ok=True)
         factor = case.drive.amplitude**2
         for name in ENERGIES:
@@ -205,13 +208,9 @@ class Members:
                 file.visititems(lambda _, item: _scale_energy(item, factor))
         self._finish(folder, case, summary)
 
-    def _measures(self) -> tuple[str, ...]:
-        asked = {"entropy": "entropy", "transfer": "bands"}
-        left_out = {asked[m] for m in asked.keys() - set(self.options.measures)}
-        return tuple(m for m in self.measures if m not in left_out)
-
     @staticmethod
-    def _arrival(case: Case, wave: LinearWave) -> float | None:
+    def arrival(case: Case, wave: LinearWave) -> float | None:
+        """The paper's t_hat in s: when ``wave`` is loudest at the first site of ``case``; None without sites."""
         first = _leading_site(case)
         return float(wave.arrival[first - 1]) if first else None
 

@@ -92,18 +92,25 @@ def sweep(
     made = crew.share(order, lambda key: shop.make(cases[key], waves[shop.linear_folder(cases[key])]), bar)
     reasons = {key: broken.get(shop.linear_folder(cases[key])) for key in missing if key not in feasible} | made
 
-    def conclude() -> tuple[Outcome | None, ...]:
-        outcomes = tuple(_outcome(member, shop, reasons) for member in members)
-        _write_index(plan, members, outcomes, folder)
-        if not stop.requested and all(outcomes):
-            assemble(plan, members, outcomes, folder)
-        return outcomes
-
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(crew.busy / seconds))
-    outcomes = on_root(comm, conclude)
+    outcomes = on_root(comm, lambda: conclude(plan, members, shop, reasons))
     team.Free()
     return SweepResult(outcomes, sum(r == "" for r in made.values()), seconds, busy, folder)
+
+
+def conclude(
+    plan: Sweep, members: list[Member], shop: Members, reasons: dict[str, str | None]
+) -> tuple[Outcome | None, ...]:
+    """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns how the members ended.
+
+    ``reasons`` names the members (by id) that failed just now, and why.
+    """
+    outcomes = tuple(_outcome(member, shop, reasons) for member in members)
+    _write_index(plan, members, outcomes, shop.folder)
+    if all(outcomes):
+        assemble(plan, members, outcomes, shop.folder)
+    return outcomes
 
 
 class _Crew:

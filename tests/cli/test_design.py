@@ -1,0 +1,167 @@
+"""The verb design as a user types it: files, table, refusal, pictures again from the file alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray
+
+from tests.conftest import assert_same_bits, datasets
+from vipetsc.case import Case, CaseError
+from vipetsc.case.design import DesignCase
+from vipetsc.lattice import bloch, four_band
+from vipetsc.modes.options import NnmCase
+
+CASE = """
+[design]
+lambda = { first = 0.1, last = 1.0, count = 4 }
+eta = { count = 10 }
+wavenumbers = 21
+"""
+FIGURES = {"deflections", "cost_maps", "dispersion_against_lambda", "dispersion_against_eta"}
+
+
+@pytest.fixture
+def case(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(CASE)
+    return path
+
+
+def numbers(path):
+    """The datasets that hold numbers."""
+    return {name: values for name, values in datasets(path).items() if values.dtype != object}
+
+
+def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, case, tmp_path):
+    out = tmp_path / "out"
+    done = vipetsc(0, "design", case, "--out", out)
+    assert done.returncode == 0, done.stderr
+    rows = {tuple(line.split()[:2]): line.split()[2:] for line in done.stdout.splitlines()}
+    assert rows["printed", "weighted"][:2] == rows["calibrated", "weighted"][:2] == ["0.1", "0.5"]
+    names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
+    assert names == {"case.toml", "design.h5", *(f"figures/{name}.png" for name in FIGURES)}
+
+    with xarray.open_dataset(out / "design.h5", engine="h5netcdf") as file:
+        assert list(file.reading.values) == ["printed", "calibrated"]
+        assert file["weighted"].dims == ("reading", "lambda", "eta")
+        assert file.eta.values[-1] == 0.9  # eta = 1 would leave the host without mass
+        assert "eta = 1" in file.attrs["left_out"]
+        assert file.attrs["vipetsc_version"]
+        best = file.sel(reading="calibrated", cost="weighted")
+        place = {"lambda": best.optimum_lambda.item(), "eta": best.optimum_eta.item()}
+        assert best.out_of_phase.sel(place).item() == 1
+        assert best["weighted"].sel(place).item() == best.optimum_value.item() == best.paper_value.item()
+        assert best.frequency.attrs["units"] == "rad/s"
+        cell = four_band("calibrated", place["lambda"], place["eta"])
+        expected = bloch(cell, file.wavenumber.values).frequency
+        np.testing.assert_allclose(best.frequency.sel(place).values, expected, atol=1e-9)
+        second = best.optimum_deflection.sel(band=2)
+        np.testing.assert_allclose(second, best.signed_deflection.sel(place), atol=1e-12)
+        np.testing.assert_allclose((best.optimum_amplitude**2).sum("dof"), 1)
+    assert DesignCase.load(out / "case.toml").to_toml() == (out / "case.toml").read_text()
+
+    again = vipetsc(0, "design", case, "--out", out)
+    assert again.returncode == 2
+    assert "--force" in again.stderr
+    before = numbers(out / "design.h5")
+    assert vipetsc(2, "design", case, "--out", out, "--force").returncode == 0
+    assert_same_bits(before, numbers(out / "design.h5"))
+
+
+def test_pictures_again_from_the_file_alone(vipetsc, case, tmp_path):
+    out, bare = tmp_path / "out", tmp_path / "bare"
+    assert vipetsc(0, "design", case, "--out", out, "--set", "design.readings=['printed']").returncode == 0
+    bare.mkdir()
+    (out / "design.h5").rename(bare / "design.h5")
+    done = vipetsc(0, "plot", bare, "--format", "png", "--format", "pdf")
+    assert done.returncode == 0, done.stderr
+    drawn = {p.name: p.stat().st_size for p in (bare / "figures").iterdir()}
+    assert drawn.keys() == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
+    assert min(drawn.values()) > 5000
+    assert (bare / "figures" / "cost_maps.png").read_bytes() == (out / "figures" / "cost_maps.png").read_bytes()
+    one = vipetsc(0, "plot", bare / "design.h5", "--fig", "cost_maps")
+    assert one.stdout.split() == [str(bare / "figures" / "cost_maps.png")]
+    wrong = vipetsc(0, "plot", bare, "--fig", "ledger")
+    assert wrong.returncode == 2
+    assert "cost_maps" in wrong.stderr
+    (bare / "design.h5").write_bytes(b"nothing")
+    broken = vipetsc(0, "plot", bare)
+    assert broken.returncode == 2
+    assert "is not a search" in broken.stderr
+
+
+def test_a_grid_without_a_good_cell_says_so(vipetsc, case, tmp_path):
+    stiff = ("--set", "design.lambda.first=5.0", "--set", "design.lambda.last=6.0")
+    done = vipetsc(0, "design", case, "--out", tmp_path / "out", *stiff)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("none is out of phase") == 6
+    assert np.isnan(datasets(tmp_path / "out" / "design.h5")["optimum_lambda"]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("design.lambda.first=-0.1", "design.lambda.first = -0.1"),
+        ("design.lambda.coutn=3", "did you mean design.lambda.count"),
+        ("design.eta.last=1.5", "design.eta.last = 1.5"),
+        ("design.eta.first=1.0", "design.eta.first = 1.0"),
+        ("design.lambda.last=0.1", "must be above design.lambda.first"),
+        ("design.readings=['printd']", "did you mean 'printed'"),
+        ("design.readings=['printed', 'printed']", "once"),
+        ("design.lambda.count=1000000", "at most"),
+        ("design.wavenumbers=2.5", "design.wavenumbers"),
+        ("desing.wavenumbers=5", "did you mean design"),
+        ("design=3", "must be a section"),
+        ("lattice.preset=diatomic", "only the four-band preset"),
+    ],
+)
+def test_what_is_wrong_with_a_search_is_named(change, message):
+    with pytest.raises(CaseError) as error:
+        DesignCase.load(None, [change])
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
+    """Everything wrong is said at once, once."""
+    wrong = ("--set", "design.eta.last=1.5", "--set", "design.lambda.coutn=3", "--set", "design.wavenumbers=2")
+    done = vipetsc(ranks, "design", case, "--out", tmp_path / "out", *wrong)
+    assert done.returncode == 2, done.stdout
+    for message in (
+        "3 problems",
+        "design.eta.last = 1.5",
+        "did you mean design.lambda.count",
+        "design.wavenumbers = 2",
+    ):
+        assert done.stderr.count(message) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_of_other_kinds_are_never_replaced(vipetsc, case, tmp_path):
+    for evidence in ("run.h5", "branch-mode-1.h5", "index.json"):
+        folder = tmp_path / evidence.split(".")[0]
+        folder.mkdir()
+        (folder / "case.toml").write_text("")
+        (folder / evidence).write_text("results")
+        done = vipetsc(0, "design", case, "--out", folder, "--force")
+        assert done.returncode == 2
+        assert "of this kind" in done.stderr
+    search = tmp_path / "search"
+    search.mkdir()
+    (search / "case.toml").write_text("")
+    (search / "design.h5").write_text("results")
+    for verb in (("run",), ("nnm", "runs/nnm-cubic.toml")):
+        done = vipetsc(0, *verb, "--out", search, "--force")
+        assert done.returncode == 2
+        assert "of this kind" in done.stderr
+    missing = vipetsc(0, "design", tmp_path / "nowhere.toml")
+    assert missing.returncode == 2
+    assert "a case file (TOML) is needed" in missing.stderr
+
+
+def test_the_section_may_stand_beside_those_of_other_verbs():
+    table = {"design": {"wavenumbers": 5}, "lattice": {"preset": "four-band"}, "nnm": {"modes": [1]}}
+    assert DesignCase.from_table(table).design.wavenumbers == 5
+    assert Case.from_table(table).lattice.cells == 300
+    assert NnmCase.from_table(table).nnm.modes == [1]
