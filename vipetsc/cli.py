@@ -332,6 +332,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
 def _plot_study(folders: list[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm) -> int:
     """Pictures of sweeps, with branches beside them, into the first folder."""
     from vipetsc.figures import draw_study, study_figures
+    from vipetsc.studies.backbone import relate_folders
 
     def check() -> None:
         unknown = set(names or []) - set(study_figures)
@@ -340,6 +341,7 @@ def _plot_study(folders: list[Path], names: list[str] | None, formats: tuple[str
         for folder in folders:
             if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
                 raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
+        relate_folders(folders)
 
     on_root(comm, check)
     drawn = comm.gather(draw_study(folders, names, formats, (comm.rank, comm.size)))

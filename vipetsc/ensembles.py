@@ -92,13 +92,27 @@ class EnsembleFile:
         return json.loads((self.folder / "index.json").read_text(encoding="utf-8"))
 
     def member(self, place: tuple[int, ...]) -> Path:
-        """Folder of the member at ``place``: ``run.h5``, ``analysis.h5``, ``summary.json``."""
+        """Folder of the member at ``place``: ``run.h5``, ``analysis.h5``, ``summary.json``; else ``folder``."""
         row = self.index["members"][int(np.ravel_multi_index(place, self.sweep.shape))]
         return self.folder / row["id"]
 
     def case(self, place: tuple[int, ...]) -> Case:
         """The resolved case of the member at ``place``."""
         return Case.load(self.member(place) / "case.toml")
+
+    def curves(self, along: str = "amplitude") -> Iterator[tuple[Case, tuple[int | slice, ...]]]:
+        """Every curve over the axis ``along``: the case of its first sound member, and the index of its values.
+
+        ``values(name)[index]`` is the curve. Nothing if no axis has that name.
+        """
+        if along not in self.dimensions:
+            return
+        axis = self.dimensions.index(along)
+        for place in np.ndindex(*(1 if i == axis else n for i, n in enumerate(self.sweep.shape))):
+            members = [(*place[:axis], i, *place[axis + 1 :]) for i in range(self.sweep.shape[axis])]
+            sound = [m for m in members if self.member(m) != self.folder]
+            if sound:
+                yield self.case(sound[0]), (*place[:axis], slice(None), *place[axis + 1 :])
 
     def whole_members(self) -> Iterator[tuple[tuple[int, ...], Path]]:
         """Places and folders of the members whose fields were kept."""

@@ -38,7 +38,7 @@ def dispersion(run: RunFile, analysis: h5py.File | None) -> Figure:
     *maps, side = figure.subplots(1, len(shown) + 1, sharey=True, gridspec_kw={"width_ratios": widths})
     for i, (axes, (name, spectrum)) in enumerate(zip(maps, spectra.items(), strict=True)):
         image = style.draw_map(axes, wavenumber / np.pi, frequency[kept] / 1e3, spectrum.T, norm, "inferno")
-        _branches(axes, cell)
+        bloch_branches(axes, cell)
         axes.set(xlabel="Wavenumber κ (π rad/cell)", xlim=(0, wavenumber[-1] / np.pi), ylim=(0, top / 1e3))
         style.letter(axes, f"({'abc'[i]}) {PANELS[name]}")
     maps[0].set_ylabel("Angular frequency ω (krad/s)")
@@ -50,7 +50,8 @@ def dispersion(run: RunFile, analysis: h5py.File | None) -> Figure:
     return figure
 
 
-def _branches(axes: Axes, cell: UnitCell) -> None:
+def bloch_branches(axes: Axes, cell: UnitCell) -> None:
+    """The Bloch branches of ``cell`` over wavenumber (pi rad/cell) and frequency (krad/s), dashed white."""
     kappa = np.linspace(0, np.pi, 181)
     axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color="white", lw=0.5, ls=(0, (4, 3)), alpha=0.75)
 

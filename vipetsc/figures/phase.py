@@ -28,7 +28,7 @@ def phase(run: RunFile, analysis: h5py.File | None) -> Figure:
     if not {"displacement", "velocity"} <= run.file.keys():
         return style.without_data("Phase portraits: they need displacement and velocity, and one was not recorded")
     pair = run.model.chain.cell
-    u, v, time = _refined(run.displacement[:, at], run.velocity[:, at], run.field_time)
+    u, v, time = refined(run.displacement[:, at], run.velocity[:, at], run.field_time)
     u = 1e3 * u
     h, r = pair.host, pair.resonator
     onsets = run.impacts["onset"][run.impacts["site"] == site + 1]
@@ -60,7 +60,7 @@ def phase(run: RunFile, analysis: h5py.File | None) -> Figure:
     return figure
 
 
-def _refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Displacement, velocity and time on a finer grid, so that fast turns at the stops are not polygons."""
     if len(time) < 2:
         return u, v, time

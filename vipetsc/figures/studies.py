@@ -12,12 +12,18 @@ from matplotlib.figure import Figure
 
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
+from vipetsc.figures.band_energies import band_energies
 from vipetsc.figures.entropy import entropy, entropy_all
 from vipetsc.figures.entropy_time import entropy_history, entropy_maps
 from vipetsc.figures.explained import partition_explained
 from vipetsc.figures.partition import partition, reconstruction
+from vipetsc.figures.regimes import phase_regimes
 from vipetsc.figures.registry import save
 from vipetsc.figures.scattering import amplitudes, wavelets
+from vipetsc.figures.transfer import transfer
+from vipetsc.figures.transfer_backbone import ibtet_backbone
+from vipetsc.figures.transfer_curves import ibtet
+from vipetsc.figures.transfer_dispersions import transfer_dispersions
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,12 @@ study_figures: dict[str, StudyFigure] = {
         entropy_all,
         entropy_maps,
         entropy_history,
+        transfer,
+        transfer_dispersions,
+        band_energies,
+        ibtet,
+        ibtet_backbone,
+        phase_regimes,
     )
 }
 

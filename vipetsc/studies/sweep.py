@@ -169,7 +169,7 @@ def _prepare(plan: Sweep, folder: Path, force: bool) -> None:
     for path in folder.iterdir() if force else ():
         if path.is_dir():
             shutil.rmtree(path)
-        elif path.name in ("index.json", "ensemble.h5"):
+        elif path.name in ("index.json", "ensemble.h5", "backbone.h5"):
             path.unlink()
     write_text(kept, text)
     (folder / "linear").mkdir(exist_ok=True)

@@ -1,0 +1,285 @@
+"""The pictures of inter-band transfer show what the sweep's files hold, and nothing where files lack."""
+
+from pathlib import Path
+
+from mpi4py import MPI
+
+import h5py
+import matplotlib.figure
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+from vipetsc.case import Sweep
+from vipetsc.ensembles import EnsembleFile
+from vipetsc.figures import draw_study, look, study_figures
+from vipetsc.figures.band_energies import closing_error
+from vipetsc.figures.regimes import Portrait
+from vipetsc.figures.studies import Study
+from vipetsc.figures.transfer_curves import transfer_curves
+from vipetsc.records import RunFile
+from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
+from vipetsc.studies.sweep import sweep
+
+FIGURES = ("transfer", "transfer_dispersions", "band_energies", "ibtet", "ibtet_backbone", "phase_regimes")
+AMPLITUDES = [1.0, 2.0, 30.0, 60.0, 120.0, 240.0, 500.0]
+GRAZING = 0.03
+TABLE = {
+    "lattice": {"preset": "four-band", "reading": "calibrated", "cells": 20},
+    "contacts": {"sites": 1},
+    "drive": {"band": 2, "at": "max-group-velocity", "cycles": 4},
+    "time": {"rtol": 1e-7},
+    "sweep": {
+        "measures": ["transfer"],
+        "contacts": {"law": ["hertz", "bilinear"]},
+        "drive": {"amplitude": AMPLITUDES},
+    },
+}
+
+
+def made(folder, **options):
+    """A sweep of 20 cells with one site in ``folder``; ``options`` go into ``[sweep]``."""
+    table = TABLE | {"sweep": TABLE["sweep"] | options}
+    result = sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
+    assert result.complete
+    return folder
+
+
+@pytest.fixture(scope="module")
+def reduced(tmp_path_factory):
+    """A sweep over both laws and seven amplitudes without fields, and a branch of the Hertz law beside it."""
+    folder = made(tmp_path_factory.mktemp("reduced"))
+    branch = tmp_path_factory.mktemp("branch")
+    energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, 1e6, 60)])
+    region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING, energy < 1e5], [1, 2, 3], 4)
+    with h5py.File(branch / BRANCH, "w") as file:
+        file["energy"], file["region"] = energy, region
+        file["slope"] = np.where(region == 1, 0.0, 700.0 / energy)
+        file["contacts"], file["kind"] = (region > 1).astype(int), np.zeros(len(energy), np.int8)
+        file.attrs["case"] = '[lattice]\nreading = "printed"\n[contacts]\nlaw = "hertz"\n'
+    assert relate_folders([folder, branch]) == [folder / "backbone.h5"]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Two Hertz members with full fields: one without contact, one with."""
+    table = {"contacts": {"law": ["hertz"]}, "drive": {"amplitude": [1.0, 60.0]}, "fields": True}
+    return made(tmp_path_factory.mktemp("whole"), **table)
+
+
+def drawn(name, *folders):
+    """Suffixes and figures of ``name`` from ``folders``."""
+    ensembles = tuple(EnsembleFile(f) for f in folders)
+    with look():
+        found = dict(study_figures[name](Study(ensembles)))
+    for ensemble in ensembles:
+        ensemble.file.close()
+    assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
+    return found
+
+
+def lines(axes):
+    """Labelled lines of ``axes``: label -> (x, y)."""
+    return {line.get_label(): line.get_xydata().T for line in axes.lines}
+
+
+def all_axes(figure):
+    """The axes that are not colour bars."""
+    return [a for a in figure.axes if a.get_label() != "<colorbar>"]
+
+
+def panel(figure, text):
+    """The axes whose title holds ``text``."""
+    (found,) = [a for a in figure.axes if text in a.get_title(loc="left")]
+    return found
+
+
+def test_ibtet_shows_the_ensembles_values(reduced):
+    (figure,) = drawn("ibtet", reduced).values()
+    with EnsembleFile(reduced) as ensemble:
+        for law in ("hertz", "bilinear"):
+            for row in (1, 2):
+                axes = panel(figure, f".{row}) {law.capitalize()}, calibrated")
+                x, y = lines(axes)["1 site, 4 cycles"]
+                np.testing.assert_array_equal(x, AMPLITUDES)
+                np.testing.assert_array_equal(y, ensemble.curve("ibtet", "amplitude", law=law))
+    assert panel(figure, "(a.1)").get_xscale() == panel(figure, "(a.1)").get_yscale() == "linear"
+    assert panel(figure, "(a.2)").get_xscale() == panel(figure, "(a.2)").get_yscale() == "log"
+
+
+def test_floor_is_that_of_members_without_contact(reduced):
+    with EnsembleFile(reduced) as ensemble:
+        curves = list(transfer_curves(Study((ensemble,))))
+        assert [c.case.contacts.law for c in curves] == ["hertz", "bilinear"]
+        for curve in curves:
+            assert curve.floor == pytest.approx(curve.ibtet[0], rel=1e-9)
+            assert curve.peak == int(np.argmax(curve.ibtet)) and curve.peak > 1
+
+
+def test_shares_are_the_ensembles_and_sum_to_one(reduced):
+    figures = drawn("band_energies", reduced)
+    assert list(figures) == ["shares-calibrated-1-site-4-cycles"]
+    (figure,) = figures.values()
+    with EnsembleFile(reduced) as ensemble:
+        names = list(ensemble.file["bands/share"].attrs["parts"])
+        share = ensemble.curve("bands/share", "amplitude", law="bilinear")
+    shown = lines(panel(figure, "Bilinear"))
+    for name, values in zip(names, share.T, strict=True):
+        np.testing.assert_allclose(shown[name][1], values, rtol=0, atol=1e-299)
+    np.testing.assert_allclose(shown["sum"][1], 1.0, rtol=1e-12)
+
+
+def test_backbone_is_aligned_exactly(reduced):
+    figures = drawn("ibtet_backbone", reduced)
+    assert list(figures) == ["calibrated-1-site-4-cycles"]  # no branch of the bilinear law was given
+    (axes,) = all_axes(figures["calibrated-1-site-4-cycles"])
+    assert "branch of the printed reading" in axes.get_title(loc="left")
+    with EnsembleFile(reduced) as ensemble, h5py.File(reduced / "backbone.h5") as file:
+        assert "bilinear" in file.attrs["left_out"][0]
+        (group,) = file.values()
+        about = dict(group.attrs)
+        case, _ = next(ensemble.curves())
+        start = initiation_of(ensemble, case)
+        work = ensemble.curve("work", "amplitude", law="hertz")
+        touched = ensemble.curve("contact_episodes", "amplitude", law="hertz") > 0
+    np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)
+    assert about["initiation_energy"] == start.energy and about["onset_amplitude"] == start.amplitude
+    # Work grows with the amplitude's square until the first contact comes back to the drive.
+    assert start.energy / start.amplitude**2 == pytest.approx(work[0], rel=1e-6)
+    shown = lines(axes)
+    np.testing.assert_allclose(shown["lattice"][0], work * GRAZING / start.energy, rtol=1e-12)
+    grey, floor = shown["slope + floor"], about["floor"]
+    assert np.all(grey[1][grey[0] <= GRAZING] == floor)
+    moving = grey[0] > GRAZING
+    np.testing.assert_allclose(grey[1][moving], 700.0 / grey[0][moving] / about["divisor"] + floor, rtol=1e-12)
+    red = shown["in region III"]
+    (green,) = [xy for label, xy in shown.items() if "adj." in label]
+    np.testing.assert_allclose(green[1], about["factor"] * red[0] ** about["exponent"], rtol=1e-12)
+    residual = np.log(red[1] / green[1])
+    assert abs(residual.sum()) < 1e-9 and abs(residual @ np.log(red[0])) < 1e-8  # least squares in logarithms
+
+
+def test_backbone_of_another_sweep_is_passed_over(reduced, tmp_path):
+    for name in ("ensemble.h5", "backbone.h5", "index.json"):
+        (tmp_path / name).write_bytes((reduced / name).read_bytes())
+    with h5py.File(tmp_path / "backbone.h5", "r+") as file:
+        file.attrs["case"] = "another"
+    assert not drawn("ibtet_backbone", tmp_path)
+
+
+def test_reduced_sweeps_have_no_pictures_of_fields(reduced):
+    for name in ("transfer", "transfer_dispersions", "phase_regimes"):
+        assert not drawn(name, reduced)
+
+
+def test_whole_members_alone_make_no_curves(whole):
+    for name in ("ibtet", "ibtet_backbone"):
+        assert not drawn(name, whole)
+
+
+def test_nothing_to_draw_from_nothing():
+    assert all(not dict(study_figures[name](Study(()))) for name in FIGURES)
+
+
+def test_transfer_has_a_panel_a_band_and_both_segments(whole):
+    figures = drawn("transfer", whole)
+    assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
+    figure = figures["hertz-calibrated-1-site-4-cycles-60N"]
+    heading = figure.get_suptitle() if hasattr(figure, "get_suptitle") else figure._suptitle.get_text()
+    assert heading == "Hertz, calibrated, 1 site, 4 cycles, 60 N"
+    titles = [a.get_title(loc="left") for a in all_axes(figure) if a.get_title(loc="left")]
+    assert [t.split()[0] for t in titles] == [f"({x})" for x in "abcdefghi"]
+    assert [t[4:] for t in titles[1:5]] == ["Band 1", "Band 2", "Band 3", "Band 4"]
+    assert titles[7:] == ["(h) Velocity spectra, cell 5", "(i) Velocity spectra, cell 10"]
+    # One scale of colours for the whole and its parts.
+    (norm,) = {id(a.images[0].norm) for a in all_axes(figure) if a.get_title(loc="left")[:3] in ("(a)", "(b)", "(e)")}
+    assert norm
+
+
+def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
+    figure = drawn("transfer", whole)["hertz-calibrated-1-site-4-cycles-60N"]
+    axes = panel(figure, "cell 10")
+    with EnsembleFile(whole) as ensemble, RunFile(ensemble.member((0, 1)) / "run.h5") as run:
+        velocity, driven = run.velocity[:, 9], 1e-3 * run.model.drive.frequency
+    (inset,) = axes.child_axes
+    for j, line in enumerate(inset.lines):
+        np.testing.assert_array_equal(line.get_ydata(), velocity[:, j])
+    x, y = lines(panel(figure, "cell 5"))["mass 1"]
+    assert abs(x[np.argmax(y)] - driven) < 0.2 * driven
+
+
+def test_dispersions_stand_by_law_and_amplitude(whole):
+    (figure,) = drawn("transfer_dispersions", whole).values()
+    found = all_axes(figure)
+    assert [a.get_title(loc="left") for a in found] == ["(a.1) Hertz, 1 N", "(a.2) Hertz, 60 N"]
+    with EnsembleFile(whole) as ensemble:
+        for axes, value in zip(found, ensemble.values("ibtet").ravel(), strict=True):
+            assert axes.texts[0].get_text() == f"IBTET {value:.2g}"
+            assert axes.images[0].get_array().max() == pytest.approx(1.0)
+
+
+def test_band_energies_sum_to_the_total(whole):
+    """Over the whole record the parts are orthogonal; the running mean differs from the total by cross terms."""
+    figures = drawn("band_energies", whole)
+    assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
+    with EnsembleFile(whole) as ensemble:
+        for _, folder in ensemble.whole_members():
+            with h5py.File(folder / "analysis.h5") as file:
+                energy, total = file["bands/energy"][...], file["bands/total"][...]
+            assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=0.01)
+    shown = lines(panel(figures["hertz-calibrated-1-site-4-cycles-60N"], "(a)"))
+    parts = sum(y for label, (_, y) in shown.items() if label.startswith(("band", "gap", "above")))
+    np.testing.assert_allclose(shown["sum of parts"][1], parts, rtol=1e-9)
+
+
+def test_closing_error_is_exact_for_parts_in_quadrature():
+    """cos a t + cos b t: the cross term averages out over a common period, and only there."""
+    t = 2 * np.pi * np.arange(4000) / 400
+    parts = np.array([np.cos(3 * t) ** 2, np.cos(5 * t) ** 2])
+    total = (np.cos(3 * t) + np.cos(5 * t)) ** 2
+    assert np.nanmax(closing_error(parts, total, 400)) < 1e-12
+    assert np.nanmax(closing_error(parts, total, 130)) > 0.1
+    assert np.isnan(closing_error(parts, np.append(total[:-500], np.zeros(500)), 10)[-1])
+
+
+def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
+    (figure,) = drawn("phase_regimes", whole, reduced).values()
+    curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
+    with EnsembleFile(reduced) as ensemble:
+        grey = curve.lines[0].get_xydata().T
+        np.testing.assert_array_equal(grey[1], ensemble.curve("ibtet", "amplitude", law="hertz"))
+    with EnsembleFile(whole) as ensemble:
+        points = np.array([line.get_xydata()[0] for line in curve.lines[1:]])
+        np.testing.assert_array_equal(points[:, 0], ensemble.values("amplitude"))
+        np.testing.assert_array_equal(points[:, 1], ensemble.values("ibtet").ravel())
+        with RunFile(ensemble.member((0, 1)) / "run.h5") as run:
+            portrait = Portrait.of(run, 0.1)
+            w = run.displacement[:, run.site_cells[0] - 1, 2] - run.displacement[:, run.site_cells[0] - 1, 1]
+    assert [a.get_title(loc="left") for a in (first, second)] == ["1: 1 N", "2: 60 N"]
+    shown = np.diff(portrait.displacement, axis=1)
+    assert np.abs(shown).max() >= np.abs(w).max() > portrait.clearance
+    resonator, host = (line.get_xydata().T for line in second.lines)
+    np.testing.assert_array_equal(resonator[0], 1e3 * portrait.displacement[:, 1])
+    np.testing.assert_array_equal(host[1], portrait.velocity[:, 0])
+
+
+def test_regimes_without_an_ensemble_beside_them(whole):
+    (figure,) = drawn("phase_regimes", whole).values()
+    assert len(all_axes(figure)[0].lines) == 2  # the two points themselves
+
+
+@pytest.mark.parametrize("kind", ["png", "pdf"])
+def test_files_are_named_by_figure_and_suffix(reduced, kind):
+    written = draw_study([reduced], ["ibtet", "ibtet_backbone"], [kind])
+    stems = ("ibtet-calibrated", "ibtet_backbone-calibrated-1-site-4-cycles")
+    assert [p.name for p in written] == [f"{stem}.{kind}" for stem in stems]
+    assert all(p.stat().st_size > 10_000 for p in written)
+
+
+def test_curves_of_a_sweep(reduced):
+    with EnsembleFile(reduced) as ensemble:
+        found = list(ensemble.curves())
+        assert [(c.contacts.law, i) for c, i in found] == [("hertz", (0, slice(None))), ("bilinear", (1, slice(None)))]
+        assert list(ensemble.curves("wavenumber")) == []
+        assert Path(ensemble.member((0, 3))).parent == reduced
