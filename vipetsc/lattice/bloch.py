@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -86,6 +87,11 @@ def _extremum(function, kappa: np.ndarray, values: np.ndarray) -> tuple[float, f
 
 def pass_bands(cell: UnitCell, points: int = 721) -> list[Band]:
     """Pass bands, lowest first; edges are the extremes over kappa in [0, pi], refined off the grid."""
+    return list(_pass_bands(cell, points))
+
+
+@lru_cache
+def _pass_bands(cell: UnitCell, points: int) -> tuple[Band, ...]:
     kappa = np.linspace(0, np.pi, points)
     frequency = bloch(cell, kappa).frequency
     bands = []
@@ -93,7 +99,7 @@ def pass_bands(cell: UnitCell, points: int = 721) -> list[Band]:
         _, high = _extremum(lambda x, b=b: _frequency(cell, b + 1, x), kappa, frequency[:, b])
         _, low = _extremum(lambda x, b=b: -_frequency(cell, b + 1, x), kappa, -frequency[:, b])
         bands.append(Band(b + 1, max(-low, 0.0), high))
-    return bands
+    return tuple(bands)
 
 
 def gaps(bands: list[Band]) -> list[tuple[float, float]]:
@@ -101,6 +107,7 @@ def gaps(bands: list[Band]) -> list[tuple[float, float]]:
     return [(a.high, b.low) for a, b in itertools.pairwise(bands) if b.low > a.high]
 
 
+@lru_cache
 def max_group_velocity(cell: UnitCell, band: int, points: int = 721) -> tuple[float, float, float]:
     """Where ``band`` (1-based) is fastest: wavenumber (rad per cell), frequency (rad/s), |v_g| (cells/s)."""
 
@@ -114,6 +121,11 @@ def max_group_velocity(cell: UnitCell, band: int, points: int = 721) -> tuple[fl
 
 def waves_at(cell: UnitCell, frequency: float, points: int = 721) -> list[tuple[int, float, float]]:
     """Propagating waves of ``frequency`` (rad/s): (band, kappa in (0, pi), |v_g| in cells/s); [] in a gap."""
+    return list(_waves_at(cell, frequency, points))
+
+
+@lru_cache
+def _waves_at(cell: UnitCell, frequency: float, points: int) -> tuple[tuple[int, float, float], ...]:
     kappa = np.linspace(0, np.pi, points)
     offset = bloch(cell, kappa).frequency - frequency
     waves = []
@@ -124,4 +136,4 @@ def waves_at(cell: UnitCell, frequency: float, points: int = 721) -> list[tuple[
             root = brentq(lambda x, b=b: _frequency(cell, b + 1, x) - frequency, kappa[i], kappa[i + 1], xtol=1e-13)
             speed = float(abs(bloch(cell, root).group_velocity[b]))
             waves.append((b + 1, root, speed))
-    return waves
+    return tuple(waves)
