@@ -6,7 +6,7 @@ import difflib
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vipetsc.ensembles import EnsembleFile
@@ -41,12 +41,17 @@ class Study:
             sweeps = tuple(stack.enter_context(EnsembleFile(f)) for f in folders if (f / "ensemble.h5").exists())
             yield cls(sweeps, tuple(f for f in folders if any(f.glob("branch-*.h5"))))
 
+    def measuring(self, measure: str) -> Study:
+        """The same without the sweeps that do not measure it."""
+        return replace(self, ensembles=tuple(e for e in self.ensembles if measure in e.sweep.options.measures))
+
 
 # Each offers what its data allow.
 StudyFigure = Callable[[Study], Iterator[Drawing]]
-study_figures: dict[str, StudyFigure] = {
-    f.__name__: f
-    for f in (
+
+# By what a sweep measures; a sweep is shown only by the figures of its own measures.
+_FAMILIES: dict[str, tuple[StudyFigure, ...]] = {
+    "entropy": (
         amplitudes,
         wavelets,
         partition,
@@ -56,14 +61,18 @@ study_figures: dict[str, StudyFigure] = {
         entropy_all,
         entropy_maps,
         entropy_history,
+    ),
+    "transfer": (
         transfer,
         transfer_dispersions,
         band_energies,
         ibtet,
         ibtet_backbone,
         phase_regimes,
-    )
+    ),
 }
+study_figures: dict[str, StudyFigure] = {f.__name__: f for family in _FAMILIES.values() for f in family}
+_MEASURE = {f.__name__: measure for measure, family in _FAMILIES.items() for f in family}
 
 
 def draw_study(
@@ -107,5 +116,5 @@ def draw_study(
 def offered(study: Study, names: Iterable[str]) -> Iterator[Drawing]:
     """Every picture of ``names`` that the data allow, each with the stem of its file."""
     for name in names:
-        for suffix, make in study_figures[name](study):
+        for suffix, make in study_figures[name](study.measuring(_MEASURE[name])):
             yield f"{name}-{suffix}" if suffix else name, make
