@@ -266,6 +266,27 @@ def _name(paths: list[Path], comm: MPI.Comm) -> int:
     return DONE
 
 
+def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Every figure and claim of the paper: what is missing is computed, drawn, measured, and put into a report."""
+    from vipetsc.studies.paper import make_paper
+    from vipetsc.studies.plan import FULL, QUICK, paper_plan
+    from vipetsc.studies.tables import claims_table, plan_table
+
+    plan = paper_plan(QUICK if options.quick else FULL)
+    folder = options.out or Path("runs") / ("paper-quick" if options.quick else "paper")
+    if options.list:
+        _say(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
+        return DONE
+    stop = StopRequest().install()
+    result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: _say(comm, f"  {text}"))
+    if result.stopped:
+        _say(comm, "stopped on request; the same command goes on")
+        return FAILED
+    _say(comm, claims_table(result.claims))
+    _say(comm, f"  {len(result.made)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
+    return DONE if result.complete else FAILED
+
+
 def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Versions, MPI, HDF5 and ranks; what is missing and how to get it."""
     text, healthy = doctor_table(comm)
@@ -275,6 +296,15 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def _runs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", type=Path, nargs="+", metavar="PATH", help="folder of a run or of a sweep, or a run.h5")
+
+
+def _paper(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="ID", help="only what these figures (fig05) and claims (C7) need"
+    )
+    parser.add_argument("--quick", action="store_true", help="coarse grids: minutes, marked on every picture")
+    parser.add_argument("--list", action="store_true", help="what is done, what is left and how long it takes")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="runs/paper, or runs/paper-quick, if left out")
 
 
 def _swept(parser: argparse.ArgumentParser) -> None:
@@ -296,5 +326,6 @@ VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
     "design": (design, "the (lambda, eta) search of the four-band cell", (_case, _folder)),
     "analyse": (analyse, "measures of runs already made, from their files", (_runs,)),
     "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),
+    "paper": (paper, "every figure and claim of the paper, and a report", (_paper,)),
     "doctor": (doctor, "versions and what is missing", ()),
 }

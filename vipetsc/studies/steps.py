@@ -46,7 +46,7 @@ class Step(ABC):
         return root / self.name
 
     def changed(self, *changes: str) -> Step:
-        """This step with further changes to its case."""
+        """The same step with further changes to its case."""
         return replace(self, changes=(*self.changes, *changes))
 
     @property
@@ -87,6 +87,11 @@ class Step(ABC):
         """Numbers about the results for a report; empty where there are none to tell."""
         return {}
 
+    def sound(self, root: Path) -> bool:
+        """Whether nothing of the step failed, once it is done."""
+        found = self.statistics(root)
+        return not found.get("failed") and not any("failed" in ending for ending in found.get("endings", ()))
+
 
 class SweepStep(Step):
     """A sweep; its members are kept when it is stopped."""
@@ -110,7 +115,7 @@ class SweepStep(Step):
 
     def results(self, folder: Path) -> list[Path]:
         """See ``Step``."""
-        return [folder / "ensemble.h5"]
+        return [folder / "ensemble.h5", folder / "backbone.h5"]
 
     def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
         """See ``Step``."""
