@@ -222,8 +222,8 @@ PLATES: Sequence[Plate] = (
     Plate(
         "fig12", "Fig. 12", "Transfer beside the slope of the branch",
         "Transfer of the four-band lattice (dots; red where fitted) over energy, scaled so that the first contact "
-        "falls on grazing; slope of the out-of-phase branch over a divisor (dashed) and with the linear floor (grey); power "
-        "law over region III (green). Five sites, 30 cycles.",
+        "falls on grazing; slope of the out-of-phase branch over a divisor (dashed) and with the linear floor "
+        "(grey); power law over region III (green). Five sites, 30 cycles.",
         ("C16",), (_study("ibtet_backbone", TRANSFER, only=("5-sites-30-cycles",)),),
     ),
     Plate(

@@ -34,9 +34,8 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
         model = Case.from_table(table).model()
         draw_lattice(axes, model.chain, model.drive_cell, brief=True)
         words = "1 contact site" if count == 1 else f"{count} contact sites"
-        style.letter(
-            axes, f"(c.{i + 1}) {words}" + "; cell above, clearance in mm below; driven at the arrow" * (i == 0)
-        )
+        legend = "; cell above, clearance in mm below; driven at the arrow" if i == 0 else ""
+        style.letter(axes, f"(c.{i + 1}) {words}{legend}")
     return figure
 
 

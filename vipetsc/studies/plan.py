@@ -36,6 +36,8 @@ COSTS = {
     "scattering": 2.0,
 }
 
+RUNS = ("output.figures=false",)  # of all sweeps: the figures of the paper are drawn from all of them together
+
 COARSER = {
     "scattering": (
         'sweep.drive.wavenumber=["3pi/9", "5pi/9"]',
@@ -124,8 +126,10 @@ def paper_plan(grid: str = FULL, cases: Path | None = None) -> Plan:
     for name, cost in COSTS.items():
         kind = DesignStep if name == "design" else BranchStep if name in BRANCHES else SweepStep
         file = cases / f"{name.removesuffix('-calibrated')}.toml"
-        calibrated = ("lattice.reading=calibrated", OUT_OF_PHASE) if name.endswith("-calibrated") else ()
-        steps.append(kind(name, file, calibrated + (COARSER.get(name, ()) if grid == QUICK else ()), cost))
+        changes = ("lattice.reading=calibrated", OUT_OF_PHASE) if name.endswith("-calibrated") else ()
+        changes += COARSER.get(name, ()) if grid == QUICK else ()
+        changes = (*RUNS, *changes) if kind is SweepStep else changes
+        steps.append(kind(name, file, changes, cost))
     found = {step.name: step for step in steps}
     relation = Relation(found["interband"], tuple(found[name] for name in BRANCHES))
     return Plan(grid, tuple(steps), relation, note=COARSE if grid == QUICK else "")

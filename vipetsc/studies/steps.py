@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -71,9 +72,13 @@ class Step(ABC):
         folder = self.folder(root)
         if not (folder / "case.toml").exists():
             return MISSING
-        if (folder / "case.toml").read_text(encoding="utf-8") != self.text:
+        if not self._is_own((folder / "case.toml").read_text(encoding="utf-8")):
             return STALE
         return DONE if self.complete(folder) else BEGUN
+
+    def _is_own(self, text: str) -> bool:
+        """Whether a case in TOML is this step's, in whatever order its keys stand."""
+        return tomllib.loads(text) == tomllib.loads(self.text)
 
     def left(self, root: Path) -> float:
         """CPU time in s that is still needed."""
@@ -111,7 +116,7 @@ class SweepStep(Step):
         if not (folder / "ensemble.h5").exists():
             return False
         with h5py.File(folder / "ensemble.h5") as file:
-            return file.attrs["case"] == self.text
+            return self._is_own(file.attrs["case"])
 
     def results(self, folder: Path) -> list[Path]:
         """See ``Step``."""
@@ -207,7 +212,7 @@ class DesignStep(Step):
         if not (folder / "design.h5").exists():
             return False
         with h5py.File(folder / "design.h5") as file:
-            return file.attrs["case"] == self.text
+            return self._is_own(file.attrs["case"])
 
     def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
         """See ``Step``."""
