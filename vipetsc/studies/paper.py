@@ -156,7 +156,7 @@ def pictures(root: Path) -> dict[str, list[str]]:
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[str, Any], ...]:
     """``claims.json`` and ``report.html`` as far as something is newer; returns the claims."""
-    module = importlib.import_module("vipetsc.studies.claims")
+    module = importlib.import_module(plan.claims)
     path, report = root / "claims.json", root / "report.html"
     if _older(path, [newest(plan.steps, root), *_written(Path(module.__file__).parent, "*.py")]):
         tell("claims")

@@ -60,7 +60,8 @@ COARSER = {
 class Plan:
     """Steps in the order in which they are made, the relation drawn between some, and the figures of the paper.
 
-    ``grid`` is "full" or "quick"; ``note`` stands on every picture.
+    ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``claims`` names the module that measures
+    (``measure_claims``, ``write_claims``).
     """
 
     grid: str
@@ -68,6 +69,7 @@ class Plan:
     relation: Relation | None = None
     plates: Sequence[Plate] = PLATES
     note: str = ""
+    claims: str = "vipetsc.studies.claims"
 
     def only(self, ids: Iterable[str]) -> Plan:
         """The part of the plan that figures and claims need; all of it without ``ids``.
