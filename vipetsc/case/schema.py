@@ -155,9 +155,10 @@ class DriveTable(Section):
 class TimeTable(Section):
     """End in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
 
-    ``engine``: ``ts`` steps with PETSc's Runge-Kutta ``method``, ``propagator`` takes exact linear steps with contacts
-    collocated, ``auto`` the propagator where it suits. ``atol``: ``scaled`` is .1 rtol times the displacement and the velocity of the drive's linear wave,
-    ``paper`` is 1e-9 times the amplitude, a number is used for displacements (m) and velocities (m/s).
+    ``engine``: ``ts`` steps with PETSc's Runge-Kutta ``method``; ``propagator`` takes exact linear steps, with
+    contact forces collocated; ``auto`` is the propagator where it suits. ``atol``: ``scaled`` is .1 rtol times the
+    displacement and the velocity of the drive's linear wave, ``paper`` is 1e-9 times the amplitude, a number is
+    used for displacements (m) and velocities (m/s).
     """
 
     end: Positive | Literal["traverse"] = "traverse"

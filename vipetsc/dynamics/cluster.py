@@ -16,7 +16,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.series import StepSeries
 
-# A contact's first substep as a share of its duration.
+# A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1
 # Longest substeps in radians of the fastest oscillation: searched for changes; only driven.
 SEARCHED, DRIVEN = 0.4, 1.25
@@ -91,6 +91,7 @@ class Cluster:
         self.counts = np.zeros(3, np.int64)
         self.switches = 0
         self._burst = model.drive.duration
+        self._first = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / march_kernel.ORDER), 2.0)
         self._since = np.zeros(len(self.sites))
         self._durations = np.ones(len(self.sites))
         self._tops = np.zeros((len(self.sites), 3))
@@ -139,7 +140,7 @@ class Cluster:
         for site in set(tracker.open) - before:
             self._since[site] = now
             self._durations[site] = tracker.duration(abs(float(self.operator.approach[site])))
-            first = FIRST_SUBSTEP * self._durations[site] / self._clock[words.INTERVAL]
+            first = self._first * self._durations[site] / self._clock[words.INTERVAL]
             self._clock[words.SUBSTEP] = min(self._clock[words.SUBSTEP], first)
         if not tracker.open:
             self._clock[words.SUBSTEP] = 1.0

@@ -111,7 +111,7 @@ def motion(q, p, clock, driven, jets, gamma, motion):
     **_options,
 )
 def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, w, v):
-    """Forces ``f`` and motion ``w``, ``v`` (member, node) of the active members in a substep; whether that converged."""
+    """Forces ``f`` and motion ``w``, ``v`` (member, node) of the active members in a substep; whether it converged."""
     sites, h, n = q[SITES], clock[INTERVAL], active.size
     terms = gamma.shape[2]
     free_w, free_v = np.empty((n, NODES)), np.empty((n, NODES))
@@ -138,7 +138,7 @@ def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, 
                 if size < 1e-18:
                     break
     last = np.inf
-    for sweep in range(MOST_SWEEPS):
+    for _ in range(MOST_SWEEPS):
         change = 0.0
         for a in range(n):
             i = active[a]

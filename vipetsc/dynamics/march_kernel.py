@@ -29,7 +29,7 @@ from vipetsc.dynamics.cluster_kernel import (
 )
 from vipetsc.dynamics.collocation import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.contact_kernel import first_change, peaks, switching
-from vipetsc.dynamics.kernel import CLEARANCE, CONTACT_MODE, FREE, HERTZ, SITE_MODE, SITES
+from vipetsc.dynamics.kernel import CLEARANCE, CONTACT_MODE, FREE, HERTZ, SITE_MODE, SITES, contact_force
 
 # How a march ended: at the end of the step, on a change of modes, or without progress.
 DONE, CHANGE, FAILED = range(3)
@@ -38,8 +38,11 @@ SUBSTEPS, REJECTED, LANDINGS = range(3)
 
 MOST_SUBSTEPS = 20_000
 LANDING_STEPS = 8
+# A contact's substep in ages of the contact.
+AGES = 1.5
 # Order by which the substep follows its error.
 ORDER = 8.0
+GROWTH = 2.0
 
 _options = {"cache": True, "error_model": "numpy", "boundscheck": False}
 
@@ -87,6 +90,23 @@ def _land(
             return at, False
         at *= again
     return at, False
+
+
+@njit("void(i8[::1], f8[::1], i8, f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8[:, ::1])", **_options)
+def _top(q, p, i, start, end, h, f, top):
+    """Update a contact's largest indentation and force and its smallest force by a substep."""
+    side = 1.0 if q[q[SITE_MODE] + i] > 0 else -1.0
+    depth = max(side * start[i, 0], side * end[i, 0]) - p[q[CLEARANCE] + i]
+    first = side * contact_force(q, p, i, start[i, 0], start[i, 1])[0]
+    last = side * contact_force(q, p, i, end[i, 0], end[i, 1])[0]
+    force, weakest, inside = max(first, last), min(first, last), -np.inf
+    for j in range(NODES):
+        inside = max(inside, -side * f[i, j])
+        weakest = min(weakest, -side * f[i, j])
+    if inside > force or (side * start[i, 1] > 0.0 and side * end[i, 1] < 0.0):
+        # A turn lies inside.
+        depth, force, weakest = peaks(q, p, start, end, h, i)
+    top[i, 0], top[i, 1], top[i, 2] = max(top[i, 0], depth), max(top[i, 1], force), min(top[i, 2], weakest)
 
 
 @njit(
@@ -169,7 +189,7 @@ def march(
                 if age * h <= 1e-7 * durations[i]:
                     kind = ONSET
                 else:
-                    length = min(length, 2.0 * age)
+                    length = min(length, AGES * age)
         if kind == ONSET:
             length = wanted
         counts[SUBSTEPS] += 1
@@ -180,16 +200,10 @@ def march(
                 return FAILED
             continue
         renew(kind, length, jets, gamma, share, weight, active, f, trial)
-        wrong = error(q, p, clock, length, gamma, tail, active, f)
-        factor = min(max(0.9 * (1.0 / max(wrong, 1e-30)) ** (1.0 / ORDER), 0.2), 3.0)
-        if wrong > 1.0 and length > 1e-9:
-            counts[REJECTED] += 1
-            clock[SUBSTEP] = factor * length
-            continue
         clock[PLACE] += length
         motion(q, p, clock, driven, trial, gamma, end)
         clock[PLACE] -= length
-        landed = False
+        taken, landed = length, False
         first, which, row = first_change(q, p, start, end, h * length)
         if first <= 1.0:
             site, function = int(which), int(row)
@@ -200,21 +214,28 @@ def march(
                 continue
             kind = EXIT if separates else kind
             counts[LANDINGS] += 1
-            length, landed = _land(q, p, clock, kind, length, first, site, function, driven, jets, gamma, share,
-                                   weight, powers, active, f, w, v, trial, start, end)  # fmt: skip
-            if length < 0.0:
+            taken, landed = _land(q, p, clock, kind, length, first, site, function, driven, jets, gamma, share,
+                                  weight, powers, active, f, w, v, trial, start, end)  # fmt: skip
+            if taken < 0.0:
                 counts[REJECTED] += 1
-                clock[SUBSTEP] = -0.4 * length
+                clock[SUBSTEP] = -0.4 * taken
                 continue
-        elif count > int(driven):
-            clock[SUBSTEP] = max(factor * length, min(clock[SUBSTEP], wanted))
+        if taken > 0.0:
+            # Judged only now: a force continued beyond its end is no smooth function.
+            wrong = error(q, p, clock, taken, gamma, tail, active, f)
+            factor = min(max(0.9 * (1.0 / max(wrong, 1e-30)) ** (1.0 / ORDER), 0.2), GROWTH)
+            if wrong > 1.0 and taken > 1e-9:
+                counts[REJECTED] += 1
+                clock[SUBSTEP] = factor * taken
+                continue
+            if not landed and count > int(driven):
+                clock[SUBSTEP] = max(factor * taken, clock[SUBSTEP] if taken < clock[SUBSTEP] else 0.0)
+        length = taken
         if length > 0.0:
             book(q, p, clock, kind, length, share, weight, active, f, w, v, moments, energy)
             for i in range(sites):
                 if modes[i] != FREE:
-                    depth, force, weakest = peaks(q, p, start, end, h * length, i)
-                    top[i, 0], top[i, 1] = max(top[i, 0], depth), max(top[i, 1], force)
-                    top[i, 2] = min(top[i, 2], weakest)
+                    _top(q, p, i, start, end, h * length, f, top)
             clock[PLACE] += length
             jets[:] = trial
             start[:] = end

@@ -1,4 +1,4 @@
-"""The propagator P(H) on a rank's cells: one stencil for all cells but those near the ends, which have their own rows."""
+"""The propagator P(H) on a rank's cells: one stencil, and rows of their own for the cells near the ends."""
 
 from __future__ import annotations
 
