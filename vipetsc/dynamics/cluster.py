@@ -18,6 +18,8 @@ from vipetsc.dynamics.series import StepSeries
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1
+# Changes of one cluster in one step beyond which it counts as stalled.
+MOST_CHANGES = 20_000
 # Longest substeps in radians of the fastest oscillation: searched for changes; only driven.
 SEARCHED, DRIVEN = 0.4, 1.25
 
@@ -121,16 +123,17 @@ class Cluster:
         clock[words.BEGIN], clock[words.PLACE] = begin, 0.0
         clock[words.DRIVE_END] = (self._burst - begin) / h if self.driven else 0.0
         self.moments[:] = 0.0
-        while True:
+        for _ in range(MOST_CHANGES):
             outcome = march_kernel.march(
                 operator.q, operator.p, clock, self._since, self._durations, *self._arguments
             )  # fmt: skip
             if outcome == march_kernel.DONE:
                 return
-            now = begin + float(clock[words.PLACE]) * h
             if outcome == march_kernel.FAILED:
-                raise StalledError(f"the contacts of sites {', '.join(str(s + 1) for s in self.sites)} at {now:.9g} s")
-            self._switch(now)
+                break
+            self._switch(begin + float(clock[words.PLACE]) * h)
+        now = begin + float(clock[words.PLACE]) * h
+        raise StalledError(f"the contacts of sites {', '.join(str(s + 1) for s in self.sites)} at {now:.9g} s")
 
     def _switch(self, now: float) -> None:
         tracker = self.tracker

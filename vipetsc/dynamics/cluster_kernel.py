@@ -75,7 +75,7 @@ def first_onset(jet, clearance, length):
         while s <= length:
             w, rate = _at(jet, s)
             gap, closing = clearance - side * w, side * rate
-            if gap < tolerance and closing > 0.0:
+            if gap < 0.5 * tolerance and closing > 0.0:
                 polish = gap / closing
                 first = min(first, max(s + polish, 0.0) if bend * polish * polish < tolerance else s)
                 break
@@ -148,13 +148,14 @@ def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, 
                     for k in range(NODES):
                         x += to_w[a, b, j, k] * f[active[b], k]
                         y += to_v[a, b, j, k] * f[active[b], k]
+                if not abs(x) + abs(y) < np.inf:
+                    f[:sites] = 0.0
+                    return False
                 if i < sites:
                     # Changes count against the clearance and against the approach.
                     change = max(change, abs(x - w[i, j]) / p[q[CLEARANCE] + i])
                     change = max(change, abs(y - v[i, j]) / (abs(y) + abs(p[q[APPROACH] + i])))
                 w[i, j], v[i, j] = x, y
-        if not np.isfinite(change):
-            return False
         if change < 1e-15 or (change < 1e-13 and change >= last):
             return True
         last = change
@@ -163,6 +164,7 @@ def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, 
             if i < sites:
                 for j in range(NODES):
                     f[i, j] = -contact_force(q, p, i, w[i, j], v[i, j])[0]
+    f[:sites] = 0.0
     return False
 
 

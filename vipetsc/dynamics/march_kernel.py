@@ -40,6 +40,8 @@ MOST_SUBSTEPS = 20_000
 LANDING_STEPS = 8
 # A contact's substep in ages of the contact.
 AGES = 1.5
+# Share of a step that is too short for anything to happen.
+BLIND = 1e-7
 # Order by which the substep follows its error.
 ORDER = 8.0
 GROWTH = 2.0
@@ -66,7 +68,9 @@ def _land(
     at, last = first * length, np.inf
     for attempt in range(2 * LANDING_STEPS):
         if at <= ROUNDING:
-            return 0.0, True
+            switching(q, p, site, start, values)
+            value, rate, tolerance = values[row, 0], values[row, 1], values[row, 2]
+            return 0.0, value > tolerance or (value >= -tolerance and rate > 0.0)
         if not collocate(q, p, clock, kind, at, jets, gamma, share, powers, active, f, w, v):
             return -at, False
         renew(kind, at, jets, gamma, share, weight, active, f, trial)
@@ -144,7 +148,7 @@ def march(
     modes = q[q[SITE_MODE] : q[SITE_MODE] + sites]
     members = jets.shape[0]
     f, w, v = np.zeros((members, NODES)), np.zeros((members, NODES)), np.zeros((members, NODES))
-    trial = np.empty_like(jets)
+    trial, blind = np.empty_like(jets), False
     for _ in range(MOST_SUBSTEPS):
         rest = 1.0 - clock[PLACE]
         if rest <= ROUNDING:
@@ -192,6 +196,8 @@ def march(
                     length = min(length, AGES * age)
         if kind == ONSET:
             length = wanted
+        if blind:
+            length = min(length, BLIND)
         counts[SUBSTEPS] += 1
         if not collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, w, v):
             counts[REJECTED] += 1
@@ -205,7 +211,7 @@ def march(
         clock[PLACE] -= length
         taken, landed = length, False
         first, which, row = first_change(q, p, start, end, h * length)
-        if first <= 1.0:
+        if first <= 1.0 and not blind:
             site, function = int(which), int(row)
             separates = q[HERTZ] == 1 and abs(modes[site]) == CONTACT_MODE and function == 0
             if separates and kind == ONSET and length > 1e-9:
@@ -220,6 +226,8 @@ def march(
                 counts[REJECTED] += 1
                 clock[SUBSTEP] = -0.4 * taken
                 continue
+        # A change at the very start that is none: past it.
+        blind = taken == 0.0 and not landed
         if taken > 0.0:
             # Judged only now: a force continued beyond its end is no smooth function.
             wrong = error(q, p, clock, taken, gamma, tail, active, f)
