@@ -73,7 +73,7 @@ class Ledger:
 
     def check(self, energies: Energies) -> str | None:
         """What is wrong with a state of these energies, or None; keeps the largest residual and work."""
-        saturated = self.unit * 2.0**52
+        saturated = self.unit * 2.0**50
         total = energies.kinetic + energies.spring + energies.contact
         if not (np.isfinite(energies.work) and total < saturated):
             return "the state is not finite"

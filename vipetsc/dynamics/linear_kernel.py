@@ -9,7 +9,7 @@ from __future__ import annotations
 from numba import njit
 
 # Cells in one pass: what a pass reads stays in the first-level cache.
-CHUNK = 256
+CHUNK = 512
 # Terms that one pass over a chunk adds.
 GROUP = 8
 
