@@ -27,8 +27,8 @@ from vipetsc.parallel import StopRequest
 
 # Steps a sample interval may be cut into.
 MOST_PARTS = 64
-# Members of one cluster beyond which plain time stepping costs less.
-MOST_MEMBERS = 32
+# Sites of one cluster beyond which plain time stepping costs less.
+MOST_SITES = 32
 
 
 def step_series(model: Model) -> StepSeries | None:
@@ -83,12 +83,12 @@ class Propagator(Engine):
         series = step_series(model)
         if series is None:
             return f"{model.chain.cells} cells are fewer than the propagator's band"
-        largest = max(members_of(model, series.reach), key=len)
-        if len(largest) > MOST_MEMBERS:
-            cells = sorted(m.cell + 1 for m in largest)
+        groups = ([m.cell + 1 for m in group if m.site >= 0] for group in members_of(model, series.reach))
+        cells = sorted(max(groups, key=len))
+        if len(cells) > MOST_SITES:
             return (
-                f"{len(largest)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
-                f" another (at most {MOST_MEMBERS} may)"
+                f"{len(cells)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
+                f" another (at most {MOST_SITES} may)"
             )
         return None
 
