@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from tests.conftest import assert_same_bits, datasets, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.cluster_kernel import first_onset
@@ -15,7 +15,6 @@ from vipetsc.dynamics.collocation import collocation
 from vipetsc.dynamics.series import StepSeries
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import Chain
-from vipetsc.parallel import StopRequest
 
 THREE_MASSES = {
     "masses": [0.010, 0.004, 0.002],
@@ -97,10 +96,12 @@ def test_a_linear_run_is_the_modal_solution(folder, ends, lattice, drive, time):
 
 def agree(folder, case: Case, velocity: float = 1e-7, onset: float = 1e-9) -> dict:
     """Both engines give the same run; returns the propagator's statistics."""
-    simulate(with_engine(case, "ts", rtol=1e-12), folder / "ts")
+    stepped = simulate(with_engine(case, "ts", rtol=1e-12), folder / "ts")
     result = simulate(with_engine(case, "propagator"), folder / "propagator")
     theirs, ours = (datasets(folder / name / "run.h5") for name in ("ts", "propagator"))
     assert result.statistics["engine"] == "propagator"
+    for name in ("episodes", "switches", "floored", "clipped"):
+        assert result.statistics[name] == stepped.statistics[name], name
     for name in ("site", "side"):
         np.testing.assert_array_equal(ours[f"impacts/{name}"], theirs[f"impacts/{name}"])
     np.testing.assert_allclose(ours["impacts/onset"], theirs["impacts/onset"], rtol=0, atol=onset)
@@ -189,18 +190,6 @@ def test_auto_takes_it_where_it_suits(folder):
     statistics = simulate(small_case(time={"end": 0.002, "engine": "auto"}), folder / "run").statistics
     assert statistics["engine"] == "propagator"
     assert "engine_note" not in statistics
-
-
-class StopAt(StopRequest):
-    """A request that comes at the n-th look."""
-
-    def __init__(self, looks: int) -> None:
-        self.left = looks
-
-    @property
-    def requested(self) -> bool:
-        self.left -= 1
-        return self.left < 0
 
 
 @pytest.mark.parametrize("looks", [1, 137, 300])
