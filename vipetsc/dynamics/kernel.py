@@ -265,3 +265,19 @@ def add_energies(y, q, p, unit, sums):
             kc = p[q[CONTACT]]
             energy = kc * x * x * np.sqrt(x) / 2.5 if q[HERTZ] == 1 else 0.5 * kc * x * x
             _add_exactly(sums, 4, energy, unit)
+
+
+@njit("void(f8[::1], i8[::1], f8[::1], f8, f8[::1])", **_options)
+def measure(y, q, p, unit, total):
+    """Kinetic, spring, contact and dissipated energy of this rank into ``total`` (2 whole numbers each), and its work.
+
+    Carrying leaves every number below 2^53: their sums over ranks, as floats, are exact.
+    """
+    sums = np.zeros(8, np.int64)
+    add_energies(y, q, p, unit, sums)
+    add_dissipated(y, q, unit, sums)
+    for i in range(4):
+        carried = sums[2 * i + 1] >> 40
+        total[2 * i] = sums[2 * i] + carried
+        total[2 * i + 1] = sums[2 * i + 1] - (carried << 40)
+    total[8] = y[q[WORK]] if q[WORK] >= 0 else 0.0

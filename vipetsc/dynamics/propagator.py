@@ -121,16 +121,17 @@ class Propagator(Engine):
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s, a multiple of the sample interval; see ``Engine``."""
         failure = None
-        while self.time < target and failure is None:
+        last = round(target / self._interval) * self._parts
+        while self.steps < last and failure is None:
             try:
                 self._step()
             except StalledError as error:
                 failure = error
-            if self._parts > 1 or self.time >= target or failure:
-                self._status[:] = self._stop.requested, failure is not None
-                self._layout.comm.Allreduce(MPI.IN_PLACE, self._status, MPI.MAX)
-                if self._status[1]:
-                    raise failure or StalledError("contacts on another rank")
+            # Any rank's failure or request counts on all.
+            self._status[:] = self._stop.requested, failure is not None
+            self._layout.comm.Allreduce(MPI.IN_PLACE, self._status, MPI.MAX)
+            if self._status[1]:
+                raise failure or StalledError("contacts on another rank")
         return not self._status[0]
 
     def _step(self) -> None:
