@@ -167,6 +167,8 @@ def test_a_member_that_does_not_come_out_is_recorded(vipetsc, case, tmp_path):
         "--set",
         "contacts.stiffness=1e30",
         "--set",
+        "time.engine=ts",
+        "--set",
         "sweep.drive.amplitude=[0.1, 20.0]",
         "--set",
         "sweep.contacts.sites=[1]",
