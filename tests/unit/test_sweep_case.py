@@ -30,7 +30,7 @@ def test_members_are_the_product_in_the_files_order():
     cases = [m.case for m in plan.members()]
     assert [c.drive.amplitude for c in cases] == [1.0, 1.0, 2.0, 2.0, 3.0, 3.0]
     assert [len(c.contacts.sites) for c in cases] == [1, 2] * 3
-    table = tomllib.loads(BASE) | {"drive": {"amplitude": 2.0}, "contacts": {"sites": 2}}
+    table = tomllib.loads(BASE) | {"drive": {"amplitude": 2.0}, "contacts": {"sites": 2}, "time": {"engine": "auto"}}
     assert cases[3] == Case.from_table(table)
 
 
