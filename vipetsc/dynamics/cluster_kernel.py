@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from scipy.special import binom
 
 from vipetsc.dynamics.collocation import NODES
 from vipetsc.dynamics.contact_kernel import LANDED
@@ -23,11 +24,13 @@ from vipetsc.dynamics.kernel import (
     contact_force,
     drive_force,
 )
+from vipetsc.dynamics.series import MOST_TERMS
 
 # Words of the clock: time at the step's begin, H, place s, next substep, end of the drive (s), longest substep.
 BEGIN, INTERVAL, PLACE, SUBSTEP, DRIVE_END, LONGEST, RTOL, ATOL, TOP = range(9)
 ROUNDING = 1e-15  # a share of a step that is none
 MOST_SWEEPS = 60
+BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 # Share of the estimated error (interpolation of the force) that the end of a substep is left with.
 SUPERCONVERGENCE = 0.02
 
@@ -171,11 +174,20 @@ def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, 
 @njit("void(i8, f8, f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])", **_options)
 def renew(kind, length, jets, gamma, share, weight, active, f, trial):
     """Jets of all members at the end of a substep in which the forces ``f`` acted."""
-    trial[:] = jets
-    for i in range(jets.shape[0]):
-        shift(trial[i], length)
-    terms = gamma.shape[2]
-    moments = np.empty(2 * terms)
+    members, terms = jets.shape[0], gamma.shape[2]
+    # All members' series at once: the loops over them are the contiguous ones.
+    turned = np.empty((2 * terms, members))
+    for k in range(2 * terms):
+        for i in range(members):
+            turned[k, i] = jets[i, k]
+    for k in range(2 * terms - 1):
+        for i in range(2 * terms - 2, k - 1, -1):
+            for j in range(members):
+                turned[i, j] += length * turned[i + 1, j]
+    for k in range(2 * terms):
+        for i in range(members):
+            trial[i, k] = turned[k, i]
+    moments, series = np.empty(2 * terms), np.empty((terms, 2 * terms))
     for a in range(active.size):
         source = active[a]
         moments[:] = 0.0
@@ -184,14 +196,15 @@ def renew(kind, length, jets, gamma, share, weight, active, f, trial):
             for k in range(2 * terms):
                 moments[k] += amount
                 amount *= lag
-        for i in range(jets.shape[0]):
+        for m in range(terms):
+            for k in range(2 * m + 2):
+                series[m, k] = BINOMIALS[2 * m + 1, k] * moments[2 * m + 1 - k]
+        for i in range(members):
             for m in range(terms):
-                g, binomial = gamma[i, source, m], 1.0
-                if g == 0.0:
-                    continue
-                for k in range(2 * m + 2):
-                    trial[i, k] += g * binomial * moments[2 * m + 1 - k]
-                    binomial *= (2 * m + 1 - k) / (k + 1.0)
+                g = gamma[i, source, m]
+                if g != 0.0:
+                    for k in range(2 * m + 2):
+                        trial[i, k] += g * series[m, k]
 
 
 @njit("f8(i8[::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, ::1], i8[::1], f8[:, ::1])", **_options)
