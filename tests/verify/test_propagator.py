@@ -234,7 +234,7 @@ def test_nodes_integrate_what_they_should():
             assert weight @ share**power == pytest.approx(1 / (power + 1), rel=1e-13)
         for lag in range(6):
             # Of the constant 1: (share_j)^(lag + 1) / (lag + 1).
-            whole = table.powers[kind, lag].sum(axis=1)
+            whole = table.powers[kind, lag].sum(axis=0)
             np.testing.assert_allclose(whole, share ** (lag + 1) / (lag + 1), rtol=1e-12)
 
 

@@ -126,39 +126,47 @@ def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, 
             if active[a] == sites:
                 f[sites, j] = drive_force(clock[BEGIN] + (clock[PLACE] + at) * h, p, q)
     to_w, to_v = np.zeros((n, n, NODES, NODES)), np.zeros((n, n, NODES, NODES))
+    near = np.zeros((n, n), np.bool_)
     for a in range(n):
         for b in range(n):
             power, size = length, 1.0
             for m in range(terms):
                 g = gamma[active[a], active[b], m]
                 if g != 0.0:
-                    for j in range(NODES):
-                        for k in range(NODES):
-                            to_w[a, b, j, k] += g * power * length * powers[kind, 2 * m + 1, j, k]
-                            to_v[a, b, j, k] += g * power * (2 * m + 1) / h * powers[kind, 2 * m, j, k]
+                    near[a, b] = True
+                    by_w, by_v = g * power * length, g * power * (2 * m + 1) / h
+                    for k in range(NODES):
+                        for j in range(NODES):
+                            to_w[a, b, k, j] += by_w * powers[kind, 2 * m + 1, k, j]
+                            to_v[a, b, k, j] += by_v * powers[kind, 2 * m, k, j]
                 power *= length * length
                 size *= (clock[TOP] * length) ** 2 / ((2 * m + 2) * (2 * m + 3))
                 if size < 1e-18:
                     break
     last = np.inf
+    x, y = np.empty(NODES), np.empty(NODES)
     for _ in range(MOST_SWEEPS):
         change = 0.0
         for a in range(n):
             i = active[a]
-            for j in range(NODES):
-                x, y = free_w[a, j], free_v[a, j]
-                for b in range(n):
+            x[:] = free_w[a]
+            y[:] = free_v[a]
+            for b in range(n):
+                if near[a, b]:
                     for k in range(NODES):
-                        x += to_w[a, b, j, k] * f[active[b], k]
-                        y += to_v[a, b, j, k] * f[active[b], k]
-                if not abs(x) + abs(y) < np.inf:
+                        force = f[active[b], k]
+                        for j in range(NODES):
+                            x[j] += to_w[a, b, k, j] * force
+                            y[j] += to_v[a, b, k, j] * force
+            for j in range(NODES):
+                if not abs(x[j]) + abs(y[j]) < np.inf:
                     f[:sites] = 0.0
                     return False
                 if i < sites:
                     # Changes count against the clearance and against the approach.
-                    change = max(change, abs(x - w[i, j]) / p[q[CLEARANCE] + i])
-                    change = max(change, abs(y - v[i, j]) / (abs(y) + abs(p[q[APPROACH] + i])))
-                w[i, j], v[i, j] = x, y
+                    change = max(change, abs(x[j] - w[i, j]) / p[q[CLEARANCE] + i])
+                    change = max(change, abs(y[j] - v[i, j]) / (abs(y[j]) + abs(p[q[APPROACH] + i])))
+                w[i, j], v[i, j] = x[j], y[j]
         if change < 1e-15 or (change < 1e-13 and change >= last):
             return True
         last = change
