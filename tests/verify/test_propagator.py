@@ -176,6 +176,7 @@ def test_tolerance_keeps_its_promise(folder):
     [
         ({"lattice": {"cells": 2}, "contacts": {"sites": [1, 2]}}, "2 cells are fewer"),
         ({"lattice": {"cells": 40}, "contacts": {"sites": list(range(3, 39))}}, "36 sites between cells 3 and 38"),
+        ({"drive": {"frequency": 1e6}}, "drive.frequency = 1e+06 rad/s is too fast"),
     ],
 )
 @pytest.mark.parametrize("engine", ["auto", "propagator"])
