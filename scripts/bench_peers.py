@@ -11,7 +11,9 @@ import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from shutil import which
 
 import numba
 import numpy as np
@@ -19,7 +21,7 @@ from scipy.integrate import solve_ivp
 
 from vipetsc.case import Case, Model
 from vipetsc.case.case import WEAKEST
-from vipetsc.lattice import Hertz
+from vipetsc.lattice import Chain, Contact, Hertz, ToneBurst
 
 SOURCES = Path(__file__).parent / "peers"
 BOOST = Path("/usr/include/boost/numeric/odeint.hpp")
@@ -62,15 +64,21 @@ def parameters(model: Model) -> str:
 
 
 def compile_peers(folder: Path) -> dict[str, Path]:
-    """Build the C++ peers into ``folder``; odeint is left out where boost is not installed."""
-    petsc = subprocess.run(["pkg-config", "--cflags", "--libs", "PETSc"], capture_output=True, text=True, check=True)
-    commands = {"tsrk": ("mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc.stdout.split())}
+    """Build the C++ peers into ``folder``; those whose compiler or library is not installed are left out.
+
+    Raises RuntimeError if a compiler fails.
+    """
+    commands = {}
     if BOOST.exists():
-        commands["odeint"] = ("g++", *FLAGS, str(SOURCES / "odeint.cpp"))
-    programs = {}
-    for name, command in commands.items():
-        programs[name] = (folder / name).resolve()
-        subprocess.run([*command, "-o", str(programs[name])], check=True)
+        commands["odeint"] = ["g++", *FLAGS, str(SOURCES / "odeint.cpp")]
+    if which("mpicxx") and which("pkg-config"):
+        petsc = subprocess.run(["pkg-config", "--cflags", "--libs", "PETSc"], capture_output=True, text=True)
+        if petsc.returncode == 0:
+            commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc.stdout.split()]
+    programs = {name: (folder / name).resolve() for name in commands}
+    building = [subprocess.Popen([*commands[name], "-o", str(path)]) for name, path in programs.items()]
+    if any([compiler.wait() for compiler in building]):
+        raise RuntimeError("a peer could not be compiled, see the message above")
     return programs
 
 
@@ -111,16 +119,16 @@ def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
     return solve
 
 
-def _pairs(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pairs(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Hosts and resonators of the sites as indices of masses, and the clearances in m."""
-    cell, first = model.chain.cell, np.array(model.chain.sites, int) * model.chain.cell.dofs
-    return first + cell.host, first + cell.resonator, np.array(model.chain.clearances)
+    first = np.array(chain.sites, int) * chain.cell.dofs
+    return first + chain.cell.host, first + chain.cell.resonator, np.array(chain.clearances)
 
 
 def plain_right_hand_side(model: Model) -> RightHandSide:
     """The lattice in numpy, its stiffness as a sparse matrix."""
     stiffness, inverse_mass = model.chain.stiffness_matrix().tocsr(), 1 / model.chain.masses()
-    host, resonator, clearance = _pairs(model)
+    host, resonator, clearance = _pairs(model.chain)
     contact, drive = model.contact, model.drive
     driven, n = model.drive_cell * model.chain.cell.dofs + model.drive_mass, inverse_mass.size
 
@@ -138,13 +146,17 @@ def plain_right_hand_side(model: Model) -> RightHandSide:
 
 def compiled_right_hand_side(model: Model) -> RightHandSide:
     """The same by numba, row by row."""
-    stiffness, inverse_mass = model.chain.stiffness_matrix().tocsr(), 1 / model.chain.masses()
+    driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
+    return _compile(model.chain, model.contact, model.drive, driven)
+
+
+@cache
+def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> RightHandSide:
+    stiffness, inverse_mass = chain.stiffness_matrix().tocsr(), 1 / chain.masses()
     first, columns, values = stiffness.indptr, stiffness.indices, stiffness.data
-    host, resonator, clearance = _pairs(model)
-    contact, exponent = model.contact.stiffness, model.contact.law.exponent
-    drive = model.drive
+    host, resonator, clearance = _pairs(chain)
+    contact, exponent, n = law.stiffness, law.law.exponent, inverse_mass.size
     amplitude, frequency, cycles, end = drive.window_amplitude, drive.frequency, drive.cycles, drive.duration
-    driven, n = model.drive_cell * model.chain.cell.dofs + model.drive_mass, inverse_mass.size
 
     @numba.njit
     def slope(t: float, y: np.ndarray) -> np.ndarray:
@@ -175,11 +187,7 @@ def compiled_right_hand_side(model: Model) -> RightHandSide:
 def peers(folder: Path) -> dict[str, Solver]:
     """Every peer this machine has, by name; ``folder`` takes programs and passing files."""
     programs = compile_peers(folder)
-    found = {
-        f"odeint {m}": compiled(programs["odeint"], m, folder) for m in ("dopri5", "fehlberg78") if "odeint" in programs
-    }
-    found |= {f"TSRK {m}": compiled(programs["tsrk"], m, folder) for m in ("5dp", "8vr")}
-    return found | {
-        "DOP853 numba": scipys(compiled_right_hand_side),
-        "DOP853 numpy": scipys(plain_right_hand_side),
-    }
+    wanted = [("odeint", "dopri5"), ("odeint", "fehlberg78"), ("tsrk", "5dp"), ("tsrk", "8vr")]
+    shown = {"odeint": "odeint", "tsrk": "TSRK"}
+    found = {f"{shown[p]} {method}": compiled(programs[p], method, folder) for p, method in wanted if p in programs}
+    return found | {"DOP853 numba": scipys(compiled_right_hand_side), "DOP853 numpy": scipys(plain_right_hand_side)}

@@ -52,7 +52,7 @@ def peak() -> float:
 
 def flight(engine: str, cells: int, intervals: int) -> dict:
     """Milliseconds a sample interval of a lattice of ``cells``, once a short burst has reached its full strength."""
-    case = lattice_case([f"lattice.cells={cells}", f"time.engine={engine}", "drive.cycles=3"])
+    case = lattice_case([f"lattice.cells={cells}", f"time.engine={engine}", "drive.cycles=3", "output.window=[1, 9]"])
     moving = Flight(case, COMM)
     model = moving.model
     first = round(model.drive.duration / 3 / model.sample_interval)
