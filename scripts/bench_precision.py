@@ -93,7 +93,8 @@ def equal_error_ratios(rows: list[dict], wanted: list[float]) -> tuple[dict[str,
     rounds = max(len(row["all"]) for row in rows)
 
     def seconds(name: str, turn: int, at: float) -> float | None:
-        complete = [row for row in rows if row["solver"] == name and len(row["all"]) == rounds]
+        # An error of zero is the reference itself.
+        complete = [row for row in rows if row["solver"] == name and len(row["all"]) == rounds and row["error"] > 0]
         return at_equal_error([(row["error"], row["all"][turn]) for row in complete], at)
 
     ratios, spread = {}, {}

@@ -23,6 +23,7 @@ _LOOKS = {
     "DOP853 numba": (style.PURPLE, "D", "-."),
     "DOP853 numpy": (style.ORANGE, "D", "-."),
 }
+_OTHER = (style.SKY, "v", "-")
 
 
 def solver_names(found: dict[str, Any]) -> list[str]:
@@ -31,8 +32,8 @@ def solver_names(found: dict[str, Any]) -> list[str]:
 
 
 def curve(found: dict[str, Any], solver: str) -> list[tuple[float, float]]:
-    """Errors and CPU seconds of one solver, loosest tolerance first."""
-    return [(r["error"], r["seconds"]) for r in found["rows"] if r["solver"] == solver and r["error"] is not None]
+    """Errors and CPU seconds of one solver, loosest tolerance first, without failures and the reference itself."""
+    return [(r["error"], r["seconds"]) for r in found["rows"] if r["solver"] == solver and r["error"]]
 
 
 def markdown(found: dict[str, Any]) -> str:
@@ -66,7 +67,7 @@ def _whole_sentence(found: dict[str, Any]) -> str:
     runs = ", ".join(f"{engine} {seconds:.2f} s" for engine, seconds in found["whole"].items())
     return (
         f"Built-in case, from start to `run.h5`: {runs} of CPU. One right-hand side at"
-        f" {4 * found['cells']} degrees of freedom: {found['right_hand_side_us']:.2g} us through PETSc."
+        f" {found['degrees_of_freedom']} degrees of freedom: {found['right_hand_side_us']:.2g} us through PETSc."
     )
 
 
@@ -107,7 +108,7 @@ def work_precision_figure(found: dict[str, Any]) -> Figure:
     for name in solver_names(found):
         points = np.array(curve(found, name))
         if points.size:
-            colour, marker, line = _LOOKS[name]
+            colour, marker, line = _LOOKS.get(name, _OTHER)
             axes.loglog(*points.T, line, color=colour, marker=marker, ms=3, label=name)
     floor = max(found["reference"]["separation"].values())
     left = min(axes.get_xlim()[0], floor / 5)
@@ -127,7 +128,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
     figure = style.new_figure(style.PAGE, 2.6)
     left, right = figure.subplots(1, 2)
     for engine in dict.fromkeys(row["engine"] for row in found["scaling"]):
-        colour, marker, _ = _LOOKS[f"vipetsc {engine}"]
+        colour, marker, _ = _LOOKS.get(f"vipetsc {engine}", _OTHER)
         for ranks, line in ((1, "-"), (2, "--")):
             rows = [r for r in found["scaling"] if r["engine"] == engine and r["ranks"] == ranks]
             cells = [r["cells"] for r in rows]
@@ -135,7 +136,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
             left.loglog(cells, [r["wall_ms"] for r in rows], line, color=colour, marker=marker, ms=3, label=label)
             right.semilogx(cells, [r["peak_gib_a_rank"] for r in rows], line, color=colour, marker=marker, ms=3)
     _limit(left, found["scaling"])
-    right.set_ylim(bottom=0)
+    right.set_ylim(0, 1.15 * max(row["peak_gib_a_rank"] for row in found["scaling"]))
     left.set_ylabel("wall time per 2e-4 s of model time (ms)")
     right.set_ylabel("peak memory a rank (GiB)")
     for axes, title in ((left, "(a) time"), (right, "(b) memory")):

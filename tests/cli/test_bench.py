@@ -52,6 +52,17 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
     assert "| DOP853 numpy |" in table.stdout
 
 
+def test_a_flight_on_two_ranks_is_timed_beside_its_memory(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from bench_scaling import on_ranks
+
+    row = on_ranks(2, "flight", engine="ts", cells=30, intervals=3)
+    assert row["ranks"] == 2
+    assert row["wall_ms"] > 0
+    assert 0 < row["share_of_bandwidth_limit"] < 1
+    assert 0.01 < row["peak_gib_a_rank"] < 4
+
+
 @pytest.mark.parametrize(
     "arguments", [("--table",), ("--set", "lattice.cels=3"), ("--set", "contacts.restitution=0.7")]
 )
