@@ -71,17 +71,17 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
     return {"reference": about, "rows": table, "ratios": ratios, "spread": spread}
 
 
-def at_equal_error(points: Iterable[tuple[float, float]], wanted: float) -> float | None:
+def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: bool = False) -> float | None:
     """CPU seconds at the error ``wanted`` from ``points`` (error, seconds), interpolated in logarithms.
 
     Points that another one beats in both are left out, in favour of a solver whose error falls unevenly. None where
-    the points do not reach.
+    the points do not reach; with ``bound``, an error larger than all of them costs no more than the largest one.
     """
     front: list[tuple[float, float]] = []
     for e, s in sorted(points):
         if not front or s < front[-1][1]:
             front.append((e, s))
-    if not front or not front[0][0] <= wanted <= front[-1][0]:
+    if not front or wanted < front[0][0] or (wanted > front[-1][0] and not bound):
         return None
     errors, seconds = np.log(np.array(front)).T
     return float(np.exp(np.interp(np.log(wanted), errors, seconds)))
@@ -95,7 +95,8 @@ def equal_error_ratios(rows: list[dict], wanted: list[float]) -> tuple[dict[str,
     def seconds(name: str, turn: int, at: float) -> float | None:
         # An error of zero is the reference itself.
         complete = [row for row in rows if row["solver"] == name and len(row["all"]) == rounds and row["error"] > 0]
-        return at_equal_error([(row["error"], row["all"][turn]) for row in complete], at)
+        # A bound counts against the solver to which it is applied: ours may have one, a peer may not.
+        return at_equal_error([(row["error"], row["all"][turn]) for row in complete], at, name.startswith("vipetsc"))
 
     ratios, spread = {}, {}
     for engine in (name for name in names if name.startswith("vipetsc")):

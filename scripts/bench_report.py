@@ -54,9 +54,10 @@ def _precision_table(found: dict[str, Any]) -> str:
     for name in names:
         cells = []
         for wanted in ERRORS:
-            seconds = at_equal_error(curve(found, name), wanted) if wanted >= reference["floor"] else None
+            points, own = curve(found, name), name.startswith("vipetsc")
+            seconds = at_equal_error(points, wanted, own) if wanted >= reference["floor"] else None
             ratio = found["ratios"].get(f"{name} / {engine} at {wanted:g}")
-            cells.append("-" if seconds is None else f"{seconds:.3g}" + (f" ({ratio:.2g})" if ratio else ""))
+            cells.append("-" if seconds is None else f"{seconds:.3g}" + (f" ({ratio:.3g})" if ratio else ""))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     apart = ", ".join(f"{name} {value:.1e}" for name, value in reference["separation"].items())
     lines += ["", f"Reference: {reference['solver']}, to {reference['end']:g} s; distances from it: {apart}."]

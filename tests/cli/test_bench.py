@@ -81,6 +81,8 @@ def test_equal_error_is_interpolated_in_logarithms_and_never_beyond_the_points(m
     assert at_equal_error(power_law, 10**-5.5) == pytest.approx(2**5.5)
     assert at_equal_error(power_law, 1e-3) is None
     assert at_equal_error(power_law, 1e-9) is None
-    assert at_equal_error([], 1e-5) is None
+    assert at_equal_error(power_law, 1e-3, bound=True) == pytest.approx(2**4)
+    assert at_equal_error(power_law, 1e-9, bound=True) is None
+    assert at_equal_error([], 1e-5, bound=True) is None
     # A point that is slower and less accurate than another one says nothing about what an error costs.
     assert at_equal_error([*power_law, (3e-6, 1e4)], 3e-6) == pytest.approx(at_equal_error(power_law, 3e-6))
