@@ -143,7 +143,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
     for axes, title in ((left, "(a) time"), (right, "(b) memory")):
         axes.set_xlabel("cells")
         style.letter(axes, title)
-    left.legend(loc="upper left")
+    right.legend(*left.get_legend_handles_labels(), loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
 
 
