@@ -2,7 +2,7 @@
 
 The lattice is the four-band one of 300 cells with its five sites, A = 30 N, conservative; all solvers return the
 velocities every 2e-4 s, on one core. Peers step over kinks of the contact law without locating them. Writes
-``latest.json`` and pictures. The full bench takes about a quarter of an hour, ``--quick`` about a minute;
+``latest.json`` and pictures. The full bench takes about a quarter of an hour, ``--quick`` a minute or two;
 ``--large`` adds the whole program on a million cells (minutes).
 """
 
