@@ -1,0 +1,48 @@
+"""All claims of the paper, measured from the files of its steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vipetsc.studies.claims.claim import FAILS, UNMEASURED, Claim, Finding, Statement, rounded, verdict
+from vipetsc.studies.claims.entropy import ENTROPY
+from vipetsc.studies.claims.evidence import Evidence, MissingEvidence
+from vipetsc.studies.claims.scattering import SCATTERING
+
+READINGS = "printed", "calibrated"
+STATEMENTS = (*SCATTERING, *ENTROPY)
+
+
+def measure_claims(root: str | Path) -> list[Claim]:
+    """C1-C17 in both readings, from the steps in ``root`` (scattering/, interband/, nnm-hertz/, ...).
+
+    What cannot be measured because its files are missing has the verdict "not measured" and says what is missing.
+    """
+    return [measured(statement, reading, Path(root)) for statement in STATEMENTS for reading in READINGS]
+
+
+def measured(statement: Statement, reading: str, root: Path) -> Claim:
+    """One claim in one reading."""
+    finding = Finding()
+    with Evidence(root) as evidence:
+        try:
+            statement.measure(evidence, reading, finding)
+        except MissingEvidence as missing:
+            found, missed = UNMEASURED, []
+            finding.reasons.append(str(missing))
+        else:
+            found, missed = verdict(statement.criteria, finding.value)
+        files = tuple(evidence.files)
+    reasons = [f"not met: {', '.join(missed)}"] if missed and found != FAILS else []
+    return Claim(
+        statement.id,
+        reading,
+        statement.claim,
+        rounded(finding.value),
+        rounded(finding.uncertainty),
+        statement.threshold,
+        found,
+        "; ".join([*reasons, *finding.reasons]),
+        statement.figure.format(reading=reading),
+        files,
+    )
