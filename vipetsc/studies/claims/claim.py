@@ -73,11 +73,15 @@ class Criterion:
 
 @dataclass
 class Finding:
-    """What a measurement gathers: numbers by name, their uncertainties, and sentences that explain them."""
+    """What a measurement gathers: numbers by name, their uncertainties, and sentences that explain them.
+
+    ``figure`` takes the place of the statement's where the picture's name depends on the data.
+    """
 
     value: Numbers = field(default_factory=dict)
     uncertainty: Numbers = field(default_factory=dict)
     reasons: list[str] = field(default_factory=list)
+    figure: str = ""
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,12 @@ from pathlib import Path
 from vipetsc.studies.claims.claim import FAILS, UNMEASURED, Claim, Finding, Statement, rounded, verdict
 from vipetsc.studies.claims.entropy import ENTROPY
 from vipetsc.studies.claims.evidence import Evidence, MissingEvidence
+from vipetsc.studies.claims.interband import INTERBAND
+from vipetsc.studies.claims.modes import MODES
 from vipetsc.studies.claims.scattering import SCATTERING
 
 READINGS = "printed", "calibrated"
-STATEMENTS = (*SCATTERING, *ENTROPY)
+STATEMENTS = (*SCATTERING, *ENTROPY, *INTERBAND, *MODES)
 
 
 def measure_claims(root: str | Path) -> list[Claim]:
@@ -30,6 +32,9 @@ def measured(statement: Statement, reading: str, root: Path) -> Claim:
         except MissingEvidence as missing:
             found, missed = UNMEASURED, []
             finding.reasons.append(str(missing))
+        except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
+            found, missed = UNMEASURED, []
+            finding.reasons.append(f"{', '.join(evidence.files)} cannot be used: {error}".replace(f"{root}/", ""))
         else:
             found, missed = verdict(statement.criteria, finding.value)
         files = tuple(evidence.files)
@@ -43,6 +48,6 @@ def measured(statement: Statement, reading: str, root: Path) -> Claim:
         statement.threshold,
         found,
         "; ".join([*reasons, *finding.reasons]),
-        statement.figure.format(reading=reading),
+        finding.figure or statement.figure.format(reading=reading),
         files,
     )

@@ -138,7 +138,7 @@ def scattered(evidence: Evidence, reading: str, finding: Finding) -> None:
     trio = Trio.of(evidence, reading, "wavenumber_content", "dispersion")
     low, medium = trio.generated(trio.low), trio.generated(trio.medium)
     finding.value["share at new wavenumbers, medium amplitude"] = medium
-    finding.value["that share over the one at low amplitude"] = medium / low
+    finding.value["share at new wavenumbers, medium over low amplitude"] = medium / low
     finding.value["share within 2 % of the Bloch branches"] = _beside_branches(trio.medium)
     finding.value["share at new wavenumbers, low amplitude"] = low
     finding.value["share within 2 % of the Bloch branches, low amplitude"] = _beside_branches(trio.low)
@@ -260,7 +260,7 @@ SCATTERING = (
         "amplitudes-{reading}",
         (
             Criterion("share at new wavenumbers, medium amplitude", low=NEW, decisive=True),
-            Criterion("that share over the one at low amplitude", low=MORE, decisive=True),
+            Criterion("share at new wavenumbers, medium over low amplitude", low=MORE, decisive=True),
             Criterion("share within 2 % of the Bloch branches", low=BOUND),
         ),
         scattered,
