@@ -15,8 +15,10 @@ from vipetsc.lattice import bloch, pass_bands
 from vipetsc.spectra import Parts, power_law
 from vipetsc.studies.claims import measure_claims, write_claims
 from vipetsc.studies.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED, Criterion, rounded, verdict
+from vipetsc.studies.claims.entropy import SPREAD_LAW
 from vipetsc.studies.claims.evidence import Curve, Evidence, MissingEvidence
 from vipetsc.studies.claims.measure import READINGS, STATEMENTS, measured
+from vipetsc.studies.claims.scattering import BRANCHES
 from vipetsc.studies.ensemble import COMPLETE, Outcome, assemble
 
 IDS = [f"C{i}" for i in range(1, 18)]
@@ -217,7 +219,7 @@ def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
     put_entropies(tmp_path, ["5pi/9"], ragged, lambda case: 0.1)
     found = measure("C7", tmp_path)
     assert found.verdict == IN_PART and "5 (" in found.reason and "not met" in found.reason
-    assert found.value["share of configurations of spread sites with adjusted R^2 >= .95"] == pytest.approx(0.5)
+    assert found.value[SPREAD_LAW] == pytest.approx(0.5)
     assert measure("C9", tmp_path).verdict == FAILS
 
 
@@ -318,7 +320,7 @@ def test_scattering_off_the_branches_holds_in_part(tmp_path):
     put_scattering(tmp_path, (0.0, 0.5, 0.6), (0.0, 0.2, 0.8), beside=0.3)
     found = measure("C3", tmp_path)
     assert found.verdict == IN_PART
-    assert found.value["share within 2 % of the Bloch branches"] == pytest.approx(0.7, abs=0.02)
+    assert found.value[BRANCHES] == pytest.approx(0.7, abs=0.02)
     assert measure("C4", tmp_path).verdict == IN_PART
 
 

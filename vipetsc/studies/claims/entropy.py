@@ -22,6 +22,18 @@ HIGH = 10.0  # N, the paper's high amplitude
 FALLEN = 0.17  # normalised entropy at HIGH, of configurations of at least SEVERAL sites
 SEVERAL = 3
 
+# Numbers that decide, by name.
+FLOOR = "floor of the normalised entropy"
+RISES = "share of configurations with an abrupt rise"
+PEAKS = f"share of configurations with the peak at {PEAK[0]:g} to {PEAK[1]:g} N"
+AT_HIGH = f"normalised entropy at {HIGH:g} N behind the peak, {SEVERAL} sites or more"
+SPREAD_LAW = f"share of configurations of spread sites with adjusted R^2 >= {STRAIGHT:g}"
+NEIGHBOURS_LAW = f"share of configurations of neighbouring sites with adjusted R^2 >= {STRAIGHT:g}"
+TREND = "share of curves that rise, peak and fall by half"
+LAW = f"share of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g}"
+OVER_PEAK = f"share of configurations with larger error bars from {HIGH:g} N on than at the peak"
+OVER_QUIET = f"share of configurations with larger error bars from {HIGH:g} N on than without contact"
+
 
 @dataclass(frozen=True)
 class Row:
@@ -76,16 +88,12 @@ def power_law(evidence: Evidence, reading: str, finding: Finding) -> None:
     spread = rows(evidence, SPREAD, reading, "energy_weighted", wavenumber=EXCITED)
     value, about = finding.value, finding.uncertainty
     quiet = [float(np.nanmax(c.normalised()[c.untouched])) if c.untouched.any() else np.nan for c in _curves(spread)]
-    value["floor of the normalised entropy"] = np.nanmax(quiet) if np.any(np.isfinite(quiet)) else None
-    value["share of configurations with an abrupt rise"] = _share([_rise(c) <= ABRUPT for c in _curves(spread)])
-    value["share of configurations with the peak at .9 to 1.8 N"] = _share(
-        [PEAK[0] <= c.amplitude[c.peak] <= PEAK[1] for c in _curves(spread)]
-    )
+    value[FLOOR] = np.nanmax(quiet) if np.any(np.isfinite(quiet)) else None
+    value[RISES] = _share([_rise(c) <= ABRUPT for c in _curves(spread)])
+    value[PEAKS] = _share([PEAK[0] <= c.amplitude[c.peak] <= PEAK[1] for c in _curves(spread)])
     several = [_at_high(r.curve) for r in spread if r.sites >= SEVERAL]
-    value["normalised entropy at 10 N, three sites or more"] = max(several) if several else None
-    value["share of configurations of spread sites with adjusted R^2 >= .95"] = _share(
-        [r.r2 >= STRAIGHT for r in spread]
-    )
+    value[AT_HIGH] = float(np.max(several)) if several else None
+    value[SPREAD_LAW] = _share([r.r2 >= STRAIGHT for r in spread])
     for row in spread:
         _tell(finding, row, "spread")
     try:
@@ -93,17 +101,16 @@ def power_law(evidence: Evidence, reading: str, finding: Finding) -> None:
     except MissingEvidence as missing:
         finding.reasons.append(str(missing))
     else:
-        name = "share of configurations of neighbouring sites with adjusted R^2 >= .95"
-        value[name] = _share([r.r2 >= STRAIGHT for r in masked])
+        value[NEIGHBOURS_LAW] = _share([r.r2 >= STRAIGHT for r in masked])
         for row in masked:
             _tell(finding, row, "neighbours, masked")
     about["amplitudes"] = len(spread[0].curve.amplitude)
     late = [c for c in _curves(spread) if c.amplitude[c.peak] > PEAK[1]]
     if late:
         finding.reasons.append(
-            f"{len(late)} of {len(spread)} configurations peak at"
-            f" {min(c.amplitude[c.peak] for c in late):.3g} to {max(c.amplitude[c.peak] for c in late):.3g} N,"
-            f" with {min(r.points for r in spread)} points or more behind the peak"
+            f"{len(late)} of {len(spread)} configurations peak from"
+            f" {min(c.amplitude[c.peak] for c in late):.3g} N on, the latest with"
+            f" {min(r.points for r in spread)} amplitudes left for a power law"
         )
     weak = [f"{r.sites} ({r.r2:.3f})" for r in spread if not r.r2 >= STRAIGHT and np.isfinite(r.r2)]
     if weak:
@@ -120,6 +127,9 @@ def _rise(curve: Curve) -> float:
 
 
 def _at_high(curve: Curve) -> float:
+    """The normalised entropy at ``HIGH``; NaN if the peak is not below it."""
+    if curve.amplitude[curve.peak] >= HIGH:
+        return float("nan")
     return Curve(curve.amplitude, curve.normalised(), curve.episodes).at(HIGH)
 
 
@@ -146,16 +156,14 @@ def everywhere(evidence: Evidence, reading: str, finding: Finding) -> None:
         if average == averages[0]:
             primary = found
     value = finding.value
-    value["share of curves that rise, peak and fall by half"] = _share([r.falls for r in primary])
-    value["share of curves with adjusted R^2 >= .9"] = shares["energy_weighted"]
-    value["share of curves with adjusted R^2 >= .9, log-log line alone"] = _share(
-        [r.r2 >= STRAIGHT_EVERYWHERE for r in primary]
-    )
+    value[TREND] = _share([r.falls for r in primary])
+    value[LAW] = shares["energy_weighted"]
+    value[f"{LAW}, log-log line alone"] = _share([r.r2 >= STRAIGHT_EVERYWHERE for r in primary])
     known = [r.r2 for r in primary if np.isfinite(r.r2)]
     value["median adjusted R^2 (log-log)"] = float(np.median(known)) if known else None
     value["curves"] = len(primary)
     for average in averages[1:]:
-        finding.uncertainty[f"share of curves with adjusted R^2 >= .9, {average} mean"] = shares[average]
+        finding.uncertainty[f"{LAW}, {average} mean"] = shares[average]
     finding.uncertainty["fewest points of a fit"] = min(r.points for r in primary)
     late = sum(r.curve.peak >= len(r.curve.amplitude) - 3 for r in primary)
     if late:
@@ -184,13 +192,9 @@ def error_bars(evidence: Evidence, reading: str, finding: Finding) -> None:
             over_low.append(float(error.value[high].mean() / quiet.mean()))
     if not over_peak:
         raise MissingEvidence(f"{SPREAD} has no amplitude of {HIGH:g} N or more")
-    finding.value["share of configurations with larger error bars from 10 N on than at the peak"] = _share(
-        [ratio > 1 for ratio in over_peak]
-    )
+    finding.value[OVER_PEAK] = _share([ratio > 1 for ratio in over_peak])
     if over_low:
-        finding.value["share of configurations with larger error bars from 10 N on than without contact"] = _share(
-            [ratio > 1 for ratio in over_low]
-        )
+        finding.value[OVER_QUIET] = _share([ratio > 1 for ratio in over_low])
         finding.value["mean ratio to the error bars without contact"] = float(np.mean(over_low))
     finding.value["mean ratio to the error bars at the peak"] = float(np.mean(over_peak))
     finding.uncertainty["smallest ratio to the error bars at the peak"] = min(over_peak)
@@ -210,14 +214,12 @@ ENTROPY = (
         "Entropy against amplitude has a floor, an abrupt rise, a peak and a power-law decay.",
         "entropy-{reading}-5pi-9-energy_weighted",
         (
-            Criterion("floor of the normalised entropy", high=QUIET),
-            Criterion("share of configurations with an abrupt rise", low=MOST, of=CONFIGURATIONS),
-            Criterion("share of configurations with the peak at .9 to 1.8 N", low=MOST, of=CONFIGURATIONS),
-            Criterion("normalised entropy at 10 N, three sites or more", high=FALLEN),
-            Criterion("share of configurations of spread sites with adjusted R^2 >= .95", low=MOST, of=CONFIGURATIONS),
-            Criterion(
-                "share of configurations of neighbouring sites with adjusted R^2 >= .95", low=MOST, of=CONFIGURATIONS
-            ),
+            Criterion(FLOOR, high=QUIET),
+            Criterion(RISES, low=MOST, of=CONFIGURATIONS),
+            Criterion(PEAKS, low=MOST, of=CONFIGURATIONS),
+            Criterion(AT_HIGH, high=FALLEN),
+            Criterion(SPREAD_LAW, low=MOST, of=CONFIGURATIONS),
+            Criterion(NEIGHBOURS_LAW, low=MOST, of=CONFIGURATIONS),
         ),
         power_law,
     ),
@@ -226,10 +228,8 @@ ENTROPY = (
         "Rise, peak and power-law decay are the same for wavenumbers from 2π/9 to 7π/9.",
         "entropy_all-{reading}-energy_weighted",
         (
-            Criterion(
-                "share of curves that rise, peak and fall by half", low=NEARLY_ALL, of=CONFIGURATIONS * WAVENUMBERS
-            ),
-            Criterion("share of curves with adjusted R^2 >= .9", low=NEARLY_ALL, of=CONFIGURATIONS * WAVENUMBERS),
+            Criterion(TREND, low=NEARLY_ALL, of=CONFIGURATIONS * WAVENUMBERS),
+            Criterion(LAW, low=NEARLY_ALL, of=CONFIGURATIONS * WAVENUMBERS),
         ),
         everywhere,
     ),
@@ -239,12 +239,12 @@ ENTROPY = (
         "entropy-{reading}-5pi-9-energy_weighted",
         (
             Criterion(
-                "share of configurations with larger error bars from 10 N on than at the peak",
+                OVER_PEAK,
                 low=MOST,
                 of=CONFIGURATIONS,
             ),
             Criterion(
-                "share of configurations with larger error bars from 10 N on than without contact",
+                OVER_QUIET,
                 low=MOST,
                 of=CONFIGURATIONS,
             ),

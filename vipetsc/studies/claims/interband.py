@@ -19,6 +19,9 @@ ONE_SITE = 0.05, 0.15  # "approximately 10 per cent"
 ALIKE, NEAR = 0.9, 2.0  # correlation of two curves' logarithms, ratio of their peaks' amplitudes
 SUM = 0.01  # of the total energy
 
+# Numbers that decide, by name.
+LAMBDA, ETA = (f"{name} at the optimum of a grid of {GRID:g}" for name in ("lambda", "eta"))
+
 
 def optimum(evidence: Evidence, reading: str, finding: Finding) -> None:
     """C10."""
@@ -37,8 +40,8 @@ def optimum(evidence: Evidence, reading: str, finding: Finding) -> None:
     rows, columns = _multiples(lam), _multiples(eta)
     cost = np.where(file["out_of_phase"][row], file["weighted"][row], -np.inf)[np.ix_(rows, columns)]
     i, j = np.unravel_index(np.argmax(cost), cost.shape)
-    finding.value["lambda at the optimum of a grid of .1"] = float(lam[rows][i])
-    finding.value["eta at the optimum of a grid of .1"] = float(eta[columns][j])
+    finding.value[LAMBDA] = float(lam[rows][i])
+    finding.value[ETA] = float(eta[columns][j])
     near = int(np.argmin(abs(lam - PAPER[0]))), int(np.argmin(abs(eta - PAPER[1])))
     finding.value["u2 and u3 out of phase on band 2 at the paper's cell (1 = yes)"] = int(
         file["out_of_phase"][row][near]
@@ -156,8 +159,8 @@ INTERBAND = (
         "The four-band cell is best at (λ, η) = (.1, .5), where host and resonator move out of phase on band 2.",
         "cost_maps",
         (
-            Criterion("lambda at the optimum of a grid of .1", low=PAPER[0] - GRID / 2, high=PAPER[0] + GRID / 2),
-            Criterion("eta at the optimum of a grid of .1", low=PAPER[1] - GRID / 2, high=PAPER[1] + GRID / 2),
+            Criterion(LAMBDA, low=PAPER[0] - GRID / 2, high=PAPER[0] + GRID / 2),
+            Criterion(ETA, low=PAPER[1] - GRID / 2, high=PAPER[1] + GRID / 2),
             Criterion("u2 and u3 out of phase on band 2 at the paper's cell (1 = yes)", low=1),
         ),
         optimum,

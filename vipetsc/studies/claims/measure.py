@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vipetsc.studies.claims.claim import FAILS, UNMEASURED, Claim, Finding, Statement, rounded, verdict
+from vipetsc.studies.claims.claim import UNMEASURED, Claim, Finding, Statement, rounded, verdict
 from vipetsc.studies.claims.entropy import ENTROPY
 from vipetsc.studies.claims.evidence import Evidence, MissingEvidence
 from vipetsc.studies.claims.interband import INTERBAND
@@ -38,7 +38,8 @@ def measured(statement: Statement, reading: str, root: Path) -> Claim:
         else:
             found, missed = verdict(statement.criteria, finding.value)
         files = tuple(evidence.files)
-    reasons = [f"not met: {', '.join(missed)}"] if missed and found != FAILS else []
+    some = 0 < len(missed) < len(statement.criteria)
+    reasons = [f"not met: {' / '.join(missed)}"] if some else []
     return Claim(
         statement.id,
         reading,

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands
-from vipetsc.lattice.bloch import waves_at
 from vipetsc.spectra import Dispersion, ridge
-from vipetsc.studies.backbone import initiation_of
 from vipetsc.studies.claims.claim import Criterion, Finding, Statement
 from vipetsc.studies.claims.evidence import Evidence, Member, MissingEvidence
+from vipetsc.studies.claims.trio import OPTICAL, Trio
 
-STEP = "scattering-amplitudes"
 EXCITED = 5 * np.pi / 9  # rad/cell, of the paper's section II
-OPTICAL = 2  # its band
 BINS = 1  # how far, in bins of the transform, a ridge may lie from the branch
 STILL = 0.01  # share of the energy that may change its wavenumber before a spectrum is not constant
 NEW, MORE = 0.10, 10  # share at new wavenumbers that counts as scattering, and how many times that of the low amplitude
@@ -26,73 +21,9 @@ NATIVE = 7, 8  # wavenumber bins that the packet starts in
 BY_FOURIER, BY_WAVELET = 0.99, 0.85
 RECONSTRUCTED = 0.01  # the paper's one per cent
 
-
-@dataclass(frozen=True)
-class Trio:
-    """The runs at low, medium and high amplitude, and the wave they drive.
-
-    ``wavenumber`` in rad/cell, ``speed`` in cells/s; ``lobe`` (rad/cell) is the half-width of the burst's main
-    lobe, 2 Om/(Nc v_g); ``duration`` of the burst in s; ``distance`` in cells to the first site.
-    """
-
-    low: Member
-    medium: Member
-    high: Member
-    wavenumber: float
-    speed: float
-    lobe: float
-    duration: float
-    distance: int
-
-    @classmethod
-    def of(cls, evidence: Evidence, reading: str, *needed: str) -> Trio:
-        """The lowest, the middle and the highest amplitude; raises MissingEvidence."""
-        members = evidence.members(STEP, evidence.place(STEP, reading), *needed)
-        if len(members) < 3:
-            raise MissingEvidence(f"{STEP} has {len(members)} amplitudes; low, medium and high are needed")
-        model = members[0].case.model()
-        cell, drive, sites = model.chain.cell, model.drive, np.asarray(model.chain.sites)
-        waves = [wave for wave in waves_at(cell, drive.frequency) if wave[0] == OPTICAL]
-        if not waves or not sites.size:
-            raise MissingEvidence(f"{STEP}: the drive excites no wave of band {OPTICAL}, or the lattice has no sites")
-        _, wavenumber, speed = waves[0]
-        lobe = 2 * drive.frequency / (drive.cycles * speed)
-        distance = int(np.min(np.abs(sites - model.drive_cell)))
-        picked = members[0], members[len(members) // 2], members[-1]
-        return cls(*picked, wavenumber, speed, lobe, drive.duration, distance)
-
-    @property
-    def passing(self) -> float:
-        """When the middle of the burst passes the first site, s."""
-        return self.duration / 2 + self.distance / self.speed
-
-    def generated(self, member: Member) -> float:
-        """Share of the kinetic energy outside the burst's main lobe, from ``passing`` on."""
-        content = member.analysis["wavenumber_content"][member.analysis["time"][...] >= self.passing].sum(axis=0)
-        new = np.abs(member.analysis["wavenumber"][...] - self.wavenumber) > self.lobe
-        return float(content[new].sum() / content.sum())
-
-    def silent(self, evidence: Evidence, finding: Finding, member: Member) -> None:
-        """Say so if ``member`` has no contact, and from where on there is one."""
-        if member.episodes:
-            return
-        text = f"{member.amplitude:g} N makes no contact"
-        try:
-            onset = initiation_of(evidence.ensemble(STEP), member.case).onset
-        except OSError:
-            onset = np.nan
-        if np.isfinite(onset):
-            finding.value["first contact (N)"] = onset
-            text = f"{member.amplitude:g} N is below first contact at {onset:.3g} N"
-        finding.reasons.append(f"{text}: the lattice is linear there")
-
-    def hardly(self, finding: Finding) -> None:
-        """Say so if the high amplitude is but a few times that of first contact."""
-        onset = finding.value.get("first contact (N)")
-        if onset:
-            finding.reasons.append(
-                f"{self.high.amplitude:g} N is {self.high.amplitude / onset:.3g} times first contact"
-            )
+# Numbers that decide, by name, where the name holds a number.
+BRANCHES = f"share within {100 * BESIDE:g} % of the top edge from the Bloch branches"
+IN_FOURIER, IN_WAVELET = (f"smallest share in bins {NATIVE[0]} and {NATIVE[1]}, {w}" for w in ("Fourier", "wavelet"))
 
 
 def on_the_branch(evidence: Evidence, reading: str, finding: Finding) -> None:
@@ -136,13 +67,14 @@ def unchanged(evidence: Evidence, reading: str, finding: Finding) -> None:
 def scattered(evidence: Evidence, reading: str, finding: Finding) -> None:
     """C3."""
     trio = Trio.of(evidence, reading, "wavenumber_content", "dispersion")
-    low, medium = trio.generated(trio.low), trio.generated(trio.medium)
+    (low, _), (medium, deviation) = trio.generated(trio.low), trio.generated(trio.medium)
     finding.value["share at new wavenumbers, medium amplitude"] = medium
     finding.value["share at new wavenumbers, medium over low amplitude"] = medium / low
-    finding.value["share within 2 % of the Bloch branches"] = _beside_branches(trio.medium)
+    finding.value[BRANCHES] = _beside_branches(trio.medium)
     finding.value["share at new wavenumbers, low amplitude"] = low
-    finding.value["share within 2 % of the Bloch branches, low amplitude"] = _beside_branches(trio.low)
+    finding.value[f"{BRANCHES}, low amplitude"] = _beside_branches(trio.low)
     finding.value["main lobe's half-width (rad/cell)"] = trio.lobe
+    finding.uncertainty["deviation over time of the share at new wavenumbers"] = deviation
     trio.silent(evidence, finding, trio.medium)
 
 
@@ -159,29 +91,34 @@ def reflected(evidence: Evidence, reading: str, finding: Finding) -> None:
     trio = Trio.of(evidence, reading, "wavenumber_content", "kinetic_energy")
     shares = {}
     for name, member in (("low", trio.low), ("medium", trio.medium), ("high", trio.high)):
-        shares[name] = trio.generated(member)
+        shares[name], deviation = trio.generated(member)
         finding.value[f"share at new wavenumbers, {name} amplitude"] = shares[name]
-        finding.value[f"share of the incident energy reflected, {name} amplitude"] = _returned(trio, member)
+        finding.uncertainty[f"deviation over time of the share at new wavenumbers, {name} amplitude"] = deviation
+        returned, deviation = _returned(trio, member)
+        finding.value[f"share of the incident energy reflected, {name} amplitude"] = returned
+        finding.uncertainty[f"deviation over time of the share reflected, {name} amplitude"] = deviation
     finding.value["new wavenumbers, high over medium amplitude"] = shares["high"] / shares["medium"]
     trio.silent(evidence, finding, trio.medium)
     trio.hardly(finding)
 
 
-def _returned(trio: Trio, member: Member) -> float:
-    """Kinetic energy before the first site over the incident, when the reflected packet is back at the drive.
+def _returned(trio: Trio, member: Member) -> tuple[float, float]:
+    """Kinetic energy before the first site over the incident, when the reflected packet is half-way back to the drive.
 
-    The mean over one burst's length about that time, when what came from the first site has not met it again. What
-    is incident is the energy of the linear run, scaled by the amplitudes' squares.
+    The mean and the deviation over half a burst's length about that time: the incident packet has passed then, and the
+    reflected one does not stand against the end yet. What is incident is the energy of the linear run, scaled by the
+    amplitudes' squares.
     """
-    centre = trio.duration / 2 + 2 * trio.distance / trio.speed
+    centre = trio.duration / 2 + 1.5 * trio.distance / trio.speed
     time = member.analysis["time"][...]
-    there = np.abs(time - centre) <= trio.duration / 2
+    there = np.abs(time - centre) <= trio.duration / 4
     model = member.case.model()
     cell, first = member.analysis["cell"][...] - 1, model.drive_cell
     before = np.abs(cell - first) < trio.distance
     incident = trio.low.analysis["kinetic_energy"][there].sum(axis=1).mean()
     incident *= (member.amplitude / trio.low.amplitude) ** 2
-    return float(member.analysis["kinetic_energy"][there][:, before].sum(axis=1).mean() / incident)
+    share = member.analysis["kinetic_energy"][there][:, before].sum(axis=1) / incident
+    return float(share.mean()), float(share.std())
 
 
 def native_bins(evidence: Evidence, reading: str, finding: Finding) -> None:
@@ -190,9 +127,10 @@ def native_bins(evidence: Evidence, reading: str, finding: Finding) -> None:
     arrival = trio.distance / max_group_velocity(trio.low.case.unit_cell(), OPTICAL)[2]
     members = {"low": trio.low, "medium": trio.medium, "high": trio.high}
     shares = {name: _native(member, trio.duration, arrival) for name, member in members.items()}
-    for kind, index in (("Fourier", 0), ("wavelet", 1)):
-        finding.value[f"smallest share in bins 7 and 8, {kind}"] = min(share[index] for share in shares.values())
-        finding.uncertainty[f"spread over the amplitudes, {kind}"] = np.ptp([share[index] for share in shares.values()])
+    for name, index in ((IN_FOURIER, 0), (IN_WAVELET, 1)):
+        found = [share[index] for share in shares.values()]
+        finding.value[name] = min(found)
+        finding.uncertainty[f"spread over the amplitudes: {name}"] = np.ptp(found)
 
 
 def _native(member: Member, start: float, end: float) -> tuple[float, float]:
@@ -261,7 +199,7 @@ SCATTERING = (
         (
             Criterion("share at new wavenumbers, medium amplitude", low=NEW, decisive=True),
             Criterion("share at new wavenumbers, medium over low amplitude", low=MORE, decisive=True),
-            Criterion("share within 2 % of the Bloch branches", low=BOUND),
+            Criterion(BRANCHES, low=BOUND),
         ),
         scattered,
     ),
@@ -280,8 +218,8 @@ SCATTERING = (
         "The packet starts in the wavenumber bins 7 and 8.",
         "partition-{reading}",
         (
-            Criterion("smallest share in bins 7 and 8, Fourier", low=BY_FOURIER),
-            Criterion("smallest share in bins 7 and 8, wavelet", low=BY_WAVELET),
+            Criterion(IN_FOURIER, low=BY_FOURIER),
+            Criterion(IN_WAVELET, low=BY_WAVELET),
         ),
         native_bins,
     ),
