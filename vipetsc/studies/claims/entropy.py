@@ -53,6 +53,11 @@ class Row:
     points: int
 
     @property
+    def best(self) -> float:
+        """The better adjusted R^2 of the two fits; NaN without one."""
+        return float(np.fmax(self.r2, self.r2_nonlinear))
+
+    @property
     def falls(self) -> bool:
         """Whether the peak lies between the ends, and less than half of it is left at the upper end."""
         y = self.curve.normalised()
@@ -87,8 +92,8 @@ def power_law(evidence: Evidence, reading: str, finding: Finding) -> None:
     """C7."""
     spread = rows(evidence, SPREAD, reading, "energy_weighted", wavenumber=EXCITED)
     value, about = finding.value, finding.uncertainty
-    quiet = [float(np.nanmax(c.normalised()[c.untouched])) if c.untouched.any() else np.nan for c in _curves(spread)]
-    value[FLOOR] = np.nanmax(quiet) if np.any(np.isfinite(quiet)) else None
+    quiet = np.concatenate([c.normalised()[c.untouched] for c in _curves(spread)])
+    value[FLOOR] = float(quiet.max()) if quiet.size else None
     value[RISES] = _share([_rise(c) <= ABRUPT for c in _curves(spread)])
     value[PEAKS] = _share([PEAK[0] <= c.amplitude[c.peak] <= PEAK[1] for c in _curves(spread)])
     several = [_at_high(r.curve) for r in spread if r.sites >= SEVERAL]
@@ -152,7 +157,7 @@ def everywhere(evidence: Evidence, reading: str, finding: Finding) -> None:
         found = [r for k in wavenumbers for r in rows(evidence, SPREAD, reading, average, wavenumber=float(k))]
         if not found:
             raise MissingEvidence(f"{SPREAD} does not vary the wavenumber")
-        shares[average] = _share([max(r.r2, r.r2_nonlinear) >= STRAIGHT_EVERYWHERE for r in found])
+        shares[average] = _share([r.best >= STRAIGHT_EVERYWHERE for r in found])
         if average == averages[0]:
             primary = found
     value = finding.value
@@ -171,7 +176,7 @@ def everywhere(evidence: Evidence, reading: str, finding: Finding) -> None:
             f"{late} of {len(primary)} curves have their peak among the three largest amplitudes: too few points are"
             " left for a power law"
         )
-    weak = [r for r in primary if r.sites == 1 and not max(r.r2, r.r2_nonlinear) >= STRAIGHT_EVERYWHERE]
+    weak = [r for r in primary if r.sites == 1 and not r.best >= STRAIGHT_EVERYWHERE]
     if weak:
         finding.reasons.append(f"one site falls short at {len(weak)} of {len(wavenumbers)} wavenumbers")
 
@@ -179,32 +184,33 @@ def everywhere(evidence: Evidence, reading: str, finding: Finding) -> None:
 def error_bars(evidence: Evidence, reading: str, finding: Finding) -> None:
     """C9."""
     found = rows(evidence, SPREAD, reading, "energy_weighted", wavenumber=EXCITED)
-    over_peak, over_low = [], []
+    over_peak, over_quiet = [], []
     for row in found:
         place = evidence.place(SPREAD, reading, wavenumber=EXCITED, sites=row.sites)
         error = evidence.curve(SPREAD, "entropy/error", place)
-        high = error.amplitude >= HIGH
-        at_peak = error.value[error.amplitude == row.curve.amplitude[row.curve.peak]]
-        quiet = error.value[error.untouched]
-        if high.any() and at_peak.size:
-            over_peak.append(float(error.value[high].mean() / at_peak[0]))
-        if high.any() and quiet.size:
-            over_low.append(float(error.value[high].mean() / quiet.mean()))
-    if not over_peak:
-        raise MissingEvidence(f"{SPREAD} has no amplitude of {HIGH:g} N or more")
+        loud = error.value[error.amplitude >= HIGH]
+        if not loud.size:
+            raise MissingEvidence(f"{SPREAD} has no amplitude of {HIGH:g} N or more")
+        peak = row.curve.amplitude[row.curve.peak]
+        # Where the peak is no lower than that, nothing lies behind it to compare with.
+        at_peak = error.value[(error.amplitude == peak) & (peak < HIGH)]
+        over_peak.append(float(loud.mean() / at_peak[0]) if at_peak.size else np.nan)
+        if error.untouched.any():
+            over_quiet.append(float(loud.mean() / error.value[error.untouched].mean()))
     finding.value[OVER_PEAK] = _share([ratio > 1 for ratio in over_peak])
-    if over_low:
-        finding.value[OVER_QUIET] = _share([ratio > 1 for ratio in over_low])
-        finding.value["mean ratio to the error bars without contact"] = float(np.mean(over_low))
-    finding.value["mean ratio to the error bars at the peak"] = float(np.mean(over_peak))
-    finding.uncertainty["smallest ratio to the error bars at the peak"] = min(over_peak)
-    finding.uncertainty["largest ratio to the error bars at the peak"] = max(over_peak)
-    finding.uncertainty["configurations"] = len(over_peak)
+    if over_quiet:
+        finding.value[OVER_QUIET] = _share([ratio > 1 for ratio in over_quiet])
+        finding.value["mean ratio to the error bars without contact"] = float(np.mean(over_quiet))
+    known = [ratio for ratio in over_peak if np.isfinite(ratio)]
+    if known:
+        finding.value["mean ratio to the error bars at the peak"] = float(np.mean(known))
+        finding.uncertainty["smallest ratio to the error bars at the peak"] = min(known)
+        finding.uncertainty["largest ratio to the error bars at the peak"] = max(known)
+    finding.uncertainty["configurations"] = len(found)
     late = [r for r in found if r.curve.amplitude[r.curve.peak] >= HIGH]
     if late:
         finding.reasons.append(
-            f"{len(late)} of {len(found)} configurations have their peak at {HIGH:g} N or above, so that high is not"
-            " behind it"
+            f"{len(late)} of {len(found)} configurations have their peak at {HIGH:g} N or above: nothing is behind it"
         )
 
 
