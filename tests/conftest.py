@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from vipetsc.case import Case
+from vipetsc.parallel import StopRequest
 
 
 @pytest.fixture
@@ -64,6 +65,18 @@ def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]
         assert values.shape == second[name].shape, name
         texts = values.dtype == object  # whose bytes are addresses
         assert values.tolist() == second[name].tolist() if texts else values.tobytes() == second[name].tobytes(), name
+
+
+class StopAt(StopRequest):
+    """A request that comes at the n-th look."""
+
+    def __init__(self, looks: int) -> None:
+        self.left = looks
+
+    @property
+    def requested(self) -> bool:
+        self.left -= 1
+        return self.left < 0
 
 
 def clean_environment() -> dict[str, str]:

@@ -135,9 +135,16 @@ def _duration(seconds: float) -> str:
 def run_table(result: Result) -> str:
     """How a run ended and its numbers."""
     s = result.statistics
+    how = f"{s['method']}, {s['right_hand_side']}"
+    steps = f"{s['steps']} accepted, {s['rejected']} rejected ({how})"
+    if s["engine"] == "propagator":
+        steps = (
+            f"{s['steps']} linear ({s['method']}, {s['bandwidth']} cells each way, exact to {s['truncation']:.1g}), "
+        )
+        steps += f"{s['substeps']} with forces"
     rows = [
         ("impacts", f"{s['episodes']} episodes, {s['landings']} landings"),
-        ("steps", f"{s['steps']} accepted, {s['rejected']} rejected ({s['method']}, {s['right_hand_side']})"),
+        ("steps", steps),
         ("time", f"{s['wall_seconds']:.2f} s wall, {s['cpu_seconds']:.2f} s CPU of all ranks"),
         ("folder", str(result.folder)),
     ]
@@ -145,6 +152,8 @@ def run_table(result: Result) -> str:
         share = s["dissipated"] / s["work"]
         rows.insert(0, ("energy", f"work {s['work']:.6g} J, dissipated {100 * share:.4g} %, "
                                   f"ledger closes to {s['ledger_error']:.2g} of the work"))  # fmt: skip
+    if "engine_note" in s:
+        rows.append(("engine", f"{s['engine']}: {s['engine_note']}"))
     acted = {n: s[n] for n in ("grazes", "floored", "clipped", "pulled") if s[n]}
     if acted:
         rows.insert(2, ("limits", ", ".join(f"{n} {count}" for n, count in acted.items())))

@@ -99,8 +99,8 @@ def test_a_scaled_member_is_what_its_simulation_would_be(vipetsc, case, tmp_path
     assert np.array_equal(scaled["time"], run["time"])
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks):
+@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGTERM)])
+def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, number):
     whole = vipetsc(0, "sweep", case, "--out", tmp_path / "whole")
     assert whole.returncode == 0, whole.stderr
     out = tmp_path / "killed"
@@ -126,8 +126,11 @@ def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks)
         if len(list(out.glob("*/summary.json"))) >= done:
             break
         time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    if number == signal.SIGKILL:
+        os.killpg(process.pid, number)
+    else:
+        process.terminate()
+    assert process.wait(60) != 0
     assert not (out / "ensemble.h5").exists()
     made = {p: p.stat().st_mtime_ns for p in out.glob("*/summary.json")}
     assert made

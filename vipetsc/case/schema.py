@@ -158,12 +158,14 @@ class TimeTable(Section):
 
     ``samples`` is their number from 0 to the end, in place of an interval.
 
-    ``atol``: ``scaled`` is .1 rtol times the displacement and the velocity of the drive's linear wave,
-    ``paper`` is 1e-9 times the amplitude, a number is used for displacements (m) and velocities (m/s).
+    ``engine``: ``ts`` steps with PETSc's Runge-Kutta ``method``; ``propagator`` takes exact linear steps, with
+    contact forces collocated; ``auto`` is the propagator where it suits. ``atol``: ``scaled`` is .1 rtol times the
+    displacement and the velocity of the drive's linear wave, ``paper`` is 1e-9 times the amplitude, a number is
+    used for displacements (m) and velocities (m/s).
     """
 
     end: Positive | Literal["traverse"] = "traverse"
-    engine: Literal["ts"] = "ts"
+    engine: Literal["ts", "propagator", "auto"] = "ts"
     method: Literal[METHODS] = "8vr"
     rtol: Annotated[float, Field(ge=1e-14, le=1e-2)] = 1e-10
     atol: Positive | Literal["scaled", "paper"] = "scaled"

@@ -83,6 +83,9 @@ class Sweep:
         if not isinstance(section, dict):
             remedy = "missing; list what varies, as in: [sweep.drive] amplitude = { log = [1.0, 100.0], count = 9 }"
             raise CaseError([*problems, Problem("sweep", section, remedy)], source)
+        # Many runs want the fastest engine that a case allows.
+        if isinstance(table.get("time", {}), dict):
+            table["time"] = {"engine": "auto"} | table.get("time", {})
         varying = {key: section[key] for key in section if key in Case.model_fields and key != "name"}
         options, wrong = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
         problems += wrong

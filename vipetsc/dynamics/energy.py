@@ -49,31 +49,22 @@ class Ledger:
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
         self.worst = 0.0
         self.most_work = 0.0
-        self._sums = np.zeros(8, np.int64)
         self._total = np.zeros(9)
 
     def measure(self, state: PETSc.Vec) -> Energies:
         """Energies of ``state``, whose ghosts must be up to date; all ranks must call it."""
-        operator, layout, sums = self.operator, self.operator.layout, self._sums
-        sums[:] = 0
+        total = self._total
         with state.localForm() as local:
-            y = local.array
-            kernel.add_energies(y, operator.q, operator.p, self.unit, sums)
-            kernel.add_dissipated(y, operator.q, self.unit, sums)
-            work = y[layout.work] if layout.owns_drive else 0.0
-        # Carrying leaves every number below 2^53: the sum of floats over ranks is exact.
-        carried = sums[1::2] >> 40
-        self._total[0:8:2] = sums[0::2] + carried
-        self._total[1:8:2] = sums[1::2] - (carried << 40)
-        self._total[8] = work
-        self.comm.Allreduce(MPI.IN_PLACE, self._total, MPI.SUM)
-        coarse, fine = self._total[0:8:2], self._total[1:8:2]
-        kinetic, spring, contact, dissipated = (coarse * self.unit + fine * (self.unit / _FINE)).tolist()
-        return Energies(kinetic, spring, contact, float(self._total[8]), dissipated)
+            kernel.measure(local.array, self.operator.q, self.operator.p, self.unit, total)
+        self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
+        *parts, work = total.tolist()
+        held = [a * self.unit + b * (self.unit / _FINE) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+        kinetic, spring, contact, dissipated = held
+        return Energies(kinetic, spring, contact, work, dissipated)
 
     def check(self, energies: Energies) -> str | None:
         """What is wrong with a state of these energies, or None; keeps the largest residual and work."""
-        saturated = self.unit * 2.0**52
+        saturated = self.unit * 2.0**50
         total = energies.kinetic + energies.spring + energies.contact
         if not (np.isfinite(energies.work) and total < saturated):
             return "the state is not finite"

@@ -85,24 +85,30 @@ class ImpactTracker:
         """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
         shortest = np.inf
         for site in self.open:
-            shortest = min(shortest, self._duration(abs(float(self.operator.approach[site]))))
+            shortest = min(shortest, self.duration(abs(float(self.operator.approach[site]))))
         return shortest
 
     def follow(self, h: float) -> None:
         """Take the step from ``start`` to ``end`` as done: update the running peaks of open episodes."""
         for site, episode in self.open.items():
             q, p = self.operator.q, self.operator.p
-            depth, force, weakest = contact_kernel.peaks(q, p, self.start, self.end, h, site)
-            episode.indentation = max(episode.indentation, depth)
-            episode.force = max(episode.force, force)
-            # A pull within the landing's rounding is none.
-            if weakest < -1e-9 * episode.force and site not in self.pulling:
-                self.pulling.add(site)
-                self.counts.pulled += 1
+            self.grow(site, episode, *contact_kernel.peaks(q, p, self.start, self.end, h, site))
         self.start, self.end = self.end, self.start
 
-    def switch(self, t: float, state: PETSc.Vec) -> int:
-        """Switch every owned site that has landed at time t (motion in ``start``); returns how many."""
+    def grow(self, site: int, episode: Episode, depth: float, force: float, weakest: float) -> None:
+        """Update an open episode with a stretch's largest indentation in m, largest and smallest force in N."""
+        episode.indentation = max(episode.indentation, depth)
+        episode.force = max(episode.force, force)
+        # A pull within the landing's rounding is none.
+        if weakest < -1e-9 * episode.force and site not in self.pulling:
+            self.pulling.add(site)
+            self.counts.pulled += 1
+
+    def switch(self, t: float, energies: np.ndarray) -> int:
+        """Switch every owned site that has landed at time t (motion in ``start``); returns how many.
+
+        ``energies`` are the sites' dissipated energies in J.
+        """
         switched = 0
         for site in range(len(self.sites)):
             contact_kernel.switching(self.operator.q, self.operator.p, site, self.start, self._switching)
@@ -113,36 +119,34 @@ class ImpactTracker:
                 if rate <= 0 and value <= tolerance:
                     self.counts.grazes += int(self.operator.mode[site] == kernel.FREE)
                     continue
-                self._change(site, int(mode), t, state)
+                self._change(site, int(mode), t, float(energies[site]))
                 switched += 1
                 break
         return switched
 
-    def _change(self, site: int, mode: int, t: float, state: PETSc.Vec) -> None:
+    def _change(self, site: int, mode: int, t: float, energy: float) -> None:
         operator = self.operator
         before = int(operator.mode[site])
         operator.mode[site] = mode
-        energy = state.array_r[operator.q[kernel.DISSIPATED] + site]
         if before == kernel.FREE:
             rate = self.start[site, 1]
             self.counts.floored += int(abs(rate) < self.floor)
             operator.approach[site] = np.sign(mode) * max(abs(rate), self.floor)
-            self.open[site] = Episode(self.sites[site], int(np.sign(mode)), t, float(rate), loss=-float(energy))
+            self.open[site] = Episode(self.sites[site], int(np.sign(mode)), t, float(rate), loss=-energy)
         elif mode == kernel.FREE:
             episode = self.open.pop(site)
             self.pulling.discard(site)
             episode.separation = t
-            episode.loss += float(energy)
+            episode.loss += energy
             self.closed.append(episode)
         elif abs(mode) == kernel.CLIPPED:
             self.counts.clipped += 1
 
-    def unfinished(self, state: PETSc.Vec) -> list[Episode]:
-        """Copies of the episodes still open, with the loss so far."""
-        energies = state.array_r[self.operator.q[kernel.DISSIPATED] :]
+    def unfinished(self, energies: np.ndarray) -> list[Episode]:
+        """Copies of the episodes still open, with the loss so far; ``energies`` as in ``switch``."""
         return [Episode(**asdict(e) | {"loss": e.loss + float(energies[site])}) for site, e in self.open.items()]
 
-    def _duration(self, speed: float) -> float:
+    def duration(self, speed: float) -> float:
         """Contact time in s of an isolated conservative impact at ``speed`` in m/s (Johnson 1985, sec. 11.4)."""
         kc, n = self.contact.stiffness, self.contact.law.exponent
         depth = ((n + 1) / 2 * self.reduced_mass * speed**2 / kc) ** (1 / (n + 1))

@@ -11,7 +11,8 @@ The route (PETSc's own event handling loses short contacts and its error control
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -19,7 +20,8 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.dynamics.impacts import ImpactTracker
+from vipetsc.dynamics.engine import Engine, StalledError
+from vipetsc.dynamics.impacts import Episode, ImpactTracker
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.lattice import Hertz
@@ -36,10 +38,6 @@ MOST_TRIALS = 200_000
 SHORTEST_STEP = 8 * np.finfo(float).eps
 
 
-class StalledError(RuntimeError):
-    """The step size fell to the rounding of the time, or the state is not finite."""
-
-
 @dataclass
 class StepCounts:
     """What the integrator did."""
@@ -50,7 +48,7 @@ class StepCounts:
     switches: int = 0
 
 
-class Integrator:
+class Integrator(Engine):
     """Advances a lattice exactly onto given times; ``state`` and ``time`` are always an accepted step's end.
 
     Parameters
@@ -66,6 +64,8 @@ class Integrator:
     ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
     """
 
+    name = "ts"
+
     def __init__(
         self,
         model: Model,
@@ -78,6 +78,8 @@ class Integrator:
         self.comm = layout.comm
         self.tracker = tracker
         self.operator = operator
+        self._burst = model.drive.duration
+        self._dissipated = layout.dissipated
         self.counts = StepCounts()
         self.time = 0.0
         self.state = layout.create_vector()
@@ -96,6 +98,17 @@ class Integrator:
         share, order = (1 / 200, 2.5) if hertz else (1 / 20, 8)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
         tracker.observe(0.0, self.state, tracker.start)
+
+    @classmethod
+    def create(
+        cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
+    ) -> Integrator:
+        """An integrator at rest at t = 0 with its own impact tracker."""
+        return cls(model, layout, operator, ImpactTracker(operator, model.contact), native, stop)
+
+    @classmethod
+    def refusal(cls, model: Model) -> None:
+        """None: any lattice can be stepped."""
 
     def _create_ts(self, model: Model, layout: Layout, native: bool) -> PETSc.TS:
         options = PETSc.Options()
@@ -131,6 +144,9 @@ class Integrator:
 
         Raises StalledError where no step can be taken.
         """
+        # The drive's end is a kink of its third derivative: a step ends there.
+        if self.time < self._burst < target and not self.advance(self._burst):
+            return False
         tried = self.counts.steps + self.counts.rejected
         while self.time < target:
             if self.counts.steps + self.counts.rejected - tried > MOST_TRIALS:
@@ -226,7 +242,7 @@ class Integrator:
         """Switch modes of all landed sites and set the step with which to go on."""
         tracker = self.tracker
         was_free = not self._any_open
-        self.counts.switches += tracker.switch(self.time, self.state)
+        self.counts.switches += tracker.switch(self.time, self.state.array_r[self._dissipated :])
         shortest = self.comm.allreduce(tracker.contact_time(), MPI.MIN)
         self._any_open = bool(np.isfinite(shortest))
         if self._any_open and not self._fixed:
@@ -238,14 +254,25 @@ class Integrator:
         tracker.observe(self.time, self.state, tracker.start)
         self.ts.restartStep()
 
-    def destroy(self) -> None:
-        """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
-        for thing in (self.ts, self.state, self.saved):
-            thing.destroy()
+    def take_episodes(self) -> list[Episode]:
+        """Episodes closed since the last call, of the owned sites."""
+        closed, self.tracker.closed = self.tracker.closed, []
+        return closed
+
+    def unfinished(self) -> list[Episode]:
+        """Copies of the owned sites' open episodes."""
+        return self.tracker.unfinished(self.state.array_r[self._dissipated :])
+
+    def statistics(self) -> dict[str, Any]:
+        """Steps, what landings and limits of the contact law there were, and how the right-hand side is called."""
+        limits = {name: self.comm.allreduce(count) for name, count in asdict(self.tracker.counts).items()}
+        statistics = asdict(self.counts) | limits
+        statistics["switches"] = self.comm.allreduce(self.counts.switches)
+        return statistics | {"method": self.method, "right_hand_side": self.right_hand_side}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs to go on with the same bits, this rank's share."""
-        return {
+        return self.tracker.checkpoint() | {
             "state": self.state.array_r.copy(),
             "time": np.array(self.time),
             "steps": np.array([self.step, self.free_step, float(self._any_open)]),
@@ -253,7 +280,8 @@ class Integrator:
         }
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
-        """Go back to a checkpoint; the tracker must have been restored before."""
+        """Go back to a checkpoint."""
+        self.tracker.restore(checkpoint)
         self.state.array[:] = checkpoint["state"]
         self.time = float(checkpoint["time"])
         self.step, self.free_step, any_open = checkpoint["steps"].tolist()
@@ -261,3 +289,8 @@ class Integrator:
         self.counts = StepCounts(*checkpoint["counts"].tolist())
         self.ts.restartStep()
         self.tracker.observe(self.time, self.state, self.tracker.start)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
+        for thing in (self.ts, self.state, self.saved):
+            thing.destroy()

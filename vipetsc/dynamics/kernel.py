@@ -24,6 +24,11 @@ HEADER = 35
 # Contact modes of a site: the sign is the side.
 FREE, CONTACT_MODE, CLIPPED = 0, 1, 2
 
+# Energies count in whole numbers up to the largest; added to floats of at most 2^51, _WHOLE rounds to whole numbers.
+_LARGEST = 2.0**50
+_WHOLE = 2.0**52 + 2.0**51
+_WHOLE_BITS = int(np.float64(_WHOLE).view(np.int64))
+
 # Cells in one pass: what a pass touches stays in the first-level cache.
 CHUNK = 512
 
@@ -154,8 +159,8 @@ def right_hand_side(t, y, f, q, p):
 @njit("void(i8[::1], i8, f8, f8)", **_options)
 def _add_exactly(sums, at, value, unit):
     coarse = np.rint(value / unit)
-    if not abs(coarse) < 2.0**52:
-        coarse = 2.0**52  # not finite or far beyond the scale: the guard sees a runaway energy
+    if not abs(coarse) < _LARGEST:
+        coarse = _LARGEST  # not finite or far beyond the scale: the guard sees a runaway energy
         value = coarse * unit
     sums[at] += np.int64(coarse)
     sums[at + 1] += np.int64(np.rint((value - coarse * unit) / unit * 2.0**40))
@@ -168,6 +173,64 @@ def add_dissipated(y, q, unit, sums):
         _add_exactly(sums, 6, y[q[DISSIPATED] + site], unit)
 
 
+@njit("void(f8[::1], f8[::1], f8)", **_options)
+def _add_kinetic(out, v, inverse_mass):
+    for i in range(out.size):
+        out[i] += 0.5 * v[i] * v[i] / inverse_mass
+
+
+@njit("void(f8[::1], f8[::1], f8[::1], f8)", **_options)
+def _add_spring(out, end, start, stiffness):
+    for i in range(out.size):
+        stretch = end[i] - start[i]
+        out[i] += 0.5 * stiffness * stretch * stretch
+
+
+@njit("void(f8[::1], f8[::1], f8[::1], f8)", **_options)
+def _as_multiples(values, coarse, fine, unit):
+    """Whole numbers of ``unit`` in ``values``, at most 2^50, and of unit/2^40 in the rest, both plus ``_WHOLE``.
+
+    A float near 2^52 + 2^51 has units of one: adding it leaves whole numbers in the lowest bits.
+    """
+    for i in range(values.size):
+        value = values[i]
+        whole = np.rint(value * (1.0 / unit))
+        fits = abs(whole) < _LARGEST  # not finite or far beyond the scale: the guard sees a runaway energy
+        whole = whole if fits else _LARGEST
+        coarse[i] = whole + _WHOLE
+        fine[i] = (np.rint((value * (1.0 / unit) - whole) * 2.0**40) if fits else 0.0) + _WHOLE
+
+
+@njit("void(f8[::1], f8[::1], f8[::1], f8, i8[::1], i8)", **_options)
+def _add_all_exactly(values, coarse, fine, unit, sums, at):
+    _as_multiples(values, coarse, fine, unit)
+    for part in range(2):
+        bits = (coarse if part == 0 else fine).view(np.int64)
+        total = 0
+        for i in range(values.size):
+            total += bits[i] - _WHOLE_BITS
+        sums[at + part] += total
+
+
+@njit("UniTuple(f8, 2)(f8[::1], i8[::1], f8[::1], i8)", **_options)
+def _cell_energies(y, q, p, cell):
+    """Kinetic and spring energy of one cell, its springs to the next cell and a wall on its left included."""
+    n, d = q[CELLS], q[DOFS]
+    kinetic = spring = 0.0
+    for mass in range(d):
+        v = y[(d + mass) * n + cell]
+        kinetic += 0.5 * v * v / p[q[INVERSE_MASS] + mass]
+    for s in range(q[SPRINGS]):
+        start, end = q[q[SPRING_START] + s], q[q[SPRING_END] + s]
+        k, next_cell = p[q[SPRING_STIFFNESS] + s], q[q[SPRING_NEXT] + s]
+        if not (next_cell == 1 and cell == n - 1 and q[RIGHT_FREE] == 1):
+            stretch = displacement(y, q, cell, next_cell, end) - y[start * n + cell]
+            spring += 0.5 * k * stretch * stretch
+        if next_cell == 1 and cell == 0 and q[LEFT_GHOST] < 0 and q[LEFT_FREE] == 0:
+            spring += 0.5 * k * y[end * n] * y[end * n]
+    return kinetic, spring
+
+
 @njit("void(f8[::1], i8[::1], f8[::1], f8, i8[::1])", **_options)
 def add_energies(y, q, p, unit, sums):
     """Add this rank's kinetic, spring and contact energy to ``sums`` (2 integers each, in units of J).
@@ -176,22 +239,24 @@ def add_energies(y, q, p, unit, sums):
     depend on the order or on the partition.
     """
     n, d = q[CELLS], q[DOFS]
-    for cell in range(n):
-        kinetic = 0.0
+    kinetic, spring, coarse, fine = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
+    for a in range(0, n, CHUNK):
+        b = min(a + CHUNK, n)
+        held, stretched = kinetic[: b - a], spring[: b - a]
+        held[:] = 0.0
+        stretched[:] = 0.0
         for mass in range(d):
-            v = y[(d + mass) * n + cell]
-            kinetic += 0.5 * v * v / p[q[INVERSE_MASS] + mass]
-        spring = 0.0
+            _add_kinetic(held, y[(d + mass) * n + a : (d + mass) * n + b], p[q[INVERSE_MASS] + mass])
         for s in range(q[SPRINGS]):
-            start, end = q[q[SPRING_START] + s], q[q[SPRING_END] + s]
-            k, next_cell = p[q[SPRING_STIFFNESS] + s], q[q[SPRING_NEXT] + s]
-            if not (next_cell == 1 and cell == n - 1 and q[RIGHT_FREE] == 1):
-                stretch = displacement(y, q, cell, next_cell, end) - y[start * n + cell]
-                spring += 0.5 * k * stretch * stretch
-            if next_cell == 1 and cell == 0 and q[LEFT_GHOST] < 0 and q[LEFT_FREE] == 0:
-                spring += 0.5 * k * y[end * n] * y[end * n]
-        _add_exactly(sums, 0, kinetic, unit)
-        _add_exactly(sums, 2, spring, unit)
+            start, end, ahead = q[q[SPRING_START] + s] * n, q[q[SPRING_END] + s] * n, q[q[SPRING_NEXT] + s]
+            last = min(b, n - ahead)
+            _add_spring(stretched[: last - a], y[end + a + ahead : end + last + ahead], y[start + a : start + last],
+                        p[q[SPRING_STIFFNESS] + s])  # fmt: skip
+        for cell in (0, n - 1):
+            if a <= cell < b:
+                held[cell - a], stretched[cell - a] = _cell_energies(y, q, p, cell)
+        _add_all_exactly(held, coarse[: b - a], fine[: b - a], unit, sums, 0)
+        _add_all_exactly(stretched, coarse[: b - a], fine[: b - a], unit, sums, 2)
     host, resonator = q[HOST], q[RESONATOR]
     for site in range(q[SITES]):
         cell = q[q[SITE_CELL] + site]
@@ -200,3 +265,19 @@ def add_energies(y, q, p, unit, sums):
             kc = p[q[CONTACT]]
             energy = kc * x * x * np.sqrt(x) / 2.5 if q[HERTZ] == 1 else 0.5 * kc * x * x
             _add_exactly(sums, 4, energy, unit)
+
+
+@njit("void(f8[::1], i8[::1], f8[::1], f8, f8[::1])", **_options)
+def measure(y, q, p, unit, total):
+    """Kinetic, spring, contact and dissipated energy of this rank into ``total`` (2 whole numbers each), and its work.
+
+    Carrying leaves every number below 2^53: their sums over ranks, as floats, are exact.
+    """
+    sums = np.zeros(8, np.int64)
+    add_energies(y, q, p, unit, sums)
+    add_dissipated(y, q, unit, sums)
+    for i in range(4):
+        carried = sums[2 * i + 1] >> 40
+        total[2 * i] = sums[2 * i] + carried
+        total[2 * i + 1] = sums[2 * i + 1] - (carried << 40)
+    total[8] = y[q[WORK]] if q[WORK] >= 0 else 0.0

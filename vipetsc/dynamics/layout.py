@@ -93,10 +93,18 @@ class Layout:
         a, b = self.ranges[rank]
         return [self.offsets[rank] + mass * (b - a) + cell - a for mass in range(self.dofs)]
 
-    def create_vector(self) -> PETSc.Vec:
-        """A zero state with ghosts for the neighbouring cells' displacements."""
+    def state_indices(self, cell: int) -> list[int]:
+        """Global indices of the displacements and velocities of ``cell``, mass by mass."""
+        first = self.displacement_indices(cell)
+        return first + [first[-1] + (i + 1) * (first[1] - first[0]) for i in range(self.dofs)]
+
+    def create_vector(self, array: np.ndarray | None = None) -> PETSc.Vec:
+        """A zero state with ghosts for the neighbouring cells' displacements, in ``array`` if one is given."""
         ghosts = [i for cell in self.neighbours() if cell is not None for i in self.displacement_indices(cell)]
         indices = np.asarray(ghosts, PETSc.IntType)
-        vector = PETSc.Vec().createGhost(indices, size=(self.size, PETSc.DETERMINE), comm=self.comm)
+        size = (self.size, PETSc.DETERMINE)
+        if array is not None:
+            return PETSc.Vec().createGhostWithArray(indices, array, size=size, comm=self.comm)
+        vector = PETSc.Vec().createGhost(indices, size=size, comm=self.comm)
         vector.set(0.0)
         return vector

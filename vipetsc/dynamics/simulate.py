@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,17 @@ import numpy as np
 
 from vipetsc.case import Case, Model
 from vipetsc.dynamics.energy import Ledger
-from vipetsc.dynamics.impacts import ImpactTracker
-from vipetsc.dynamics.integrator import Integrator, StalledError
+from vipetsc.dynamics.engine import StalledError, choose
+from vipetsc.dynamics.integrator import Integrator
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
+from vipetsc.dynamics.propagator import Propagator
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.parallel import Progress, StopRequest, on_root
 from vipetsc.store import RunFolder, provenance
+
+# In the order in which engine = "auto" tries them.
+ENGINES = (Propagator, Integrator)
 
 
 @dataclass(frozen=True)
@@ -94,8 +98,8 @@ class _Run:
         self.comm = home.comm
         self.layout = Layout.of(model, self.comm)
         self.operator = LatticeOperator(model, self.layout)
-        self.tracker = ImpactTracker(self.operator, model.contact)
-        self.integrator = Integrator(model, self.layout, self.operator, self.tracker, native, stop)
+        kind, self.refused = choose(case.time.engine, model, ENGINES)
+        self.engine = kind.create(model, self.layout, self.operator, native, stop)
         self.ledger = Ledger(model, self.operator)
         self.recorder = Recorder(case, model, self.layout)
         self.parts = 0
@@ -108,34 +112,29 @@ class _Run:
         if number < 0:
             return
         checkpoint = self.home.read_state(number)
-        self.tracker.restore(checkpoint)
-        self.integrator.restore(checkpoint)
+        self.engine.restore(checkpoint)
         self.samples, self.episodes = (int(n) for n in checkpoint["done"])
         self.ledger.worst, self.ledger.most_work = checkpoint["ledger"].tolist()
         self.parts = number + 1
-        self.last = self.integrator.time
-        self.progress.start_at(self.integrator.time)
+        self.last = self.engine.time
+        self.progress.start_at(self.engine.time)
 
     def go(self) -> tuple[bool, str]:
         """Simulate to the end; whether it was reached, and how it ended in words."""
-        integrator, model = self.integrator, self.model
-        burst = model.drive.duration
+        engine, model = self.engine, self.model
         while self.samples < model.samples:
             t = self.samples * model.sample_interval
             try:
-                # The drive's end is a kink of its third derivative: a step ends there.
-                going = integrator.advance(burst) if integrator.time < burst < t else True
-                going = going and integrator.advance(t)
+                going = engine.advance(t)
             except StalledError as error:
                 return False, self._failure(f"stalled: {error}")
             if not going:
-                return False, f"stopped on request at t = {integrator.time:.6g} s"
-            # Ghosts are fresh: the integrator has just looked at the sites.
-            energies = self.ledger.measure(integrator.state)
+                return False, f"stopped on request at t = {engine.time:.6g} s"
+            energies = self.ledger.measure(engine.state)
             problem = self.ledger.check(energies)
             if problem:
                 return False, self._failure(problem)
-            self.recorder.record(self.samples, t, integrator.state, energies)
+            self.recorder.record(self.samples, t, engine.state, energies)
             self.energies, self.last = energies, t
             self.samples += 1
             if self.recorder.full:
@@ -144,21 +143,21 @@ class _Run:
         return True, f"complete: {model.samples} samples to t = {self.last:.6g} s"
 
     def _flush(self) -> None:
-        episodes, self.tracker.closed = self.tracker.closed, []
+        episodes = self.engine.take_episodes()
         self.episodes += self.comm.allreduce(len(episodes))
         self.home.write_part(self.parts, self.recorder.take(episodes))
         done = {
             "done": np.array([self.samples, self.episodes]),
             "ledger": np.array([self.ledger.worst, self.ledger.most_work]),
         }
-        self.home.write_state(self.parts, self.integrator.checkpoint() | self.tracker.checkpoint() | done)
+        self.home.write_state(self.parts, self.engine.checkpoint() | done)
         self.parts += 1
 
     def _failure(self, reason: str) -> str:
         """``reason`` with the time, the place where the lattice moves fastest, and the last good sample."""
         layout = self.layout
         half = layout.dofs * layout.owned
-        y = self.integrator.state.array_r
+        y = self.engine.state.array_r
         finite = np.isfinite(y[:half]) & np.isfinite(y[half : 2 * half])
         speed = np.where(finite, np.abs(y[half : 2 * half]), np.inf).reshape(layout.dofs, layout.owned)
         cell = int(speed.max(axis=0).argmax()) if layout.owned else 0
@@ -170,7 +169,7 @@ class _Run:
         if near is not None:
             place += f", nearest site {near + 1} in cell {sites[near] + 1}"
         good = "none" if self.last is None else f"t = {self.last:.6g} s"
-        return f"{reason}, at t = {self.integrator.time:.6g} s ({place}); last good sample: {good}"
+        return f"{reason}, at t = {self.engine.time:.6g} s ({place}); last good sample: {good}"
 
     def finish(self, complete: bool, sentence: str, begin: tuple[float, float]) -> Result:
         """Write what is still in memory; unless the run was stopped on request, the final files too."""
@@ -190,7 +189,7 @@ class _Run:
             if comm.rank == 0:
                 home.finish(about | {"case": self.case.model_dump(by_alias=True)})
             comm.Barrier()
-        self.integrator.destroy()
+        self.engine.destroy()
         return Result(complete, resumable, sentence, statistics, home.path)
 
     def _all_cells(self) -> np.ndarray:
@@ -198,27 +197,24 @@ class _Run:
         return np.arange(first - 1, last, self.case.output.every)
 
     def _write_last_part(self) -> None:
-        episodes = self.tracker.closed + self.tracker.unfinished(self.integrator.state)
-        self.tracker.closed = []
+        episodes = self.engine.take_episodes() + self.engine.unfinished()
         self.episodes += self.comm.allreduce(len(episodes))
         self.home.write_part(self.parts, self.recorder.take(episodes))
         self.parts += 1
 
     def _statistics(self, begin: tuple[float, float]) -> dict[str, Any]:
-        comm, integrator = self.comm, self.integrator
-        counts = {k: comm.allreduce(v) for k, v in asdict(self.tracker.counts).items()}
+        comm = self.comm
         cpu = comm.allreduce(time.process_time() - begin[1])
         energies = getattr(self, "energies", None)
         statistics = {"samples": self.samples, "end": self.last or 0.0, "episodes": self.episodes}
-        statistics |= asdict(integrator.counts) | counts
-        statistics["switches"] = comm.allreduce(integrator.counts.switches)
+        statistics |= {"engine": self.engine.name} | self.engine.statistics()
+        if self.refused:
+            statistics["engine_note"] = self.refused
         statistics["ledger_error"] = self.ledger.error
         if energies is not None:
             statistics["work"] = energies.work
             statistics["dissipated"] = energies.dissipated
         statistics |= {
-            "method": integrator.method,
-            "right_hand_side": integrator.right_hand_side,
             "wall_seconds": round(time.perf_counter() - begin[0], 3),
             "cpu_seconds": round(cpu, 3),
         }

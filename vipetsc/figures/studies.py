@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -33,12 +33,17 @@ class Study:
     ensembles: tuple[EnsembleFile, ...]
     branches: tuple[Path, ...] = ()
 
+    def measuring(self, measure: str) -> Study:
+        """The same without the sweeps that do not measure it."""
+        return replace(self, ensembles=tuple(e for e in self.ensembles if measure in e.sweep.options.measures))
+
 
 # Each draws what its data allow: pairs of a suffix for the file's name ("" for none) and a figure.
 StudyFigure = Callable[[Study], Iterator[tuple[str, Figure]]]
-study_figures: dict[str, StudyFigure] = {
-    f.__name__: f
-    for f in (
+
+# By what a sweep measures; a sweep is shown only by the figures of its own measures.
+_FAMILIES: dict[str, tuple[StudyFigure, ...]] = {
+    "entropy": (
         amplitudes,
         wavelets,
         partition,
@@ -48,14 +53,18 @@ study_figures: dict[str, StudyFigure] = {
         entropy_all,
         entropy_maps,
         entropy_history,
+    ),
+    "transfer": (
         transfer,
         transfer_dispersions,
         band_energies,
         ibtet,
         ibtet_backbone,
         phase_regimes,
-    )
+    ),
 }
+study_figures: dict[str, StudyFigure] = {f.__name__: f for family in _FAMILIES.values() for f in family}
+_MEASURE = {f.__name__: measure for measure, family in _FAMILIES.items() for f in family}
 
 
 def draw_study(
@@ -98,7 +107,7 @@ def draw_study(
         sweeps = tuple(stack.enter_context(EnsembleFile(f)) for f in folders if (f / "ensemble.h5").exists())
         study = Study(sweeps, tuple(f for f in folders if any(f.glob("branch-*.h5"))))
         for name in wanted[rank::size]:
-            for suffix, figure in study_figures[name](study):
+            for suffix, figure in study_figures[name](study.measuring(_MEASURE[name])):
                 stem = f"{name}-{suffix}" if suffix else name
                 written += [save(figure, target / f"{stem}.{kind}") for kind in formats]
     return written

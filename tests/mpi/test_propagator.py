@@ -1,0 +1,55 @@
+"""The propagator on any number of ranks: the same bits as on one."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.conftest import StopAt, assert_same_bits, datasets, small_case
+from tests.mpi.test_partition import runs_alike
+from vipetsc.case import Case
+from vipetsc.dynamics import simulate
+
+
+@pytest.mark.parallel([1, 2, 3, 4])
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+def test_same_bits_with_clusters_across_borders(folder, ends, law):
+    # On 2, 3 and 4 ranks, 24 cells are cut after 12; 8, 16; 6, 12, 18.
+    case = small_case(
+        lattice={"ends": ends},
+        contacts={"law": law, "sites": [1, 6, 7, 12, 13, 16, 17, 24]},
+        time={"end": 0.03, "engine": "propagator"},
+    )
+    runs_alike(folder, case)
+
+
+@pytest.mark.parallel([2, 3, 4])
+def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
+    """Samples .8 ms apart: the band reaches over several ranks of a few cells."""
+    case = small_case(
+        lattice={"cells": 11},
+        contacts={"sites": [3, 8]},
+        drive={"cell": 6, "mass": 3},
+        time={"end": 0.04, "sample_interval": 8e-4, "engine": "propagator"},
+    )
+    runs_alike(folder, case)
+
+
+@pytest.mark.parallel([2, 3])
+def test_same_bits_diatomic_and_driven_in_the_middle(folder):
+    table = {
+        "lattice": {"preset": "diatomic", "cells": 31},
+        "contacts": {"sites": [8, 15, 16, 31], "clearance": 4e-5},
+        "drive": {"amplitude": 40.0, "cycles": 10, "cell": 16, "mass": 2},
+        "time": {"end": 0.05, "engine": "propagator"},
+    }
+    runs_alike(folder, Case.from_table(table))
+
+
+@pytest.mark.parallel([2, 3])
+def test_a_stopped_run_goes_on_to_the_same_bits(folder):
+    case = small_case(contacts={"sites": [1, 8, 12, 13]}, time={"end": 0.04, "engine": "propagator"})
+    simulate(case, folder / "straight")
+    assert simulate(case, folder / "stopped", stop=StopAt(120)).resumable
+    assert simulate(case, folder / "stopped", resume=True).complete
+    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "stopped")))

@@ -1,0 +1,89 @@
+"""What every engine offers to a simulation, and which one a case gets."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from vipetsc.case import Model
+from vipetsc.dynamics.impacts import Episode
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.operator import LatticeOperator
+from vipetsc.parallel import StopRequest
+
+
+class StalledError(RuntimeError):
+    """The step size fell to the rounding of the time, or the state is not finite."""
+
+
+class Engine(ABC):
+    """Advances a lattice exactly onto given times; a subclass gives its ``name`` in case files.
+
+    ``state`` (as ``Layout`` orders it, ghosts up to date) and ``time`` in s are those of the last time reached.
+    """
+
+    name: ClassVar[str]
+    state: PETSc.Vec
+    time: float
+
+    @classmethod
+    @abstractmethod
+    def create(
+        cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
+    ) -> Engine:
+        """An engine for ``model``, at rest at t = 0; all ranks must call it."""
+
+    @classmethod
+    @abstractmethod
+    def refusal(cls, model: Model) -> str | None:
+        """Why this engine is not the one for ``model``, in words; None if it is."""
+
+    @abstractmethod
+    def advance(self, target: float) -> bool:
+        """Go on until the time is exactly ``target`` in s, the next sample; False if a stop was requested.
+
+        Raises StalledError, on all ranks, where no step can be taken.
+        """
+
+    @abstractmethod
+    def take_episodes(self) -> list[Episode]:
+        """Episodes closed since the last call that this rank logs."""
+
+    @abstractmethod
+    def unfinished(self) -> list[Episode]:
+        """Copies of the open episodes that this rank logs, with the loss so far."""
+
+    @abstractmethod
+    def statistics(self) -> dict[str, Any]:
+        """What the engine did, summed over ranks; all must call it."""
+
+    @abstractmethod
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """All that a resumed run needs to go on with the same bits, this rank's share."""
+
+    @abstractmethod
+    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
+        """Go back to a checkpoint."""
+
+    @abstractmethod
+    def destroy(self) -> None:
+        """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
+
+
+def choose(name: str, model: Model, engines: tuple[type[Engine], ...]) -> tuple[type[Engine], str | None]:
+    """The engine called ``name`` and None, or the first of ``engines`` that suits, and why another was not taken.
+
+    ``auto`` names whichever suits first; the last engine suits every model.
+    """
+    wanted = [engine for engine in engines if engine.name == name] or list(engines)
+    reason = None
+    for engine in [*wanted, engines[-1]]:
+        reason, refused = reason, engine.refusal(model)
+        if refused is None:
+            return engine, reason
+        reason = reason or f"{engine.name} refused: {refused}"
+    raise ValueError(reason)
