@@ -34,7 +34,8 @@ def measured(statement: Statement, reading: str, root: Path) -> Claim:
             finding.reasons.append(str(missing))
         except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
             found, missed = UNMEASURED, []
-            finding.reasons.append(f"{', '.join(evidence.files)} cannot be used: {error}".replace(f"{root}/", ""))
+            words = " ".join(str(error).split()).replace(f"{root}/", "")
+            finding.reasons.append(f"{evidence.files[-1] if evidence.files else 'a file'} cannot be used: {words}")
         else:
             found, missed = verdict(statement.criteria, finding.value)
         files = tuple(evidence.files)
