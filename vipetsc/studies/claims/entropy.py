@@ -15,6 +15,7 @@ EXCITED = 5 * np.pi / 9  # rad/cell
 CONFIGURATIONS, MOST, NEARLY_ALL = 6, 4, 30  # the paper's six; "the majority" of them, "nearly all" of 36
 WAVENUMBERS = 6
 STRAIGHT, STRAIGHT_EVERYWHERE = 0.95, 0.9  # adjusted R^2
+FEWEST = 4  # points of a fit: three lie near some power law by chance
 QUIET = 0.1  # normalised entropy that is still "nearly zero"
 ABRUPT = 10**0.5  # ratio of amplitudes, half a decade, in which an abrupt rise goes from QUIET to half the peak
 PEAK = 0.9, 1.8  # N
@@ -27,10 +28,12 @@ FLOOR = "floor of the normalised entropy"
 RISES = "share of configurations with an abrupt rise"
 PEAKS = f"share of configurations with the peak at {PEAK[0]:g} to {PEAK[1]:g} N"
 AT_HIGH = f"normalised entropy at {HIGH:g} N behind the peak, {SEVERAL} sites or more"
-SPREAD_LAW = f"share of configurations of spread sites with adjusted R^2 >= {STRAIGHT:g}"
-NEIGHBOURS_LAW = f"share of configurations of neighbouring sites with adjusted R^2 >= {STRAIGHT:g}"
+SPREAD_LAW = f"share of configurations of spread sites with adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
+NEIGHBOURS_LAW = (
+    f"share of configurations of neighbouring sites with adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
+)
 TREND = "share of curves that rise, peak and fall by half"
-LAW = f"share of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g}"
+LAW = f"share of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g} over {FEWEST} points or more"
 OVER_PEAK = f"share of configurations with larger error bars from {HIGH:g} N on than at the peak"
 OVER_QUIET = f"share of configurations with larger error bars from {HIGH:g} N on than without contact"
 
@@ -56,6 +59,10 @@ class Row:
     def best(self) -> float:
         """The better adjusted R^2 of the two fits; NaN without one."""
         return float(np.fmax(self.r2, self.r2_nonlinear))
+
+    def straight(self, r2: float, bound: float) -> bool:
+        """Whether ``r2``, one of its own, reaches ``bound`` over enough points."""
+        return bool(r2 >= bound and self.points >= FEWEST)
 
     @property
     def falls(self) -> bool:
@@ -98,7 +105,7 @@ def power_law(evidence: Evidence, reading: str, finding: Finding) -> None:
     value[PEAKS] = _share([PEAK[0] <= c.amplitude[c.peak] <= PEAK[1] for c in _curves(spread)])
     several = [_at_high(r.curve) for r in spread if r.sites >= SEVERAL]
     value[AT_HIGH] = float(np.max(several)) if several else None
-    value[SPREAD_LAW] = _share([r.r2 >= STRAIGHT for r in spread])
+    value[SPREAD_LAW] = _share([r.straight(r.r2, STRAIGHT) for r in spread])
     for row in spread:
         _tell(finding, row, "spread")
     try:
@@ -106,16 +113,18 @@ def power_law(evidence: Evidence, reading: str, finding: Finding) -> None:
     except MissingEvidence as missing:
         finding.reasons.append(str(missing))
     else:
-        value[NEIGHBOURS_LAW] = _share([r.r2 >= STRAIGHT for r in masked])
+        value[NEIGHBOURS_LAW] = _share([r.straight(r.r2, STRAIGHT) for r in masked])
         for row in masked:
             _tell(finding, row, "neighbours, masked")
     about["amplitudes"] = len(spread[0].curve.amplitude)
     late = [c for c in _curves(spread) if c.amplitude[c.peak] > PEAK[1]]
+    onset = [float(c.amplitude[~c.untouched].min()) for c in _curves(spread) if not c.untouched.all()]
+    value["smallest amplitude with contact (N)"] = min(onset, default=None)
     if late:
         finding.reasons.append(
-            f"{len(late)} of {len(spread)} configurations peak from"
-            f" {min(c.amplitude[c.peak] for c in late):.3g} N on, the latest with"
-            f" {min(r.points for r in spread)} amplitudes left for a power law"
+            f"{len(late)} of {len(spread)} configurations peak only from"
+            f" {min(c.amplitude[c.peak] for c in late):.3g} N on, so that as few as {min(r.points for r in spread)} of"
+            f" {len(late[0].amplitude)} amplitudes are left for a power law"
         )
     weak = [f"{r.sites} ({r.r2:.3f})" for r in spread if not r.r2 >= STRAIGHT and np.isfinite(r.r2)]
     if weak:
@@ -157,13 +166,13 @@ def everywhere(evidence: Evidence, reading: str, finding: Finding) -> None:
         found = [r for k in wavenumbers for r in rows(evidence, SPREAD, reading, average, wavenumber=float(k))]
         if not found:
             raise MissingEvidence(f"{SPREAD} does not vary the wavenumber")
-        shares[average] = _share([r.best >= STRAIGHT_EVERYWHERE for r in found])
+        shares[average] = _share([r.straight(r.best, STRAIGHT_EVERYWHERE) for r in found])
         if average == averages[0]:
             primary = found
     value = finding.value
     value[TREND] = _share([r.falls for r in primary])
     value[LAW] = shares["energy_weighted"]
-    value[f"{LAW}, log-log line alone"] = _share([r.r2 >= STRAIGHT_EVERYWHERE for r in primary])
+    value[f"{LAW}, log-log line alone"] = _share([r.straight(r.r2, STRAIGHT_EVERYWHERE) for r in primary])
     known = [r.r2 for r in primary if np.isfinite(r.r2)]
     value["median adjusted R^2 (log-log)"] = float(np.median(known)) if known else None
     value["curves"] = len(primary)
@@ -176,7 +185,7 @@ def everywhere(evidence: Evidence, reading: str, finding: Finding) -> None:
             f"{late} of {len(primary)} curves have their peak among the three largest amplitudes: too few points are"
             " left for a power law"
         )
-    weak = [r for r in primary if r.sites == 1 and not r.best >= STRAIGHT_EVERYWHERE]
+    weak = [r for r in primary if r.sites == 1 and not r.straight(r.best, STRAIGHT_EVERYWHERE)]
     if weak:
         finding.reasons.append(f"one site falls short at {len(weak)} of {len(wavenumbers)} wavenumbers")
 
