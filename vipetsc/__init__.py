@@ -1,6 +1,13 @@
 """Waves in phononic lattices whose cells carry vibro-impacts, on PETSc and MPI."""
 
+import os
 from importlib import import_module
+from pathlib import Path
+
+from vipetsc.compiled import kernel_cache
+
+# Numba reads it when it is first imported; a folder that the user has chosen stays.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(kernel_cache(Path(__file__).parent)))
 
 __version__ = "0.1.0"
 

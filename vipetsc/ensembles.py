@@ -68,16 +68,20 @@ class EnsembleFile:
         return data[tuple(slice(None) if d == along else place[i] for i, d in enumerate(self.dimensions))]
 
     def place(self, **fixed: Any) -> tuple[int, ...]:
-        """Index on every axis of the member with these coordinates; 0 on axes that are not named."""
-        place = dict.fromkeys(self.dimensions, 0)
+        """Index on every axis of the first member with these coordinates; 0 on axes that are not named.
+
+        Coordinates of the same axis (``sites=1, cycles=30`` of a zipped one) have to meet in one member.
+        """
+        place = {}
         for name, value in fixed.items():
-            dimension = name if name in place else self._dimension_of(name)
+            dimension = name if name in self.dimensions else self._dimension_of(name)
             there = self.values(name)
             match = np.isclose(there, value) if np.issubdtype(there.dtype, np.number) else there == value
+            match &= place.get(dimension, True)
             if not np.any(match):
                 raise KeyError(f"{name} = {value!r} is not in {self.folder}; there are {list(there)}")
-            place[dimension] = int(np.argmax(match))
-        return tuple(place.values())
+            place[dimension] = match
+        return tuple(int(np.argmax(place[name])) if name in place else 0 for name in self.dimensions)
 
     def _dimension_of(self, name: str) -> str:
         names = self.sweep.names()

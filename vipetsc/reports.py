@@ -113,7 +113,8 @@ def validate_table(case: Case, ranks: int) -> str:
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("file size", f"{size / 2**20:.4g} MiB ({writer})"),
-        ("cost", f"about {steps:.3g} steps, {_duration(cost)} on {ranks} rank{'s' * (ranks > 1)} before contacts"),
+        ("cost", f"about {steps:.3g} steps of engine ts, {_duration(cost)} on {ranks} rank{'s' * (ranks > 1)} before"
+                 " contacts"),
     ]  # fmt: skip
     return _table(rows)
 

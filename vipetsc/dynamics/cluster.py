@@ -11,7 +11,7 @@ from vipetsc.dynamics import cluster_kernel as words
 from vipetsc.dynamics import march_kernel
 from vipetsc.dynamics.collocation import collocation
 from vipetsc.dynamics.engine import StalledError
-from vipetsc.dynamics.impacts import ImpactTracker
+from vipetsc.dynamics.impacts import Episode, ImpactTracker
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.series import StepSeries
@@ -154,12 +154,12 @@ class Cluster:
             self.tracker.grow(site, episode, *self._tops[site].tolist())
         self._tops[:] = 0.0
 
-    def take_episodes(self) -> list:
+    def take_episodes(self) -> list[Episode]:
         """Episodes closed since the last call; none where another rank logs them."""
         closed, self.tracker.closed = self.tracker.closed, []
         return closed if self.logs else []
 
-    def unfinished(self) -> list:
+    def unfinished(self) -> list[Episode]:
         """Copies of the open episodes; none where another rank logs them."""
         self._settle()
         return self.tracker.unfinished(self.energy) if self.logs else []

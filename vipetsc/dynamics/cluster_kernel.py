@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from scipy.special import binom
 
 from vipetsc.dynamics.collocation import NODES
 from vipetsc.dynamics.contact_kernel import LANDED
@@ -23,11 +24,13 @@ from vipetsc.dynamics.kernel import (
     contact_force,
     drive_force,
 )
+from vipetsc.dynamics.series import MOST_TERMS
 
 # Words of the clock: time at the step's begin, H, place s, next substep, end of the drive (s), longest substep.
 BEGIN, INTERVAL, PLACE, SUBSTEP, DRIVE_END, LONGEST, RTOL, ATOL, TOP = range(9)
 ROUNDING = 1e-15  # a share of a step that is none
 MOST_SWEEPS = 60
+BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 # Share of the estimated error (interpolation of the force) that the end of a substep is left with.
 SUPERCONVERGENCE = 0.02
 
@@ -123,39 +126,47 @@ def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, 
             if active[a] == sites:
                 f[sites, j] = drive_force(clock[BEGIN] + (clock[PLACE] + at) * h, p, q)
     to_w, to_v = np.zeros((n, n, NODES, NODES)), np.zeros((n, n, NODES, NODES))
+    near = np.zeros((n, n), np.bool_)
     for a in range(n):
         for b in range(n):
             power, size = length, 1.0
             for m in range(terms):
                 g = gamma[active[a], active[b], m]
                 if g != 0.0:
-                    for j in range(NODES):
-                        for k in range(NODES):
-                            to_w[a, b, j, k] += g * power * length * powers[kind, 2 * m + 1, j, k]
-                            to_v[a, b, j, k] += g * power * (2 * m + 1) / h * powers[kind, 2 * m, j, k]
+                    near[a, b] = True
+                    by_w, by_v = g * power * length, g * power * (2 * m + 1) / h
+                    for k in range(NODES):
+                        for j in range(NODES):
+                            to_w[a, b, k, j] += by_w * powers[kind, 2 * m + 1, k, j]
+                            to_v[a, b, k, j] += by_v * powers[kind, 2 * m, k, j]
                 power *= length * length
                 size *= (clock[TOP] * length) ** 2 / ((2 * m + 2) * (2 * m + 3))
                 if size < 1e-18:
                     break
     last = np.inf
+    x, y = np.empty(NODES), np.empty(NODES)
     for _ in range(MOST_SWEEPS):
         change = 0.0
         for a in range(n):
             i = active[a]
-            for j in range(NODES):
-                x, y = free_w[a, j], free_v[a, j]
-                for b in range(n):
+            x[:] = free_w[a]
+            y[:] = free_v[a]
+            for b in range(n):
+                if near[a, b]:
                     for k in range(NODES):
-                        x += to_w[a, b, j, k] * f[active[b], k]
-                        y += to_v[a, b, j, k] * f[active[b], k]
-                if not abs(x) + abs(y) < np.inf:
+                        force = f[active[b], k]
+                        for j in range(NODES):
+                            x[j] += to_w[a, b, k, j] * force
+                            y[j] += to_v[a, b, k, j] * force
+            for j in range(NODES):
+                if not abs(x[j]) + abs(y[j]) < np.inf:
                     f[:sites] = 0.0
                     return False
                 if i < sites:
                     # Changes count against the clearance and against the approach.
-                    change = max(change, abs(x - w[i, j]) / p[q[CLEARANCE] + i])
-                    change = max(change, abs(y - v[i, j]) / (abs(y) + abs(p[q[APPROACH] + i])))
-                w[i, j], v[i, j] = x, y
+                    change = max(change, abs(x[j] - w[i, j]) / p[q[CLEARANCE] + i])
+                    change = max(change, abs(y[j] - v[i, j]) / (abs(y[j]) + abs(p[q[APPROACH] + i])))
+                w[i, j], v[i, j] = x[j], y[j]
         if change < 1e-15 or (change < 1e-13 and change >= last):
             return True
         last = change
@@ -171,11 +182,20 @@ def collocate(q, p, clock, kind, length, jets, gamma, share, powers, active, f, 
 @njit("void(i8, f8, f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])", **_options)
 def renew(kind, length, jets, gamma, share, weight, active, f, trial):
     """Jets of all members at the end of a substep in which the forces ``f`` acted."""
-    trial[:] = jets
-    for i in range(jets.shape[0]):
-        shift(trial[i], length)
-    terms = gamma.shape[2]
-    moments = np.empty(2 * terms)
+    members, terms = jets.shape[0], gamma.shape[2]
+    # All members' series at once: the loops over them are the contiguous ones.
+    turned = np.empty((2 * terms, members))
+    for k in range(2 * terms):
+        for i in range(members):
+            turned[k, i] = jets[i, k]
+    for k in range(2 * terms - 1):
+        for i in range(2 * terms - 2, k - 1, -1):
+            for j in range(members):
+                turned[i, j] += length * turned[i + 1, j]
+    for k in range(2 * terms):
+        for i in range(members):
+            trial[i, k] = turned[k, i]
+    moments, series = np.empty(2 * terms), np.empty((terms, 2 * terms))
     for a in range(active.size):
         source = active[a]
         moments[:] = 0.0
@@ -184,14 +204,15 @@ def renew(kind, length, jets, gamma, share, weight, active, f, trial):
             for k in range(2 * terms):
                 moments[k] += amount
                 amount *= lag
-        for i in range(jets.shape[0]):
+        for m in range(terms):
+            for k in range(2 * m + 2):
+                series[m, k] = BINOMIALS[2 * m + 1, k] * moments[2 * m + 1 - k]
+        for i in range(members):
             for m in range(terms):
-                g, binomial = gamma[i, source, m], 1.0
-                if g == 0.0:
-                    continue
-                for k in range(2 * m + 2):
-                    trial[i, k] += g * binomial * moments[2 * m + 1 - k]
-                    binomial *= (2 * m + 1 - k) / (k + 1.0)
+                g = gamma[i, source, m]
+                if g != 0.0:
+                    for k in range(2 * m + 2):
+                        trial[i, k] += g * series[m, k]
 
 
 @njit("f8(i8[::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, ::1], i8[::1], f8[:, ::1])", **_options)

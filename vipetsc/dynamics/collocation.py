@@ -27,9 +27,9 @@ _SHARES = {
 class Collocation:
     """Nodes of a substep of unit length; leading axes are the three kinds.
 
-    ``share`` (3, node) and ``weight`` (3, node) integrate over it; ``powers`` (3, power, node, node): the integral
-    from 0 to node j of (share_j - s)^power times node k's Lagrange polynomial; ``tail`` (2, node): the last two
-    Legendre coefficients of a function from its values at the nodes.
+    ``share`` (3, node) and ``weight`` (3, node) integrate over it; ``powers`` (3, power, node k, node j): the
+    integral from 0 to node j of (share_j - s)^power times node k's Lagrange polynomial; ``tail`` (2, node): the
+    last two Legendre coefficients of a function from its values at the nodes.
     """
 
     share: np.ndarray
@@ -55,7 +55,7 @@ def collocation(powers: int) -> Collocation:
         lagrange = _lagrange(x, at) * (slope(at) * fine_weight * x[:, None])  # (node k, node j, fine)
         power = np.ones_like(lag)
         for p in range(powers):
-            table[kind, p] = np.einsum("jf,kjf->jk", power, lagrange)
+            table[kind, p] = np.einsum("jf,kjf->kj", power, lagrange)
             power = power * lag
     tail = np.stack([(2 * k + 1) * w * legval(2 * x - 1, np.eye(NODES)[k]) for k in (NODES - 2, NODES - 1)])
     return Collocation(share, weight, table, tail)

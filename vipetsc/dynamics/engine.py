@@ -75,15 +75,10 @@ class Engine(ABC):
 
 
 def choose(name: str, model: Model, engines: tuple[type[Engine], ...]) -> tuple[type[Engine], str | None]:
-    """The engine called ``name`` and None, or the first of ``engines`` that suits, and why another was not taken.
+    """The engine called ``name``, or for ``auto`` the first, and None; or the last of ``engines``, and why.
 
-    ``auto`` names whichever suits first; the last engine suits every model.
+    The last one suits every model.
     """
-    wanted = [engine for engine in engines if engine.name == name] or list(engines)
-    reason = None
-    for engine in [*wanted, engines[-1]]:
-        reason, refused = reason, engine.refusal(model)
-        if refused is None:
-            return engine, reason
-        reason = reason or f"{engine.name} refused: {refused}"
-    raise ValueError(reason)
+    engine = next((engine for engine in engines if engine.name == name), engines[0])
+    refusal = engine.refusal(model)
+    return (engine, None) if refusal is None else (engines[-1], f"{engine.name} refused: {refusal}")

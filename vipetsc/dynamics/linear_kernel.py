@@ -6,6 +6,7 @@ cell alone, so that results have the same bits on any partition.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 # Cells in one pass: what a pass reads stays in the first-level cache.
@@ -16,13 +17,17 @@ GROUP = 8
 _options = {"cache": True, "error_model": "numpy", "boundscheck": False}
 
 
-@njit("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])", **_options)
-def _add_eight(out, c, x0, x1, x2, x3, x4, x5, x6, x7):
-    c0, c1, c2, c3, c4, c5, c6, c7 = c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7]
-    for i in range(out.size):
-        out[i] = (
-            out[i] + c0 * x0[i] + c1 * x1[i] + c2 * x2[i] + c3 * x3[i] + c4 * x4[i] + c5 * x5[i] + c6 * x6[i]
-            + c7 * x7[i]
+@njit("void(f8[::1], u8, u8, f8[::1], i8, f8[::1], u8, u8, u8, u8, u8, u8, u8, u8)", **_options)
+def _add_eight(out, at, count, c, g, x, a0, a1, a2, a3, a4, a5, a6, a7):
+    """Add eight terms, of values ``c[g : g + 8]`` and from ``x`` at a0 to a7, to ``out[at : at + count]``.
+
+    Unsigned places need no look at negative ones: the loop is vectorised.
+    """
+    c0, c1, c2, c3, c4, c5, c6, c7 = c[g], c[g + 1], c[g + 2], c[g + 3], c[g + 4], c[g + 5], c[g + 6], c[g + 7]
+    for i in range(count):
+        out[at + i] = (
+            out[at + i] + c0 * x[a0 + i] + c1 * x[a1 + i] + c2 * x[a2 + i] + c3 * x[a3 + i] + c4 * x[a4 + i]
+            + c5 * x[a5 + i] + c6 * x[a6 + i] + c7 * x[a7 + i]
         )  # fmt: skip
 
 
@@ -33,24 +38,30 @@ def stencil(x, first, out, at, count, starts, rows, offsets, values):
     The terms of output row o are ``starts[o]`` to ``starts[o + 1]``, a multiple of ``GROUP``: ``values`` times row
     ``rows`` at the cell ``offsets`` away.
     """
+    width, flat, flat_out = x.shape[1], x.reshape(-1), out.reshape(-1)
     for a in range(0, count, CHUNK):
-        n = min(CHUNK, count - a)
+        n = np.uint64(min(CHUNK, count - a))
         for o in range(out.shape[0]):
-            y = out[o, at + a : at + a + n]
+            y = out[o, at + a : at + min(a + CHUNK, count)]
             y[:] = 0.0
+            place = np.uint64(o * out.shape[1] + at + a)
             for g in range(starts[o], starts[o + 1], GROUP):
                 b = first + a
                 _add_eight(
-                    y,
-                    values[g : g + GROUP],
-                    x[rows[g], b + offsets[g] : b + offsets[g] + n],
-                    x[rows[g + 1], b + offsets[g + 1] : b + offsets[g + 1] + n],
-                    x[rows[g + 2], b + offsets[g + 2] : b + offsets[g + 2] + n],
-                    x[rows[g + 3], b + offsets[g + 3] : b + offsets[g + 3] + n],
-                    x[rows[g + 4], b + offsets[g + 4] : b + offsets[g + 4] + n],
-                    x[rows[g + 5], b + offsets[g + 5] : b + offsets[g + 5] + n],
-                    x[rows[g + 6], b + offsets[g + 6] : b + offsets[g + 6] + n],
-                    x[rows[g + 7], b + offsets[g + 7] : b + offsets[g + 7] + n],
+                    flat_out,
+                    place,
+                    n,
+                    values,
+                    g,
+                    flat,
+                    np.uint64(rows[g] * width + b + offsets[g]),
+                    np.uint64(rows[g + 1] * width + b + offsets[g + 1]),
+                    np.uint64(rows[g + 2] * width + b + offsets[g + 2]),
+                    np.uint64(rows[g + 3] * width + b + offsets[g + 3]),
+                    np.uint64(rows[g + 4] * width + b + offsets[g + 4]),
+                    np.uint64(rows[g + 5] * width + b + offsets[g + 5]),
+                    np.uint64(rows[g + 6] * width + b + offsets[g + 6]),
+                    np.uint64(rows[g + 7] * width + b + offsets[g + 7]),
                 )
 
 

@@ -35,26 +35,30 @@ class Patches:
         self._where = np.where(own, cells - layout.start, layout.owned + np.searchsorted(others, cells))
         self.columns = np.zeros((2 * layout.dofs, len(cells)))
         self._halo = np.zeros((2 * layout.dofs, len(others)))
-        self._scatter = None
+        self._scatter: PETSc.Scatter | None = None
+        self._objects: tuple = ()
         if layout.comm.allreduce(len(others)):
             found = [layout.state_indices(int(cell)) for cell in others]
+            # By component, as the halo's rows are.
             indices = np.asarray(found, PETSc.IntType).reshape(-1, 2 * layout.dofs).T.ravel()
-            self._indices = PETSc.IS().createGeneral(np.ascontiguousarray(indices), comm=layout.comm)
+            wanted = PETSc.IS().createGeneral(indices, comm=layout.comm)
             self._fetched = PETSc.Vec().createWithArray(self._halo, comm=PETSc.COMM_SELF)
+            like = layout.create_vector()
+            self._scatter = PETSc.Scatter().create(like, wanted, self._fetched, None)
+            like.destroy()
+            wanted.destroy()
+            self._objects = (self._scatter, self._fetched)
 
     def fetch(self, state: PETSc.Vec, owned: np.ndarray) -> None:
         """Bring the columns up to date with ``state``, whose own cells are ``owned`` (2 dof, cell).
 
         All ranks must call it.
         """
-        if hasattr(self, "_indices"):
-            if self._scatter is None:
-                self._scatter = PETSc.Scatter().create(state, self._indices, self._fetched, None)
+        if self._scatter is not None:
             self._scatter.scatter(state, self._fetched, PETSc.InsertMode.INSERT_VALUES)
         linear_kernel.gather(owned, self._halo, self._where, self.columns)
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
-        for name in ("_scatter", "_indices", "_fetched"):
-            if getattr(self, name, None) is not None:
-                getattr(self, name).destroy()
+        for thing in self._objects:
+            thing.destroy()

@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import Any
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 
@@ -97,6 +98,9 @@ class Propagator(Engine):
         """A lattice shorter than P's band, or too many sites that feel one another within a step."""
         series = step_series(model)
         if series is None:
+            shortest = StepSeries(model.chain, model.sample_interval / MOST_PARTS, model.rtol)
+            if model.chain.cells > 2 * shortest.reach:
+                return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
             return f"{model.chain.cells} cells are fewer than the propagator's band"
         groups = ([m.cell + 1 for m in group if m.site >= 0] for group in members_of(model, series.reach))
         cells = sorted(max(groups, key=len))
@@ -108,7 +112,7 @@ class Propagator(Engine):
         return None
 
     @property
-    def state(self):
+    def state(self) -> PETSc.Vec:
         """The state at ``time``, as ``Layout`` orders it."""
         return self._states[self._now]
 

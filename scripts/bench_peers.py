@@ -1,0 +1,193 @@
+"""The peers: C++ odeint and plain TSRK compiled from scripts/peers, SciPy's DOP853 on numpy and on numba.
+
+All of them solve the case's own lattice and return its velocities at the case's samples. They step over kinks of the
+contact law without locating them, as such programs do. Conservative cases only.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from shutil import which
+
+import numba
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from vipetsc.case import Case, Model
+from vipetsc.case.case import WEAKEST
+from vipetsc.lattice import Chain, Contact, Hertz, ToneBurst
+
+SOURCES = Path(__file__).parent / "peers"
+BOOST = Path("/usr/include/boost/numeric/odeint.hpp")
+# The last one lets g++ vectorise odeint's sums over 13 stages: a quarter off fehlberg78's time.
+FLAGS = ("-O3", "-march=native", "-std=c++17", "--param", "vect-max-version-for-alias-checks=100")
+
+RightHandSide = Callable[[float, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Velocities (time, cell dof) in m/s in the order of ``Chain.masses``, and the CPU seconds they took."""
+
+    velocity: np.ndarray
+    seconds: float
+
+
+Solver = Callable[[Case], Solution]
+
+
+def parameters(model: Model) -> str:
+    """The lattice as the C++ peers read it; raises ValueError for what they do not know."""
+    chain, contact, drive = model.chain, model.contact, model.drive
+    if contact.restitution != 1 or chain.ends == "periodic":
+        raise ValueError("the peers know conservative lattices with fixed or free ends only")
+    couplings = chain.cell.couplings()
+    lines = [
+        ("lattice", chain.cells, chain.cell.dofs, int(chain.ends == "fixed")),
+        ("sampling", model.samples, model.sample_interval),
+        ("scale", model.scale, drive.frequency),
+        ("masses", *chain.cell.masses),
+        ("couplings", len(couplings)),
+        *couplings,
+        ("contact", int(contact.law is Hertz), contact.stiffness, chain.cell.host, chain.cell.resonator),
+        ("sites", len(chain.sites)),
+        *zip(chain.sites, chain.clearances, strict=True),
+        ("drive", model.drive_cell, model.drive_mass, drive.window_amplitude, drive.frequency, drive.cycles),
+    ]
+    return "".join(" ".join(map(str, line)) + "\n" for line in lines)
+
+
+def compile_peers(folder: Path) -> dict[str, Path]:
+    """Build the C++ peers into ``folder``; those whose compiler or library is not installed are left out.
+
+    Raises RuntimeError if a compiler fails.
+    """
+    commands = {}
+    if BOOST.exists():
+        commands["odeint"] = ["g++", *FLAGS, str(SOURCES / "odeint.cpp")]
+    if which("mpicxx") and which("pkg-config"):
+        petsc = subprocess.run(["pkg-config", "--cflags", "--libs", "PETSc"], capture_output=True, text=True)
+        if petsc.returncode == 0:
+            commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc.stdout.split()]
+    programs = {name: (folder / name).resolve() for name in commands}
+    building = [subprocess.Popen([*commands[name], "-o", str(path)]) for name, path in programs.items()]
+    if any([compiler.wait() for compiler in building]):
+        raise RuntimeError("a peer could not be compiled, see the message above")
+    return programs
+
+
+def compiled(program: Path, method: str, folder: Path) -> Solver:
+    """A C++ peer as a solver; its files pass through ``folder``. It raises RuntimeError where the peer fails."""
+
+    def solve(case: Case) -> Solution:
+        model = case.model()
+        given, output = folder / "parameters.txt", folder / "samples.bin"
+        given.write_text(parameters(model))
+        rtol = case.time.rtol
+        command = [program, given, method, rtol, WEAKEST * rtol, output]
+        ended = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+        if ended.returncode:
+            raise RuntimeError(f"{program.name} {method} failed: {(ended.stderr.strip() or '?').splitlines()[-1]}")
+        sampled = np.fromfile(output).reshape(model.samples, model.chain.cell.dofs, model.chain.cells)
+        seconds = json.loads(ended.stdout)["cpu_seconds"]
+        return Solution(sampled.transpose(0, 2, 1).reshape(model.samples, -1), seconds)
+
+    return solve
+
+
+def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
+    """SciPy's DOP853 as a solver, on the right-hand side that ``right_hand_side`` makes of a model."""
+
+    def solve(case: Case) -> Solution:
+        model = case.model()
+        slope = right_hand_side(model)
+        n = model.chain.masses().size
+        times = np.arange(model.samples) * model.sample_interval
+        atol = np.repeat(model.atol, n)
+        begin = time.process_time()
+        found = solve_ivp(slope, (0.0, times[-1]), np.zeros(2 * n), "DOP853", times, rtol=case.time.rtol, atol=atol)
+        if not found.success:
+            raise RuntimeError(f"DOP853 failed: {found.message}")
+        return Solution(found.y[n:].T, time.process_time() - begin)
+
+    return solve
+
+
+def _pairs(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Hosts and resonators of the sites as indices of masses, and the clearances in m."""
+    first = np.array(chain.sites, int) * chain.cell.dofs
+    return first + chain.cell.host, first + chain.cell.resonator, np.array(chain.clearances)
+
+
+def plain_right_hand_side(model: Model) -> RightHandSide:
+    """The lattice in numpy, its stiffness as a sparse matrix."""
+    stiffness, inverse_mass = model.chain.stiffness_matrix().tocsr(), 1 / model.chain.masses()
+    host, resonator, clearance = _pairs(model.chain)
+    contact, drive = model.contact, model.drive
+    driven, n = model.drive_cell * model.chain.cell.dofs + model.drive_mass, inverse_mass.size
+
+    def slope(t: float, y: np.ndarray) -> np.ndarray:
+        u = y[:n]
+        force = stiffness @ -u
+        push = contact.force(u[resonator] - u[host], clearance)
+        force[host] += push
+        force[resonator] -= push
+        force[driven] += drive.force(t)
+        return np.concatenate([y[n:], force * inverse_mass])
+
+    return slope
+
+
+def compiled_right_hand_side(model: Model) -> RightHandSide:
+    """The same by numba, row by row."""
+    driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
+    return _compile(model.chain, model.contact, model.drive, driven)
+
+
+@cache
+def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> RightHandSide:
+    stiffness, inverse_mass = chain.stiffness_matrix().tocsr(), 1 / chain.masses()
+    first, columns, values = stiffness.indptr, stiffness.indices, stiffness.data
+    host, resonator, clearance = _pairs(chain)
+    contact, exponent, n = law.stiffness, law.law.exponent, inverse_mass.size
+    amplitude, frequency, cycles, end = drive.window_amplitude, drive.frequency, drive.cycles, drive.duration
+
+    @numba.njit
+    def slope(t: float, y: np.ndarray) -> np.ndarray:
+        f = np.empty_like(y)
+        f[:n] = y[n:]
+        for i in range(n):
+            total = 0.0
+            for k in range(first[i], first[i + 1]):
+                total -= values[k] * y[columns[k]]
+            f[n + i] = total * inverse_mass[i]
+        for site in range(host.size):
+            h, r = host[site], resonator[site]
+            w = y[r] - y[h]
+            x = abs(w) - clearance[site]
+            if x > 0.0:
+                force = np.copysign(contact * x**exponent, w)
+                f[n + h] += force * inverse_mass[h]
+                f[n + r] -= force * inverse_mass[r]
+        if 0.0 < t < end:
+            phase = frequency * t
+            f[n + driven] += amplitude * (1.0 - np.cos(phase / cycles)) * np.sin(phase) * inverse_mass[driven]
+        return f
+
+    slope(0.0, np.zeros(2 * n))
+    return slope
+
+
+def peers(folder: Path) -> dict[str, Solver]:
+    """Every peer this machine has, by name; ``folder`` takes programs and passing files."""
+    programs = compile_peers(folder)
+    wanted = [("odeint", "dopri5"), ("odeint", "fehlberg78"), ("tsrk", "5dp"), ("tsrk", "8vr")]
+    shown = {"odeint": "odeint", "tsrk": "TSRK"}
+    found = {f"{shown[p]} {method}": compiled(programs[p], method, folder) for p, method in wanted if p in programs}
+    return found | {"DOP853 numba": scipys(compiled_right_hand_side), "DOP853 numpy": scipys(plain_right_hand_side)}

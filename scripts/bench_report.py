@@ -1,0 +1,154 @@
+"""What the bench shows, from ``latest.json`` alone: Markdown tables and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_precision import ERRORS, at_equal_error
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vipetsc.figures import style
+from vipetsc.files import written_aside
+
+_LOOKS = {
+    "vipetsc propagator": (style.VERMILION, "o", "-"),
+    "vipetsc ts": (style.BLUE, "o", "-"),
+    "odeint dopri5": (style.BLACK, "s", "-"),
+    "odeint fehlberg78": (style.BLACK, "^", ":"),
+    "TSRK 5dp": (style.GREEN, "s", "--"),
+    "TSRK 8vr": (style.GREEN, "^", "--"),
+    "DOP853 numba": (style.PURPLE, "D", "-."),
+    "DOP853 numpy": (style.ORANGE, "D", "-."),
+}
+_OTHER = (style.SKY, "v", "-")
+
+
+def solver_names(found: dict[str, Any]) -> list[str]:
+    """The solvers in ``found``, in the order in which they were measured."""
+    return list(dict.fromkeys(row["solver"] for row in found["rows"]))
+
+
+def curve(found: dict[str, Any], solver: str) -> list[tuple[float, float]]:
+    """Errors and CPU seconds of one solver, loosest tolerance first, without failures and the reference itself."""
+    return [(r["error"], r["seconds"]) for r in found["rows"] if r["solver"] == solver and r["error"]]
+
+
+def markdown(found: dict[str, Any]) -> str:
+    """The README's summary of what was measured: CPU time at equal error, whole runs, scaling."""
+    parts = {"rows": _precision_table, "whole": _whole_sentence, "scaling": _scaling_table}
+    return "\n\n".join(tell(found) for key, tell in parts.items() if found.get(key)) + "\n"
+
+
+def _precision_table(found: dict[str, Any]) -> str:
+    """CPU seconds at equal error, and ratios to the last engine of ours."""
+    names = solver_names(found)
+    engine = [name for name in names if name.startswith("vipetsc")][-1]
+    reference = found["reference"]
+    lines = [
+        f"| CPU seconds (ratio to {engine}) at error | " + " | ".join(_power(e) for e in ERRORS) + " |",
+        "|---|" + "---|" * len(ERRORS),
+    ]
+    for name in names:
+        cells = []
+        for wanted in ERRORS:
+            points, own = curve(found, name), name.startswith("vipetsc")
+            seconds = at_equal_error(points, wanted, own) if wanted >= reference["floor"] else None
+            ratio = found["ratios"].get(f"{name} / {engine} at {wanted:g}")
+            cells.append("-" if seconds is None else f"{seconds:.3g}" + (f" ({ratio:.3g})" if ratio else ""))
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    apart = ", ".join(f"{name} {value:.1e}" for name, value in reference["separation"].items())
+    lines += ["", f"Reference: {reference['solver']}, to {reference['end']:g} s; distances from it: {apart}."]
+    return "\n".join(lines)
+
+
+def _whole_sentence(found: dict[str, Any]) -> str:
+    runs = ", ".join(f"{engine} {seconds:.2f} s" for engine, seconds in found["whole"].items())
+    return (
+        f"Built-in case, from start to `run.h5`: {runs} of CPU. One right-hand side at"
+        f" {found['degrees_of_freedom']} degrees of freedom: {found['right_hand_side_us']:.2g} us through PETSc."
+    )
+
+
+def _scaling_table(found: dict[str, Any]) -> str:
+    lines = [
+        "| engine | cells | ranks | ms per 2e-4 s | two ranks gain (bare memory gains) | peak GiB a rank"
+        " | share of bandwidth limit |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in found["scaling"]:
+        gain = f"{row['speedup']:.2f} ({row['memory_speedup']:.2f})" if "speedup" in row else ""
+        lines.append(
+            f"| {row['engine']} | {row['cells']:,} | {row['ranks']} | {row['wall_ms']:.3g} | {gain}"
+            f" | {row['peak_gib_a_rank']:.2f} | {100 * row['share_of_bandwidth_limit']:.2g} % |"
+        )
+    return "\n".join(lines)
+
+
+def _power(value: float) -> str:
+    return f"{value:.0e}".replace("e-0", "e-")
+
+
+def draw(found: dict[str, Any], folder: Path) -> list[Path]:
+    """``work-precision.png`` and ``scaling.png`` in ``folder``, each where it was measured."""
+    pictures = {"rows": ("work-precision", work_precision_figure), "scaling": ("scaling", scaling_figure)}
+    paths = []
+    for name, make in (picture for key, picture in pictures.items() if found.get(key)):
+        paths.append(folder / f"{name}.png")
+        with style.look(), written_aside(paths[-1]) as aside:
+            make(found).savefig(aside, format="png")
+    return paths
+
+
+def work_precision_figure(found: dict[str, Any]) -> Figure:
+    """CPU seconds over the relative error of all sampled velocities."""
+    figure = style.new_figure(4.6, 3.0)
+    axes = figure.subplots()
+    for name in solver_names(found):
+        points = np.array(curve(found, name))
+        if points.size:
+            colour, marker, line = _LOOKS.get(name, _OTHER)
+            axes.loglog(*points.T, line, color=colour, marker=marker, ms=3, label=name)
+    floor = max(found["reference"]["separation"].values())
+    left = min(axes.get_xlim()[0], floor / 5)
+    axes.axvspan(left, floor, color=style.PALE, lw=0)
+    axes.set_xlim(left=left)
+    axes.text(np.sqrt(left * floor), 0.03, "references differ", ha="center", va="bottom", rotation=90, fontsize=6,
+              color=style.GREY, transform=axes.get_xaxis_transform())  # fmt: skip
+    axes.set_xlabel("relative error of the sampled velocities")
+    axes.set_ylabel("CPU time (s)")
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    style.letter(axes, f"{found['cells']} cells, {found['reference']['end']:g} s, one core")
+    return figure
+
+
+def scaling_figure(found: dict[str, Any]) -> Figure:
+    """Wall time and memory over the number of cells."""
+    figure = style.new_figure(style.PAGE, 2.6)
+    left, right = figure.subplots(1, 2)
+    for engine in dict.fromkeys(row["engine"] for row in found["scaling"]):
+        colour, marker, _ = _LOOKS.get(f"vipetsc {engine}", _OTHER)
+        for ranks, line in ((1, "-"), (2, "--")):
+            rows = [r for r in found["scaling"] if r["engine"] == engine and r["ranks"] == ranks]
+            cells = [r["cells"] for r in rows]
+            label = f"{engine}, {ranks} rank{'s' if ranks > 1 else ''}"
+            left.loglog(cells, [r["wall_ms"] for r in rows], line, color=colour, marker=marker, ms=3, label=label)
+            right.semilogx(cells, [r["peak_gib_a_rank"] for r in rows], line, color=colour, marker=marker, ms=3)
+    _limit(left, found["scaling"])
+    right.set_ylim(0, 1.15 * max(row["peak_gib_a_rank"] for row in found["scaling"]))
+    left.set_ylabel("wall time per 2e-4 s of model time (ms)")
+    right.set_ylabel("peak memory a rank (GiB)")
+    for axes, title in ((left, "(a) time"), (right, "(b) memory")):
+        axes.set_xlabel("cells")
+        style.letter(axes, title)
+    right.legend(*left.get_legend_handles_labels(), loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return figure
+
+
+def _limit(axes: Axes, rows: list[dict]) -> None:
+    """The time in which one rank's memory reads and writes the state once."""
+    first = [r for r in rows if r["ranks"] == 1 and r["engine"] == rows[0]["engine"]]
+    limit = [r["wall_ms"] * r["share_of_bandwidth_limit"] for r in first]
+    axes.loglog([r["cells"] for r in first], limit, ":", color=style.GREY, label="memory alone, 1 rank")

@@ -1,0 +1,80 @@
+"""Scaling in cells and ranks, memory, bandwidth; and whole runs of the program."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from mpi4py import MPI
+
+from bench_ours import engines
+
+from vipetsc.case import Case
+from vipetsc.dynamics import simulate
+
+WORKER = Path(__file__).with_name("bench_worker.py")
+
+
+def on_ranks(ranks: int, task: str, **arguments: object) -> dict:
+    """What the worker's ``task`` measures on ``ranks``."""
+    # This process has its own MPI: the mpirun it starts must not inherit that.
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
+    command = ["mpirun", "-n", str(ranks), sys.executable, str(WORKER), task, json.dumps(arguments)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if ended.returncode:
+        raise RuntimeError(f"{task} on {ranks} ranks failed: {ended.stderr.strip()[-2000:]}")
+    return json.loads(ended.stdout.strip().splitlines()[-1])
+
+
+def scaling(cells: Iterable[int], rounds: int) -> list[dict]:
+    """One row for each engine, length and number of ranks: medians over ``rounds``, the ranks in turn."""
+    rows = []
+    for engine in engines():
+        for n in cells:
+            turns: dict[int, list[dict]] = {1: [], 2: []}
+            # Long enough to time, short enough to wait for.
+            intervals = max(10, min(200, 1_000_000 // n))
+            for _ in range(rounds):
+                for ranks, found in turns.items():
+                    found.append(on_ranks(ranks, "flight", engine=engine, cells=n, intervals=intervals))
+            for ranks, found in turns.items():
+                medians = {key: statistics.median(turn[key] for turn in found) for key in found[0] if key != "ranks"}
+                rows.append({"engine": engine, "cells": n, "ranks": ranks} | medians)
+            pairs = list(zip(turns[1], turns[2], strict=True))
+            for key, about in (("wall_ms", "speedup"), ("triad_gb_per_second", "memory_speedup")):
+                gain = statistics.median(one[key] / two[key] for one, two in pairs)
+                rows[-1][about] = gain if about == "speedup" else 1 / gain
+    return rows
+
+
+def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
+    """CPU seconds of the built-in case from start to ``run.h5``, by engine: median of ``rounds`` after a warm-up."""
+    seconds: dict[str, list[float]] = {name: [] for name in engines()}
+    for turn in range(rounds + 1):
+        for engine, found in seconds.items():
+            case = Case.builtin([f"time.engine={engine}", *(["time.end=0.01"] if turn == 0 else [])])
+            result = simulate(case, folder / f"whole-{engine}", MPI.COMM_SELF, force=True)
+            if turn:
+                found.append(result.statistics["cpu_seconds"])
+    return {engine: statistics.median(found) for engine, found in seconds.items()}
+
+
+def large(folder: Path, rounds: int) -> dict:
+    """A million cells by the whole program on one and on two ranks, in turn, beside what the memory itself gains."""
+    runs: dict[int, list[dict]] = {1: [], 2: []}
+    for _ in range(rounds):
+        for ranks, found in runs.items():
+            found.append(on_ranks(ranks, "large", folder=str(folder / f"large-{ranks}")))
+    pairs = list(zip(runs[1], runs[2], strict=True))
+    return {
+        "runs": runs[1] + runs[2],
+        "speedup_on_two_ranks": statistics.median(one["wall"] / two["wall"] for one, two in pairs),
+        "memory_speedup_on_two_ranks": statistics.median(
+            two["triad_gb_per_second"] / one["triad_gb_per_second"] for one, two in pairs
+        ),
+    }

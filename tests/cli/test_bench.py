@@ -1,0 +1,88 @@
+"""The bench on a lattice of a few cells: rows, ratios, tables; and the rule by which times are compared."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import clean_environment
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+TINY = (
+    "lattice.cells=24",
+    "contacts.sites=[6, 12]",
+    "contacts.clearance=4e-4",
+    "drive.cycles=3",
+    "time.end=0.018",
+)  # fmt: skip
+
+
+def bench(*arguments: object) -> subprocess.CompletedProcess:
+    command = [sys.executable, SCRIPTS / "bench.py", *arguments]
+    return subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, timeout=120, check=False, env=clean_environment()
+    )
+
+
+def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
+    changes = [word for key in TINY for word in ("--set", key)]
+    ended = bench("--quick", "--only", "precision", "--out", tmp_path, *changes)
+    assert ended.returncode == 0, ended.stderr
+    found = json.loads((tmp_path / "latest.json").read_text())
+    errors: dict[str, list[float]] = {}
+    for row in found["rows"]:
+        assert row["seconds"] > 0, row
+        errors.setdefault(row["solver"], []).append(row["error"])
+    wanted = {"vipetsc ts", "TSRK 5dp", "TSRK 8vr", "DOP853 numba", "DOP853 numpy"}
+    if Path("/usr/include/boost/numeric/odeint.hpp").exists():
+        wanted |= {"odeint dopri5", "odeint fehlberg78"}
+    assert wanted <= errors.keys()
+    for solver, falling in errors.items():
+        # Kinks that Fehlberg's estimate overlooks leave its error uneven.
+        assert falling[-1] < (0.3 if solver == "odeint fehlberg78" else 1e-3) * falling[0], (solver, falling)
+    assert max(found["reference"]["separation"].values()) < 1e-9
+    assert min(found["ratios"].values()) > 0
+    assert (tmp_path / "work-precision.png").stat().st_size > 5000
+    table = bench("--table", "--out", tmp_path)
+    assert table.returncode == 0, table.stderr
+    assert "| DOP853 numpy |" in table.stdout
+
+
+def test_a_flight_on_two_ranks_is_timed_beside_its_memory(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from bench_scaling import on_ranks
+
+    row = on_ranks(2, "flight", engine="ts", cells=30, intervals=3)
+    assert row["ranks"] == 2
+    assert row["wall_ms"] > 0
+    assert 0 < row["share_of_bandwidth_limit"] < 1
+    assert 0.01 < row["peak_gib_a_rank"] < 4
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--table",), ("--set", "lattice.cels=3"), ("--set", "contacts.restitution=0.7")]
+)
+def test_what_cannot_be_measured_is_refused(tmp_path, arguments):
+    ended = bench(*arguments, "--out", tmp_path / "none")
+    assert ended.returncode == 2
+    assert "Traceback" not in ended.stderr
+    assert not (tmp_path / "none").exists()
+
+
+def test_equal_error_is_interpolated_in_logarithms_and_never_beyond_the_points(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from bench_precision import at_equal_error
+
+    power_law = [(10.0**-k, 2.0**k) for k in range(4, 9)]
+    assert at_equal_error(power_law, 10**-5.5) == pytest.approx(2**5.5)
+    assert at_equal_error(power_law, 1e-3) is None
+    assert at_equal_error(power_law, 1e-9) is None
+    assert at_equal_error(power_law, 1e-3, bound=True) == pytest.approx(2**4)
+    assert at_equal_error(power_law, 1e-9, bound=True) is None
+    assert at_equal_error([], 1e-5, bound=True) is None
+    # A point that is slower and less accurate than another one says nothing about what an error costs.
+    assert at_equal_error([*power_law, (3e-6, 1e4)], 3e-6) == pytest.approx(at_equal_error(power_law, 3e-6))
