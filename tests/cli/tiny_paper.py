@@ -21,7 +21,7 @@ BRANCH = ("nnm.energy=[0.0, 30.0]",)
 CHANGES = {
     "scattering-amplitudes": (*DIATOMIC, "contacts.sites=2"),
     "interband-amplitudes": FOUR_BAND,
-    "interband-one-site": FOUR_BAND,
+    "interband-one-site": (*FOUR_BAND, "sweep.drive.amplitude=[2.0, 40.0]"),
     "design": ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11"),
     "nnm-hertz": BRANCH,
     "nnm-bilinear": BRANCH,
