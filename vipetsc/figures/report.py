@@ -17,6 +17,7 @@ from vipetsc.files import write_text
 
 WIDEST = 1500  # pixels of a picture in the page
 COLOURS = 200
+VERDICTS = "holds", "holds in part", "does not hold", "not measured"
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def write_report(report: Report, path: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["numbers"] = numbers
+    environment.filters |= {"numbers": numbers, "sources": sources}
     rows = {}
     for claim in report.claims:
         rows.setdefault(claim["id"], {})[claim["reading"]] = claim
@@ -98,12 +99,20 @@ def numbers(found: Any) -> list[str]:
     return [f"{name} = {_text(value)}" if name else _text(value) for name, value in named.items() if value is not None]
 
 
+def sources(files: Sequence[str]) -> str:
+    """The steps that ``files`` belong to, with how many of each."""
+    steps = [name.partition("/")[0] for name in files]
+    counts = {step: steps.count(step) for step in dict.fromkeys(steps)}
+    return ", ".join(step if n == 1 else f"{step} ({n} files)" for step, n in counts.items())
+
+
 def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
 
 
 def _counted(verdicts: Sequence[str]) -> list[tuple[str, int]]:
-    return [(verdict, verdicts.count(verdict)) for verdict in dict.fromkeys(sorted(verdicts))]
+    order = sorted(set(verdicts), key=lambda v: (VERDICTS.index(v) if v in VERDICTS else len(VERDICTS), v))
+    return [(verdict, verdicts.count(verdict)) for verdict in order]
 
 
 def _shown(size: tuple[int, int]) -> tuple[int, int]:
