@@ -1,0 +1,133 @@
+"""Figures of the paper: shared, kept, noted; their names in words; the report's small texts; schematics."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from vipetsc.case import Case
+from vipetsc.figures import look, save
+from vipetsc.figures.paper import PLATES, words
+from vipetsc.figures.registry import NOTE, draw_each
+from vipetsc.figures.report import numbers, sources
+from vipetsc.figures.schematics import lattice_page, reduced_model
+from vipetsc.figures.style import DPI, new_figure
+from vipetsc.studies.claims.measure import STATEMENTS
+from vipetsc.studies.plan import CLAIMS
+
+
+def drawings(count: int, made: list[int]):
+    def page(number: int) -> Figure:
+        made.append(number)
+        return new_figure(1, 1)
+
+    for number in range(count):
+        yield f"page-{number}", lambda number=number: page(number)
+
+
+def turned(count: int, turns) -> list[str]:
+    """The pictures whose turn it is, none of them drawn."""
+    seen: list[str] = []
+
+    def keep(path: Path) -> bool:
+        seen.append(path.stem)
+        return True
+
+    draw_each(drawings(count, []), Path("nowhere"), ["png"], iter(turns), keep=keep)
+    return seen
+
+
+@given(count=st.integers(0, 12), size=st.integers(1, 5))
+def test_ranks_draw_every_picture_once(count, size):
+    seen = [stem for rank in range(size) for stem in turned(count, itertools.count(rank, size))]
+    assert sorted(seen) == sorted(f"page-{number}" for number in range(count))
+
+
+@given(count=st.integers(0, 12), owners=st.lists(st.integers(0, 2), min_size=12, max_size=12))
+def test_ranks_that_draw_from_one_count_miss_none(count, owners):
+    turns = [[number for number, owner in enumerate(owners) if owner == rank] for rank in range(3)]
+    seen = [stem for own in turns for stem in turned(count, own)]
+    assert sorted(seen) == sorted(f"page-{number}" for number in range(count))
+
+
+def test_what_is_kept_is_not_drawn_and_not_half(tmp_path):
+    made: list[int] = []
+    (tmp_path / "page-0.png").write_text("old")
+    (tmp_path / "page-1.png").write_text("old")
+    (tmp_path / "page-0.pdf").write_text("old")
+    written = draw_each(drawings(2, made), tmp_path, ["png", "pdf"], itertools.count(), keep=Path.exists)
+    assert made == [1]
+    assert [p.name for p in written] == ["page-1.png", "page-1.pdf"]
+
+
+def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
+    with look():
+        figure = new_figure(2, 1)
+        figure.subplots().plot([0, 1])
+        plain, noted = (imread(save(figure, tmp_path / f"{note or 'plain'}.png", note)) for note in ("", "coarse"))
+    strip = round(NOTE * DPI)
+    assert noted.shape[0] == pytest.approx(plain.shape[0] + strip, abs=1)
+    assert noted.shape[1] == plain.shape[1]
+    assert np.ptp(noted[-strip:, :, :3]) > 0.2
+    assert np.abs(noted[: plain.shape[0]] - plain).mean() < 0.01
+
+
+def test_every_claim_has_a_figure_that_shows_it():
+    shown = {claim for plate in PLATES for claim in plate.claims}
+    assert shown == set(CLAIMS) == {statement.id for statement in STATEMENTS}
+    assert [plate.label for plate in PLATES] == [f"Fig. {i}" for i in range(1, 13)] + [
+        *(f"Fig. A{i}" for i in range(1, 4)),
+        *(f"Fig. S{i}" for i in range(1, 9)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("stem", "said"),
+    [
+        ("fig05-entropy-calibrated-5pi-9-energy_weighted", "calibrated reading, 5π/9, energy-weighted average"),
+        ("fig05-neighbours-entropy-printed-masked", "neighbouring sites, printed reading, masked average"),
+        (
+            "fig07-transfer-hertz-printed-5-sites-30-cycles-24.33N",
+            "Hertz, printed reading, 5 sites, 30 cycles, 24.33 N",
+        ),
+        ("figS5-phase_regimes-bilinear-calibrated-1-site-30-cycles", "bilinear, calibrated reading, 1 site, 30 cycles"),
+        ("fig11-branches-in-phase-printed", "in phase, printed reading"),
+        ("figS3-design-cost-maps", ""),
+    ],
+)
+def test_names_of_files_in_words(stem, said):
+    assert words(stem) == said
+
+
+def test_small_texts_of_the_report():
+    assert numbers({"share": 0.123456, "points": 12, "lost": None}) == ["share = 0.1235", "points = 12"]
+    assert numbers(3.0) == ["3"]
+    assert sources(["a/x.h5", "a/y.h5", "b/x.h5"]) == "a (2 files), b"
+
+
+@pytest.mark.parametrize("preset", ["diatomic", "four-band"])
+def test_the_lattice_page_shows_every_configuration(preset):
+    case = Case.from_table({"name": preset, "lattice": {"preset": preset, "reading": "printed"}})
+    with look():
+        figure = lattice_page(case, (1, 5))
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert sum(bool(re.search(r"\d contact site", title)) for title in titles) == 2
+    strips = [axes for axes in figure.axes if "contact site" in axes.get_title(loc="left")]
+    shown = {text.get_text() for text in strips[0].texts}
+    assert str(Case.from_table({"lattice": {"preset": preset}, "contacts": {"sites": 1}}).contacts.sites[0]) in shown
+
+
+def test_the_reduced_model_names_its_numbers():
+    with look():
+        figure = reduced_model((0.0025, 0.0025), (2e4, 2e3), 10**-2.75)
+    text = " ".join(t.get_text() for t in figure.axes[0].texts)
+    for words_ in ("20 kN/m", "2 kN/m", "2.5 g", "1.778 mm"):
+        assert words_ in text
