@@ -149,19 +149,18 @@ def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 
 def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
-    from vipetsc.figures import draw
+    from vipetsc.plotting import draw_run
     from vipetsc.studies.analysis import analyse
 
     on_root(comm, lambda: analyse(folder / "run.h5", folder / "analysis.h5"))
     if case.output.figures:
-        drawn = comm.gather(draw(folder, share=(comm.rank, comm.size)))
-        for path in sorted(str(p) for paths in drawn or [] for p in paths):
-            _say(comm, f"  {path}")
+        _name(draw_run(folder, None, ("png",), comm), comm)
 
 
 def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Every combination in the section [sweep] of a case; goes on where it was stopped."""
     from vipetsc.case import Sweep
+    from vipetsc.plotting import draw_sweeps
     from vipetsc.studies.sweep import sweep as make
 
     plan = on_root(comm, lambda: _read(options.case, lambda path: Sweep.load(path, options.set)))
@@ -169,7 +168,7 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     result = make(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
     _say(comm, sweep_table(result))
     if plan.figures and (folder / "ensemble.h5").exists():
-        _plot_study([folder], None, ("png",), comm)
+        _name(draw_sweeps([folder], None, ("png",), comm), comm)
     return DONE if result.complete else FAILED
 
 
@@ -178,6 +177,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     from vipetsc.modes.follow import follow_all, prepare_folder
     from vipetsc.modes.options import NnmCase
     from vipetsc.modes.report import BranchLog, branch_table
+    from vipetsc.plotting import draw_branches
 
     if options.force and options.resume:
         raise FolderError("--force and --resume exclude each other: begin anew, or go on")
@@ -190,28 +190,9 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     for branch in branches:
         _say(comm, branch_table(branch))
 
-    _plot_branches([folder], ("png",), comm)
+    _name(draw_branches([folder], ("png",), comm), comm)
     failed = comm.bcast(any(b.ending.startswith("failed") for b in branches))
     return FAILED if failed else DONE
-
-
-def _plot_branches(folders: list[Path], formats: tuple[str, ...], comm: MPI.Comm) -> int:
-    """A picture of every branch in the first folder, beside the branches of that name in the others."""
-
-    def draw() -> list[Path]:
-        from vipetsc.figures import draw_backbone
-
-        drawn = []
-        stem = "branches" if len(folders) > 1 else "branch"
-        for path in sorted(folders[0].glob("branch-*.h5")):
-            together = [folder / path.name for folder in folders if (folder / path.name).exists()]
-            target = folders[0] / "figures" / path.stem.replace("branch", stem, 1)
-            drawn += [draw_backbone(together, target.with_suffix(f".{kind}")) for kind in formats]
-        return drawn
-
-    for path in on_root(comm, draw):
-        _say(comm, f"  {path}")
-    return DONE
 
 
 def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
@@ -263,23 +244,6 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE
 
 
-def _plot_design(folder: Path, names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm) -> int:
-    """Pictures of the search in ``folder`` again."""
-    from vipetsc.figures import design_figures, draw_design
-
-    def redraw() -> str:
-        unknown = set(names or []) - set(design_figures)
-        if unknown:
-            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(design_figures)}")
-        try:
-            return "\n".join(map(str, draw_design(folder, names, formats)))
-        except (OSError, KeyError) as error:
-            raise FolderError(f"{folder / 'design.h5'}: is not a search of vipetsc ({error})") from None
-
-    _say(comm, on_root(comm, redraw))
-    return DONE
-
-
 def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
     from vipetsc.studies.again import analyse_again
@@ -290,64 +254,37 @@ def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 
 def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
-    """Pictures of a finished run again, from its files."""
-    from vipetsc.figures import draw, run_figures
-    from vipetsc.records import RunFile
-    from vipetsc.studies.analysis import analyse
+    """Pictures of what folders hold again, from their files."""
+    from vipetsc.plotting import draw_folders
 
-    formats = tuple(options.format or ("png",))
-    if all(any(path.glob("branch-*.h5")) and not (path / "run.h5").exists() for path in options.path):
-        return _plot_branches(options.path, formats, comm)
-    if (options.path[0] / "ensemble.h5").exists():
-        return _plot_study(options.path, options.fig, formats, comm)
-    if len(options.path) > 1:
-        raise FolderError(f"{' '.join(map(str, options.path))}: only sweeps and folders of branches can share a page")
-    (path,) = options.path
-    folder = path.parent if path.name in ("run.h5", "design.h5") else path
-    if (folder / "design.h5").exists():
-        return _plot_design(folder, options.fig, formats, comm)
-
-    def check() -> None:
-        unknown = set(options.fig or []) - set(run_figures)
-        if unknown:
-            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(run_figures)}")
-        run, analysis = folder / "run.h5", folder / "analysis.h5"
-        if not run.exists():
-            raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
-        try:
-            with RunFile(run):
-                pass
-        except (OSError, ValueError, KeyError) as error:
-            raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
-        if not analysis.exists() or analysis.stat().st_mtime < run.stat().st_mtime:
-            analyse(run, analysis)
-
-    on_root(comm, check)
-    drawn = comm.gather(draw(folder, options.fig, formats=formats, share=(comm.rank, comm.size)))
-    for path in sorted(str(p) for paths in drawn or [] for p in paths):
-        _say(comm, path)
-    return DONE
+    return _name(draw_folders(options.path, options.fig, tuple(options.format or ("png",)), comm), comm)
 
 
-def _plot_study(folders: list[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm) -> int:
-    """Pictures of sweeps, with branches beside them, into the first folder."""
-    from vipetsc.figures import draw_study, study_figures
-    from vipetsc.studies.backbone import relate_folders
-
-    def check() -> None:
-        unknown = set(names or []) - set(study_figures)
-        if unknown:
-            raise FolderError(f"--fig {' '.join(sorted(unknown))}: figures are {', '.join(study_figures)}")
-        for folder in folders:
-            if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
-                raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
-        relate_folders(folders)
-
-    on_root(comm, check)
-    drawn = comm.gather(draw_study(folders, names, formats, (comm.rank, comm.size)))
-    for path in sorted(str(p) for paths in drawn or [] for p in paths):
+def _name(paths: list[Path], comm: MPI.Comm) -> int:
+    for path in paths if comm.rank == 0 else ():
         _say(comm, f"  {path}")
     return DONE
+
+
+def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Every figure and claim of the paper: what is missing is computed, drawn, measured, and put into a report."""
+    from vipetsc.studies.paper import make_paper
+    from vipetsc.studies.plan import FULL, QUICK, paper_plan
+    from vipetsc.studies.tables import claims_table, plan_table
+
+    plan = paper_plan(QUICK if options.quick else FULL)
+    folder = options.out or Path("runs") / ("paper-quick" if options.quick else "paper")
+    if options.list:
+        _say(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
+        return DONE
+    stop = StopRequest().install()
+    result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: _say(comm, f"  {text}"))
+    if result.stopped:
+        _say(comm, "stopped on request; the same command goes on")
+        return FAILED
+    _say(comm, claims_table(result.claims))
+    _say(comm, f"  {len(result.made)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
+    return DONE if result.complete else FAILED
 
 
 def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
@@ -359,6 +296,15 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def _runs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", type=Path, nargs="+", metavar="PATH", help="folder of a run or of a sweep, or a run.h5")
+
+
+def _paper(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="ID", help="only what these figures (fig05) and claims (C7) need"
+    )
+    parser.add_argument("--quick", action="store_true", help="coarse grids: minutes, marked on every picture")
+    parser.add_argument("--list", action="store_true", help="what is done, what is left and how long it takes")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="runs/paper, or runs/paper-quick, if left out")
 
 
 def _swept(parser: argparse.ArgumentParser) -> None:
@@ -380,5 +326,6 @@ VERBS: dict[str, tuple[Callable, str, tuple[Callable, ...]]] = {
     "design": (design, "the (lambda, eta) search of the four-band cell", (_case, _folder)),
     "analyse": (analyse, "measures of runs already made, from their files", (_runs,)),
     "plot": (plot, "pictures of a finished run again, from its files", (_plot,)),
+    "paper": (paper, "every figure and claim of the paper, and a report", (_paper,)),
     "doctor": (doctor, "versions and what is missing", ()),
 }

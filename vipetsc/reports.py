@@ -185,7 +185,7 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
         remedy,
     )
     check(shutil.which("mpirun") is not None, "mpirun", str(shutil.which("mpirun")), "apt install openmpi-bin")
-    for module in ("scipy", "matplotlib", "numba", "pydantic", "tqdm", "tomli_w"):
+    for module in ("scipy", "matplotlib", "jinja2", "numba", "pydantic", "tqdm", "tomli_w"):
         try:
             version = getattr(importlib.import_module(module), "__version__", "yes")
             check(True, module, version, "")

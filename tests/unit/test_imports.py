@@ -33,6 +33,7 @@ MAY_IMPORT = {
         "files",
         "dynamics",
         "modes",
+        "figures",
         "store",
         "parallel",
     },

@@ -76,8 +76,13 @@ def style():
 
 def only(name, study):
     """The one figure of ``name`` that a study yields."""
-    ((_, figure),) = study_figures[name](study)
+    (figure,) = drawn(name, study).values()
     return figure
+
+
+def drawn(name, study):
+    """Suffixes and figures of ``name`` that a study offers."""
+    return {suffix: make() for suffix, make in study_figures[name](study)}
 
 
 def maps(figure):
@@ -240,7 +245,7 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
 
 @pytest.mark.parametrize("average", AVERAGES)
 def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
-    figures = dict(study_figures["entropy"](Study((curves,))))
+    figures = drawn("entropy", Study((curves,)))
     assert len(figures) == 2 * 2 * len(AVERAGES)
     figure = figures[f"calibrated-5pi-9-{average}"]
     grid = np.reshape(figure.axes, (2, 2))
@@ -283,7 +288,7 @@ def test_some_configuration_has_a_power_law(curves):
 
 
 def test_all_panels_by_wavenumber_and_configuration(curves):
-    figures = dict(study_figures["entropy_all"](Study((curves,))))
+    figures = drawn("entropy_all", Study((curves,)))
     assert len(figures) == 2 * len(AVERAGES)
     grid = np.reshape(figures["printed-masked"].axes, (2, 2))
     assert [axes.get_ylabel() for axes in grid[:, 0]] == ["κ* = 4π/9", "κ* = 5π/9"]
@@ -315,7 +320,7 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
 
 
 def test_entropy_history_is_an_image_over_amplitude(curves):
-    figure = dict(study_figures["entropy_history"](Study((curves,))))["calibrated-5pi-9"]
+    figure = drawn("entropy_history", Study((curves,)))["calibrated-5pi-9"]
     for axes, sites in zip(figure.axes, (2, 3), strict=False):
         mesh = axes.collections[0]
         fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9, "sites": sites}

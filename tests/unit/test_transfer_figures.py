@@ -72,7 +72,7 @@ def drawn(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     ensembles = tuple(EnsembleFile(f) for f in folders)
     with look():
-        found = dict(study_figures[name](Study(ensembles)))
+        found = {suffix: make() for suffix, make in study_figures[name](Study(ensembles))}
     for ensemble in ensembles:
         ensemble.file.close()
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())

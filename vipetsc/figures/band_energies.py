@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import h5py
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures import style
 from vipetsc.figures.members import configuration, configuration_stem, law_name, stem, title, transfer_members
+from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer_curves import TransferCurve, transfer_curves
 from vipetsc.records import RunFile
 
@@ -24,17 +26,17 @@ DECADES = 6
 LARGEST_ERROR = 0.01
 
 
-def band_energies(study: Study) -> Iterator[tuple[str, Figure]]:
+def band_energies(study: Study) -> Iterator[Drawing]:
     """Energies of all parts and their sum over time for every whole member; mean shares for every sweep."""
     for run, analysis in transfer_members(study):
         if len(analysis["bands/energy"].attrs["parts"]) and len(analysis["time"]) > 1:
-            yield stem(run.case), energies_over_time(run, analysis)
+            yield stem(run.case), partial(energies_over_time, run, analysis)
     pages: dict[str, list[TransferCurve]] = {}
     for curve in transfer_curves(study):
         if curve.share is not None:
             pages.setdefault(configuration_stem(curve.case), []).append(curve)
     for name, curves in pages.items():
-        yield f"shares-{name}", shares(curves)
+        yield f"shares-{name}", partial(shares, curves)
 
 
 def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndarray:

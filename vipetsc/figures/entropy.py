@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from vipetsc.case.sweep import coordinate
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
 from vipetsc.figures.series import AMPLITUDE, counted, in_pi, reading_of, suffix
+from vipetsc.figures.style import Drawing
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study
@@ -148,7 +149,7 @@ def measured(study: Study) -> Iterator[tuple[Curves, bool]]:
         yield Curves(ensemble), len(found) > 1
 
 
-def entropy(study: Study) -> Iterator[tuple[str, Figure]]:
+def entropy(study: Study) -> Iterator[Drawing]:
     """Entropy against amplitude for each reading, wavenumber and average: linear above, log-log with fits below."""
     for curves, named in measured(study):
         for facet in curves.facets():
@@ -156,7 +157,7 @@ def entropy(study: Study) -> Iterator[tuple[str, Figure]]:
             for average in AVERAGES:
                 if any(curves.curve(average, place) for place in places):
                     name = stem(curves, places[0], named, FACETS)
-                    yield f"{name}-{average}", _entropy(curves, places, average)
+                    yield f"{name}-{average}", partial(_entropy, curves, places, average)
 
 
 def stem(curves: Curves, place: tuple[int, ...], named: bool, kept: tuple[str, ...]) -> str:
@@ -252,7 +253,7 @@ def _logarithmic(axes: Axes, curve: Curve) -> None:
     axes.set_xlim(0.8 * curve.amplitude[0], 1.25 * curve.amplitude[-1])
 
 
-def entropy_all(study: Study) -> Iterator[tuple[str, Figure]]:
+def entropy_all(study: Study) -> Iterator[Drawing]:
     """Every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
     for curves, named in measured(study):
         facets = curves.facets()
@@ -263,7 +264,7 @@ def entropy_all(study: Study) -> Iterator[tuple[str, Figure]]:
             for average in AVERAGES:
                 if any(curves.curve(average, place) for row in rows for place in row):
                     name = stem(curves, rows[0][0], named, ("reading",))
-                    yield f"{name}-{average}", _entropy_all(curves, rows, average)
+                    yield f"{name}-{average}", partial(_entropy_all, curves, rows, average)
 
 
 def _entropy_all(curves: Curves, rows: list[list[tuple[int, ...]]], average: str) -> Figure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import h5py
@@ -15,6 +16,7 @@ from vipetsc.figures import style
 from vipetsc.figures.entropy import FACETS, Curves, measured, stem
 from vipetsc.figures.scattering import mark_sites
 from vipetsc.figures.series import Series, WholeRun, series_of
+from vipetsc.figures.style import Drawing
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study
@@ -24,10 +26,10 @@ COLOURS = "viridis"
 QUIET = 1e-5  # cells quieter than this share of the loudest are left blank
 
 
-def entropy_maps(study: Study) -> Iterator[tuple[str, Figure]]:
+def entropy_maps(study: Study) -> Iterator[Drawing]:
     """H(x, t) at three amplitudes to one scale, with the energy-weighted H(t) over each; quiet cells are blank."""
     for series in series_of(study, "entropy/local"):
-        yield series.suffix, _maps(series)
+        yield series.suffix, partial(_maps, series)
 
 
 def _maps(series: Series) -> Figure:
@@ -67,7 +69,7 @@ def _limits(fields: Sequence[np.ndarray]) -> Normalize:
     return Normalize(low, high if high > low else low + 1)
 
 
-def entropy_history(study: Study) -> Iterator[tuple[str, Figure]]:
+def entropy_history(study: Study) -> Iterator[Drawing]:
     """H(t) against amplitude as an image for every configuration of a reading and wavenumber."""
     for curves, named in measured(study):
         if not Curves.there(curves.ensemble, "entropy/history"):
@@ -75,7 +77,7 @@ def entropy_history(study: Study) -> Iterator[tuple[str, Figure]]:
         for facet in curves.facets():
             places = [p for p in curves.places(facet) if np.isfinite(curves.row("entropy/history", p)).any()]
             if places:
-                yield stem(curves, places[0], named, FACETS), _history(curves, places)
+                yield stem(curves, places[0], named, FACETS), partial(_history, curves, places)
 
 
 def _history(curves: Curves, places: list[tuple[int, ...]]) -> Figure:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from vipetsc.figures import style
 from vipetsc.figures.partition import FIELD, bin_colours, shown_bins
 from vipetsc.figures.scattering import ROMAN, mark_sites, snapshot_times
 from vipetsc.figures.series import Series, series_of
+from vipetsc.figures.style import Drawing
 from vipetsc.spectra import Nodes, inverse, transform
 
 if TYPE_CHECKING:
@@ -24,11 +26,11 @@ KC = 6.0  # the partition's wavelet
 BINS_SHOWN = 4
 
 
-def partition_explained(study: Study) -> Iterator[tuple[str, Figure]]:
+def partition_explained(study: Study) -> Iterator[Drawing]:
     """A snapshot, its wavelet transform cut into bins, the inverse of some bins, and their energy in space-time."""
     for series in series_of(study, FIELD):
         if series.wave and len(series.runs[1].sites):
-            yield series.suffix, _explained(series)
+            yield series.suffix, partial(_explained, series)
 
 
 def _explained(series: Series) -> Figure:

@@ -42,7 +42,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     right = max(x + half[i] for i, (x, _) in place.items()) + 1.5
     level, highest = ROOM + 0.6, ROOM
     for spring in cell.springs:
-        a, b, text = spring.start, spring.end, _si(spring.stiffness, "N/m")
+        a, b, text = spring.start, spring.end, with_prefix(spring.stiffness, "N/m")
         if inside and {a, b} == {cell.host, cell.resonator} and not spring.next_cell:
             continue
         if spring.next_cell:
@@ -59,17 +59,17 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
         between = any(xa < p < xb and abs(q - ya) < 0.1 for p, q in place.values())
         if abs(ya - yb) < 0.1 and not between:
             first, last = sorted((a, b), key=lambda i: place[i])
-            _spring(axes, (xa + half[first], ya), (xb - half[last], yb), text)
+            draw_spring(axes, (xa + half[first], ya), (xb - half[last], yb), text)
         elif abs(xa - xb) < 0.1:
             top, bottom = sorted((a, b), key=lambda i: -place[i][1])
             drop = ROOM if inside and top == cell.host else HALF
-            _spring(axes, (xa, place[top][1] - drop), (xb, place[bottom][1] + HALF), text)
+            draw_spring(axes, (xa, place[top][1] - drop), (xb, place[bottom][1] + HALF), text)
         elif abs(ya - yb) < 0.1:
             _route(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
             highest, level = level, level + 0.55
         else:
             short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
-            _spring(axes, tuple(np.array([xa, ya]) + short), tuple(np.array([xb, yb]) - short), text)
+            draw_spring(axes, tuple(np.array([xa, ya]) + short), tuple(np.array([xb, yb]) - short), text)
     for i, (x, y) in place.items():
         if not (inside and i in (cell.host, cell.resonator)):
             _mass(axes, x, y, i, cell.masses[i], cell)
@@ -139,7 +139,7 @@ def _mass(axes: Axes, x: float, y: float, index: int, mass: float, cell: UnitCel
     axes.add_patch(FancyBboxPatch((x - HALF, y - HALF), 2 * HALF, 2 * HALF, **look))
     axes.text(x, y, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
     # Beside the mass's lower left corner, clear of what hangs below it and of the spring on its left.
-    axes.text(x - HALF - 0.05, y - HALF, _si(1e3 * mass, "g"), ha="right", va="center", fontsize=6.5, zorder=4)
+    axes.text(x - HALF - 0.05, y - HALF, with_prefix(1e3 * mass, "g"), ha="right", va="center", fontsize=6.5, zorder=4)
 
 
 def _host_with_resonator(axes: Axes, centre: tuple[float, float], cell: UnitCell) -> None:
@@ -157,16 +157,16 @@ def _host_with_resonator(axes: Axes, centre: tuple[float, float], cell: UnitCell
             axes.add_patch(Rectangle((min(stop, stop + side * 0.1), y + (0.2 if end > 0 else -0.52)), 0.1, 0.32,
                                      fc=style.SKY, zorder=4, **box))  # fmt: skip
     stiffness = sum(s.stiffness for s in cell.springs if cell.resonator in (s.start, s.end))
-    _spring(axes, (x - WIDE + 0.1, y), (x - reach, y), "", turns=3, height=0.09)
+    draw_spring(axes, (x - WIDE + 0.1, y), (x - reach, y), "", turns=3, height=0.09)
     axes.add_patch(Rectangle((x - reach, y - reach), 2 * reach, 2 * reach, fc=style.ORANGE, zorder=5, **box))
     axes.text(x, y, f"$m_{{{cell.resonator + 1}}}$", ha="center", va="center", zorder=6)
     axes.annotate("Δ", (x + reach + GAP / 2, y + 0.36), (x + reach + GAP / 2, y + ROOM + 0.2), ha="center",
                   fontsize=7, color=style.VERMILION, zorder=7,
                   arrowprops={"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6,
                               "shrinkA": 0, "shrinkB": 0})  # fmt: skip
-    axes.text(x, y - ROOM - 0.08, f"$m_{{{cell.host + 1}}}$ {_si(1e3 * cell.masses[cell.host], 'g')},  "
-              f"$m_{{{cell.resonator + 1}}}$ {_si(1e3 * cell.masses[cell.resonator], 'g')}\n"
-              f"inner spring {_si(stiffness, 'N/m')}",
+    axes.text(x, y - ROOM - 0.08, f"$m_{{{cell.host + 1}}}$ {with_prefix(1e3 * cell.masses[cell.host], 'g')},  "
+              f"$m_{{{cell.resonator + 1}}}$ {with_prefix(1e3 * cell.masses[cell.resonator], 'g')}\n"
+              f"inner spring {with_prefix(stiffness, 'N/m')}",
               ha="center", va="top", fontsize=6.5, linespacing=1.3)  # fmt: skip
 
 
@@ -180,7 +180,7 @@ def _contact_link(axes: Axes, host: tuple[float, float], resonator: tuple[float,
                   fontsize=6.5, color=style.VERMILION)  # fmt: skip
 
 
-def _spring(
+def draw_spring(
     axes: Axes,
     start: tuple[float, float],
     end: tuple[float, float],
@@ -207,7 +207,7 @@ def _spring(
 def _lead(axes: Axes, start: tuple[float, float], wall: tuple[float, float], text: str) -> None:
     """The way out of the cell: the spring to the next one if it has a ``text``, else the last one's end."""
     if text:
-        _spring(axes, start, wall, text)
+        draw_spring(axes, start, wall, text)
     else:
         axes.plot([start[0], wall[0]], [start[1], wall[1]], color=style.BLACK, lw=0.7, zorder=2)
     beyond = wall[0] + (0.4 if wall[0] > start[0] else -0.4)
@@ -220,13 +220,16 @@ def _route(axes: Axes, corners: list[tuple[float, float]], text: str) -> None:
     longest = int(np.argmax(lengths))
     for i, (a, b) in enumerate(itertools.pairwise(corners)):
         if i == longest:
-            _spring(axes, a, b, text)
+            draw_spring(axes, a, b, text)
         else:
             axes.plot([a[0], b[0]], [a[1], b[1]], color=style.BLACK, lw=0.7, zorder=2)
 
 
-def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
-    """The lattice as a strip of cells: how it ends, where it is driven (0-based cell), where contacts are."""
+def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = False) -> None:
+    """The lattice as a strip of cells: how it ends, where it is driven (0-based cell), where contacts are.
+
+    A ``brief`` one leaves out the words that several strips would repeat.
+    """
     n = chain.cells
     axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
     if n <= 150:
@@ -235,8 +238,8 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
         for wall in (0.5 - 0.02 * n, n + 0.5):
             axes.add_patch(Rectangle((wall, -0.25), 0.02 * n, 1.5, fc="white", ec=style.GREY, hatch="//////", lw=0.0))
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
-    axes.annotate("drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left", va="center",
-                  fontsize=7, color=style.BLUE,
+    axes.annotate("" if brief else "drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75),
+                  ha="left", va="center", fontsize=7, color=style.BLUE,
                   arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
     last = -np.inf
     for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
@@ -255,7 +258,7 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
                 color=style.VERMILION,
             )
             last = site
-    if chain.sites:
+    if chain.sites and not brief:
         middle = (chain.sites[0] + chain.sites[-1]) / 2 + 1
         axes.text(
             middle,
@@ -266,13 +269,13 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
             fontsize=6.5,
             color=style.VERMILION,
         )
-    else:
+    elif not chain.sites:
         axes.text(n / 2, -0.2, "no contact sites", ha="center", va="top", fontsize=6.5, color=style.GREY)
     axes.set(xlim=(-0.035 * n, 1.035 * n), ylim=(-1.7, 2.3))
     axes.set_axis_off()
 
 
-def _si(value: float, unit: str) -> str:
+def with_prefix(value: float, unit: str) -> str:
     """A value with the prefix that keeps it readable: 20 kN/m, 2.5 g."""
     for factor, prefix in ((1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m")):
         if abs(value) >= factor:

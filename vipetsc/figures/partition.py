@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
@@ -15,6 +16,7 @@ from scipy.ndimage import gaussian_filter
 from vipetsc.figures import style
 from vipetsc.figures.scattering import ROMAN, mark_sites
 from vipetsc.figures.series import Series, WholeRun, series_of
+from vipetsc.figures.style import Drawing
 from vipetsc.lattice import bloch
 
 if TYPE_CHECKING:
@@ -48,11 +50,11 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
     return sorted(chosen)
 
 
-def partition(study: Study) -> Iterator[tuple[str, Figure]]:
+def partition(study: Study) -> Iterator[Drawing]:
     """Energy of seven bins in space-time at the medium amplitude; contours of all bins; the band in their colours."""
     for series in series_of(study, FIELD):
         if series.wave:
-            yield series.suffix, _partition(series)
+            yield series.suffix, partial(_partition, series)
 
 
 def _partition(series: Series) -> Figure:
@@ -127,10 +129,10 @@ def _coloured_band(axes: Axes, series: Series, bounds: np.ndarray, colours: np.n
     style.letter(axes, f"(c) Band {band} by bin")
 
 
-def reconstruction(study: Study) -> Iterator[tuple[str, Figure]]:
+def reconstruction(study: Study) -> Iterator[Drawing]:
     """Kinetic energy and that of the bins' sum over time, their relative error, and the share between bins."""
     for series in series_of(study, "partition/reconstructed"):
-        yield series.suffix, _reconstruction(series)
+        yield series.suffix, partial(_reconstruction, series)
 
 
 def _reconstruction(series: Series) -> Figure:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import h5py
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,6 +18,7 @@ from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.members import configuration, configuration_stem, law_name, transfer_members
 from vipetsc.figures.phase import refined
+from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer_curves import TransferCurve, transfer_curves
 from vipetsc.records import RunFile
 
@@ -47,20 +51,29 @@ class Portrait:
         u, v, _ = refined(displacement[shown], velocity[shown], run.field_time[shown])
         return cls(run.case, u, v, ibtet, float(run.clearances[0]))
 
+    @classmethod
+    def read(cls, folder: Path) -> Portrait:
+        """The motion of the member in ``folder``."""
+        with RunFile(folder / "run.h5") as run, h5py.File(folder / "analysis.h5") as analysis:
+            return cls.of(run, float(analysis["ibtet"][()]))
 
-def phase_regimes(study: Study) -> Iterator[tuple[str, Figure]]:
+
+def phase_regimes(study: Study) -> Iterator[Drawing]:
     """The supplement's phase trajectories of one embedded contact cell, for every law and reading."""
-    groups: dict[str, list[Portrait]] = {}
-    for run, analysis in transfer_members(study):
+    groups: dict[str, tuple[Case, list[Path]]] = {}
+    for run, _ in transfer_members(study):
         recorded = {"displacement", "velocity"} <= run.file.keys() and run.site_cells[0] in run.cells
         if len(run.site_cells) == 1 and recorded:
             name = f"{run.case.contacts.law}-{configuration_stem(run.case)}"
-            groups.setdefault(name, []).append(Portrait.of(run, float(analysis["ibtet"][()])))
+            groups.setdefault(name, (run.case, []))[1].append(run.path.parent)
     curves = list(transfer_curves(study))
-    for name, portraits in groups.items():
-        case = portraits[0].case
+    for name, (case, folders) in groups.items():
         alike = [c for c in curves if _settings(c.case) == _settings(case)]
-        yield name, _page(sorted(portraits, key=lambda p: p.case.drive.amplitude), alike[0] if alike else None)
+        yield name, partial(_page_of, folders, alike[0] if alike else None)
+
+
+def _page_of(folders: Iterable[Path], curve: TransferCurve | None) -> Figure:
+    return _page(sorted(map(Portrait.read, folders), key=lambda p: p.case.drive.amplitude), curve)
 
 
 def _settings(case: Case) -> tuple:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import h5py
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from vipetsc.figures import style
 from vipetsc.figures.bands import bands
@@ -18,9 +21,12 @@ from vipetsc.figures.lattice import unit_cell
 from vipetsc.figures.ledger import ledger
 from vipetsc.figures.phase import phase
 from vipetsc.figures.spacetime import spacetime
+from vipetsc.figures.style import Drawing
 from vipetsc.files import written_aside
 from vipetsc.lattice import UnitCell
 from vipetsc.records import RunFile
+
+NOTE = 0.16  # height in inches of the strip that a note takes below a picture
 
 # The dearest first, so that ranks which share the work finish together.
 run_figures: dict[str, Callable[[RunFile, h5py.File | None], Figure]] = {
@@ -60,7 +66,7 @@ def draw(
         if name not in run_figures:
             near = difflib.get_close_matches(name, run_figures, 1, 0) or list(run_figures)
             raise KeyError(f"no figure {name!r}; did you mean {near[0]!r}? There are {', '.join(run_figures)}")
-    folder, written = Path(folder), []
+    folder = Path(folder)
     (folder / "figures").mkdir(exist_ok=True)
     rank, size = share
     with ExitStack() as stack:
@@ -68,10 +74,8 @@ def draw(
         run = stack.enter_context(RunFile(folder / "run.h5"))
         measured = folder / "analysis.h5"
         analysis = stack.enter_context(h5py.File(measured, "r")) if measured.exists() else None
-        for name in names[rank::size]:
-            figure = run_figures[name](run, analysis)
-            written += [save(figure, folder / "figures" / f"{name}.{kind}") for kind in formats]
-    return written
+        drawings = ((name, partial(run_figures[name], run, analysis)) for name in names)
+        return draw_each(drawings, folder / "figures", formats, itertools.count(rank, size))
 
 
 def names() -> tuple[str, ...]:
@@ -85,8 +89,50 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
         return save(bands(cell, frequency), Path(path))
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Write ``figure`` to ``path`` in the format of its suffix, under another name first."""
+def draw_each(
+    drawings: Iterable[Drawing],
+    target: Path,
+    formats: Sequence[str],
+    turns: Iterator[int],
+    note: str = "",
+    keep: Callable[[Path], bool] = lambda path: False,
+) -> list[Path]:
+    """Draw those of ``drawings`` (stem, figure) whose number is among ``turns``, into ``target/<stem>.<format>``.
+
+    Parameters
+    ----------
+    turns
+        Rising numbers, the next one asked for when a picture is done: every ``size``-th from a rank on shares
+        the work evenly, a counter that all ranks draw from shares it by what it costs.
+    note
+        Words that stand below every picture.
+    keep
+        Whether the file at a path is to stay as it is.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
+    written: list[Path] = []
+    mine = next(turns, None)
+    for number, (stem, make) in enumerate(drawings):
+        if number != mine:
+            continue
+        paths = [target / f"{stem}.{kind}" for kind in formats]
+        if not all(map(keep, paths)):
+            figure = make()
+            written += [save(figure, path, note) for path in paths]
+        mine = next(turns, None)
+    return written
+
+
+def save(figure: Figure, path: Path, note: str = "") -> Path:
+    """Write ``figure`` to ``path`` in the format of its suffix, under another name first; a ``note`` goes below it."""
+    width, height = figure.get_size_inches()
+    strip = Bbox([[0, -NOTE if note else 0], [width, height]])
+    text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=style.GREY)
     with written_aside(path) as aside:
-        figure.savefig(aside, format=path.suffix[1:], dpi=style.DPI)
+        figure.savefig(aside, format=path.suffix[1:], dpi=style.DPI, bbox_inches=strip if note else None)
+    text.remove()
     return path

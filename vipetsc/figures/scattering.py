@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures import style
 from vipetsc.figures.series import Series, WholeRun, series_of
+from vipetsc.figures.style import Drawing
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.spectra import transform
 
@@ -22,14 +24,14 @@ KC, NODES = 12.0, 120  # the wavelets of the entropy, on a grid twice as fine
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii")
 
 
-def amplitudes(study: Study) -> Iterator[tuple[str, Figure]]:
+def amplitudes(study: Study) -> Iterator[Drawing]:
     """Three amplitudes by (space-time kinetic energy, wavenumber content, dispersion).
 
     Energies are divided by the square of the amplitude: one scale serves a row, and what differs between its
     panels is nonlinear.
     """
     for series in series_of(study, "kinetic_energy", "wavenumber_content", "dispersion"):
-        yield series.suffix, _amplitudes(series)
+        yield series.suffix, partial(_amplitudes, series)
 
 
 def _amplitudes(series: Series) -> Figure:
@@ -103,14 +105,14 @@ def mark_sites(axes: Axes, member: WholeRun, along: str, colour: str = "white") 
         axes.plot(sites, edge, marker="^", transform=axes.get_xaxis_transform(), **look)
 
 
-def wavelets(study: Study) -> Iterator[tuple[str, Figure]]:
+def wavelets(study: Study) -> Iterator[Drawing]:
     """|X(kappa, x)| of the host velocity at four times for three amplitudes, divided by the amplitude.
 
     A black line marks the wavenumber of the linear wave at the drive's frequency.
     """
     for series in series_of(study):
         if series.wave and len(series.runs[0].sites) and len(series.runs[0].run.cells) > 1:
-            yield series.suffix, _wavelets(series)
+            yield series.suffix, partial(_wavelets, series)
 
 
 def snapshot_times(series: Series) -> np.ndarray:

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 from vipetsc.case import Case
+from vipetsc.case.schema import LatticeTable
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.lattice.bloch import waves_at
 from vipetsc.records import RunFile
@@ -161,7 +162,8 @@ def _word(name: str, value: Any) -> str:
 
 def reading_of(ensemble: EnsembleFile) -> str:
     """The reading that all members of a sweep share which does not vary it."""
-    return Case.from_table({"lattice": dict(ensemble.sweep.table["lattice"])}).lattice.reading
+    given = ensemble.sweep.table.get("lattice", {})
+    return str(given.get("reading", LatticeTable.model_fields["reading"].default))
 
 
 def in_pi(wavenumber: float) -> str:

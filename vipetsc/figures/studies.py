@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-from matplotlib.figure import Figure
 
 from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
@@ -18,8 +17,9 @@ from vipetsc.figures.entropy_time import entropy_history, entropy_maps
 from vipetsc.figures.explained import partition_explained
 from vipetsc.figures.partition import partition, reconstruction
 from vipetsc.figures.regimes import phase_regimes
-from vipetsc.figures.registry import save
+from vipetsc.figures.registry import draw_each
 from vipetsc.figures.scattering import amplitudes, wavelets
+from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer import transfer
 from vipetsc.figures.transfer_backbone import ibtet_backbone
 from vipetsc.figures.transfer_curves import ibtet
@@ -33,13 +33,21 @@ class Study:
     ensembles: tuple[EnsembleFile, ...]
     branches: tuple[Path, ...] = ()
 
+    @classmethod
+    @contextmanager
+    def open(cls, folders: Iterable[Path]) -> Iterator[Study]:
+        """The sweeps and branches in ``folders``, open for the time of the block; raises OSError or ValueError."""
+        with ExitStack() as stack:
+            sweeps = tuple(stack.enter_context(EnsembleFile(f)) for f in folders if (f / "ensemble.h5").exists())
+            yield cls(sweeps, tuple(f for f in folders if any(f.glob("branch-*.h5"))))
+
     def measuring(self, measure: str) -> Study:
         """The same without the sweeps that do not measure it."""
         return replace(self, ensembles=tuple(e for e in self.ensembles if measure in e.sweep.options.measures))
 
 
-# Each draws what its data allow: pairs of a suffix for the file's name ("" for none) and a figure.
-StudyFigure = Callable[[Study], Iterator[tuple[str, Figure]]]
+# Each offers what its data allow.
+StudyFigure = Callable[[Study], Iterator[Drawing]]
 
 # By what a sweep measures; a sweep is shown only by the figures of its own measures.
 _FAMILIES: dict[str, tuple[StudyFigure, ...]] = {
@@ -80,7 +88,7 @@ def draw_study(
     names
         Which of ``study_figures``; by default all that the data allow.
     share
-        (rank, size): draw every ``size``-th of them from ``rank`` on, so that ranks can share the work.
+        (rank, size): draw every ``size``-th picture from ``rank`` on, so that ranks can share the work.
 
     Returns
     -------
@@ -99,15 +107,14 @@ def draw_study(
         if name not in study_figures:
             near = difflib.get_close_matches(name, study_figures, 1, 0) or list(study_figures)
             raise KeyError(f"no figure {name!r}; did you mean {near[0]!r}? There are {', '.join(study_figures)}")
-    target, written = folders[0] / "figures", []
+    target = folders[0] / "figures"
     target.mkdir(exist_ok=True)
-    rank, size = share
-    with ExitStack() as stack:
-        stack.enter_context(style.look())
-        sweeps = tuple(stack.enter_context(EnsembleFile(f)) for f in folders if (f / "ensemble.h5").exists())
-        study = Study(sweeps, tuple(f for f in folders if any(f.glob("branch-*.h5"))))
-        for name in wanted[rank::size]:
-            for suffix, figure in study_figures[name](study.measuring(_MEASURE[name])):
-                stem = f"{name}-{suffix}" if suffix else name
-                written += [save(figure, target / f"{stem}.{kind}") for kind in formats]
-    return written
+    with style.look(), Study.open(folders) as study:
+        return draw_each(offered(study, wanted), target, formats, itertools.count(*share))
+
+
+def offered(study: Study, names: Iterable[str]) -> Iterator[Drawing]:
+    """Every picture of ``names`` that the data allow, each with the stem of its file."""
+    for name in names:
+        for suffix, make in study_figures[name](study.measuring(_MEASURE[name])):
+            yield f"{name}-{suffix}" if suffix else name, make

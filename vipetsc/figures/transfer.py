@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import h5py
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from vipetsc.figures import style
 from vipetsc.figures.dispersion import bloch_branches
 from vipetsc.figures.members import stem, title, transfer_members
+from vipetsc.figures.style import Drawing
 from vipetsc.lattice import pass_bands
 from vipetsc.records import RunFile
 from vipetsc.spectra import TAPER, Parts, part_kinetic_energy, taper
@@ -27,11 +29,11 @@ MASSES = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, 
 ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
 
 
-def transfer(study: Study) -> Iterator[tuple[str, Figure]]:
+def transfer(study: Study) -> Iterator[Drawing]:
     """For every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for run, analysis in transfer_members(study):
         if "velocity" in run.file and {"kinetic_energy", *SEGMENTS} <= analysis.keys():
-            yield stem(run.case), nine_panels(run, analysis)
+            yield stem(run.case), partial(nine_panels, run, analysis)
 
 
 def nine_panels(run: RunFile, analysis: h5py.File) -> Figure:

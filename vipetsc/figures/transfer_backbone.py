@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import h5py
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.members import configuration, configuration_stem, law_name
+from vipetsc.figures.style import Drawing
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study
@@ -22,7 +24,7 @@ SHADES = {1: "#FFFFFF", 2: "#E4E4E4", 3: "#FFFFFF", 4: "#F1F1F1"}
 RED = "#CC0000"
 
 
-def ibtet_backbone(study: Study) -> Iterator[tuple[str, Figure]]:
+def ibtet_backbone(study: Study) -> Iterator[Drawing]:
     """The paper's Fig. Ejump_FEP for every reading and configuration, from ``backbone.h5``; laws in columns.
 
     A ``backbone.h5`` that was made of another sweep is passed over.
@@ -39,7 +41,7 @@ def ibtet_backbone(study: Study) -> Iterator[tuple[str, Figure]]:
                 case = Case.from_toml(group.attrs["case"])
                 pages.setdefault(configuration_stem(case), []).append((case, group))
             for name, columns in pages.items():
-                yield name, _page(columns)
+                yield name, partial(_page, columns)
 
 
 def _page(columns: Sequence[tuple[Case, h5py.Group]]) -> Figure:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.members import configuration
+from vipetsc.figures.style import Drawing
 
 if TYPE_CHECKING:
     from vipetsc.ensembles import EnsembleFile
@@ -65,13 +67,13 @@ def _curves(ensemble: EnsembleFile) -> Iterator[TransferCurve]:
         yield TransferCurve(case, amplitude[order], ibtet[index][order], floor, own, parts)
 
 
-def ibtet(study: Study) -> Iterator[tuple[str, Figure]]:
+def ibtet(study: Study) -> Iterator[Drawing]:
     """The paper's Fig. Ejump, one page a reading: laws in columns, linear and log-log scales in rows."""
     pages: dict[str, list[TransferCurve]] = {}
     for curve in transfer_curves(study):
         pages.setdefault(curve.case.lattice.reading, []).append(curve)
     for reading, curves in pages.items():
-        yield reading, _page(reading, curves)
+        yield reading, partial(_page, reading, curves)
 
 
 def _page(reading: str, curves: list[TransferCurve]) -> Figure:

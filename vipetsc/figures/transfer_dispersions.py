@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import h5py
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -13,7 +16,9 @@ from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.dispersion import bloch_branches
 from vipetsc.figures.members import configuration, configuration_stem, law_name, transfer_members
+from vipetsc.figures.style import Drawing
 from vipetsc.lattice import pass_bands
+from vipetsc.records import RunFile
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study
@@ -32,20 +37,28 @@ class Panel:
     energy: np.ndarray
     ibtet: float
 
+    @classmethod
+    def read(cls, folder: Path) -> Panel:
+        """The member in ``folder``, its spectrum no finer than a page can show."""
+        with RunFile(folder / "run.h5") as run, h5py.File(folder / "analysis.h5") as analysis:
+            frequency = analysis["frequency"][...]
+            kept = frequency <= 1.1 * pass_bands(run.model.chain.cell)[-1].high
+            energy = style.pooled(analysis["dispersion"][:, kept], MOST_ROWS, MOST_ROWS)
+            return cls(run.case, analysis["wavenumber"][...], frequency[kept], energy, float(analysis["ibtet"][()]))
 
-def transfer_dispersions(study: Study) -> Iterator[tuple[str, Figure]]:
+
+def transfer_dispersions(study: Study) -> Iterator[Drawing]:
     """The paper's Fig. FourBandDisp for every reading and configuration: laws in rows, amplitudes in columns."""
-    groups: dict[str, list[Panel]] = {}
+    groups: dict[str, list[Path]] = {}
     for run, analysis in transfer_members(study):
-        if "dispersion" not in analysis:
-            continue
-        frequency = analysis["frequency"][...]
-        kept = frequency <= 1.1 * pass_bands(run.model.chain.cell)[-1].high
-        energy = style.pooled(analysis["dispersion"][:, kept], MOST_ROWS, MOST_ROWS)
-        panel = Panel(run.case, analysis["wavenumber"][...], frequency[kept], energy, float(analysis["ibtet"][()]))
-        groups.setdefault(configuration_stem(run.case), []).append(panel)
-    for stem, panels in groups.items():
-        yield stem, table_of_dispersions(panels)
+        if "dispersion" in analysis:
+            groups.setdefault(configuration_stem(run.case), []).append(run.path.parent)
+    for stem, folders in groups.items():
+        yield stem, partial(_table_of, folders)
+
+
+def _table_of(folders: Iterable[Path]) -> Figure:
+    return table_of_dispersions([Panel.read(folder) for folder in folders])
 
 
 def table_of_dispersions(panels: list[Panel]) -> Figure:

@@ -1,0 +1,253 @@
+"""The paper in one command: on one rank and two, through a kill, a second time, in part, in a browser."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from tests.cli.tiny_paper import DRAWN, tiny_plan
+from tests.conftest import clean_environment
+from vipetsc.figures.paper import PLATES
+from vipetsc.studies.plan import CLAIMS, paper_plan
+from vipetsc.studies.steps import DONE
+
+ROOT = Path(__file__).parents[2]
+
+
+def command(ranks: int, folder: Path, *ids: str) -> list[str]:
+    launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
+    return [*launcher, sys.executable, "-m", "tests.cli.tiny_paper", str(folder), *ids]
+
+
+def make(ranks: int, folder: Path, *ids: str) -> dict:
+    """What the tiny paper says it did."""
+    ended = subprocess.run(
+        command(ranks, folder, *ids),
+        cwd=ROOT,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout.splitlines()[-1])
+
+
+def environment() -> dict[str, str]:
+    return clean_environment() | {"PYTHONPATH": str(ROOT)}
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> Path:
+    """The tiny paper on two ranks, killed in the middle and gone on with."""
+    folder = tmp_path_factory.mktemp("paper") / "out"
+    process = subprocess.Popen(
+        command(2, folder), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 200
+    while process.poll() is None and time.monotonic() < deadline:
+        if len(list(folder.glob("interband/*/summary.json"))) >= 5:
+            break
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (folder / "claims.json").exists()
+    done = make(2, folder)
+    assert done["complete"]
+    assert "interband" in done["made"]
+    assert "scattering-amplitudes" not in done["made"]
+    return folder
+
+
+def test_one_rank_makes_the_same_claims_as_two_that_were_killed(killed, tmp_path):
+    done = make(0, tmp_path / "out", "C8", "C11")
+    assert set(done["made"]) == {"scattering", "interband"}
+    claims = (killed / "claims.json").read_bytes()
+    assert (tmp_path / "out" / "claims.json").read_bytes() == claims
+    assert {row["verdict"] for row in json.loads(claims)} == {"holds"}
+
+
+def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(killed):
+    before = {path: path.stat().st_mtime_ns for path in killed.rglob("*") if path.is_file()}
+    assert make(2, killed) == {"made": [], "drawn": 0, "complete": True}
+    assert {path: path.stat().st_mtime_ns for path in killed.rglob("*") if path.is_file()} == before
+    (killed / "figures" / "fig10-reduced-model-printed.pdf").unlink()
+    assert make(0, killed)["drawn"] == 2
+
+
+def test_every_figure_of_the_paper_is_offered(killed):
+    plan = tiny_plan()
+    folders = plan.folders(killed)
+    assert set(folders) == {step.name for step in plan.steps}
+    stems = [stem for plate in PLATES for stem, _ in plate.offers(folders)]
+    assert len(stems) == len(set(stems))
+    assert {stem.partition("-")[0] for stem in stems} == {plate.id for plate in PLATES}
+    drawn = {path.name for path in (killed / "figures").iterdir()} - {"index.json"}
+    ours = [stem for stem in stems if stem.partition("-")[0] in DRAWN]
+    assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf")}
+
+
+def test_a_changed_case_is_stale(killed):
+    plan = tiny_plan()
+    step = next(step for step in plan.steps if step.name == "design")
+    assert step.state(killed) == DONE
+    assert step.changed("design.lambda.count=4").state(killed) == "stale"
+
+
+def test_every_claim_and_figure_leads_to_steps():
+    for grid in ("full", "quick"):
+        plan = paper_plan(grid)
+        assert {claim for step in plan.steps for claim in plan.claims_of(step)} == set(CLAIMS)
+        for plate in plan.plates:
+            part = plan.only([plate.id])
+            assert {step.name for step in part.steps} >= set(plate.steps)
+        assert [step.name for step in plan.only(["C10"]).steps] == ["design"]
+        assert {step.name for step in plan.only(["figs8"]).steps} > {"interband", "nnm-hertz-calibrated"}
+        assert plan.only([]) == plan
+    full, quick = paper_plan("full"), paper_plan("quick")
+    assert all(a.text != b.text for a, b in zip(full.steps, quick.steps, strict=True) if a.name not in SAME)
+
+
+SAME = (
+    "scattering-amplitudes",
+    "interband-amplitudes",
+    "interband-one-site",
+    "nnm-hertz-calibrated",
+    "nnm-bilinear-calibrated",
+)
+
+
+def test_list_says_what_is_left(vipetsc, tmp_path):
+    listed = vipetsc(0, "paper", "--list", "--out", tmp_path / "none")
+    assert listed.returncode == 0, listed.stderr
+    assert re.search(r"^scattering +missing +\d+ min +.*C7 C8", listed.stdout, re.M)
+    assert all(re.search(rf"^{plate.id} .*missing", listed.stdout, re.M) for plate in PLATES)
+    assert not (tmp_path / "none").exists()
+
+
+def test_bad_ids_and_foreign_folders_are_refused(vipetsc, tmp_path):
+    wrong = vipetsc(2, "paper", "--only", "fig99", "C7", "--out", tmp_path / "out")
+    assert wrong.returncode == 2
+    assert wrong.stderr.count("--only fig99: figures are fig01, fig02") == 1
+    assert "claims are C1 to C17" in wrong.stderr
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "letter.txt").write_text("mine")
+    foreign = vipetsc(0, "paper", "--only", "fig10", "--out", tmp_path / "foreign")
+    assert foreign.returncode == 2
+    assert "holds other files" in foreign.stderr
+
+
+def test_quick_and_full_do_not_mix(vipetsc, tmp_path):
+    (tmp_path / "plan.json").write_text('{"grid": "full"}')
+    mixed = vipetsc(0, "paper", "--quick", "--only", "fig10", "--out", tmp_path)
+    assert mixed.returncode == 2
+    assert "holds the paper on the full grid; choose another --out for the quick one" in mixed.stderr
+
+
+class Browser:
+    """Headless Chromium behind its driver, spoken to as the W3C protocol has it."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        self.home, self.base = folder, f"http://127.0.0.1:{port}"
+        log = (folder / "driver.log").open("w")
+        self.driver = subprocess.Popen(["chromedriver", f"--port={port}"], stdout=log, stderr=log)
+
+    def call(self, path: str, body: dict | None = None, patience: float = 30) -> object:
+        """The ``value`` of the driver's answer; waits until the driver listens."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"})
+        deadline = time.monotonic() + patience
+        while True:
+            try:
+                with urllib.request.urlopen(request, timeout=60) as answer:
+                    return json.load(answer)["value"]
+            except urllib.error.HTTPError:
+                raise
+            except OSError:
+                if time.monotonic() > deadline or self.driver.poll() is not None:
+                    raise
+                time.sleep(0.1)
+
+    def open(self, page: Path, width: int, height: int) -> str:
+        """A new session that shows ``page`` in a window of that size; returns its path."""
+        switches = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+                    "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
+                    f"--user-data-dir={self.home}/{width}"]  # fmt: skip
+        metrics = {"deviceMetrics": {"width": width, "height": height, "pixelRatio": 1.0, "mobile": width < 600}}
+        wanted = {
+            "browserName": "chrome",
+            "goog:chromeOptions": {"args": switches, "mobileEmulation": metrics},
+            "goog:loggingPrefs": {"browser": "ALL"},
+        }
+        answer = self.call("/session", {"capabilities": {"alwaysMatch": wanted}})
+        session = f"/session/{answer['sessionId']}"
+        self.call(f"{session}/url", {"url": page.as_uri()})
+        return session
+
+    def close(self) -> None:
+        self.driver.terminate()
+        self.driver.wait()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    opened = Browser(tmp_path_factory.mktemp("browser"))
+    yield opened
+    opened.close()
+
+
+MEASURE = """
+const root = document.documentElement, images = [...document.images];
+return {
+  page: root.scrollWidth, window: window.innerWidth, images: images.length,
+  broken: images.filter(i => !i.complete || i.naturalWidth === 0).map(i => i.alt),
+  wide: [...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > window.innerWidth + 1
+      && !e.closest('.wide')).map(e => e.tagName + '.' + e.className),
+  linked: [...document.querySelectorAll('[src], link[href]')]
+      .map(e => e.src || e.href).filter(u => !u.startsWith('data:')),
+  dead: [...document.querySelectorAll('a[href^="#"]')].map(a => a.getAttribute('href'))
+      .filter(h => !document.querySelector(h)),
+};
+"""
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 900)])
+def test_the_report_fits_a_phone_and_a_desk(killed, browser, tmp_path, width, height):
+    session = browser.open(killed / "report.html", width, height)
+    found = browser.call(f"{session}/execute/sync", {"script": MEASURE, "args": []})
+    errors = [line for line in browser.call(f"{session}/se/log", {"type": "browser"}) if line["level"] == "SEVERE"]
+    picture = base64.b64decode(browser.call(f"{session}/screenshot"))
+    assert picture[:4] == b"\x89PNG"
+    assert found["window"] == width
+    assert found["page"] <= width
+    assert found["wide"] == []
+    assert found["images"] == len(list((killed / "figures").glob("*.png")))
+    assert found["broken"] == []
+    assert found["linked"] == []
+    assert found["dead"] == []
+    assert errors == []
+
+
+def test_the_report_says_what_it_must(killed):
+    page = (killed / "report.html").read_text(encoding="utf-8")
+    assert "quick: coarse grid" in page
+    for words in ("calibrated", "printed", "holds", "minus sign", "Hermitian", "ledger", "petsc"):
+        assert words in page
+    assert len(page) < 20e6

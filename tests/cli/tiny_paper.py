@@ -1,0 +1,112 @@
+"""The paper shrunk to seconds: ``python -m tests.cli.tiny_paper DIR [ID ...]``, alone or under mpirun."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from vipetsc.studies.plan import QUICK, Plan, paper_plan
+
+ONE_READING = 'sweep.lattice.reading=["calibrated"]'
+SHORT = ("drive.cycles=5", "time.rtol=1e-7", "contacts.clearance=1e-4", ONE_READING)
+DIATOMIC = (*SHORT, "lattice.cells=40")
+FOUR_BAND = (*SHORT, "lattice.cells=30")
+AMPLITUDES = "sweep.drive.amplitude={ log = [0.2, 50.0], count = 6 }"
+BRANCH = ("nnm.energy=[0.0, 30.0]",)
+CHANGES = {
+    "scattering-amplitudes": (*DIATOMIC, "contacts.sites=2"),
+    "interband-amplitudes": FOUR_BAND,
+    "interband-one-site": (*FOUR_BAND, "sweep.drive.amplitude=[2.0, 40.0]"),
+    "design": ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11"),
+    "nnm-hertz": BRANCH,
+    "nnm-bilinear": BRANCH,
+    "nnm-hertz-calibrated": BRANCH,
+    "nnm-bilinear-calibrated": BRANCH,
+    "interband": (*SHORT[1:], "lattice.cells=30", AMPLITUDES.replace("50.0", "15.0")),
+    "scattering-neighbours": (
+        *DIATOMIC, "time.samples=201", "contacts.sites.first=10", "sweep.contacts.sites.count=[1, 2]", AMPLITUDES
+    ),
+    "scattering": (*DIATOMIC, "time.samples=201", "sweep.contacts.sites=[1, 2]", AMPLITUDES),
+}  # fmt: skip
+DRAWN = ("fig01", "fig09", "fig10", "fig11", "figS3")  # the cheap ones; all others are offered as well
+
+
+def tiny_plan() -> Plan:
+    """All steps of the quick plan in small, a few figures, and claims that are sums over the results."""
+    plan = paper_plan(QUICK)
+    steps = {step.name: step.changed(*CHANGES[step.name]) for step in plan.steps}
+    relation = replace(
+        plan.relation, sweep=steps["interband"], branches=tuple(steps[b.name] for b in plan.relation.branches)
+    )
+    return replace(plan, steps=tuple(steps.values()), relation=relation, claims=__spec__.name if __spec__ else __name__)
+
+
+def drawing(plan: Plan) -> Plan:
+    """The plan with the figures ``DRAWN`` alone."""
+    return replace(plan, plates=tuple(plate for plate in plan.plates if plate.id in DRAWN))
+
+
+@dataclass(frozen=True)
+class Total:
+    """A claim in the shape of the project's own."""
+
+    id: str
+    reading: str
+    claim: str
+    value: dict[str, float]
+    uncertainty: dict[str, float]
+    threshold: str
+    verdict: str
+    reason: str
+    figure: str
+    files: tuple[str, ...]
+
+
+def measure_claims(root: Path) -> list[Total]:
+    """Sums over the results of two steps: any bit that differs shows."""
+    found = []
+    for name, key, step, data in (
+        ("C7", "entropy", "scattering", "entropy/energy_weighted"),
+        ("C11", "transfer", "interband", "ibtet"),
+    ):
+        path = root / step / "ensemble.h5"
+        value = {}
+        if path.exists():
+            with h5py.File(path) as file:
+                value = {"total": float(np.nansum(file[data][...]))}
+        verdict = "holds" if value else "not measured"
+        for reading in ("calibrated", "printed"):
+            text = f"the {key} of the small lattice adds up"
+            found.append(Total(name, reading, text, value, {}, "total > 0", verdict, "", "", (f"{step}/ensemble.h5",)))
+    return found
+
+
+def write_claims(claims: list[Total], path: Path) -> None:
+    """As the project's own."""
+    path.write_text(json.dumps([vars(claim) for claim in claims], indent=1))
+
+
+def main() -> int:
+    """Make the tiny paper and print what was done."""
+    import petsc4py
+
+    petsc4py.init(["tiny", "-no_signal_handler"])
+    from mpi4py import MPI
+
+    from vipetsc.parallel import install_abort_hook
+    from vipetsc.studies.paper import make_paper
+
+    install_abort_hook()
+    result = make_paper(drawing(tiny_plan()), sys.argv[1], only=sys.argv[2:])
+    if MPI.COMM_WORLD.rank == 0:
+        print(json.dumps({"made": result.made, "drawn": len(result.drawn), "complete": result.complete}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
