@@ -7,14 +7,12 @@ a kill, only ever meets whole ones. ``run.h5`` follows netCDF-4's conventions (d
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import platform
 import shutil
 import sys
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from petsc4py import PETSc
 
 import h5py
 import numpy as np
+from numpy.lib import format as npy
 
 import vipetsc
 from vipetsc.case import Case
@@ -150,7 +149,7 @@ class RunFolder:
         """
         found: dict[int, int] = {}
         sizes = set()
-        for path in self.parts.glob("state-*.npz"):
+        for path in self.parts.glob("state-*.npy"):
             _, number, _, size = path.stem.split("-")
             found[int(number)] = found.get(int(number), 0) + 1
             sizes.add(int(size))
@@ -160,18 +159,17 @@ class RunFolder:
 
     def read_state(self, number: int) -> dict[str, np.ndarray]:
         """Checkpoint ``number`` of this rank."""
-        with np.load(self._state(number, self.comm.rank)) as file:
-            return dict(file)
+        return _load(self._state(number, self.comm.rank))
 
-    def read_part(self, number: int, rank: int) -> AbstractContextManager[Mapping[str, np.ndarray]]:
-        """Part ``number`` as ``rank`` wrote it, to be used in a ``with`` statement."""
-        return np.load(self._part(number, rank))
+    def read_part(self, number: int, rank: int, wanted: Collection[str]) -> Mapping[str, np.ndarray]:
+        """The arrays ``wanted`` of part ``number`` as ``rank`` wrote it."""
+        return _load(self._part(number, rank), wanted)
 
     def _part(self, number: int, rank: int) -> Path:
-        return self.parts / f"part-{number:06d}-{rank}.npz"
+        return self.parts / f"part-{number:06d}-{rank}.npy"
 
     def _state(self, number: int, rank: int) -> Path:
-        return self.parts / f"state-{number:06d}-{rank}-{self.comm.size}.npz"
+        return self.parts / f"state-{number:06d}-{rank}-{self.comm.size}.npy"
 
     def assemble(self, case: Case, cells: np.ndarray, parts: int, parallel: bool, about: dict[str, Any]) -> None:
         """Turn the first ``parts`` parts into ``run.h5``; all ranks must call it.
@@ -228,11 +226,11 @@ class RunFolder:
         sample = 0
         rank = writers.rank
         for number in range(parts):
-            with self.read_part(number, rank) as part:
-                count = part[case.output.fields[0]].shape[0] if case.output.fields else 0
-                for name in case.output.fields:
-                    _write_share(file[name], (slice(sample, sample + count), own), part[name])
-                sample += count
+            part = self.read_part(number, rank, case.output.fields)
+            count = part[case.output.fields[0]].shape[0] if case.output.fields else 0
+            for name in case.output.fields:
+                _write_share(file[name], (slice(sample, sample + count), own), part[name])
+            sample += count
         for name, text in _LEDGER.items():
             coordinates.put(f"energy/{name}", ("time",), energies[name], "J", text)
         text = "energy dissipated at each site"
@@ -250,9 +248,9 @@ class RunFolder:
         gathered: dict[str, list[np.ndarray]] = {}
         wanted = {"time", "field_time", "dissipated_by_site", *_LEDGER, *(f"impact_{n}" for n in _IMPACTS)}
         for number in range(parts):
-            with self.read_part(number, 0) as part:
-                for key in wanted:
-                    gathered.setdefault(key, []).append(part[key])
+            part = self.read_part(number, 0, wanted)
+            for key in wanted:
+                gathered.setdefault(key, []).append(part[key])
         joined = {key: np.concatenate(arrays) for key, arrays in gathered.items()}
         impacts = {name: joined[f"impact_{name}"] for name in _IMPACTS}
         order = np.lexsort((impacts["site"], impacts["onset"]))
@@ -308,16 +306,33 @@ def _write_share(dataset: h5py.Dataset, where: Any, values: np.ndarray) -> None:
         dataset[where] = values
 
 
-def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    # Through memory: a zip file that meets a full disk half way complains again when it is forgotten.
-    packed = io.BytesIO()
-    np.savez(packed, **arrays)
+def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write the names of ``arrays`` and then each of them, one after the other; a zip file costs three times that."""
     try:
-        with written_aside(path) as aside:
-            aside.write_bytes(packed.getbuffer())
+        with written_aside(path) as aside, aside.open("wb") as file:
+            np.save(file, np.array(list(arrays)))
+            for values in map(np.ascontiguousarray, arrays.values()):
+                # Through ``write``, which says what is wrong where numpy's own way of writing to disk does not.
+                npy.write_array_header_1_0(file, npy.header_data_from_array_1_0(values))
+                file.write(values.data)
     except OSError as error:
         message = f"{path} could not be written; make room and go on with --resume: {error.strerror}"
         raise OSError(error.errno, message) from error
+
+
+def _load(path: Path, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """What ``_save`` wrote, or the ``wanted`` arrays of it."""
+    found = {}
+    with path.open("rb") as file:
+        for name in np.load(file):
+            npy.read_magic(file)
+            shape, _, kind = npy.read_array_header_1_0(file)
+            count = int(np.prod(shape))
+            if wanted is None or name in wanted:
+                found[str(name)] = np.fromfile(file, kind, count).reshape(shape)
+            else:
+                file.seek(count * kind.itemsize, os.SEEK_CUR)
+    return found
 
 
 def _difference(old: str, new: str) -> str:

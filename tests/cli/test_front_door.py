@@ -206,7 +206,7 @@ def begin(case: Path, out: Path, ranks: int, *more: str) -> subprocess.Popen:
 
 def await_checkpoints(process: subprocess.Popen, out: Path, ranks: int, number: int) -> None:
     while process.poll() is None:
-        states = [p for p in (out / "parts").glob("state-*.npz") if int(p.stem.split("-")[1]) >= number]
+        states = [p for p in (out / "parts").glob("state-*.npy") if int(p.stem.split("-")[1]) >= number]
         if len(states) >= max(ranks, 1):
             return
         time.sleep(0.005)

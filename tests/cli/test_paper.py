@@ -6,6 +6,7 @@ import base64
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -228,6 +229,7 @@ return {
 """
 
 
+@pytest.mark.skipif(shutil.which("chromedriver") is None, reason="no chromedriver; scripts/test installs it")
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 900)])
 def test_the_report_fits_a_phone_and_a_desk(killed, browser, tmp_path, width, height):
     session = browser.open(killed / "report.html", width, height)
