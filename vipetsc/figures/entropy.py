@@ -106,6 +106,11 @@ class Curves:
             {name: float(fits[name][place]) for name in names},
         )
 
+    def silence(self, average: str, place: tuple[int, ...]) -> str:
+        """Why there is no curve: members are missing, or all are the linear wave."""
+        there = np.isfinite(self.row(f"entropy/{average}", place))
+        return "no members" if there.sum() < 2 else "nothing touches"
+
     def words(self, place: tuple[int, ...]) -> str:
         """A configuration in words: 5 sites."""
         parts = []
@@ -173,7 +178,7 @@ def _entropy(curves: Curves, places: list[tuple[int, ...]], average: str) -> Fig
         style.letter(upper, curves.words(place))
         curve = curves.curve(average, place)
         if curve is None:
-            style.say(upper, "no members")
+            style.say(upper, curves.silence(average, place))
             style.say(lower, "")
             continue
         _others(upper, curves, average, place)
@@ -276,7 +281,7 @@ def _entropy_all(curves: Curves, rows: list[list[tuple[int, ...]]], average: str
             if r == 0:
                 style.letter(axes, curves.words(place))
             if curve is None:
-                style.say(axes, "no members")
+                style.say(axes, curves.silence(average, place))
                 continue
             _points(axes, curve, COLOURS[average], AVERAGES[average], 1.6)
             _law(axes, curve, 5.5)
