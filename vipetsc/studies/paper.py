@@ -90,16 +90,19 @@ def make_paper(
         return PaperResult(tuple(made), (), (), False, True, root)
     if plan.relation:
         plan.relation.make(root, comm)
-    drawn = draw_paper(part, root, comm, tell)
+    drawn = draw_paper(part, root, comm, stop, tell)
+    if comm.allreduce(stop.requested, MPI.LOR):
+        return PaperResult(tuple(made), drawn, (), False, True, root)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
     complete = on_root(comm, lambda: all(s.state(root) == DONE and s.sound(root) for s in part.steps))
     return PaperResult(tuple(made), drawn, claims, complete, False, root)
 
 
-def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell = lambda text: None) -> tuple[Path, ...]:
+def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> tuple[Path, ...]:
     """Draw the figures that are missing or older than what they show; returns the files written, on all ranks.
 
-    The ranks draw pictures from one count, so that they end together whatever a picture costs.
+    The ranks draw pictures from one count, so that they end together whatever a picture costs; none is begun after
+    a request to stop.
     """
     folders = on_root(comm, lambda: plan.folders(root))
     since = on_root(comm, lambda: {plate.id: shown_since(plan, plate, root) for plate in plan.plates})
@@ -112,9 +115,14 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell = lambda text:
         return path.exists() and path.stat().st_mtime_ns >= since[path.name.partition("-")[0]]
 
     counter = SharedCounter(comm)
+
+    def turns() -> Iterator[int]:
+        while not stop.requested:
+            yield counter.draw()
+
     with style.look():
         drawings = _noted(plan.plates, folders, offered)
-        own = draw_each(drawings, target, FORMATS, iter(counter.draw, -1), plan.note, keep)
+        own = draw_each(drawings, target, FORMATS, turns(), plan.note, keep)
     drawn = sorted(path for paths in comm.allgather(own) for path in paths)
     counter.free()
     on_root(comm, lambda: _note_pictures(target, offered))
@@ -149,9 +157,11 @@ def _note_pictures(target: Path, offered: dict[str, list[str]]) -> None:
 
 
 def pictures(root: Path) -> dict[str, list[str]]:
-    """The stems of the pictures drawn in ``root``, by figure."""
-    index = root / "figures" / "index.json"
-    return json.loads(index.read_text(encoding="utf-8")) if index.exists() else {}
+    """The stems of the pictures in ``root``, by figure."""
+    folder = root / "figures"
+    index = folder / "index.json"
+    known = json.loads(index.read_text(encoding="utf-8")) if index.exists() else {}
+    return {plate: [stem for stem in stems if (folder / f"{stem}.png").exists()] for plate, stems in known.items()}
 
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[str, Any], ...]:
