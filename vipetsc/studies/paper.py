@@ -157,11 +157,9 @@ def _note_pictures(target: Path, offered: dict[str, list[str]]) -> None:
 
 
 def pictures(root: Path) -> dict[str, list[str]]:
-    """The stems of the pictures in ``root``, by figure."""
-    folder = root / "figures"
-    index = folder / "index.json"
-    known = json.loads(index.read_text(encoding="utf-8")) if index.exists() else {}
-    return {plate: [stem for stem in stems if (folder / f"{stem}.png").exists()] for plate, stems in known.items()}
+    """The stems of the pictures that belong into ``root``, by figure; empty before any was drawn."""
+    index = root / "figures" / "index.json"
+    return json.loads(index.read_text(encoding="utf-8")) if index.exists() else {}
 
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[str, Any], ...]:
@@ -175,10 +173,10 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[
     if _older(report, _written(root, "claims.json", "figures/*.png") + _written(CODE, "report.*", "paper.py")):
         tell("report")
         drawn = pictures(root)
-        shown = [
-            Shown(plate, [Picture(root / "figures" / f"{stem}.png", words(stem)) for stem in drawn.get(plate.id, [])])
-            for plate in plan.plates
-        ]
+        shown = []
+        for plate in plan.plates:
+            paths = [root / "figures" / f"{stem}.png" for stem in drawn.get(plate.id, [])]
+            shown.append(Shown(plate, [Picture(path, words(path.stem)) for path in paths if path.exists()]))
         statistics = {s.name: s.statistics(root) for s in plan.steps if s.state(root) == DONE}
         write_report(Report(plan.note, claims, shown, statistics, provenance(comm)), report)
     return tuple(claims)
