@@ -24,16 +24,16 @@ OUT_OF_PHASE = "nnm.modes=[2]"
 # CPU time in s: of a member of a sweep, else of the whole step.
 COSTS = {
     "scattering-amplitudes": 4.0,
-    "interband-amplitudes": 6.0,
+    "interband-amplitudes": 5.0,
     "interband-one-site": 4.0,
     "design": 15.0,
     "nnm-hertz": 45.0,
     "nnm-bilinear": 45.0,
     "nnm-hertz-calibrated": 20.0,
     "nnm-bilinear-calibrated": 20.0,
-    "interband": 2.5,
-    "scattering-neighbours": 2.0,
-    "scattering": 2.0,
+    "interband": 1.2,
+    "scattering-neighbours": 0.4,
+    "scattering": 0.4,
 }
 
 RUNS = ("output.figures=false",)  # of all sweeps: the figures of the paper are drawn from all of them together

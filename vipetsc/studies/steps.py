@@ -127,12 +127,12 @@ class SweepStep(Step):
         sweep(self.plan, folder, comm, force=afresh, stop=stop, progress=True)
 
     def left(self, root: Path) -> float:
-        """CPU time of the members not made, at the mean of those that were (scaled ones count as made)."""
+        """CPU time of the members not made, at the mean of those that were, or at ``cost`` if that is more."""
         state, folder = self.state(root), self.folder(root)
         if state == DONE:
             return 0.0
         made = _cpu_times(folder) if state == BEGUN else []
-        rate = float(np.mean(made)) if made else self.cost
+        rate = max(float(np.mean(made)), self.cost) if made else self.cost  # measuring a run takes time as well
         return rate * max(int(np.prod(self.plan.shape)) - len(made), 0)
 
     def statistics(self, root: Path) -> dict[str, Any]:
