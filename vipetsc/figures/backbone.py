@@ -29,10 +29,14 @@ _MARKS = {
 
 @dataclass(frozen=True, eq=False)
 class BranchFile:
-    """What the figure needs of a ``branch-<name>.h5``: arrays over points, orbits (may be empty)."""
+    """What the figure needs of a ``branch-<name>.h5``: arrays over points, orbits (may be empty).
+
+    ``reading`` is that of the paper's parameters, empty for a cell or a system of one's own.
+    """
 
     name: str
     law: str
+    reading: str
     data: dict[str, np.ndarray]
     kinds: list[str]
     orbits: dict[str, np.ndarray]
@@ -47,8 +51,11 @@ class BranchFile:
             kinds = str(file["kind"].attrs["flag_meanings"]).split()
             orbits = {n: v[...] for n, v in file["orbits"].items()} if "orbits" in file else {}
             flows = {f: {n: v[...] for n, v in g.items()} for f, g in file.get("flows", {}).items()}
-            law = tomllib.loads(file.attrs["case"]).get("contacts", {}).get("law", "") if "case" in file.attrs else ""
-            return cls(str(file.attrs["name"]), law, data, [kinds[k] for k in data["kind"]], orbits, flows)
+            table = tomllib.loads(file.attrs.get("case", ""))
+            law, lattice = table.get("contacts", {}).get("law", ""), table.get("lattice", {})
+            own = "cell" in lattice or table.get("nnm", {}).get("system") == "own"
+            reading = "" if own else lattice.get("reading", "")
+            return cls(str(file.attrs["name"]), law, reading, data, [kinds[k] for k in data["kind"]], orbits, flows)
 
 
 def draw_backbone(paths: Sequence[Path], target: Path) -> Path:
@@ -74,7 +81,8 @@ def backbone(branches: Sequence[BranchFile]) -> Figure:
         label = chr(ord("a") + column)
         top = rows[0, column].subplots()
         frequency_energy(top, branch)
-        style.letter(top, f"({label}) {branch.name}" + f", {branch.law}" * (count > 1 and bool(branch.law)))
+        words = [branch.name, branch.law if count > 1 else "", branch.reading]
+        style.letter(top, f"({label}) {', '.join(filter(None, words))}")
         slope(rows[1, column].subplots(), branch)
         if with_flows:
             flow_differences(rows[2, column].subplots(), branch)

@@ -77,7 +77,7 @@ def write_report(report: Report, path: Path) -> Path:
         rows.setdefault(claim["id"], {})[claim["reading"]] = claim
     readings = [r for r in READINGS if any(r in row for row in rows.values())]
     counts = {r: _counted([row[r]["verdict"] for row in rows.values() if r in row]) for r in readings}
-    figure_of = {claim: shown.plate.id for shown in reversed(report.figures) for claim in shown.plate.claims}
+    figure_of = {claim: shown.plate for shown in reversed(report.figures) for claim in shown.plate.claims}
     sweeps = {name: found for name, found in report.statistics.items() if "members" in found}
     branches = {name: found for name, found in report.statistics.items() if "points" in found}
     page = environment.get_template("report.html").render(
