@@ -101,8 +101,8 @@ def test_a_scaled_member_is_what_its_simulation_would_be(vipetsc, case, tmp_path
 
 @pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGTERM)])
 def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, number):
-    # The slower engine leaves time to be killed in.
-    case.write_text(SWEEP.replace("[time]", '[time]\nengine = "ts"'))
+    # Many members on the slower engine leave time to be killed in.
+    case.write_text(SWEEP.replace("[time]", '[time]\nengine = "ts"').replace("count = 6", "count = 20"))
     whole = vipetsc(0, "sweep", case, "--out", tmp_path / "whole")
     assert whole.returncode == 0, whole.stderr
     out = tmp_path / "killed"
