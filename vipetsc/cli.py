@@ -12,7 +12,8 @@ from typing import TypeVar
 from mpi4py import MPI
 
 import vipetsc
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case, CaseError, Sweep
+from vipetsc.case.schema import read_toml
 from vipetsc.files import write_text
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.reports import bands_table, doctor_table, run_table, sweep_table, validate_table
@@ -159,7 +160,6 @@ def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
 
 def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Every combination in the section [sweep] of a case; goes on where it was stopped."""
-    from vipetsc.case import Sweep
     from vipetsc.plotting import draw_sweeps
     from vipetsc.studies.sweep import sweep as make
 
@@ -199,6 +199,18 @@ def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Check a case and print what follows from it."""
     case = _load(options, comm)
     _say(comm, on_root(comm, lambda: validate_table(case, comm.size)))
+
+    def swept() -> str:
+        if options.case is None or "sweep" not in read_toml(options.case):
+            return ""
+        plan = Sweep.load(options.case, options.set)
+        members = plan.members()
+        counts = " x ".join(map(str, plan.shape))
+        impossible = sum(member.case is None for member in members)
+        return f"  sweep        {len(members)} members ({counts}), {impossible} of them impossible"
+
+    if about := on_root(comm, swept):
+        _say(comm, about)
     for warning in on_root(comm, case.warnings):
         _say(comm, f"warning: {warning}")
     return DONE

@@ -236,3 +236,9 @@ def test_measures_again_from_files(vipetsc, case, tmp_path):
     nothing = vipetsc(0, "analyse", tmp_path)
     assert nothing.returncode == 2
     assert "holds no run.h5" in nothing.stderr
+
+
+def test_validate_counts_the_members(vipetsc, case):
+    ended = vipetsc(0, "validate", case, "--set", "sweep.contacts.sites=[[20], [41]]")
+    assert ended.returncode == 0, ended.stderr
+    assert "12 members (2 x 6), 6 of them impossible" in ended.stdout
