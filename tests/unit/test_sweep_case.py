@@ -34,6 +34,12 @@ def test_members_are_the_product_in_the_files_order():
     assert cases[3] == Case.from_table(table)
 
 
+def test_a_key_may_be_written_in_one_piece():
+    nested = read("[sweep.drive]\namplitude = [1.0, 2.0]\n[sweep.contacts]\nsites = [1, 2]")
+    flat = read('[sweep]\n"drive.amplitude" = [1.0, 2.0]\n"contacts.sites" = [1, 2]')
+    assert [m.id for m in flat.members()] == [m.id for m in nested.members()]
+
+
 def test_ranges():
     plan = read("[sweep.drive]\namplitude = { log = [0.1, 10], count = 3 }\nfrequency = { linear = [1, 2], count = 5 }")
     amplitude, frequency = (axis.values[0] for axis in plan.axes)

@@ -86,7 +86,8 @@ class Sweep:
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
             table["time"] = {"engine": "auto"} | table.get("time", {})
-        varying = {key: section[key] for key in section if key in Case.model_fields and key != "name"}
+        sections = Case.model_fields.keys() - {"name"}
+        varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, wrong = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
         problems += wrong
         found: dict[str, tuple[Any, ...]] = {}
