@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,15 @@ run_figures: dict[str, Callable[[RunFile, h5py.File | None], Figure]] = {
 }
 
 
+def chosen(names: Sequence[str] | None, figures: Mapping[str, object]) -> list[str]:
+    """``names``, all of ``figures`` if None; raises KeyError for one that is not there, with the nearest that is."""
+    for name in names or ():
+        if name not in figures:
+            near = difflib.get_close_matches(name, figures, 1, 0) or list(figures)
+            raise KeyError(f"no figure {name!r}; did you mean {near[0]!r}? There are {', '.join(figures)}")
+    return list(figures if names is None else names)
+
+
 def draw(
     folder: str | Path,
     names: Sequence[str] | None = None,
@@ -61,11 +70,7 @@ def draw(
     OSError, ValueError
         If the run cannot be read, or the picture not written.
     """
-    names = list(run_figures if names is None else names)
-    for name in names:
-        if name not in run_figures:
-            near = difflib.get_close_matches(name, run_figures, 1, 0) or list(run_figures)
-            raise KeyError(f"no figure {name!r}; did you mean {near[0]!r}? There are {', '.join(run_figures)}")
+    names = chosen(names, run_figures)
     folder = Path(folder)
     (folder / "figures").mkdir(exist_ok=True)
     rank, size = share

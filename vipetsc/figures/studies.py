@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -17,7 +16,7 @@ from vipetsc.figures.entropy_time import entropy_history, entropy_maps
 from vipetsc.figures.explained import partition_explained
 from vipetsc.figures.partition import partition, reconstruction
 from vipetsc.figures.regimes import phase_regimes
-from vipetsc.figures.registry import draw_each
+from vipetsc.figures.registry import chosen, draw_each
 from vipetsc.figures.scattering import amplitudes, wavelets
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer import transfer
@@ -102,11 +101,7 @@ def draw_study(
     OSError, ValueError
         If a file cannot be read, or a picture not written.
     """
-    wanted = list(study_figures if names is None else names)
-    for name in wanted:
-        if name not in study_figures:
-            near = difflib.get_close_matches(name, study_figures, 1, 0) or list(study_figures)
-            raise KeyError(f"no figure {name!r}; did you mean {near[0]!r}? There are {', '.join(study_figures)}")
+    wanted = chosen(names, study_figures)
     target = folders[0] / "figures"
     target.mkdir(exist_ok=True)
     with style.look(), Study.open(folders) as study:
