@@ -89,7 +89,7 @@ def clean_environment() -> dict[str, str]:
 def vipetsc():
     """Call the program as a user types it: ``vipetsc(ranks, "run", ...)`` returns the ended process."""
 
-    def call(ranks: int, *arguments: object, timeout: float = 120, **options) -> subprocess.CompletedProcess:
+    def call(ranks: int, *arguments: object, timeout: float = 300, **options) -> subprocess.CompletedProcess:
         launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
         command = [*launcher, sys.executable, "-m", "vipetsc", *map(str, arguments)]
         options = {"capture_output": True, "text": True, "env": clean_environment()} | options
