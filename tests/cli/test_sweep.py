@@ -6,6 +6,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -206,6 +207,11 @@ def test_full_fields_on_request(vipetsc, case, tmp_path):
     )
     assert ended.returncode == 0, ended.stderr
     (member,) = json.loads((out / "index.json").read_text())["members"]
+    # As a kill leaves it that comes before the run has begun.
+    shutil.rmtree(out / member["id"])
+    (out / member["id"] / "parts").mkdir(parents=True)
+    again = vipetsc(1, "sweep", out / "case.toml", "--out", out)
+    assert again.returncode == 0, again.stderr
     found = datasets(out / member["id"] / "run.h5")
     assert found["velocity"].shape == (301, 40, 2)
     measured = datasets(out / member["id"] / "analysis.h5")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -151,8 +152,13 @@ class Members:
         on_root(self.team, measure)
 
     def _make_whole(self, case: Case, folder: Path, wave: LinearWave) -> None:
-        begun = on_root(self.team, (folder / "parts").is_dir)
-        begun = begun and on_root(self.team, lambda: (folder / "case.toml").read_text("utf-8") == case.to_toml())
+        def is_begun() -> bool:
+            kept = folder / "case.toml"
+            if folder.is_dir() and not kept.exists():
+                shutil.rmtree(folder)  # killed before it had begun
+            return (folder / "parts").is_dir() and kept.read_text(encoding="utf-8") == case.to_toml()
+
+        begun = on_root(self.team, is_begun)
         result = simulate(case, folder, self.team, force=not begun, resume=begun, stop=self.stop)
         self._check(result)
 
