@@ -32,8 +32,8 @@ from bench_report import draw, markdown
 from bench_scaling import large, scaling, whole_runs
 
 from vipetsc.case import Case
-from vipetsc.files import write_text
-from vipetsc.store import provenance
+from vipetsc.io.atomic import write_text
+from vipetsc.io.store import provenance
 
 PARTS = ("precision", "whole", "scaling")
 FULL = {

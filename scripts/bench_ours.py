@@ -15,7 +15,7 @@ from vipetsc.case.schema import TimeTable
 from vipetsc.dynamics.engine import choose
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
-from vipetsc.dynamics.simulate import ENGINES
+from vipetsc.dynamics.run import ENGINES
 
 
 def engines() -> tuple[str, ...]:

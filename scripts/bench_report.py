@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.files import written_aside
+from vipetsc.io.atomic import atomic_write
 
 _LOOKS = {
     "vipetsc propagator": (style.VERMILION, "o", "-"),
@@ -97,7 +97,7 @@ def draw(found: dict[str, Any], folder: Path) -> list[Path]:
     paths = []
     for name, make in (picture for key, picture in pictures.items() if found.get(key)):
         paths.append(folder / f"{name}.png")
-        with style.look(), written_aside(paths[-1]) as aside:
+        with style.rc_style(), atomic_write(paths[-1]) as aside:
             make(found).savefig(aside, format="png")
     return paths
 

@@ -22,9 +22,9 @@ def main(arguments: list[str] | None = None) -> int:
     from vipetsc.parallel import install_abort_hook
 
     install_abort_hook()
-    from vipetsc import cli
+    from vipetsc.cli.main import main as run_verb
 
-    return cli.main(own)
+    return run_verb(own)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ import xarray
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, CaseError
 from vipetsc.case.design import DesignCase
+from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import bloch, four_band
-from vipetsc.modes.options import NnmCase
 
 CASE = """
 [design]

@@ -14,7 +14,7 @@ import pytest
 import vipetsc as package
 from tests.conftest import clean_environment
 from vipetsc.case import Case, Sweep
-from vipetsc.modes.options import NnmCase
+from vipetsc.case.nnm import NnmCase
 
 README = Path(package.__file__).parents[1] / "README.md"
 HEADING = "## Your own lattice in ten minutes"

@@ -19,9 +19,9 @@ import pytest
 
 from tests.cli.tiny_paper import DRAWN, tiny_plan
 from tests.conftest import clean_environment
-from vipetsc.figures.paper import PLATES
-from vipetsc.studies.plan import CLAIMS, paper_plan
-from vipetsc.studies.steps import DONE
+from vipetsc.paper.figures import PAPER_FIGURES
+from vipetsc.paper.plan import CLAIMS, paper_plan
+from vipetsc.paper.steps import DONE
 
 ROOT = Path(__file__).parents[2]
 
@@ -93,9 +93,9 @@ def test_every_figure_of_the_paper_is_offered(killed):
     plan = tiny_plan()
     folders = plan.folders(killed)
     assert set(folders) == {step.name for step in plan.steps}
-    stems = [stem for plate in PLATES for stem, _ in plate.offers(folders)]
+    stems = [stem for plate in PAPER_FIGURES for stem, _ in plate.offers(folders)]
     assert len(stems) == len(set(stems))
-    assert {stem.partition("-")[0] for stem in stems} == {plate.id for plate in PLATES}
+    assert {stem.partition("-")[0] for stem in stems} == {plate.id for plate in PAPER_FIGURES}
     drawn = {path.name for path in (killed / "figures").iterdir()} - {"index.json"}
     ours = [stem for stem in stems if stem.partition("-")[0] in DRAWN]
     assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf")}
@@ -135,7 +135,7 @@ def test_list_says_what_is_left(vipetsc, tmp_path):
     listed = vipetsc(0, "paper", "--list", "--out", tmp_path / "none")
     assert listed.returncode == 0, listed.stderr
     assert re.search(r"^scattering +missing +\d+ min +.*C7 C8", listed.stdout, re.M)
-    assert all(re.search(rf"^{plate.id} .*missing", listed.stdout, re.M) for plate in PLATES)
+    assert all(re.search(rf"^{plate.id} .*missing", listed.stdout, re.M) for plate in PAPER_FIGURES)
     assert not (tmp_path / "none").exists()
 
 

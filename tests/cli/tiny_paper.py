@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from vipetsc.studies.plan import QUICK, Plan, paper_plan
+from vipetsc.paper.plan import QUICK, Plan, paper_plan
 
 ONE_READING = 'sweep.lattice.reading=["calibrated"]'
 SHORT = ("drive.cycles=5", "time.rtol=1e-7", "contacts.clearance=1e-4", ONE_READING)
@@ -98,8 +98,8 @@ def main() -> int:
     petsc4py.init(["tiny", "-no_signal_handler"])
     from mpi4py import MPI
 
+    from vipetsc.paper.make import make_paper
     from vipetsc.parallel import install_abort_hook
-    from vipetsc.studies.paper import make_paper
 
     install_abort_hook()
     result = make_paper(drawing(tiny_plan()), sys.argv[1], only=sys.argv[2:])

@@ -7,8 +7,8 @@ from mpi4py import MPI
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
+from vipetsc.case.nnm import NnmCase
 from vipetsc.modes.follow import follow_all
-from vipetsc.modes.options import NnmCase
 
 
 def three_cells(**nnm) -> NnmCase:

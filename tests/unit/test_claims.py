@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vipetsc.case import Sweep
-from vipetsc.ensembles import EnsembleFile
+from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.lattice import bloch, pass_bands
+from vipetsc.paper.claims import measure_claims, write_claims
+from vipetsc.paper.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED, Criterion, rounded, verdict
+from vipetsc.paper.claims.entropy import SPREAD_LAW
+from vipetsc.paper.claims.evidence import Curve, Evidence, MissingEvidence
+from vipetsc.paper.claims.measure import READINGS, STATEMENTS, measured
+from vipetsc.paper.claims.scattering import BRANCHES
 from vipetsc.spectra import Parts, power_law
-from vipetsc.studies.claims import measure_claims, write_claims
-from vipetsc.studies.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED, Criterion, rounded, verdict
-from vipetsc.studies.claims.entropy import SPREAD_LAW
-from vipetsc.studies.claims.evidence import Curve, Evidence, MissingEvidence
-from vipetsc.studies.claims.measure import READINGS, STATEMENTS, measured
-from vipetsc.studies.claims.scattering import BRANCHES
 from vipetsc.studies.ensemble import COMPLETE, Outcome, assemble
 
 IDS = [f"C{i}" for i in range(1, 18)]

@@ -9,9 +9,9 @@ from scipy.integrate import trapezoid
 from vipetsc.case import Case
 from vipetsc.figures import draw, draw_bands, names
 from vipetsc.figures.lattice import draw_lattice, draw_unit_cell
-from vipetsc.figures.style import look, new_figure
+from vipetsc.figures.style import new_figure, rc_style
+from vipetsc.io.run_file import ENERGIES, IMPACTS
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
-from vipetsc.records import ENERGIES, IMPACTS
 from vipetsc.spectra import kinetic_energy
 from vipetsc.studies.analysis import analyse
 
@@ -160,7 +160,7 @@ APART = UnitCell((1.0, 2.0, 3.0), (Spring(0, 0, 5.0, True), Spring(1, 2, 1.0)), 
 @pytest.mark.parametrize("cell", [diatomic(), four_band(), ODD, APART])
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_any_cell_can_be_drawn(tmp_path, cell, ends):
-    with look():
+    with rc_style():
         figure = new_figure(5, 3)
         upper, lower = figure.subplots(2, 1)
         draw_unit_cell(upper, cell)

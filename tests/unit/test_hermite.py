@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from vipetsc.dynamics.hermite import bernstein, evaluate, first_rise
+from vipetsc.contact.hermite import bernstein, evaluate, first_upcrossing
 
 coefficient = st.floats(-1, 1, allow_subnormal=False)
 
@@ -30,7 +30,7 @@ def test_bernstein_form_matches_the_hermite_data(data, h):
 @given(st.lists(coefficient, min_size=6, max_size=6))
 def test_first_rise_is_the_first_sign_change(b):
     b = np.array(b)
-    root = first_rise(b)
+    root = first_upcrossing(b)
     s = np.linspace(0, 1, 4001)
     values = BPoly(b[:, None], [0, 1])(s)
     positive = np.nonzero(values > 1e-12)[0]
@@ -52,5 +52,5 @@ def test_a_pair_of_crossings_inside_one_step_is_found():
     b = quintic(polynomial(0), first(0), second(0), polynomial(1), first(1), second(1), 1.0)
     assert b[0] < 0
     assert b[5] < 0
-    np.testing.assert_allclose(first_rise(b), peak - width, atol=1e-10)
-    np.testing.assert_allclose(first_rise(b - 1.01 * polynomial(peak)), 2)
+    np.testing.assert_allclose(first_upcrossing(b), peak - width, atol=1e-10)
+    np.testing.assert_allclose(first_upcrossing(b - 1.01 * polynomial(peak)), 2)

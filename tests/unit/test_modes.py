@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipetsc.case import CaseError
+from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Bilinear, Contact, Hertz, contact_stiffness, diatomic, four_band
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.continuation import Continuation, StepControl
-from vipetsc.modes.options import NnmCase
-from vipetsc.modes.orbit import Compiled
+from vipetsc.modes.orbit import Dop853Flow
 from vipetsc.modes.point import linear_start
 from vipetsc.modes.portrait import portrait
 from vipetsc.modes.regions import power_law, regions
@@ -73,14 +73,14 @@ def test_unsound_systems_are_refused(change, message):
 def test_quarter_map_needs_an_odd_system():
     system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, quadratic=0.1)])
     with pytest.raises(ValueError, match="half"):
-        Shooting(Compiled(system), MAPS["quarter"])
+        Shooting(Dop853Flow(system), MAPS["quarter"])
 
 
 def test_half_map_of_an_asymmetric_system():
     """x'' + x + a x^2 = 0: the second-order frequency 1 - 5/12 a^2 A^2 (Nayfeh and Mook 1979)."""
     a, energy = 0.1, 1e-3
     system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, quadratic=a)])
-    corrector = Corrector(Shooting(Compiled(system), MAPS["half"]))
+    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["half"]))
     point = linear_start(corrector, 0, energy)
     assert 2 * np.pi * point.frequency == pytest.approx(1 - 5 / 12 * a**2 * 2 * point.energy, abs=2e-9)
     assert point.multiplier == 1
@@ -114,7 +114,7 @@ def test_charts_encode_decode_and_differentiate(x, period, kind):
 def test_multipliers_are_those_of_the_monodromy_matrix(name):
     """At a linear orbit the multipliers are exp(+-i omega_1 T_2), whatever the map."""
     system = reduced()
-    corrector = Corrector(Shooting(Compiled(system), MAPS[name]))
+    corrector = Corrector(Shooting(Dop853Flow(system), MAPS[name]))
     point = linear_start(corrector, 1, 1e-3)
     found = stability(corrector.problem, corrector.problem.arc(point.x, point.period))
     omega = system.linear_modes()[0]
@@ -147,7 +147,7 @@ def test_regions_without_contacts():
 
 def test_portrait_is_the_orbit_itself():
     """The mirrored quarter agrees with a flow over the whole period."""
-    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]))
+    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
     start = linear_start(corrector, 1, 0.02)
     points = list(Continuation(corrector, start, StepControl(points=150, energy=(0, 0.5))))
     point = points[-1]
@@ -183,7 +183,7 @@ def test_case_round_trip_and_systems():
 
 @pytest.fixture(scope="module")
 def short_branch() -> Branch:
-    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]))
+    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
     start = linear_start(corrector, 1, 0.02)
     growing = Continuation(corrector, start, StepControl(points=400, energy=(0, 1e4)))
     points = [growing.point, *growing]

@@ -14,14 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from vipetsc.case import Case
-from vipetsc.figures import look, save
-from vipetsc.figures.paper import PLATES, words
+from vipetsc.figures import rc_style, save
 from vipetsc.figures.registry import NOTE, draw_each
-from vipetsc.figures.report import numbers, sources
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.style import DPI, new_figure
-from vipetsc.studies.claims.measure import STATEMENTS
-from vipetsc.studies.plan import CLAIMS
+from vipetsc.paper.claims.measure import STATEMENTS
+from vipetsc.paper.figures import PAPER_FIGURES, words
+from vipetsc.paper.plan import CLAIMS
+from vipetsc.paper.report import numbers, sources
 
 
 def drawings(count: int, made: list[int]):
@@ -69,7 +69,7 @@ def test_what_is_kept_is_not_drawn_and_not_half(tmp_path):
 
 
 def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
-    with look():
+    with rc_style():
         figure = new_figure(2, 1)
         figure.subplots().plot([0, 1])
         plain, noted = (imread(save(figure, tmp_path / f"{note or 'plain'}.png", note)) for note in ("", "coarse"))
@@ -81,9 +81,9 @@ def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
 
 
 def test_every_claim_has_a_figure_that_shows_it():
-    shown = {claim for plate in PLATES for claim in plate.claims}
+    shown = {claim for plate in PAPER_FIGURES for claim in plate.claims}
     assert shown == set(CLAIMS) == {statement.id for statement in STATEMENTS}
-    assert [plate.label for plate in PLATES] == [f"Fig. {i}" for i in range(1, 13)] + [
+    assert [plate.label for plate in PAPER_FIGURES] == [f"Fig. {i}" for i in range(1, 13)] + [
         *(f"Fig. A{i}" for i in range(1, 4)),
         *(f"Fig. S{i}" for i in range(1, 9)),
     ]
@@ -116,7 +116,7 @@ def test_small_texts_of_the_report():
 @pytest.mark.parametrize("preset", ["diatomic", "four-band"])
 def test_the_lattice_page_shows_every_configuration(preset):
     case = Case.from_table({"name": preset, "lattice": {"preset": preset, "reading": "printed"}})
-    with look():
+    with rc_style():
         figure = lattice_page(case, (1, 5))
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert sum(bool(re.search(r"\d contact site", title)) for title in titles) == 2
@@ -126,7 +126,7 @@ def test_the_lattice_page_shows_every_configuration(preset):
 
 
 def test_the_reduced_model_names_its_numbers():
-    with look():
+    with rc_style():
         figure = reduced_model((0.0025, 0.0025), (2e4, 2e3), 10**-2.75)
     text = " ".join(t.get_text() for t in figure.axes[0].texts)
     for words_ in ("20 kN/m", "2 kN/m", "2.5 g", "1.778 mm"):

@@ -11,7 +11,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.image import imread
 
 from vipetsc.case import Case, Sweep
-from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import draw_study, study_figures
 from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.entropy_time import QUIET
@@ -19,9 +18,10 @@ from vipetsc.figures.partition import bin_colours, shown_bins
 from vipetsc.figures.scattering import KC, snapshot_times
 from vipetsc.figures.series import Wave, in_pi, series_of
 from vipetsc.figures.studies import Study
-from vipetsc.figures.style import GREY, look
+from vipetsc.figures.style import GREY, rc_style
+from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import bloch
-from vipetsc.records import RunFile
 from vipetsc.spectra import filter_bank, normalised, transform
 from vipetsc.studies.sweep import sweep
 
@@ -70,7 +70,7 @@ def curves(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def style():
-    with look():
+    with rc_style():
         yield
 
 

@@ -11,13 +11,13 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Sweep
-from vipetsc.ensembles import EnsembleFile
-from vipetsc.figures import draw_study, look, study_figures
+from vipetsc.figures import draw_study, rc_style, study_figures
 from vipetsc.figures.band_energies import closing_error
 from vipetsc.figures.regimes import Portrait
 from vipetsc.figures.studies import Study
 from vipetsc.figures.transfer_curves import transfer_curves
-from vipetsc.records import RunFile
+from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.io.run_file import RunFile
 from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
 from vipetsc.studies.sweep import sweep
 
@@ -71,7 +71,7 @@ def whole(tmp_path_factory):
 def drawn(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     ensembles = tuple(EnsembleFile(f) for f in folders)
-    with look():
+    with rc_style():
         found = {suffix: make() for suffix, make in study_figures[name](Study(ensembles))}
     for ensemble in ensembles:
         ensemble.file.close()

@@ -10,7 +10,7 @@ import xarray
 
 from tests.conftest import datasets, small_case
 from vipetsc import Case, simulate
-from vipetsc.dynamics import integrator
+from vipetsc.dynamics.ts import integrator
 from vipetsc.studies.analysis import analyse
 
 

@@ -13,7 +13,7 @@ from vipetsc.modes.audit import Watch, is_jump, suspects
 from vipetsc.modes.chart import Relative
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
 from vipetsc.modes.newmark import Newmark
-from vipetsc.modes.orbit import Compiled, FiniteDifferences
+from vipetsc.modes.orbit import Dop853Flow, FiniteDifferences
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.portrait import resonance
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
@@ -36,7 +36,7 @@ def cubic() -> System:
     return System.assemble([1.0, 1.0], springs, smooth=[SmoothSpring(None, 0, cubic=0.5)])
 
 
-def follow(system: System, mode: int, start: float, flow=Compiled, shooting: str = "quarter", **control):
+def follow(system: System, mode: int, start: float, flow=Dop853Flow, shooting: str = "quarter", **control):
     """Corrector, points and special points of a branch."""
     corrector = Corrector(Shooting(flow(system), MAPS[shooting]))
     first = linear_start(corrector, mode, start)
@@ -188,7 +188,7 @@ def test_sensitivities(law):
     """Variational equations against central differences, and symplectic, on an arc with many contacts."""
     system = reduced(law)
     start = np.array([3 * D, 1.2 * D, 0.1, -0.2])
-    flow = Compiled(system)
+    flow = Dop853Flow(system)
     arc = flow.arc(start, 3e-3, 3e-3)
     assert len(arc.events) >= 8
     differences = FiniteDifferences(flow, 1e-7).arc(start, 3e-3, 3e-3).sensitivity
@@ -202,7 +202,7 @@ def test_sensitivities(law):
 def test_flow_conserves_energy_and_reverses():
     system = reduced()
     start = np.array([30 * D, 10 * D, 0.0, 0.0])
-    flow = Compiled(system)
+    flow = Dop853Flow(system)
     arc = flow.arc(start, 7e-3, 7e-3)
     assert len(arc.events) > 50
     u, v = arc.end[:2], arc.end[2:]
@@ -219,7 +219,7 @@ def test_short_contacts_inside_a_step_are_found():
     period = 2 * np.pi / omega[OUT_OF_PHASE]
     for excess, changes in ((1e-12, 2), (-1e-12, 0)):
         centre = np.append(np.zeros(2), omega[OUT_OF_PHASE] * (1 + excess) * shape)
-        arc = Compiled(system).arc(centre, period / 2, period)
+        arc = Dop853Flow(system).arc(centre, period / 2, period)
         assert len(arc.events) == changes
 
 
@@ -238,7 +238,7 @@ def test_in_phase_through_the_first_tongues():
 def test_in_phase_through_every_odd_tongue_to_the_limit():
     """At the tip of the k:1 tongue the resonator strikes (k + 1)/2 times in a quarter period, for every odd k."""
     system = reduced()
-    corrector = Corrector(Shooting(Compiled(system), MAPS["quarter"]))
+    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["quarter"]))
     start = linear_start(corrector, IN_PHASE, 1e-3)
     growing = Continuation(corrector, start, StepControl(energy=(0.0, 6e9), points=20000))
     points = [growing.point, *growing]
@@ -263,7 +263,7 @@ def test_in_phase_through_every_odd_tongue_to_the_limit():
 def test_degenerate_tangent_is_named():
     """Two equal oscillators without coupling: every combination is an orbit, so the start is a branch point."""
     system = System.assemble([1.0, 1.0], [(None, 0, 1.0), (None, 1, 1.0)])
-    corrector = Corrector(Shooting(Compiled(system), MAPS["half"]))
+    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["half"]))
     x = np.array([1.0, 0.5])
     chart = Relative(system, x, 2 * np.pi)
     xi = chart.encode(x, 2 * np.pi)
@@ -291,7 +291,7 @@ def test_both_directions_give_the_same_curve():
 
 
 def test_without_guards_the_branch_jumps_and_the_detector_says_so():
-    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]))
+    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
     start = linear_start(corrector, IN_PHASE, 3e-3)
     control = StepControl(points=150, guards=Guards.off())
     points = [start, *Continuation(corrector, start, control)]
@@ -370,7 +370,7 @@ def test_three_cells_through_grazing(law, mode):
 
 
 def test_failure_says_where_why_and_what_to_turn():
-    corrector = Corrector(Shooting(Compiled(reduced()), MAPS["quarter"]), max_newton=1)
+    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]), max_newton=1)
     start = linear_start(corrector, OUT_OF_PHASE, 2.9e-2)
     points = []
     with pytest.raises(ContinuationError) as caught:

@@ -238,10 +238,10 @@ def effective_restitution(r: float) -> float:
 def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     from mpi4py import MPI
 
-    from vipetsc.dynamics.impacts import ImpactTracker
-    from vipetsc.dynamics.integrator import Integrator
+    from vipetsc.contact.episodes import ImpactTracker
     from vipetsc.dynamics.layout import Layout
     from vipetsc.dynamics.operator import LatticeOperator
+    from vipetsc.dynamics.ts.integrator import Integrator
 
     # Springs so soft that they do nothing during one impact.
     soft = 1e-9

@@ -1,5 +1,5 @@
 """A lattice in motion, on PETSc."""
 
-from vipetsc.dynamics.simulate import Result, simulate
+from vipetsc.dynamics.run import Result, simulate
 
 __all__ = ["Result", "simulate"]

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.dynamics.impacts import Episode
+from vipetsc.contact.episodes import Episode
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.parallel import StopRequest

@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 
 from vipetsc.case import Case
-from vipetsc.files import written_aside
-from vipetsc.records import RunFile
-from vipetsc.store import RunFolder
+from vipetsc.io.atomic import atomic_write
+from vipetsc.io.run_file import RunFile
+from vipetsc.io.store import RunFolder
 
 _NUMBERS = itertools.count()
 
@@ -66,7 +66,7 @@ class RunMemory(RunFolder):
 
     def save(self, path: Path, case: Case) -> None:
         """Write the finished run to ``path`` (rank 0 only), with the fields that ``case`` names."""
-        with written_aside(path) as aside, h5py.File(aside, "w") as file:
+        with atomic_write(path) as aside, h5py.File(aside, "w") as file:
             self._write(file, case)
 
     def _write(self, file: h5py.File, case: Case) -> None:

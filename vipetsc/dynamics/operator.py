@@ -9,8 +9,8 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.dynamics import kernel, native
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.ts import kernel, native
 from vipetsc.lattice import Hertz
 
 

@@ -10,10 +10,10 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Case, Model
-from vipetsc.dynamics.energy import Energies
-from vipetsc.dynamics.impacts import Episode
+from vipetsc.contact.episodes import Episode
 from vipetsc.dynamics.layout import Layout
-from vipetsc.store import GATHER_LIMIT
+from vipetsc.dynamics.ledger import Energies
+from vipetsc.io.store import GATHER_LIMIT
 
 # A part is at most this many samples, and at most this many bytes of fields on a rank.
 PART_SAMPLES = 256

@@ -13,7 +13,7 @@ _HOMES = {
     "names": "vipetsc.figures.registry",
     "run_figures": "vipetsc.figures.registry",
     "save": "vipetsc.figures.registry",
-    "look": "vipetsc.figures.style",
+    "rc_style": "vipetsc.figures.style",
     "study_figures": "vipetsc.figures.studies",
 }
 
@@ -25,8 +25,8 @@ __all__ = [
     "draw_bands",
     "draw_design",
     "draw_study",
-    "look",
     "names",
+    "rc_style",
     "run_figures",
     "save",
     "study_figures",

@@ -62,7 +62,7 @@ def draw_backbone(paths: Sequence[Path], target: Path) -> Path:
     """Draw the branches in ``paths`` (one page, a column a branch) into ``target``; returns it."""
     target.parent.mkdir(parents=True, exist_ok=True)
     branches = [BranchFile.read(Path(p)) for p in paths]
-    with style.look():
+    with style.rc_style():
         if not all(len(b.kinds) for b in branches):
             return save(style.without_data("no point of the branch was found"), target)
         return save(backbone(branches), target)

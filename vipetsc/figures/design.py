@@ -174,7 +174,7 @@ def draw_design(
     something, OSError if the search cannot be read.
     """
     folder, written = Path(folder), []
-    with style.look(), h5py.File(folder / "design.h5", "r") as file:
+    with style.rc_style(), h5py.File(folder / "design.h5", "r") as file:
         figures = {name: design_figures[name](file) for name in names or design_figures}
         (folder / "figures").mkdir(exist_ok=True)
         for name, figure in figures.items():

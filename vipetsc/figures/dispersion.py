@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.lattice.cell import UnitCell
-from vipetsc.records import RunFile
 
 DECADES = 5
 PANELS = {

@@ -13,10 +13,10 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
-from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
 from vipetsc.figures.series import AMPLITUDE, counted, in_pi, reading_of, suffix
 from vipetsc.figures.style import Drawing
+from vipetsc.io.ensemble_file import EnsembleFile
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.records import RunFile
+from vipetsc.io.run_file import RunFile
 
 
 def impacts(run: RunFile, analysis: h5py.File | None) -> Figure:

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
 from vipetsc.figures import style
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import Chain, UnitCell
-from vipetsc.records import RunFile
 
 PITCH = 2.0  # distance between neighbouring masses of the drawing
 HALF = 0.34  # half the side of a mass

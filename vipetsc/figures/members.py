@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import h5py
 
 from vipetsc.case import Case
-from vipetsc.records import RunFile
+from vipetsc.io.run_file import RunFile
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from scipy.interpolate import CubicHermiteSpline
 
 from vipetsc.figures import style
-from vipetsc.records import RunFile
+from vipetsc.io.run_file import RunFile
 
 REFINE = 4  # points drawn for each sample
 

@@ -20,7 +20,7 @@ from vipetsc.figures.members import configuration, configuration_stem, law_name,
 from vipetsc.figures.phase import refined
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer_curves import TransferCurve, transfer_curves
-from vipetsc.records import RunFile
+from vipetsc.io.run_file import RunFile
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study

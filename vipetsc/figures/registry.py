@@ -22,9 +22,9 @@ from vipetsc.figures.ledger import ledger
 from vipetsc.figures.phase import phase
 from vipetsc.figures.spacetime import spacetime
 from vipetsc.figures.style import Drawing
-from vipetsc.files import written_aside
+from vipetsc.io.atomic import atomic_write
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import UnitCell
-from vipetsc.records import RunFile
 
 NOTE = 0.16  # height in inches of the strip that a note takes below a picture
 
@@ -75,7 +75,7 @@ def draw(
     (folder / "figures").mkdir(exist_ok=True)
     rank, size = share
     with ExitStack() as stack:
-        stack.enter_context(style.look())
+        stack.enter_context(style.rc_style())
         run = stack.enter_context(RunFile(folder / "run.h5"))
         measured = folder / "analysis.h5"
         analysis = stack.enter_context(h5py.File(measured, "r")) if measured.exists() else None
@@ -90,7 +90,7 @@ def names() -> tuple[str, ...]:
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
     """Draw the dispersion diagram of ``cell`` into ``path``; ``frequency`` in rad/s marks a drive."""
-    with style.look():
+    with style.rc_style():
         return save(bands(cell, frequency), Path(path))
 
 
@@ -137,7 +137,7 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     width, height = figure.get_size_inches()
     strip = Bbox([[0, -NOTE if note else 0], [width, height]])
     text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=style.GREY)
-    with written_aside(path) as aside:
+    with atomic_write(path) as aside:
         figure.savefig(aside, format=path.suffix[1:], dpi=style.DPI, bbox_inches=strip if note else None)
     text.remove()
     return path

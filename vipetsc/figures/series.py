@@ -15,9 +15,9 @@ import numpy as np
 
 from vipetsc.case import Case
 from vipetsc.case.schema import LatticeTable
-from vipetsc.ensembles import EnsembleFile
+from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice.bloch import waves_at
-from vipetsc.records import RunFile
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study

@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vipetsc.ensembles import EnsembleFile
 from vipetsc.figures import style
 from vipetsc.figures.band_energies import band_energies
 from vipetsc.figures.entropy import entropy, entropy_all
@@ -23,6 +22,7 @@ from vipetsc.figures.transfer import transfer
 from vipetsc.figures.transfer_backbone import ibtet_backbone
 from vipetsc.figures.transfer_curves import ibtet
 from vipetsc.figures.transfer_dispersions import transfer_dispersions
+from vipetsc.io.ensemble_file import EnsembleFile
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def draw_study(
     wanted = chosen(names, study_figures)
     target = folders[0] / "figures"
     target.mkdir(exist_ok=True)
-    with style.look(), Study.open(folders) as study:
+    with style.rc_style(), Study.open(folders) as study:
         return draw_each(offered(study, wanted), target, formats, itertools.count(*share))
 
 

@@ -58,7 +58,7 @@ _LOOK = {
 
 
 @contextmanager
-def look() -> Iterator[None]:
+def rc_style() -> Iterator[None]:
     """The house style, for making and for saving figures; leaves matplotlib's settings as they were."""
     with mpl.rc_context(_LOOK):
         yield

@@ -15,8 +15,8 @@ from vipetsc.figures import style
 from vipetsc.figures.dispersion import bloch_branches
 from vipetsc.figures.members import stem, title, transfer_members
 from vipetsc.figures.style import Drawing
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import pass_bands
-from vipetsc.records import RunFile
 from vipetsc.spectra import TAPER, Parts, part_kinetic_energy, taper
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from vipetsc.figures.members import configuration
 from vipetsc.figures.style import Drawing
 
 if TYPE_CHECKING:
-    from vipetsc.ensembles import EnsembleFile
     from vipetsc.figures.studies import Study
+    from vipetsc.io.ensemble_file import EnsembleFile
 
 LINES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.PURPLE, "D"), (style.ORANGE, "v"))
 FEWEST = 6  # amplitudes that make a curve

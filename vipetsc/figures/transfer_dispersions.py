@@ -17,8 +17,8 @@ from vipetsc.figures import style
 from vipetsc.figures.dispersion import bloch_branches
 from vipetsc.figures.members import configuration, configuration_stem, law_name, transfer_members
 from vipetsc.figures.style import Drawing
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import pass_bands
-from vipetsc.records import RunFile
 
 if TYPE_CHECKING:
     from vipetsc.figures.studies import Study

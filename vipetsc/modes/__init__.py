@@ -2,7 +2,7 @@
 
 The pieces, as a loop of one's own uses them::
 
-    corrector = Corrector(Shooting(Compiled(system), MAPS["quarter"]))
+    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["quarter"]))
     for point in Continuation(corrector, linear_start(corrector, mode, energy), StepControl()):
         ...
 
@@ -13,7 +13,7 @@ from importlib import import_module
 
 _HOMES = {
     "Branch": "branch",
-    "Compiled": "orbit",
+    "Dop853Flow": "orbit",
     "ContactPair": "system",
     "Continuation": "continuation",
     "ContinuationError": "continuation",
@@ -22,7 +22,6 @@ _HOMES = {
     "Locator": "special",
     "MAPS": "shooting",
     "Newmark": "newmark",
-    "NnmCase": "options",
     "Point": "point",
     "Shooting": "shooting",
     "SmoothSpring": "system",

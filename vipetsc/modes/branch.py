@@ -12,12 +12,12 @@ from typing import Any
 import h5py
 import numpy as np
 
-from vipetsc.files import write_text, written_aside
+from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.store import Coordinates
 from vipetsc.modes.compare import Comparison
 from vipetsc.modes.point import Point
 from vipetsc.modes.portrait import Portrait
 from vipetsc.modes.regions import power_law, regions
-from vipetsc.store import Coordinates
 
 KINDS = (
     "regular",
@@ -100,7 +100,7 @@ class Branch:
 
     def write(self, folder: Path, about: dict[str, Any]) -> None:
         """Write ``branch-<name>.h5`` and ``.csv``, each complete or as it was."""
-        with written_aside(folder / f"branch-{self.name}.h5") as aside, h5py.File(aside, "w") as file:
+        with atomic_write(folder / f"branch-{self.name}.h5") as aside, h5py.File(aside, "w") as file:
             self._fill(file, about)
         write_text(folder / f"branch-{self.name}.csv", self.to_csv())
 

@@ -11,14 +11,15 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.files import write_text
+from vipetsc.case.nnm import NnmCase, NnmTable
+from vipetsc.io.atomic import write_text
+from vipetsc.io.store import FolderError, claim_folder, provenance
 from vipetsc.modes.audit import Watch, is_jump, suspects
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.compare import compare
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
 from vipetsc.modes.newmark import Newmark
-from vipetsc.modes.options import NnmCase, NnmTable
-from vipetsc.modes.orbit import Compiled, FiniteDifferences, Flow, FlowError
+from vipetsc.modes.orbit import Dop853Flow, FiniteDifferences, Flow, FlowError
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.portrait import portrait, resonance
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
@@ -26,9 +27,8 @@ from vipetsc.modes.special import Locator
 from vipetsc.modes.switching import switch
 from vipetsc.modes.system import System
 from vipetsc.modes.tsrk import Tsrk
-from vipetsc.store import FolderError, claim_folder, provenance
 
-FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Compiled, Tsrk, Newmark)}
+FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
 """The flows by their names in case files."""
 
 SAVE_EVERY = 500

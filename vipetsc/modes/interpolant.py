@@ -65,7 +65,7 @@ def _crossing(c, low, high):
 
 
 @njit("Tuple((f8, i8))(f8[::1])", cache=True)
-def first_rise(c):
+def first_upcrossing(c):
     """Where a gap that starts at or below zero first rises through it: (place in (0, 1], verdict).
 
     Verdict 0: nowhere; 1: a crossing there; 2: an extremum there, so near zero that only the flow itself can

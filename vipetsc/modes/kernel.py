@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from scipy.integrate._ivp import dop853_coefficients as pair
 
-from vipetsc.modes.interpolant import first_rise, hermite
+from vipetsc.modes.interpolant import first_upcrossing, hermite
 
 _A = np.ascontiguousarray(pair.A[:12, :12])
 _B = np.ascontiguousarray(pair.B)
@@ -199,7 +199,7 @@ def flow(y, duration, rtol, loose, pace, reach, inverse_mass, stiffness, rows, l
                 else:
                     continue
                 # a contact that changed a moment ago sits on zero and moves away from it
-                x, found = first_rise(c)
+                x, found = first_upcrossing(c)
                 if found > 0 and x < place:
                     place, verdict, which, sense = x, found, i, s
         if verdict == 0:

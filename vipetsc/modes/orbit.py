@@ -87,7 +87,7 @@ class Flow:
         return Arc(duration, start, end, sensitivity, acceleration, events, episodes, closed, steps)
 
 
-class Compiled(Flow):
+class Dop853Flow(Flow):
     """Dormand and Prince's 8(5,3) pair, landing on every contact change; see ``kernel``.
 
     ``rtol`` is the error per step relative to the orbit's size, ``loose`` that of the sensitivities.

@@ -15,7 +15,7 @@ from vipetsc.modes.orbit import Arc, Flow, FlowError, kernel_arrays
 
 
 class Tsrk(Flow):
-    """PETSc TSRK of type ``method``; tolerances as in ``Compiled``.
+    """PETSc TSRK of type ``method``; tolerances as in ``Dop853Flow``.
 
     8vr restarts every step; an FSAL type such as 5dp is restarted after each change, or its stale stage would spoil
     the sensitivities.
@@ -129,7 +129,7 @@ class Tsrk(Flow):
                     continue
                 sign, offset = self._gap(c, s)
                 interpolant.hermite(a, b, h, sign, offset, coefficients)
-                x, found = interpolant.first_rise(coefficients)
+                x, found = interpolant.first_upcrossing(coefficients)
                 if found and x < place:
                     place, verdict, which, sense = x, found, c, s
         return place, verdict, which, sense

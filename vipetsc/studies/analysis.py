@@ -12,9 +12,9 @@ import numpy as np
 from scipy import fft
 
 from vipetsc.case import Case
-from vipetsc.files import written_aside
+from vipetsc.io.atomic import atomic_write
+from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import pass_bands
-from vipetsc.records import RunFile
 from vipetsc.spectra import (
     TAPER,
     Parts,
@@ -73,7 +73,7 @@ def analyse(
         If the run cannot be read or is not one of ours.
     """
     with ExitStack() as stack:
-        aside = stack.enter_context(written_aside(Path(out_path)))
+        aside = stack.enter_context(atomic_write(Path(out_path)))
         if not isinstance(run, RunFile):
             run = stack.enter_context(RunFile(run))
         out = stack.enter_context(h5py.File(aside, "w"))

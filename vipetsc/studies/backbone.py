@@ -13,11 +13,11 @@ from scipy.optimize import minimize_scalar
 
 from vipetsc.case import Case
 from vipetsc.case.sweep import case_id
-from vipetsc.ensembles import EnsembleFile
-from vipetsc.files import written_aside
-from vipetsc.records import RunFile
+from vipetsc.io.atomic import atomic_write
+from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.io.run_file import RunFile
+from vipetsc.io.store import FolderError
 from vipetsc.spectra import Fit, power_law
-from vipetsc.store import FolderError
 from vipetsc.studies.datasets import put
 from vipetsc.studies.members import LinearWave, linear_case
 
@@ -176,7 +176,7 @@ def relate(ensemble: EnsembleFile, branches: Sequence[Path]) -> Path | None:
     slopes = [Slope.read(folder / BRANCH) for folder in branches]
     path = ensemble.folder / "backbone.h5"
     left_out, made = [], 0
-    with written_aside(path) as aside, h5py.File(aside, "w") as file:
+    with atomic_write(path) as aside, h5py.File(aside, "w") as file:
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["case"] = ensemble.file.attrs["case"]
         for case, index in ensemble.curves("amplitude"):

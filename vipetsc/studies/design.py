@@ -10,11 +10,11 @@ import h5py
 import numpy as np
 
 from vipetsc.case.design import DesignCase
-from vipetsc.files import write_text, written_aside
+from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.store import Coordinates, claim_folder, provenance
 from vipetsc.lattice.bloch import bloch
 from vipetsc.lattice.cell import four_band
 from vipetsc.lattice.search import COSTS, Search, search, signed_deflection, unit_vectors
-from vipetsc.store import Coordinates, claim_folder, provenance
 
 PAPER = 0.1, 0.5  # the (lambda, eta) that the paper takes
 UNITS = {"deflection": "1", "group_velocity": "cells/s", "weighted": "cells/s"}
@@ -46,7 +46,7 @@ def design(case: DesignCase, folder: str | Path, force: bool = False) -> str:
     found = {r: search(r, options.lam.values(), options.eta.values(), wavenumber) for r in options.readings}
     paper = {r: search(r, *PAPER, wavenumber) for r in options.readings}
     write_text(folder / "case.toml", case.to_toml())
-    with written_aside(folder / "design.h5") as aside, h5py.File(aside, "w") as file:
+    with atomic_write(folder / "design.h5") as aside, h5py.File(aside, "w") as file:
         file.attrs.update(provenance(MPI.COMM_SELF) | {"case": case.to_toml()})
         if options.eta.last == 1:
             file.attrs["left_out"] = "eta = 1: the host mass m (1 - eta) vanishes"

@@ -13,9 +13,9 @@ import numpy as np
 import vipetsc
 from vipetsc.case import Member, Sweep
 from vipetsc.case.sweep import coordinate
-from vipetsc.files import written_aside
+from vipetsc.io.atomic import atomic_write
+from vipetsc.io.store import Coordinates
 from vipetsc.spectra import from_peak, normalised
-from vipetsc.store import Coordinates
 
 FORMAT_VERSION = 1
 COMPLETE, SCALED, FAILED = 0, 1, 2
@@ -62,7 +62,7 @@ def assemble(plan: Sweep, members: Sequence[Member], outcomes: Sequence[Outcome]
     """
     values, series, parts = _read(plan, members, outcomes, folder)
     path = folder / "ensemble.h5"
-    with written_aside(path) as aside, h5py.File(aside, "w") as file:
+    with atomic_write(path) as aside, h5py.File(aside, "w") as file:
         coordinates = Coordinates(file)
         dimensions = _put_axes(plan, coordinates)
         status = np.array([o.status for o in outcomes], np.int8).reshape(plan.shape)

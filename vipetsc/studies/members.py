@@ -17,10 +17,10 @@ from vipetsc.case import Case
 from vipetsc.case.sweep import SweepTable, case_id
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.memory import RunMemory
-from vipetsc.files import write_text, written_aside
+from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.run_file import ENERGIES, IMPACTS, RunFile
+from vipetsc.io.store import Coordinates, provenance
 from vipetsc.parallel import StopRequest, on_root
-from vipetsc.records import ENERGIES, IMPACTS, RunFile
-from vipetsc.store import Coordinates, provenance
 from vipetsc.studies.analysis import FULL, REDUCED, analyse, describe
 
 # The largest w between samples exceeds the sampled envelope by less than this for any burst of a few cycles.
@@ -61,7 +61,7 @@ class LinearWave:
 
     def write(self, path: Path) -> None:
         """Leave the wave in ``path``, whole or not at all."""
-        with written_aside(path) as aside, h5py.File(aside, "w") as file:
+        with atomic_write(path) as aside, h5py.File(aside, "w") as file:
             coordinates = Coordinates(file)
             coordinates.add("cell", np.arange(1, len(self.envelope) + 1), "1", "cell, counted from 1")
             coordinates.put("envelope", ("cell",), self.envelope, "m", "largest relative displacement at 1 N")
@@ -207,7 +207,7 @@ class Members:
         summary = provenance(self.team) | {"status": "complete: scaled from the linear run", "complete": True}
         summary["statistics"] = about
         _filled(part, cells, summary).save(folder / "run.h5", kept)
-        with written_aside(folder / "analysis.h5") as aside:
+        with atomic_write(folder / "analysis.h5") as aside:
             aside.write_bytes(shared.read_bytes())
             with h5py.File(aside, "r+") as file:
                 describe(file, case, summary["status"])

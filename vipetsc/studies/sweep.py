@@ -14,9 +14,9 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case, Member, Sweep
-from vipetsc.files import write_text
+from vipetsc.io.atomic import write_text
+from vipetsc.io.store import FolderError, claim_folder
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_root
-from vipetsc.store import FolderError, claim_folder
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Outcome, assemble
 from vipetsc.studies.members import LinearWave, Members, StoppedError
 
@@ -76,7 +76,7 @@ def sweep(
     members = plan.members()
     on_root(comm, lambda: _prepare(plan, folder, force))
     team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
-    crew = _Crew(comm, team, stop)
+    crew = TaskPool(comm, team, stop)
     shop = Members(folder, plan.options, team, stop)
 
     cases = {m.id: m.case for m in members if m.case}
@@ -113,7 +113,7 @@ def conclude(
     return outcomes
 
 
-class _Crew:
+class TaskPool:
     """Teams of ranks that draw jobs until none are left."""
 
     def __init__(self, comm: MPI.Comm, team: MPI.Comm, stop: StopRequest) -> None:

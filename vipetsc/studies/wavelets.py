@@ -7,7 +7,7 @@ from collections.abc import Collection
 import h5py
 import numpy as np
 
-from vipetsc.records import RunFile
+from vipetsc.io.run_file import RunFile
 from vipetsc.spectra import entropy, partition
 from vipetsc.studies.datasets import put
 

@@ -1,0 +1,296 @@
+"""Time stepping: PETSc's explicit Runge-Kutta, one trial at a time, landing on every contact change.
+
+The route (PETSc's own event handling loses short contacts and its error control around them):
+
+- contact modes are frozen inside a step, so that no kink lies in it;
+- after each accepted step every site is searched for a change; the state goes back to its saved copy and steps
+  exactly onto the earliest one, where modes switch;
+- a rejected trial also goes back to the saved copy: PETSc rolls back by subtraction, which loses digits when a
+  trial was far too long for a contact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+
+from vipetsc.case import Model
+from vipetsc.contact.episodes import Episode, ImpactTracker
+from vipetsc.dynamics.engine import Engine, StalledError
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.operator import LatticeOperator
+from vipetsc.lattice import Hertz
+from vipetsc.parallel import StopRequest
+
+# PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
+# and often saves a step on the way to a sample.
+STRETCH = 1.08
+# Newton steps for one landing before the search is repeated on a shorter step.
+LANDING_STEPS = 8
+# Steps and rejected trials on the way to one time beyond which a run counts as stalled.
+MOST_TRIALS = 200_000
+# A time step below this many rounding units of the time does not advance it reliably.
+SHORTEST_STEP = 8 * np.finfo(float).eps
+
+
+@dataclass
+class StepCounts:
+    """What the integrator did."""
+
+    steps: int = 0
+    rejected: int = 0
+    landings: int = 0
+    switches: int = 0
+
+
+class Integrator(Engine):
+    """Advances a lattice exactly onto given times; ``state`` and ``time`` are always an accepted step's end.
+
+    Parameters
+    ----------
+    model, layout, operator, tracker
+        The lattice, its distribution, right-hand side and contact state.
+    native
+        Register the compiled right-hand side directly (default), or through Python with the same bits.
+    stop
+        Looked at after every step; a request on any rank ends ``advance`` on all.
+
+    PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor, first step; with
+    ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
+    """
+
+    name = "ts"
+
+    def __init__(
+        self,
+        model: Model,
+        layout: Layout,
+        operator: LatticeOperator,
+        tracker: ImpactTracker,
+        native: bool = True,
+        stop: StopRequest | None = None,
+    ) -> None:
+        self.comm = layout.comm
+        self.tracker = tracker
+        self.operator = operator
+        self._burst = model.drive.duration
+        self._dissipated = layout.dissipated
+        self.counts = StepCounts()
+        self.time = 0.0
+        self.state = layout.create_vector()
+        self.saved = self.state.duplicate()
+        self.ts = self._create_ts(model, layout, native)
+        self._first_step = 0.002 / model.drive.frequency
+        options = PETSc.Options()
+        self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
+        self._fixed = options.getString("ts_adapt_type", "basic") == "none"
+        self._buffer = np.empty(2)
+        self._stop = stop or StopRequest()
+        self._any_open = False
+        # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
+        # as h^(5/2). The shares are those that the controller settles at.
+        hertz = model.contact.law is Hertz
+        share, order = (1 / 200, 2.5) if hertz else (1 / 20, 8)
+        self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
+        tracker.observe(0.0, self.state, tracker.start)
+
+    @classmethod
+    def create(
+        cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
+    ) -> Integrator:
+        """An integrator at rest at t = 0 with its own impact tracker."""
+        return cls(model, layout, operator, ImpactTracker(operator, model.contact), native, stop)
+
+    @classmethod
+    def refusal(cls, model: Model) -> None:
+        """None: any lattice can be stepped."""
+
+    def _create_ts(self, model: Model, layout: Layout, native: bool) -> PETSc.TS:
+        options = PETSc.Options()
+        # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.
+        if not options.hasName("ts_adapt_wnormtype"):
+            options["ts_adapt_wnormtype"] = "infinity"
+        tolerances = self.state.duplicate()
+        half = layout.dofs * layout.owned
+        tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol
+        tolerances.array[2 * half :] = 1e30  # the ledger follows the trajectory's steps
+        ts = PETSc.TS().create(layout.comm)
+        ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
+        ts.setType(PETSc.TS.Type.RK)
+        ts.setRKType(model.method)
+        ts.setTolerances(rtol=model.rtol, atol=tolerances)
+        ts.setMaxTime(1e300)  # PETSc wants some end; the loop below has its own
+        ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
+        # One trial a call: a rejected one is undone here, from the saved copy.
+        ts.setMaxStepRejections(0)
+        ts.setErrorIfStepFails(False)
+        ts.setSolution(self.state)
+        self.right_hand_side = self.operator.register(ts, native)
+        ts.setFromOptions()
+        return ts
+
+    @property
+    def method(self) -> str:
+        """The Runge-Kutta type in use, PETSc options included."""
+        return self.ts.getRKType()
+
+    def advance(self, target: float) -> bool:
+        """Step until the time is exactly ``target`` in s; returns False if a stop was requested.
+
+        Raises StalledError where no step can be taken.
+        """
+        # The drive's end is a kink of its third derivative: a step ends there.
+        if self.time < self._burst < target and not self.advance(self._burst):
+            return False
+        tried = self.counts.steps + self.counts.rejected
+        while self.time < target:
+            if self.counts.steps + self.counts.rejected - tried > MOST_TRIALS:
+                raise StalledError(f"{MOST_TRIALS} steps did not reach t = {target:.6g} s")
+            if not self._step(target):
+                return False
+        return True
+
+    def _step(self, target: float) -> bool:
+        remaining = target - self.time
+        shortest = SHORTEST_STEP * max(self.time, self.free_step)
+        if remaining <= shortest:
+            self.time = target
+            return True
+        # The burst rises as t^3: steps that grow with t keep even the first samples' ledger small beside the work.
+        step = min(STRETCH * self.step, self._first_step + 0.25 * self.time)
+        parts = np.ceil(remaining / step)
+        h = remaining / parts
+        if h < shortest:
+            raise StalledError(f"the step fell to {h:.3g} s")
+        self.state.copy(self.saved)
+        accepted, suggestion = self._trial(h)
+        if not accepted:
+            self.counts.rejected += 1
+            self.step = suggestion
+            self.saved.copy(self.state)
+            self.ts.restartStep()
+            return True
+        # A step cut short to meet a sample says little about the longest one possible.
+        if not self._fixed and (suggestion < 4 * h or suggestion > self.step):
+            self.step = suggestion
+        self.counts.steps += 1
+        end = target if parts == 1 else self.time + h
+        self.tracker.observe(end, self.state, self.tracker.end)
+        share, site, row = self.tracker.first_change(h)
+        self._buffer[:] = share, -float(self._stop.requested)
+        self.comm.Allreduce(MPI.IN_PLACE, self._buffer, MPI.MIN)
+        if self._buffer[0] <= 1.0:
+            self._land(h, float(self._buffer[0]), share, site, row)
+        else:
+            self.tracker.follow(h)
+            self.time = end
+        return self._buffer[1] == 0.0
+
+    def _trial(self, h: float) -> tuple[bool, float]:
+        """Try one step from the state at ``time``: whether PETSc accepted it, and its next step size."""
+        ts = self.ts
+        ts.setTime(self.time)
+        ts.setTimeStep(h)
+        ts.step()
+        suggestion = ts.getTimeStep()
+        if not np.isfinite(suggestion):
+            return False, 0.1 * h
+        return ts.getConvergedReason() >= 0, suggestion
+
+    def _land(self, h: float, share: float, own_share: float, site: int, row: int) -> None:
+        """Step from the saved state onto the change at ``share`` of the step just tried, and switch there."""
+        comm, tracker = self.comm, self.tracker
+        owner = comm.allreduce(comm.rank if own_share == share else comm.size, MPI.MIN)
+        landing, last = share * h, np.inf
+        self.counts.landings += 1
+        for attempt in range(2 * LANDING_STEPS):
+            self.saved.copy(self.state)
+            self.ts.restartStep()
+            if landing <= SHORTEST_STEP * max(self.time, self.free_step):
+                self._switch()  # the change lies at the start of the step
+                return
+            accepted, suggestion = self._trial(landing)
+            if not accepted:
+                self.step = suggestion
+                self.saved.copy(self.state)
+                return
+            tracker.observe(self.time + landing, self.state, tracker.end)
+            value, rate, tolerance = comm.bcast(tracker.distance(site, row) if comm.rank == owner else None, owner)
+            if abs(value) <= tolerance:
+                tracker.follow(landing)
+                self.time += landing
+                self._switch()
+                return
+            newton = landing - value / rate if rate else np.inf
+            if attempt < LANDING_STEPS and 0 < newton <= h and abs(value) < 0.5 * last:
+                landing, last = newton, abs(value)
+                continue
+            # A graze: short of it, go on from here; beyond it, search again on the shorter step.
+            again = comm.bcast(tracker.first_change(landing)[0] if comm.rank == owner else None, owner)
+            if again > 1.0:
+                break
+            landing *= again
+        tracker.follow(landing)
+        self.time += landing
+
+    def _switch(self) -> None:
+        """Switch modes of all landed sites and set the step with which to go on."""
+        tracker = self.tracker
+        was_free = not self._any_open
+        self.counts.switches += tracker.switch(self.time, self.state.array_r[self._dissipated :])
+        shortest = self.comm.allreduce(tracker.contact_time(), MPI.MIN)
+        self._any_open = bool(np.isfinite(shortest))
+        if self._any_open and not self._fixed:
+            if was_free:
+                self.free_step = self.step
+            self.step = min(self.step, self._first_share * shortest)
+        elif not was_free:
+            self.step = self.free_step
+        tracker.observe(self.time, self.state, tracker.start)
+        self.ts.restartStep()
+
+    def take_episodes(self) -> list[Episode]:
+        """Episodes closed since the last call, of the owned sites."""
+        closed, self.tracker.closed = self.tracker.closed, []
+        return closed
+
+    def unfinished(self) -> list[Episode]:
+        """Copies of the owned sites' open episodes."""
+        return self.tracker.unfinished(self.state.array_r[self._dissipated :])
+
+    def statistics(self) -> dict[str, Any]:
+        """Steps, what landings and limits of the contact law there were, and how the right-hand side is called."""
+        limits = {name: self.comm.allreduce(count) for name, count in asdict(self.tracker.counts).items()}
+        statistics = asdict(self.counts) | limits
+        statistics["switches"] = self.comm.allreduce(self.counts.switches)
+        return statistics | {"method": self.method, "right_hand_side": self.right_hand_side}
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """All that a resumed run needs to go on with the same bits, this rank's share."""
+        return self.tracker.checkpoint() | {
+            "state": self.state.array_r.copy(),
+            "time": np.array(self.time),
+            "steps": np.array([self.step, self.free_step, float(self._any_open)]),
+            "counts": np.array(astuple(self.counts)),
+        }
+
+    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
+        """Go back to a checkpoint."""
+        self.tracker.restore(checkpoint)
+        self.state.array[:] = checkpoint["state"]
+        self.time = float(checkpoint["time"])
+        self.step, self.free_step, any_open = checkpoint["steps"].tolist()
+        self._any_open = bool(any_open)
+        self.counts = StepCounts(*checkpoint["counts"].tolist())
+        self.ts.restartStep()
+        self.tracker.observe(self.time, self.state, self.tracker.start)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
+        for thing in (self.ts, self.state, self.saved):
+            thing.destroy()
