@@ -16,16 +16,21 @@ from tests.conftest import clean_environment
 from vipetsc.case import Case, Sweep
 from vipetsc.case.nnm import NnmCase
 
-README = Path(package.__file__).parents[1] / "README.md"
+ROOT = Path(package.__file__).parents[1]
 HEADING = "## Your own lattice in ten minutes"
+
+
+def guide() -> str:
+    """The README's first lattice and the manual's chapter that goes on with it."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert readme.count(HEADING) == 1
+    first = re.split(r"^## ", readme.split(HEADING)[1], flags=re.M)[0]
+    return first + (ROOT / "vipetsc/manual/own-lattice.md").read_text(encoding="utf-8")
 
 
 def blocks() -> list[tuple[str, str]]:
     """Language and text of every code block of the guide, in order."""
-    text = README.read_text(encoding="utf-8")
-    assert text.count(HEADING) == 1
-    guide = re.split(r"^## ", text.split(HEADING)[1], flags=re.M)[0]
-    return re.findall(r"^```(\w+)\n(.*?)^```$", guide, flags=re.M | re.S)
+    return re.findall(r"^```(\w+)\n(.*?)^```$", guide(), flags=re.M | re.S)
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +39,13 @@ def desk(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("guide")
     for language, text in blocks():
         if language == "toml":
-            name = re.match(r"# (\S+\.toml)\n", text)[1]
-            (folder / name).write_text(text)
+            name = re.match(r"# (\S+\.toml)(, added)?\n", text)
+            with (folder / name[1]).open("a" if name[2] else "w", encoding="utf-8") as file:
+                file.write(text)
         elif language == "sh":
             for line in text.splitlines():
-                call(line, folder)
+                if not line.startswith(". "):  # the environment is this interpreter's
+                    call(line, folder)
         else:
             assert language == "python"
             run([sys.executable, "-c", text], folder)
@@ -51,7 +58,7 @@ def call(line: str, folder: Path) -> None:
 
 
 def run(command: list[str], folder: Path) -> None:
-    environment = clean_environment() | {"PYTHONPATH": str(README.parent)}
+    environment = clean_environment() | {"PYTHONPATH": str(ROOT)}
     ended = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
     )
