@@ -1,1 +1,44 @@
-"""To be described."""
+r"""What touches: the force of a contact, the search for its changes, landing on them, the log of impacts.
+
+A site is a pair of masses, host and resonator, with the relative displacement w = u_resonator - u_host and a
+clearance D on both sides. ``law`` holds the compiled force, ``search`` the guaranteed root search, ``changes``
+the changes of a site's mode within a step, ``landing`` the way onto a change, ``tracker`` the modes and the log.
+
+**Law.** With the indentation x = sigma w - D on the side sigma = +1 or -1, the force on the host is
+
+    F = sigma kc x^n g,    g = 1 + c w'/w'_minus,    c = 3 (1 - r)/2,
+
+n = 3/2 for Hertz's spheres (Johnson 1985, sec. 4.2) and n = 1 for a linear stop; w'_minus is the relative velocity
+at the onset and r the restitution (Hunt and Crossley 1975). During approach w'/w'_minus > 0, so that the force is
+larger on the way in than on the way out, and the contact dissipates the power
+
+    P = sigma kc x^n (g - 1) w' = c kc x^n w'^2 / |w'_minus| >= 0.
+
+For the reduced mass m, m w'' = -F gives w' dw'/(1 + c w'/w'_minus) = -kc x^n dx/m. The right side vanishes over a
+whole contact, hence the rebound e = -w'_plus/w'_minus solves e + log(1 - c e)/c = log(1 + c)/c - 1, whose
+expansion is e = r + O((1 - r)^2): r is the restitution of a nearly elastic impact. Fast separation makes g < 0, a
+pull; ``adhesion = "clip"`` holds the force at zero then, and a grazing onset is kept from an unbounded g by a floor
+of |w'_minus|.
+
+**Modes.** A site is free, closed (in contact) or clipped. Within a time step its mode is frozen and the law is
+continued as an odd function through x = 0: the force is smooth, so that no kink spoils the order of the method.
+Every change of mode is a switching function that crosses zero upwards: sigma w - D (onset), D - sigma w
+(separation), -g and g (clipping begins and ends).
+
+**Search.** w on a step of length h is the quintic Hermite interpolant of (w, w', w'') at both ends, in Bernstein
+form: w(s h) = sum_i b_i B_i(s). The coefficients bound the polynomial, and the number of their changes of sign bounds
+the number of its roots, of which it differs by an even number (Descartes' rule). No sign change means no root, one
+means exactly one, which bisection finds; otherwise de Casteljau's scheme halves the interval, and the left half comes
+first. The first crossing is found even when a second one follows within the step (Lane and Riesenfeld 1981).
+
+**Landing.** The step is repeated so that it ends on the change: Newton's method on the switching function, evaluated
+on the trajectory itself and not on the interpolant, as long as it halves the distance; where it does not, the search
+is repeated on the shorter step. What looked like a change may turn out to be a near miss.
+
+References
+----------
+K. L. Johnson, Contact Mechanics, Cambridge University Press 1985, sec. 4.2 and 11.4.
+K. H. Hunt and F. R. E. Crossley, Coefficient of restitution interpreted as damping in vibroimpact, J. Appl. Mech. 42
+(1975) 440-445.
+J. M. Lane and R. F. Riesenfeld, Bounds on a polynomial, BIT 21 (1981) 112-117.
+"""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from vipetsc.contact.hermite import bernstein, evaluate, first_upcrossing
+from vipetsc.contact.search import bernstein, evaluate, first_upcrossing
 from vipetsc.dynamics.ts.kernel import (
     APPROACH,
     CLEARANCE,
@@ -92,7 +92,7 @@ def first_change(q, p, start, end, h):
     b = np.empty(6)
     c = np.empty(6)
     for site in range(q[SITES]):
-        bernstein(start[site, 0], start[site, 1], start[site, 2], end[site, 0], end[site, 1], end[site, 2], h, b)
+        bernstein(start[site], end[site], h, b)
         mode = q[q[SITE_MODE] + site]
         clearance = p[q[CLEARANCE] + site]
         tolerance = LANDED * clearance
@@ -132,7 +132,7 @@ def _pressure(q, p, site, b, h, s):
 def peaks(q, p, start, end, h, site):
     """Largest indentation in m, largest and smallest contact force in N of a site in a step of length h."""
     b = np.empty(6)
-    bernstein(start[site, 0], start[site, 1], start[site, 2], end[site, 0], end[site, 1], end[site, 2], h, b)
+    bernstein(start[site], end[site], h, b)
     side = 1.0 if q[q[SITE_MODE] + site] > 0 else -1.0
     deepest = max(side * b[0], side * b[5])
     recoil = np.empty(5)

@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from vipetsc.contact.hermite import bernstein, evaluate, first_upcrossing
+from vipetsc.contact.search import bernstein, evaluate, first_upcrossing
 
 coefficient = st.floats(-1, 1, allow_subnormal=False)
 
 
 def quintic(w0, v0, a0, w1, v1, a1, h):
     b = np.empty(6)
-    bernstein(w0, v0, a0, w1, v1, a1, h, b)
+    bernstein(np.array([w0, v0, a0]), np.array([w1, v1, a1]), h, b)
     return b
 
 

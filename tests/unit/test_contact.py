@@ -1,0 +1,148 @@
+"""The compiled contact law against its formulas, the search of a step for changes, and landings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vipetsc.contact import changes, landing
+from vipetsc.contact.law import (
+    CLIPPED,
+    CLOSED,
+    FREE,
+    contact_force,
+    create_contacts,
+    elastic_energy,
+    elastic_force,
+    elastic_gradient,
+    force_law,
+)
+from vipetsc.lattice import Bilinear, Contact, Hertz
+
+KC, D, R = 3e5, 2e-4, 0.7
+LAWS = pytest.mark.parametrize("law", [Hertz, Bilinear])
+
+
+@LAWS
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_force_is_that_of_the_plain_law(law, side):
+    contact = Contact(law, KC, R)
+    contacts = create_contacts(contact, [D, 2 * D])
+    contacts.sites[1] = (side * CLOSED, 2 * D, side * 0.4)
+    for x, rate in [(1e-5, 0.3), (4e-4, -0.2)]:
+        w = side * (2 * D + x)
+        force, power = contact_force(contacts, 1, w, side * rate)
+        assert force == pytest.approx(contact.force(w, 2 * D, side * rate, side * 0.4))
+        assert power == pytest.approx((force - contact.force(w, 2 * D)) * side * rate)
+        assert power > 0
+        assert contact_force(contacts, 0, w, rate) == (0.0, 0.0)
+    contacts.sites[1]["mode"] = side * CLIPPED
+    assert contact_force(contacts, 1, w, rate)[0] == 0.0
+
+
+@LAWS
+def test_energy_force_and_gradient_belong_together(law):
+    record, x = force_law(Contact(law, KC)), 3e-5
+    h = 1e-4 * x
+    assert elastic_force(record, x) == pytest.approx(KC * x**law.exponent)
+    assert elastic_force(record, -x) == -elastic_force(record, x)
+    slope = (elastic_energy(record, x + h) - elastic_energy(record, x - h)) / (2 * h)
+    assert slope == pytest.approx(elastic_force(record, x), rel=1e-6)
+    slope = (elastic_force(record, x + h) - elastic_force(record, x - h)) / (2 * h)
+    assert slope == pytest.approx(elastic_gradient(record, x), rel=1e-6)
+    assert elastic_gradient(record, -x) == elastic_gradient(record, x)
+    assert elastic_energy(record, -x) == 0.0
+
+
+def test_another_exponent_goes_between_the_two():
+    record, x = force_law(Contact(Hertz, KC))._replace(exponent=1.25), 3e-5
+    assert elastic_force(record, -x) == pytest.approx(-KC * x**1.25)
+    assert elastic_gradient(record, x) == pytest.approx(1.25 * KC * x**0.25)
+    assert elastic_energy(record, x) == pytest.approx(KC * x**2.25 / 2.25)
+
+
+def motions(w, h):
+    """w, w', w'' of a polynomial at both ends of [0, h], for one site after a resting one."""
+    first, second = w.deriv(), w.deriv(2)
+    return [np.array([[0.0, 0.0, 0.0], [w(t), first(t), second(t)]]) for t in (0.0, h)]
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
+    h, middle, width = 1e-3, 0.6e-3, 1e-4
+    # Above the clearance between middle - width and middle + width.
+    w = side * (np.poly1d([D]) - 40.0 * np.poly1d([1, -2 * middle, middle**2 - width**2]))
+    start, end = motions(w, h)
+    contacts = create_contacts(Contact(Hertz, KC, R), [D, D])
+    change = changes.first_change(contacts, start, end, h)
+    assert change.share * h == pytest.approx(middle - width)
+    assert (change.site, change.function) == (1, 0 if side == 1 else 1)
+    assert changes.switching(contacts, 1, change.function, end[1]).mode == side * CLOSED
+
+    begin = middle - width
+    start = motions(np.poly1d(w.c)(np.poly1d([1, begin])), h)[0]  # at the onset
+    contacts.sites[1] = (side * CLOSED, D, side * 8e-3)
+    change = changes.first_change(contacts, start, end, h - begin)
+    assert begin + change.share * (h - begin) == pytest.approx(middle + width)
+    assert (change.site, change.function) == (1, 0)
+    separation = changes.switching(contacts, 1, 0, end[1])
+    assert (separation.mode, np.sign(separation.value)) == (FREE, 1)
+    assert separation.rate == pytest.approx(-side * w.deriv()(h))
+
+    extremes = changes.extremes(contacts, 1, start, motions(w, middle + width)[1], 2 * width)
+    assert extremes.indentation == pytest.approx(40.0 * width**2)
+    s = np.linspace(begin, middle + width, 20001)
+    push = [side * contact_force(contacts, 1, w(t), w.deriv()(t))[0] for t in s]
+    assert extremes.force == pytest.approx(max(push), rel=1e-6)
+
+
+def test_clipping_begins_where_g_falls_through_zero():
+    h, approach = 1e-3, 0.01
+    w = np.poly1d([D + 1e-4]) - np.poly1d([20.0, 0.02, 0.0])  # ever faster out
+    start, end = motions(w, h)
+    for adhesion in ("allow", "clip"):
+        contacts = create_contacts(Contact(Hertz, KC, R, adhesion), [D, D])
+        contacts.sites[1] = (CLOSED, D, approach)
+        change = changes.first_change(contacts, start, end, h)
+        assert (change.share > 1) == (adhesion == "allow")
+    damping = contacts.law.damping
+    begin = change.share * h
+    assert 1 + damping * w.deriv()(begin) / approach == pytest.approx(0, abs=1e-9)
+    clipping = changes.switching(contacts, 1, change.function, end[1])
+    assert clipping.mode == CLIPPED
+    contacts.sites[1]["mode"] = CLIPPED
+    back = changes.switching(contacts, 1, 1, end[1])
+    assert (back.mode, back.value, back.rate) == (CLOSED, -clipping.value, -clipping.rate)
+
+
+def test_a_landing_on_a_root_converges_and_one_on_a_near_miss_is_searched_again():
+    attempt = landing.begin_landing(0.4, 1.0)
+    for _ in range(8):
+        value, rate = np.exp(attempt.length) - 2, np.exp(attempt.length)
+        attempt, outcome = landing.correct(attempt, value, rate, 1e-10, 1e-10)
+        if outcome != landing.RETRY:
+            break
+    assert outcome == landing.LANDED
+    assert attempt.length == pytest.approx(np.log(2), abs=1e-10)
+
+    attempt, outcome = landing.begin_landing(0.5, 1.0), landing.RETRY
+    outcomes = []
+    while outcome not in (landing.MISSED, landing.LANDED):
+        value, rate = -1e-6 - (attempt.length - 0.5) ** 2, -2 * (attempt.length - 0.5)
+        attempt, outcome = landing.correct(attempt, value, rate, 1e-10, 1e-10)
+        outcomes.append(outcome)
+        if outcome == landing.SEARCH:
+            attempt = landing.shorten(attempt, 0.9)
+    assert outcomes[0] == landing.SEARCH
+    assert outcomes[-1] == landing.MISSED
+    assert len(outcomes) == landing.MOST_ATTEMPTS
+
+
+def test_a_landing_within_the_tolerance_goes_on_while_it_gains():
+    """With a goal below the tolerance, the last attempt that still halves the distance is followed by another."""
+    start = landing.begin_landing(0.5, 1.0)
+    attempt, outcome = landing.correct(start, 1e-11, 1.0, 1e-10, 1e-14)
+    assert outcome == landing.RETRY
+    assert attempt.length == 0.5 - 1e-11
+    assert landing.correct(attempt, 0.9e-11, 1.0, 1e-10, 1e-14)[1] == landing.LANDED
+    assert landing.correct(attempt, 0.9e-14, 1.0, 1e-10, 1e-14)[1] == landing.LANDED

@@ -1,0 +1,145 @@
+"""Compiled search of a step for the first change of a site's mode, and the extremes of a contact within the step.
+
+A site's motion is (w, w', w''), w = u_resonator - u_host, in rows of arrays (sites, 3). Every change is an
+upcrossing of one of two switching functions of the site's mode:
+
+- free: w - D and -w - D, an onset on either side;
+- closed: D - side w, the separation, and with clipping -g (the force would turn into a pull);
+- clipped: D - side w, and g.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, Contacts, contact_force
+from vipetsc.contact.search import bernstein, derivative, evaluate, first_upcrossing, first_upcrossing_after_start
+
+# A site has landed on its clearance when |side w - D| is within this share of D.
+LANDED_W = 1e-10
+# ... and on g = 0 when |g| is within this.
+LANDED_G = 1e-9
+
+_INTERVALS = 8
+_GOLDEN = 0.6180339887498949
+
+
+class Switching(NamedTuple):
+    """A switching function at one time: value, rate in 1/s, tolerance of a landing, mode to which it leads."""
+
+    value: float
+    rate: float
+    tolerance: float
+    mode: int
+
+
+class Change(NamedTuple):
+    """The first change in a step: its ``share`` of the step (2 if there is none), the site, the switching function."""
+
+    share: float
+    site: int
+    function: int
+
+
+class Extremes(NamedTuple):
+    """Of a contact in a step: largest indentation in m, largest and smallest force in N, positive when it pushes."""
+
+    indentation: float
+    force: float
+    smallest_force: float
+
+
+@njit(cache=True, error_model="numpy")
+def switching(contacts: Contacts, i: int, function: int, motion: np.ndarray) -> Switching:
+    """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
+    site = contacts.sites[i]
+    w, rate, acceleration = motion[0], motion[1], motion[2]
+    if site.mode == FREE:
+        side = 1 - 2 * function
+        return Switching(side * w - site.clearance, side * rate, LANDED_W * site.clearance, side * CLOSED)
+    side = 1 if site.mode > 0 else -1
+    if function == 0:
+        return Switching(site.clearance - side * w, -side * rate, LANDED_W * site.clearance, FREE)
+    if not contacts.law.clip:
+        return Switching(-np.inf, 0.0, 0.0, site.mode)
+    clipped = abs(site.mode) == CLIPPED
+    slope = contacts.law.damping / site.approach
+    sign = 1.0 if clipped else -1.0
+    mode = side * (CLOSED if clipped else CLIPPED)
+    return Switching(sign * (1.0 + slope * rate), sign * slope * acceleration, LANDED_G, mode)
+
+
+@njit(cache=True, error_model="numpy")
+def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: float) -> Change:
+    """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3)."""
+    first = Change(2.0, -1, 0)
+    b, c, d = np.empty(6), np.empty(6), np.empty(5)
+    for i in range(contacts.sites.size):
+        bernstein(start[i], end[i], h, b)
+        site = contacts.sites[i]
+        tolerance = LANDED_W * site.clearance
+        if site.mode == FREE and b.max() < site.clearance - tolerance and b.min() > tolerance - site.clearance:
+            continue
+        for function in range(2):
+            if site.mode == FREE:
+                c[:] = (1 - 2 * function) * b - site.clearance
+                share = first_upcrossing_after_start(c, tolerance)
+            elif function == 0:
+                c[:] = site.clearance - (1.0 if site.mode > 0 else -1.0) * b
+                share = first_upcrossing_after_start(c, tolerance)
+            elif contacts.law.clip:
+                slope = contacts.law.damping / site.approach
+                sign = 1.0 if abs(site.mode) == CLIPPED else -1.0
+                for k in range(5):
+                    d[k] = sign * (1.0 + slope * 5.0 * (b[k + 1] - b[k]) / h)
+                share = first_upcrossing_after_start(d, LANDED_G)
+            else:
+                continue
+            if share < first.share:
+                first = Change(share, i, function)
+    return first
+
+
+@njit(cache=True, error_model="numpy")
+def _push(contacts: Contacts, i: int, b: np.ndarray, d: np.ndarray, s: float) -> float:
+    """Contact force in N at share ``s`` of a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
+    force, _ = contact_force(contacts, i, evaluate(b, s), evaluate(d, s))
+    return force if contacts.sites[i].mode > 0 else -force
+
+
+@njit(cache=True, error_model="numpy")
+def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
+    """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
+    b, d = np.empty(6), np.empty(5)
+    bernstein(start[i], end[i], h, b)
+    derivative(b, h, d)
+    site = contacts.sites[i]
+    side = 1.0 if site.mode > 0 else -1.0
+    deepest = max(side * b[0], side * b[5])
+    recoil = np.empty(5)
+    for k in range(5):
+        recoil[k] = side * (b[k] - b[k + 1])
+    if recoil[0] < 0.0:
+        turn = first_upcrossing(recoil)
+        if turn <= 1.0:
+            deepest = max(deepest, side * evaluate(b, turn))
+    largest = smallest = _push(contacts, i, b, d, 0.0)
+    best = 0.0
+    for k in range(1, _INTERVALS + 1):
+        force = _push(contacts, i, b, d, k / _INTERVALS)
+        smallest = min(smallest, force)
+        if force > largest:
+            largest, best = force, k / _INTERVALS
+    # Golden section around the largest of the samples.
+    low, high = max(best - 1.0 / _INTERVALS, 0.0), min(best + 1.0 / _INTERVALS, 1.0)
+    for _ in range(24):
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        if _push(contacts, i, b, d, left) > _push(contacts, i, b, d, right):
+            high = right
+        else:
+            low = left
+    largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high)))
+    return Extremes(deepest - site.clearance, largest, smallest)

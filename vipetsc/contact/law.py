@@ -1,0 +1,101 @@
+"""The compiled contact force: one law for time stepping, for the propagator and for normal modes.
+
+The formulas stand in the package's docstring. ``vipetsc.lattice.Contact`` is the same law on arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from vipetsc.lattice import Contact
+
+# Modes of a site; the sign is the side.
+FREE, CLOSED, CLIPPED = 0, 1, 2
+
+SITE = np.dtype([("mode", np.int64), ("clearance", np.float64), ("approach", np.float64)])
+"""A site: its mode times its side, the clearance in m, the signed approach velocity w'_minus in m/s."""
+
+
+class ForceLaw(NamedTuple):
+    """F = stiffness x^exponent g.
+
+    ``stiffness`` in N/m^n; ``exponent`` n; ``damping`` c = 3 (1 - r)/2; ``clip``: whether g is kept from becoming
+    negative; ``approach_floor``: smallest |w'_minus| in m/s.
+    """
+
+    stiffness: float
+    exponent: float
+    damping: float
+    clip: bool
+    approach_floor: float
+
+
+class Contacts(NamedTuple):
+    """Sites that share a law; ``sites`` (sites,) of dtype ``SITE``."""
+
+    law: ForceLaw
+    sites: np.ndarray
+
+
+def force_law(contact: Contact) -> ForceLaw:
+    """The record of a contact law."""
+    clip = contact.adhesion == "clip"
+    return ForceLaw(contact.stiffness, contact.law.exponent, contact.damping, clip, contact.approach_floor)
+
+
+def create_contacts(contact: Contact, clearances: Sequence[float]) -> Contacts:
+    """Free sites with the ``clearances`` in m."""
+    sites = np.zeros(len(clearances), SITE)
+    sites["clearance"] = clearances
+    sites["approach"] = 1.0
+    return Contacts(force_law(contact), sites)
+
+
+@njit(cache=True, error_model="numpy")
+def elastic_force(law: ForceLaw, x: float) -> float:
+    """kc x^n in N for the indentation x in m, continued as an odd function to x < 0."""
+    if law.exponent == 1.5:
+        return law.stiffness * (x * np.sqrt(abs(x)))
+    if law.exponent == 1.0:
+        return law.stiffness * x
+    return law.stiffness * (x * abs(x) ** (law.exponent - 1.0))
+
+
+@njit(cache=True, error_model="numpy")
+def elastic_gradient(law: ForceLaw, x: float) -> float:
+    """n kc |x|^(n-1) in N/m, the derivative of ``elastic_force``."""
+    if law.exponent == 1.5:
+        return 1.5 * law.stiffness * np.sqrt(abs(x))
+    if law.exponent == 1.0:
+        return law.stiffness
+    return law.exponent * law.stiffness * abs(x) ** (law.exponent - 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def elastic_energy(law: ForceLaw, x: float) -> float:
+    """kc x^(n+1)/(n+1) in J for the indentation x in m; zero for x <= 0."""
+    if x <= 0.0:
+        return 0.0
+    if law.exponent == 1.5:
+        return law.stiffness * x * x * np.sqrt(x) / 2.5
+    if law.exponent == 1.0:
+        return 0.5 * law.stiffness * x * x
+    return law.stiffness * x ** (law.exponent + 1.0) / (law.exponent + 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def contact_force(contacts: Contacts, i: int, w: float, rate: float) -> tuple[float, float]:
+    """Force on the host in N and dissipated power in W of site ``i`` in its present mode, at w in m and w' in m/s."""
+    site = contacts.sites[i]
+    if site.mode == FREE:
+        return 0.0, 0.0
+    side = 1.0 if site.mode > 0 else -1.0
+    elastic = elastic_force(contacts.law, side * w - site.clearance)
+    g = 0.0
+    if abs(site.mode) != CLIPPED:
+        g = 1.0 + contacts.law.damping * rate / site.approach
+    return side * elastic * g, side * elastic * (g - 1.0) * rate

@@ -1,0 +1,112 @@
+"""The guaranteed search for the first root of a polynomial in Bernstein form, and quintic Hermite interpolants.
+
+Method and references: the package's docstring.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+# Halvings of [0, 1] are at most 2^-44 = 6e-14 wide; each leaves one half to be searched later.
+_DEPTH = 64
+
+
+@njit(cache=True, error_model="numpy")
+def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> None:
+    """Coefficients ``b`` (6,) on [0, 1] of the quintic with (w, w', w'') given at both ends of a step h.
+
+    ``start`` and ``end`` (3,) hold them there.
+    """
+    b[0] = start[0]
+    b[1] = start[0] + h * start[1] / 5.0
+    b[2] = start[0] + 2.0 * h * start[1] / 5.0 + h * h * start[2] / 20.0
+    b[3] = end[0] - 2.0 * h * end[1] / 5.0 + h * h * end[2] / 20.0
+    b[4] = end[0] - h * end[1] / 5.0
+    b[5] = end[0]
+
+
+@njit(cache=True, error_model="numpy")
+def derivative(b: np.ndarray, h: float, d: np.ndarray) -> None:
+    """Coefficients ``d`` (n,) of the time derivative of ``b`` (n + 1,) over a step h."""
+    n = b.size - 1
+    for i in range(n):
+        d[i] = n * (b[i + 1] - b[i]) / h
+
+
+@njit(cache=True, error_model="numpy")
+def evaluate(b: np.ndarray, s: float) -> float:
+    """Value at s in [0, 1] by de Casteljau's scheme, for up to six coefficients."""
+    c = np.empty(6)
+    n = b.size
+    c[:n] = b
+    for k in range(1, n):
+        for i in range(n - k):
+            c[i] = (1.0 - s) * c[i] + s * c[i + 1]
+    return c[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _bisect(c: np.ndarray) -> float:
+    """Root in [0, 1] of a polynomial that turns from negative to positive once."""
+    a, b = 0.0, 1.0
+    for _ in range(53):
+        s = 0.5 * (a + b)
+        if evaluate(c, s) > 0.0:
+            b = s
+        else:
+            a = s
+    return b
+
+
+@njit(cache=True, error_model="numpy")
+def first_upcrossing(b: np.ndarray) -> float:
+    """Smallest s in [0, 1] at which the polynomial ``b`` (n <= 6,) turns positive; 2 if it never does."""
+    n = b.size
+    stack = np.empty((_DEPTH + 2, 6))
+    low = np.empty(_DEPTH + 2)
+    width = np.empty(_DEPTH + 2)
+    top = 0
+    stack[0, :n] = b
+    low[0], width[0] = 0.0, 1.0
+    left = np.empty(6)
+    while top >= 0:
+        c = stack[top, :n].copy()
+        begin, size = low[top], width[top]
+        top -= 1
+        if c[0] > 0.0:
+            return begin
+        if c.max() <= 0.0:
+            continue
+        changes = 0
+        for i in range(1, n):
+            changes += (c[i - 1] <= 0.0) != (c[i] <= 0.0)
+        if changes == 1 and c[n - 1] > 0.0:
+            return begin + size * _bisect(c)
+        if size < 1e-13:
+            return begin
+        for k in range(1, n):
+            left[k - 1] = c[0]
+            for i in range(n - k):
+                c[i] = 0.5 * (c[i] + c[i + 1])
+        left[n - 1] = c[0]
+        # The left half is on top: the right one is searched only if the left one has no crossing.
+        top += 1
+        stack[top, :n] = c
+        low[top], width[top] = begin + 0.5 * size, 0.5 * size
+        top += 1
+        stack[top, :n] = left[:n]
+        low[top], width[top] = begin, 0.5 * size
+    return 2.0
+
+
+@njit(cache=True, error_model="numpy")
+def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
+    """``first_upcrossing``, where a start within ``tolerance`` of zero has just landed and is itself no crossing."""
+    if abs(b[0]) > tolerance:
+        return first_upcrossing(b)
+    n = b.size - 1
+    divided = np.empty(n)  # by s, without the value at 0
+    for i in range(n):
+        divided[i] = b[i + 1] * n / (i + 1)
+    return first_upcrossing(divided)
