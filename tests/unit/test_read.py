@@ -1,0 +1,122 @@
+"""Results are read back by name and by value: the site that leads, the member that is meant, its folder."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from vipetsc.io.read import (
+    curves,
+    field_interval,
+    field_time,
+    holds,
+    leading_site,
+    nearest_cell,
+    open_ensemble,
+    open_run,
+    select,
+    whole_members,
+)
+
+ENSEMBLE = """
+name = "small"
+[sweep]
+fields = true
+zip = [["contacts.sites", "drive.cycles"]]
+[sweep.contacts]
+law = ["hertz", "bilinear"]
+sites = [5, 5, 1]
+[sweep.drive]
+cycles = [30, 15, 30]
+amplitude = [0.1, 0.3]
+"""
+LAWS, AMPLITUDES = ["hertz", "bilinear"], [0.1, 0.3]
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run of 30 cells, of which every third from the second on is recorded, with every second sample's fields."""
+    time, cells = np.arange(9) * 0.5, np.arange(2, 31, 3)
+    field = ("field_time", "cell", "dof"), np.arange(5 * len(cells) * 2.0).reshape(5, -1, 2)
+    root = xr.Dataset({"velocity": field}, {"time": time, "cell": cells, "field_time": time[::2], "dof": [1, 2]})
+    root.attrs["case"] = "[drive]\ncell = 12"
+    sites = xr.Dataset({"cell": ("site", [3, 20, 14])}, {"site": [1, 2, 3]})
+    energy = xr.Dataset({"kinetic": ("time", time**2)})
+    path = tmp_path / "run.h5"
+    xr.DataTree.from_dict({"/": root, "sites": sites, "energy": energy}).to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A sweep over law, (sites, cycles) and amplitude; the first member of the second law is no valid case."""
+    value = np.arange(12.0).reshape(2, 3, 2)
+    dims = "law", "sites", "amplitude"
+    cycles = ("sites", [30, 15, 30], {"long_name": "drive.cycles"})
+    measures = {"status": (dims, np.zeros((2, 3, 2), np.int8)), "ibtet": (dims, value), "cycles": cycles}
+    root = xr.Dataset(measures, {"law": LAWS, "sites": [5, 5, 1], "amplitude": AMPLITUDES}, {"case": ENSEMBLE})
+    groups = {
+        "/": root,
+        "entropy": xr.Dataset({"masked": (dims, -value)}),
+        "fits/ibtet": xr.Dataset({"exponent": (dims[:2], value[..., 0])}),
+    }
+    xr.DataTree.from_dict(groups).to_netcdf(tmp_path / "ensemble.h5", engine="h5netcdf")
+    ids = ["" if i == 6 else f"m{i:02d}" for i in range(12)]
+    (tmp_path / "index.json").write_text(json.dumps({"members": [{"id": i} for i in ids]}))
+    for name in ("m00", "m07"):
+        (tmp_path / name).mkdir()
+        for file in ("run.h5", "analysis.h5"):
+            (tmp_path / name / file).touch()
+    return tmp_path
+
+
+def test_a_run_is_read_by_name(run):
+    with open_run(run) as tree:
+        assert list(tree["sites/cell"].values) == [3, 20, 14]  # not the recorded cells, which have the same name
+        assert leading_site(tree) == 2
+        assert [nearest_cell(tree, cell) for cell in (1, 4, 20, 99)] == [0, 1, 6, 9]
+        assert list(field_time(tree)) == [0, 1, 2, 3, 4]
+        assert field_interval(tree) == 1
+        assert tree["velocity"][3, 2].values.tolist() == [64, 65]
+        assert holds(tree, "energy/kinetic", "sites", "velocity")
+        assert not holds(tree, "velocity", "energy/spring")
+
+
+def test_other_files_are_refused(tmp_path, folder):
+    with pytest.raises(OSError):
+        open_run(tmp_path / "absent.h5")
+    with pytest.raises(ValueError, match=r"ensemble\.h5 is not a run of vipetsc: it has no time, cell, energy"):
+        open_run(folder / "ensemble.h5")
+    with h5py.File(tmp_path / "ensemble.h5", "w") as file:
+        file["time"] = 1.0
+    with pytest.raises(ValueError, match="is not an ensemble of vipetsc: it has no status, case"):
+        open_ensemble(tmp_path)
+
+
+def test_members_are_selected_by_the_values_of_swept_keys(folder):
+    ensemble = open_ensemble(folder)
+    assert dict(ensemble["cycles"].sizes) == {"sites": 3} and "cycles" in ensemble.coords
+    # Keys that vary together have to meet in one member.
+    assert select(ensemble, sites=1, cycles=30)["ibtet"].values.tolist() == [[4, 5], [10, 11]]
+    assert select(ensemble, law="bilinear", sites=5, cycles=15)["entropy/masked"].values.tolist() == [-8, -9]
+    assert select(ensemble, sites=5)["ibtet"].values.tolist() == [[0, 1], [6, 7]]
+    assert select(ensemble["ibtet"], law="hertz", amplitude=0.1 + 0.2).values.tolist() == [1, 3, 5]
+    assert select(ensemble, law="bilinear")["fits/ibtet/exponent"].values.tolist() == [6, 8, 10]
+    with pytest.raises(KeyError, match="no member has cycles = 15 beside sites"):
+        select(ensemble, sites=1, cycles=15)
+    with pytest.raises(KeyError, match=r"amplitude = 0\.2"):
+        select(ensemble, amplitude=0.2)
+    with pytest.raises(KeyError, match="ibtet is no coordinate"):
+        select(ensemble, ibtet=3.0)
+
+
+def test_members_lead_to_their_folders(folder):
+    ensemble = open_ensemble(folder)
+    found = list(curves(ensemble))
+    assert [path.name for _, path in found] == ["m00", "m02", "m04", "m07", "m08", "m10"]
+    assert [curve["ibtet"].values.tolist() for curve, _ in found] == np.arange(12).reshape(6, 2).tolist()
+    assert not list(curves(ensemble, "wavenumber"))
+    whole = [(float(member["ibtet"]), path) for member, path in whole_members(ensemble)]
+    assert whole == [(0, folder / "m00"), (7, folder / "m07")]
