@@ -56,23 +56,20 @@ def create_contacts(contact: Contact, clearances: Sequence[float]) -> Contacts:
 
 
 @njit(cache=True, error_model="numpy")
-def elastic_force(law: ForceLaw, x: float) -> float:
-    """kc x^n in N for the indentation x in m, continued as an odd function to x < 0."""
-    if law.exponent == 1.5:
-        return law.stiffness * (x * np.sqrt(abs(x)))
+def elastic_force_and_slope(law: ForceLaw, x: float) -> tuple[float, float]:
+    """kc x^n in N and its derivative in N/m at the indentation x in m, continued as an odd function to x < 0."""
     if law.exponent == 1.0:
-        return law.stiffness * x
-    return law.stiffness * (x * abs(x) ** (law.exponent - 1.0))
+        return law.stiffness * x, law.stiffness
+    slope = law.stiffness * law.exponent * abs(x) ** (law.exponent - 1.0)
+    return slope * x / law.exponent, slope
 
 
 @njit(cache=True, error_model="numpy")
-def elastic_gradient(law: ForceLaw, x: float) -> float:
-    """n kc |x|^(n-1) in N/m, the derivative of ``elastic_force``."""
+def elastic_force(law: ForceLaw, x: float) -> float:
+    """The force of ``elastic_force_and_slope``; Hertz's by a square root, which is five times as fast as a power."""
     if law.exponent == 1.5:
-        return 1.5 * law.stiffness * np.sqrt(abs(x))
-    if law.exponent == 1.0:
-        return law.stiffness
-    return law.exponent * law.stiffness * abs(x) ** (law.exponent - 1.0)
+        return law.stiffness * (x * np.sqrt(abs(x)))
+    return elastic_force_and_slope(law, x)[0]
 
 
 @njit(cache=True, error_model="numpy")
