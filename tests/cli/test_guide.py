@@ -15,6 +15,7 @@ import vipetsc as package
 from tests.conftest import clean_environment
 from vipetsc.case import Case, Sweep
 from vipetsc.case.nnm import NnmCase
+from vipetsc.modes.system import System
 
 ROOT = Path(package.__file__).parents[1]
 HEADING = "## Your own lattice in ten minutes"
@@ -82,7 +83,7 @@ def test_what_the_guide_says_of_its_lattice_is_so(desk):
     assert case.drive.frequency == pytest.approx(936, abs=0.5)
     assert case.unit_cell().dofs == 3
     assert len(Sweep.load(desk / "my-lattice.toml").members()) == 7
-    assert NnmCase.load(desk / "my-lattice.toml").branch_name(2) == "out-of-phase"
+    assert System.from_case(NnmCase.load(desk / "my-lattice.toml")).branch_name(1) == "out-of-phase"
     with h5py.File(desk / "runs/my-lattice/run.h5") as file:
         assert len(file["impacts/onset"]) == 71
         assert file["energy/dissipated"][-1] / file["energy/work"][-1] == pytest.approx(1 / 3, abs=0.03)

@@ -34,7 +34,6 @@ FORBIDDEN = {"petsc4py", "mpi4py"}
 # Arrows that still point up, while the house is rebuilt.
 UPWARD = {
     "__init__ -> compiled",
-    "case.nnm -> modes.system",
     "contact.contact_kernel -> dynamics.ts.kernel",
     "contact.episodes -> dynamics.operator",
     "contact.episodes -> dynamics.ts.kernel",

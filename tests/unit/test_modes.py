@@ -173,12 +173,47 @@ def test_case_reports_everything_at_once():
 def test_case_round_trip_and_systems():
     case = NnmCase.from_table({"name": "a", "lattice": {"reading": "printed"}, "contacts": {"law": "bilinear"}})
     assert NnmCase.from_table(tomllib.loads(case.to_toml())) == case
-    assert case.system().contacts[0].clearance == pytest.approx(D)
-    assert [case.branch_name(m) for m in (1, 2)] == ["in-phase", "out-of-phase"]
+    system = System.from_case(case)
+    assert system.contacts[0].clearance == pytest.approx(D)
+    assert [system.branch_name(mode) for mode in (0, 1)] == ["in-phase", "out-of-phase"]
     with pytest.raises(CaseError, match="2 modes"):
         NnmCase.from_table({"nnm": {"modes": [3]}})
     with pytest.raises(CaseError, match=r"nnm.own"):
         NnmCase.from_table({"nnm": {"system": "own"}})
+
+
+def test_systems_of_every_kind_of_case():
+    masses, springs = [1.0, 2.0], [{"start": 0, "end": 1, "stiffness": 3.0}, {"start": 1, "end": 2, "stiffness": 5.0}]
+    own = {"masses": masses, "springs": springs, "smooth": [{"start": 0, "end": 2, "cubic": 7.0}]}
+    own["contacts"] = [{"host": 0, "resonator": 2, "clearance": 0.1}]
+    system = System.from_case(NnmCase.from_table({"nnm": {"system": "own", "own": own}}))
+    assert system.stiffness == pytest.approx(np.array([[8.0, -5.0], [-5.0, 5.0]]))
+    assert (system.contacts[0].host, system.contacts[0].resonator) == (None, 1)
+    assert system.springs == (SmoothSpring(None, 1, cubic=7.0),)
+    chain = {"lattice": {"cells": 3}, "contacts": {"sites": [1, 3]}, "nnm": {"system": "chain", "modes": [12]}}
+    system = System.from_case(NnmCase.from_table(chain))
+    assert system.dofs == 12
+    assert system.branch_name(11) == "mode-12"
+    assert [p.host // 4 for p in system.contacts] == [0, 2]
+    with pytest.raises(CaseError, match="12 modes"):
+        NnmCase.from_table(chain | {"nnm": {"system": "chain", "modes": [13]}})
+
+
+@pytest.mark.parametrize("key", ["springs", "smooth", "contacts"])
+def test_pairs_that_are_not_in_the_system_are_named(key):
+    own = {"masses": [1.0], "springs": [{"start": 0, "end": 1, "stiffness": 1.0}], "smooth": [], "contacts": []}
+    ends = {"host": 1, "resonator": 2} if key == "contacts" else {"start": 1, "end": 2}
+    rest = {"springs": {"stiffness": 1.0}, "smooth": {"cubic": 1.0}, "contacts": {"clearance": 1.0}}
+    own[key] = [*own[key], ends | rest[key]]
+    with pytest.raises(CaseError, match=rf"nnm.own.{key}.*not a pair of the system's 1 masses"):
+        NnmCase.from_table({"nnm": {"system": "own", "own": own}})
+
+
+def test_a_cell_of_ones_own_needs_clearances():
+    springs = [{"start": 1, "end": 2, "stiffness": 1.0}, {"start": 2, "end": 1, "stiffness": 1.0, "next_cell": True}]
+    cell = {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}
+    with pytest.raises(CaseError, match=r"contacts\.clearance"):
+        NnmCase.from_table({"lattice": {"cell": cell}, "contacts": {"stiffness": 1.0}})
 
 
 @pytest.fixture(scope="module")

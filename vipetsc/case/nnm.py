@@ -12,7 +12,6 @@ from pydantic import Field
 from vipetsc.case.checks import sites_of, unit_cell_of
 from vipetsc.case.schema import (
     CaseError,
-    ClearanceSpan,
     ContactsTable,
     Finite,
     LatticeTable,
@@ -24,9 +23,6 @@ from vipetsc.case.schema import (
     unknown_key,
     with_overrides,
 )
-from vipetsc.lattice import Chain, Contact, ContactLaw, contact_stiffness, log_clearances
-from vipetsc.lattice.presets import PRESETS
-from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
 BESIDE = {"drive", "time", "output", "sweep", "design"}
 """Sections of a lattice run that may stand in the same file; ``nnm`` does not read them."""
@@ -147,9 +143,9 @@ class NnmCase(Section):
         if not problems:
             case = cls(name=name, **sections)
             try:
-                dofs = case.system().dofs
+                dofs = _count_dofs(case.lattice, case.nnm)
             except ValueError as error:
-                problems.append(Problem("nnm.system", case.nnm.system, str(error)))
+                problems.append(Problem("lattice.cell", None, str(error)))
             else:
                 beyond = [m for m in case.nnm.modes if m > dofs]
                 if not beyond:
@@ -166,62 +162,15 @@ class NnmCase(Section):
         nnm = self.nnm
         return self.lattice, self.contacts, nnm.system, nnm.own, nnm.map, nnm.flow, nnm.jacobian
 
-    def contact(self) -> Contact:
-        """The contact law without dissipation; stiffness from the paper's material where none is given."""
-        c = self.contacts
-        stiffness = c.stiffness
-        if stiffness is None:
-            preset = PRESETS[self.lattice.preset or "four-band"].contacts
-            values = [
-                getattr(c, k) if getattr(c, k) is not None else preset[k] for k in ("modulus", "radius", "poisson")
-            ]
-            stiffness = float(contact_stiffness(*values))
-        return Contact(ContactLaw.named(c.law), stiffness)
-
-    def system(self) -> System:
-        """The system whose modes are sought; raises ValueError if it is not a sound one."""
-        law = self.contact()
-        if self.nnm.system == "own":
-            own = self.nnm.own
-            return System.assemble(
-                own.masses,
-                [(_mass(s.start), s.end - 1, s.stiffness) for s in own.springs],
-                [ContactPair(_mass(p.host), p.resonator - 1, p.clearance, law) for p in own.contacts],
-                [SmoothSpring(_mass(s.start), s.end - 1, s.cubic, s.quadratic) for s in own.smooth],
-            )
-        cell = unit_cell_of(self.lattice)
-        if self.nnm.system == "reduced":
-            clearance = self._clearances(1)
-            return System.reduced(cell, clearance[0], law)
-        sites = tuple(c - 1 for c in sites_of(self.lattice, self.contacts))
-        chain = Chain(cell, self.lattice.cells, self.lattice.ends, sites, tuple(self._clearances(len(sites))))
-        return System.from_chain(chain, law)
-
-    def _clearances(self, count: int) -> list[float]:
-        given = self.contacts.clearance
-        if given is None:
-            return list(PRESETS[self.lattice.preset].clearances(count))
-        if isinstance(given, ClearanceSpan):
-            return list(log_clearances(given.first, given.last, count))
-        return [given] * count if isinstance(given, float) else list(given)
-
-    def branch_name(self, mode: int) -> str:
-        """Name of the branch of a mode (1-based): in-phase and out-of-phase for two masses."""
-        system = self.system()
-        if system.dofs != 2:
-            return f"mode-{mode}"
-        shape = system.linear_modes()[1][:, mode - 1]
-        return "in-phase" if shape[0] * shape[1] > 0 else "out-of-phase"
-
-
-def _mass(number: int) -> int | None:
-    return None if number == 0 else number - 1
-
 
 def _cross_problems(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable) -> list[Problem]:
     problems = []
     if (nnm.system == "own") != (nnm.own is not None):
         problems.append(Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]'))
+    elif nnm.own is not None:
+        problems += _pair_problems(nnm.own)
+    if nnm.own is None and lattice.preset is None and contacts.clearance is None:
+        problems.append(Problem("contacts.clearance", None, "is needed (m): the lattice is no preset"))
     for key in ("energy", "frequency"):
         low, high = getattr(nnm, key)
         if not low < high:
@@ -240,3 +189,27 @@ def _cross_problems(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTabl
     if nnm.system == "reduced" and isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
         problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
     return problems
+
+
+def _pair_problems(system: SystemTable) -> list[Problem]:
+    """Springs and contacts that do not join two of the system's masses, or one of them and the ground."""
+    count = len(system.masses)
+    ends = {
+        "springs": [(s.start, s.end) for s in system.springs],
+        "smooth": [(s.start, s.end) for s in system.smooth],
+        "contacts": [(p.host, p.resonator) for p in system.contacts],
+    }
+    return [
+        Problem(f"nnm.own.{key}", list(pair), f"is not a pair of the system's {count} masses (0 is the ground)")
+        for key, pairs in ends.items()
+        for pair in pairs
+        if pair[0] == pair[1] or max(pair) > count
+    ]
+
+
+def _count_dofs(lattice: LatticeTable, nnm: NnmTable) -> int:
+    """Degrees of freedom of the system; raises ValueError if the lattice's cell is impossible."""
+    if nnm.own is not None:
+        return len(nnm.own.masses)
+    cell = unit_cell_of(lattice)
+    return 2 if nnm.system == "reduced" else lattice.cells * cell.dofs

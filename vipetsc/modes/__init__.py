@@ -6,37 +6,39 @@ The pieces, as a loop of one's own uses them::
     for point in Continuation(corrector, linear_start(corrector, mode, energy), StepControl()):
         ...
 
-PETSc is loaded when the first of these names is used; ``options`` and ``system`` do without it.
+Importing the package loads PETSc.
 """
 
-from importlib import import_module
+from vipetsc.modes.branch import Branch
+from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
+from vipetsc.modes.follow import follow_all
+from vipetsc.modes.newmark import Newmark
+from vipetsc.modes.orbit import Dop853Flow
+from vipetsc.modes.point import Point, linear_start
+from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.special import Locator
+from vipetsc.modes.switching import switch
+from vipetsc.modes.system import ContactPair, SmoothSpring, System
+from vipetsc.modes.tsrk import Tsrk
 
-_HOMES = {
-    "Branch": "branch",
-    "Dop853Flow": "orbit",
-    "ContactPair": "system",
-    "Continuation": "continuation",
-    "ContinuationError": "continuation",
-    "Corrector": "shooting",
-    "Guards": "continuation",
-    "Locator": "special",
-    "MAPS": "shooting",
-    "Newmark": "newmark",
-    "Point": "point",
-    "Shooting": "shooting",
-    "SmoothSpring": "system",
-    "StepControl": "continuation",
-    "System": "system",
-    "Tsrk": "tsrk",
-    "follow_all": "follow",
-    "linear_start": "point",
-    "switch": "switching",
-}
-
-__all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> object:
-    if name in _HOMES:
-        return getattr(import_module(f"vipetsc.modes.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__all__ = [
+    "MAPS",
+    "Branch",
+    "ContactPair",
+    "Continuation",
+    "ContinuationError",
+    "Corrector",
+    "Dop853Flow",
+    "Guards",
+    "Locator",
+    "Newmark",
+    "Point",
+    "Shooting",
+    "SmoothSpring",
+    "StepControl",
+    "System",
+    "Tsrk",
+    "follow_all",
+    "linear_start",
+    "switch",
+]

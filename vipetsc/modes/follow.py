@@ -87,8 +87,8 @@ def follow(
     listener: Listener | None = None,
 ) -> list[Branch]:
     """The branch of one mode (1-based), then the branches that cross it if the case asks for them."""
-    name = case.branch_name(mode)
-    options, system = case.nnm, case.system()
+    options, system = case.nnm, System.from_case(case)
+    name = system.branch_name(mode - 1)
     corrector = corrector_of(options, system)
     branch = Branch(name, case.to_toml(), system.dofs)
     path = folder / f"branch-{name}.h5"

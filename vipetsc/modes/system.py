@@ -8,7 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from vipetsc.lattice import Chain, Contact, UnitCell
+from vipetsc.case.checks import sites_of, unit_cell_of
+from vipetsc.case.nnm import NnmCase, SystemTable
+from vipetsc.case.schema import ClearanceSpan, ContactsTable, LatticeTable
+from vipetsc.lattice import Chain, Contact, ContactLaw, UnitCell, contact_stiffness, log_clearances
+from vipetsc.lattice.presets import PRESETS
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,33 @@ class System:
         return cls(masses, stiffness, tuple(contacts), tuple(smooth))
 
     @classmethod
+    def from_case(cls, case: NnmCase) -> System:
+        """The system of a case: its own one, the reduced model of the lattice's cell, or the lattice."""
+        law = _conservative_contact(case.lattice, case.contacts)
+        if case.nnm.own is not None:
+            return cls._from_table(case.nnm.own, law)
+        cell = unit_cell_of(case.lattice)
+        if case.nnm.system == "reduced":
+            return cls.reduced(cell, _clearances(case.lattice, case.contacts, 1)[0], law)
+        sites = tuple(number - 1 for number in sites_of(case.lattice, case.contacts))
+        clearances = _clearances(case.lattice, case.contacts, len(sites))
+        return cls.from_chain(Chain(cell, case.lattice.cells, case.lattice.ends, sites, clearances), law)
+
+    @classmethod
+    def _from_table(cls, table: SystemTable, law: Contact) -> System:
+        """The system of ``[nnm.own]``, whose masses count from 1 and whose ground is 0."""
+
+        def mass(number: int) -> int | None:
+            return number - 1 if number else None
+
+        return cls.assemble(
+            table.masses,
+            [(mass(s.start), s.end - 1, s.stiffness) for s in table.springs],
+            [ContactPair(mass(p.host), p.resonator - 1, p.clearance, law) for p in table.contacts],
+            [SmoothSpring(mass(s.start), s.end - 1, s.cubic, s.quadratic) for s in table.smooth],
+        )
+
+    @classmethod
     def from_chain(cls, chain: Chain, law: Contact) -> System:
         """The finite lattice ``chain`` with its contact sites, as one system (small chains: dense)."""
         d, cell = chain.cell.dofs, chain.cell
@@ -138,6 +169,13 @@ class System:
         """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) without contact."""
         squared, shapes = eigh(self.stiffness, np.diag(self.masses))
         return np.sqrt(np.maximum(squared, 0)), shapes * np.sign(shapes[np.abs(shapes).argmax(0), range(self.dofs)])
+
+    def branch_name(self, mode: int) -> str:
+        """Name of the branch of ``mode`` (0-based): in-phase or out-of-phase for two masses, else its number."""
+        if self.dofs != 2:
+            return f"mode-{mode + 1}"
+        first, second = self.linear_modes()[1][:, mode]
+        return "in-phase" if first * second > 0 else "out-of-phase"
 
     def gaps(self, u: np.ndarray) -> np.ndarray:
         """|w| - clearance in m of every contact at displacements ``u`` (..., n); shape (..., contacts)."""
@@ -193,3 +231,23 @@ def contact_directions(system: System) -> np.ndarray:
     """Rows (contacts, n) with w = rows @ u."""
     rows = [direction(p.host, p.resonator, system.dofs) for p in system.contacts]
     return np.array(rows).reshape(len(rows), system.dofs)
+
+
+def _conservative_contact(lattice: LatticeTable, contacts: ContactsTable) -> Contact:
+    """The contact law without dissipation; stiffness from the preset's material where none is given."""
+    stiffness = contacts.stiffness
+    if stiffness is None:
+        preset = PRESETS[lattice.preset or "four-band"].contacts
+        given = {key: getattr(contacts, key) for key in ("modulus", "radius", "poisson")}
+        stiffness = contact_stiffness(*(preset[key] if value is None else value for key, value in given.items()))
+    return Contact(ContactLaw.named(contacts.law), float(stiffness))
+
+
+def _clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> tuple[float, ...]:
+    """Clearances in m of ``count`` sites, the preset's where none are given."""
+    given = contacts.clearance
+    if given is None:
+        return tuple(PRESETS[str(lattice.preset)].clearances(count))
+    if isinstance(given, ClearanceSpan):
+        return tuple(log_clearances(given.first, given.last, count))
+    return (given,) * count if isinstance(given, float) else tuple(given)

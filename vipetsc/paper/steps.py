@@ -21,6 +21,7 @@ from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.modes.follow import follow_all, prepare_folder
+from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.backbone import relate_folders
 from vipetsc.studies.design import design
@@ -166,7 +167,8 @@ class BranchStep(Step):
 
     def results(self, folder: Path) -> list[Path]:
         """See ``Step``."""
-        return [folder / f"branch-{self.case.branch_name(mode)}.h5" for mode in self.case.nnm.modes]
+        system = System.from_case(self.case)
+        return [folder / f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
 
     def complete(self, folder: Path) -> bool:
         """Whether every branch ended, by itself or in a failure that it names."""

@@ -14,6 +14,7 @@ from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.bloch import waves_at
 from vipetsc.modes.branch import KINDS
+from vipetsc.modes.system import System
 from vipetsc.paper.claims.claim import ClaimSpec, Criterion, Measurement
 from vipetsc.paper.claims.evidence import Evidence, Member, MissingEvidence
 from vipetsc.paper.claims.interband import LAWS, of_laws
@@ -59,7 +60,7 @@ def branches(evidence: Evidence, reading: str, finding: Measurement) -> None:
         grazing = np.nonzero((region == 1) & regular)[0]
         finding.value[f"energy at the end of region I (J), {law}"] = energy[grazing[-1]] if grazing.size else None
         if law == "bilinear":
-            limit = case.system().closed_frequencies()[-1] / (2 * np.pi)
+            limit = System.from_case(case).closed_frequencies()[-1] / (2 * np.pi)
             finding.value["high-energy limit (Hz), bilinear"] = limit
             finding.value["last frequency's relative distance from the limit, bilinear"] = abs(
                 frequency[last] / limit - 1
