@@ -7,7 +7,7 @@ from matplotlib.image import imread
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Case
-from vipetsc.figures import draw, draw_bands, names
+from vipetsc.figures import draw, draw_bands, figure_names
 from vipetsc.figures.lattice import draw_lattice, draw_unit_cell
 from vipetsc.figures.style import new_figure, rc_style
 from vipetsc.io.run_file import ENERGIES, IMPACTS
@@ -93,9 +93,9 @@ def assert_not_blank(path):
     assert np.all(edge == 1)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", figure_names("run"))
 def test_every_figure_draws(folder, name):
-    (path,) = draw(folder[0], [name])
+    (path,) = draw("run", [folder[0]], [name])
     assert path == folder[0] / "figures" / f"{name}.png"
     assert_not_blank(path)
     assert not list(path.parent.glob(".*"))
@@ -133,14 +133,14 @@ def test_analysis_opens_in_xarray_and_agrees_with_the_run(tmp_path):
 
 def test_ranks_share_the_figures_and_formats(tmp_path):
     write_run(tmp_path / "run.h5")
-    drawn = [p.name for rank in range(2) for p in draw(tmp_path, formats=("pdf",), share=(rank, 2))]
-    assert sorted(drawn) == sorted(f"{n}.pdf" for n in names())
+    drawn = [p.name for rank in range(2) for p in draw("run", [tmp_path], formats=("pdf",), share=(rank, 2))]
+    assert sorted(drawn) == sorted(f"{n}.pdf" for n in figure_names("run"))
 
 
 def test_a_wrong_name_and_a_foreign_file_are_refused(tmp_path):
     write_run(tmp_path / "run.h5")
     with pytest.raises(KeyError, match="ledger"):
-        draw(tmp_path, ["leger"])
+        draw("run", [tmp_path], ["leger"])
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["x"] = 1
     with pytest.raises(ValueError, match="not a run"):

@@ -247,8 +247,9 @@ def test_xarray_opens_the_branch(short_branch, tmp_path):
 
 
 def test_picture_from_the_file(short_branch, tmp_path):
-    from vipetsc.figures import draw_backbone
+    from vipetsc.figures import draw
 
     short_branch.write(tmp_path, {})
-    path = draw_backbone([tmp_path / "branch-out-of-phase.h5"], tmp_path / "figures" / "branch.png")
+    (path,) = draw("branches", [tmp_path])
+    assert path == tmp_path / "figures" / "branch-out-of-phase.png"
     assert path.stat().st_size > 20000

@@ -15,7 +15,7 @@ from matplotlib.image import imread
 
 from vipetsc.case import Case
 from vipetsc.figures import rc_style, save
-from vipetsc.figures.registry import NOTE, draw_each
+from vipetsc.figures.drawing import NOTE, draw_each
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.style import DPI, new_figure
 from vipetsc.paper.claims.measure import STATEMENTS

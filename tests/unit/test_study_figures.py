@@ -11,13 +11,13 @@ from matplotlib.colors import to_rgba
 from matplotlib.image import imread
 
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import draw_study, study_figures
+from vipetsc.figures import FIGURES, draw
 from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.entropy_time import QUIET
 from vipetsc.figures.partition import bin_colours, shown_bins
 from vipetsc.figures.scattering import KC, snapshot_times
 from vipetsc.figures.series import Wave, in_pi, series_of
-from vipetsc.figures.studies import Study
+from vipetsc.figures.study import Study
 from vipetsc.figures.style import GREY, rc_style
 from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.io.run_file import RunFile
@@ -82,7 +82,7 @@ def only(name, study):
 
 def drawn(name, study):
     """Suffixes and figures of ``name`` that a study offers."""
-    return {suffix: make() for suffix, make in study_figures[name](study)}
+    return {suffix: make() for suffix, make in FIGURES[name].function(study)}
 
 
 def maps(figure):
@@ -99,7 +99,7 @@ def members(ensemble):
 
 
 def test_every_figure_is_drawn_from_files(whole):
-    written = draw_study([whole.folder]) + draw_study([whole.folder], ["amplitudes"], ("pdf",))
+    written = draw("sweep", [whole.folder]) + draw("sweep", [whole.folder], ["amplitudes"], ("pdf",))
     assert {p.name for p in written} == {f"{name}-calibrated.png" for name in OF_FIELDS} | {"amplitudes-calibrated.pdf"}
     for path in written:
         assert path.parent == whole.folder / "figures"
@@ -108,16 +108,16 @@ def test_every_figure_is_drawn_from_files(whole):
 
 def test_nothing_is_yielded_where_the_data_lack(whole, curves):
     for name in OF_FIELDS:
-        assert list(study_figures[name](Study((curves,)))) == []
-        assert list(study_figures[name](Study(()))) == []
+        assert list(FIGURES[name].function(Study((curves,)))) == []
+        assert list(FIGURES[name].function(Study(()))) == []
     for name in OF_CURVES:
-        assert list(study_figures[name](Study((whole,)))) == []
+        assert list(FIGURES[name].function(Study((whole,)))) == []
 
 
 def test_suffixes_tell_figures_apart(curves):
-    names = [suffix for suffix, _ in study_figures["entropy_history"](Study((curves,)))]
+    names = [suffix for suffix, _ in FIGURES["entropy_history"].function(Study((curves,)))]
     assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
-    named = [suffix for suffix, _ in study_figures["entropy_history"](Study((curves, curves)))]
+    named = [suffix for suffix, _ in FIGURES["entropy_history"].function(Study((curves, curves)))]
     assert named[:4] == [f"curves-{name}" for name in names]
 
 

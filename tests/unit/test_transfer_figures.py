@@ -11,17 +11,17 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Sweep
-from vipetsc.figures import draw_study, rc_style, study_figures
+from vipetsc.figures import FIGURES, draw, rc_style
 from vipetsc.figures.band_energies import closing_error
 from vipetsc.figures.regimes import Portrait
-from vipetsc.figures.studies import Study
+from vipetsc.figures.study import Study
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.io.run_file import RunFile
 from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
 from vipetsc.studies.sweep import sweep
 
-FIGURES = ("transfer", "transfer_dispersions", "band_energies", "ibtet", "ibtet_backbone", "phase_regimes")
+NAMES = ("transfer", "transfer_dispersions", "band_energies", "ibtet", "ibtet_backbone", "phase_regimes")
 AMPLITUDES = [1.0, 2.0, 30.0, 60.0, 120.0, 240.0, 500.0]
 GRAZING = 0.03
 TABLE = {
@@ -72,7 +72,7 @@ def drawn(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     ensembles = tuple(EnsembleFile(f) for f in folders)
     with rc_style():
-        found = {suffix: make() for suffix, make in study_figures[name](Study(ensembles))}
+        found = {suffix: make() for suffix, make in FIGURES[name].function(Study(ensembles))}
     for ensemble in ensembles:
         ensemble.file.close()
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
@@ -179,7 +179,7 @@ def test_whole_members_alone_make_no_curves(whole):
 
 
 def test_nothing_to_draw_from_nothing():
-    assert all(not dict(study_figures[name](Study(()))) for name in FIGURES)
+    assert all(not dict(FIGURES[name].function(Study(()))) for name in NAMES)
 
 
 def test_transfer_has_a_panel_a_band_and_both_segments(whole):
@@ -271,7 +271,7 @@ def test_regimes_without_an_ensemble_beside_them(whole):
 
 @pytest.mark.parametrize("kind", ["png", "pdf"])
 def test_files_are_named_by_figure_and_suffix(reduced, kind):
-    written = draw_study([reduced], ["ibtet", "ibtet_backbone"], [kind])
+    written = draw("sweep", [reduced], ["ibtet", "ibtet_backbone"], [kind])
     stems = ("ibtet-calibrated", "ibtet_backbone-calibrated-1-site-4-cycles")
     assert [p.name for p in written] == [f"{stem}.{kind}" for stem in stems]
     assert all(p.stat().st_size > 10_000 for p in written)

@@ -150,17 +150,17 @@ def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 
 def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
-    from vipetsc.cli.plot import draw_run
+    from vipetsc.cli.plot import draw_source
     from vipetsc.studies.analysis import analyse
 
     on_root(comm, lambda: analyse(folder / "run.h5", folder / "analysis.h5"))
     if case.output.figures:
-        _name(draw_run(folder, None, ("png",), comm), comm)
+        _name(draw_source("run", [folder], None, ("png",), comm), comm)
 
 
 def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Every combination in the section [sweep] of a case; goes on where it was stopped."""
-    from vipetsc.cli.plot import draw_sweeps
+    from vipetsc.cli.plot import draw_source
     from vipetsc.studies.sweep import sweep as make
 
     plan = on_root(comm, lambda: _read(options.case, lambda path: Sweep.load(path, options.set)))
@@ -168,7 +168,7 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     result = make(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
     _say(comm, sweep_table(result))
     if plan.figures and (folder / "ensemble.h5").exists():
-        _name(draw_sweeps([folder], None, ("png",), comm), comm)
+        _name(draw_source("sweep", [folder], None, ("png",), comm), comm)
     return DONE if result.complete else FAILED
 
 
@@ -176,7 +176,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
     from vipetsc.case.nnm import NnmCase
     from vipetsc.cli.branches import BranchLog, branch_table
-    from vipetsc.cli.plot import draw_branches
+    from vipetsc.cli.plot import draw_source
     from vipetsc.modes.follow import follow_all, prepare_folder
 
     if options.force and options.resume:
@@ -190,7 +190,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     for branch in branches:
         _say(comm, branch_table(branch))
 
-    _name(draw_branches([folder], ("png",), comm), comm)
+    _name(draw_source("branches", [folder], None, ("png",), comm), comm)
     failed = comm.bcast(any(b.ending.startswith("failed") for b in branches))
     return FAILED if failed else DONE
 
@@ -241,7 +241,7 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
     from vipetsc.case.design import DesignCase
 
     def seek() -> str:
-        from vipetsc.figures import draw_design
+        from vipetsc.figures import draw
         from vipetsc.studies.design import design
 
         try:
@@ -250,7 +250,7 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
             raise FolderError(f"{options.case}: {error.strerror}; a case file (TOML) is needed") from None
         folder = options.out or Path("runs") / case.name
         table = design(case, folder, options.force)
-        return "\n".join([table, *(f"  {path}" for path in draw_design(folder))])
+        return "\n".join([table, *(f"  {path}" for path in draw("design", [folder]))])
 
     _say(comm, on_root(comm, seek))
     return DONE

@@ -3,34 +3,15 @@
 from importlib import import_module
 
 _HOMES = {
-    "bands": "vipetsc.figures.bands",
-    "design_figures": "vipetsc.figures.design",
+    "FIGURES": "vipetsc.figures.registry",
     "draw": "vipetsc.figures.registry",
-    "draw_backbone": "vipetsc.figures.backbone",
     "draw_bands": "vipetsc.figures.registry",
-    "draw_design": "vipetsc.figures.design",
-    "draw_study": "vipetsc.figures.studies",
-    "names": "vipetsc.figures.registry",
-    "run_figures": "vipetsc.figures.registry",
-    "save": "vipetsc.figures.registry",
+    "figure_names": "vipetsc.figures.registry",
     "rc_style": "vipetsc.figures.style",
-    "study_figures": "vipetsc.figures.studies",
+    "save": "vipetsc.figures.drawing",
 }
 
-__all__ = [
-    "bands",
-    "design_figures",
-    "draw",
-    "draw_backbone",
-    "draw_bands",
-    "draw_design",
-    "draw_study",
-    "names",
-    "rc_style",
-    "run_figures",
-    "save",
-    "study_figures",
-]
+__all__ = ["FIGURES", "draw", "draw_bands", "figure_names", "rc_style", "save"]
 
 
 def __getattr__(name: str) -> object:

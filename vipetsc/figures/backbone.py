@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.registry import save
 
 UNSTABLE = 1.0 + 1e-6
 _REGIONS = ("", "I", "II", "III", "IV")
@@ -58,14 +57,12 @@ class BranchFile:
             return cls(str(file.attrs["name"]), law, reading, data, [kinds[k] for k in data["kind"]], orbits, flows)
 
 
-def draw_backbone(paths: Sequence[Path], target: Path) -> Path:
-    """Draw the branches in ``paths`` (one page, a column a branch) into ``target``; returns it."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    branches = [BranchFile.read(Path(p)) for p in paths]
-    with style.rc_style():
-        if not all(len(b.kinds) for b in branches):
-            return save(style.without_data("no point of the branch was found"), target)
-        return save(backbone(branches), target)
+def page(paths: Sequence[Path]) -> Figure:
+    """The branches in ``paths``, a column a branch; raises OSError or KeyError for a file that holds none."""
+    branches = [BranchFile.read(path) for path in paths]
+    if not all(len(b.kinds) for b in branches):
+        return style.without_data("no point of the branch was found")
+    return backbone(branches)
 
 
 def backbone(branches: Sequence[BranchFile]) -> Figure:

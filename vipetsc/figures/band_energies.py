@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -12,13 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.members import configuration, configuration_stem, law_name, stem, title, transfer_members
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.figures.transfer_curves import TransferCurve, transfer_curves
 from vipetsc.io.run_file import RunFile
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 BANDS = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY)
 GAPS = ((0, (4, 2)), (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-
 import h5py
 import matplotlib as mpl
 import numpy as np
@@ -14,7 +11,6 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures import style
 from vipetsc.figures.bands import BRANCHES
-from vipetsc.figures.registry import save
 
 WEIGHTED = 2  # place of the weighted cost among the costs
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
@@ -158,25 +154,3 @@ def _spread(length: int, count: int) -> list[int]:
 
 def _readings(file: h5py.File) -> list[str]:
     return list(file["reading"].asstr()[...])
-
-
-design_figures: dict[str, Callable[[h5py.File], Figure]] = {
-    f.__name__: f for f in (deflections, cost_maps, dispersion_against_lambda, dispersion_against_eta)
-}
-
-
-def draw_design(
-    folder: str | Path, names: Sequence[str] | None = None, formats: Sequence[str] = ("png",)
-) -> list[Path]:
-    """Draw the search in ``folder/design.h5`` into ``folder/figures/<name>.<format>``; returns the files.
-
-    ``names`` are of ``design_figures``, all by default. Raises KeyError for another name or a file that lacks
-    something, OSError if the search cannot be read.
-    """
-    folder, written = Path(folder), []
-    with style.rc_style(), h5py.File(folder / "design.h5", "r") as file:
-        figures = {name: design_figures[name](file) for name in names or design_figures}
-        (folder / "figures").mkdir(exist_ok=True)
-        for name, figure in figures.items():
-            written += [save(figure, folder / "figures" / f"{name}.{kind}") for kind in formats]
-    return written

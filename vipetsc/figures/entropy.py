@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,12 +13,10 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.series import AMPLITUDE, counted, in_pi, reading_of, suffix
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.io.ensemble_file import EnsembleFile
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -13,13 +12,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.entropy import FACETS, Curves, measured, stem
 from vipetsc.figures.scattering import mark_sites
 from vipetsc.figures.series import Series, WholeRun, series_of
-from vipetsc.figures.style import Drawing
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
+from vipetsc.figures.study import Study
 
 MOST_COLUMNS = 3
 COLOURS = "viridis"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,14 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.partition import FIELD, bin_colours, shown_bins
 from vipetsc.figures.scattering import ROMAN, mark_sites, snapshot_times
 from vipetsc.figures.series import Series, series_of
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.spectra import Nodes, inverse, transform
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 KC = 6.0  # the partition's wavelet
 BINS_SHOWN = 4

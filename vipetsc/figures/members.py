@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import h5py
 
 from vipetsc.case import Case
+from vipetsc.figures.study import Study
 from vipetsc.io.run_file import RunFile
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 
 def transfer_members(study: Study) -> Iterator[tuple[RunFile, h5py.File]]:

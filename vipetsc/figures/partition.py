@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
@@ -14,13 +13,11 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.scattering import ROMAN, mark_sites
 from vipetsc.figures.series import Series, WholeRun, series_of
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.lattice import bloch
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 SHOWN = 7
 DECADES = 4

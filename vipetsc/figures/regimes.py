@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -16,14 +15,12 @@ from matplotlib.lines import Line2D
 
 from vipetsc.case import Case
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.members import configuration, configuration_stem, law_name, transfer_members
 from vipetsc.figures.phase import refined
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.figures.transfer_curves import TransferCurve, transfer_curves
 from vipetsc.io.run_file import RunFile
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 PERIODS = 10  # of the drive that a portrait shows
 RED = "#CC0000"

@@ -1,91 +1,136 @@
-"""The pictures of a run by name, and the drawing of them."""
+"""Every picture by name: what it is drawn from and by which function; the check of names; the drawing of folders."""
 
 from __future__ import annotations
 
 import difflib
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import h5py
-from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
 
-from vipetsc.figures import style
+from vipetsc.figures import backbone, design, style
+from vipetsc.figures.band_energies import band_energies
 from vipetsc.figures.bands import bands
 from vipetsc.figures.dispersion import dispersion
+from vipetsc.figures.drawing import Drawing, draw_each, save
+from vipetsc.figures.entropy import entropy, entropy_all
+from vipetsc.figures.entropy_time import entropy_history, entropy_maps
+from vipetsc.figures.explained import partition_explained
 from vipetsc.figures.impacts import impacts
 from vipetsc.figures.lattice import unit_cell
 from vipetsc.figures.ledger import ledger
+from vipetsc.figures.partition import partition, reconstruction
 from vipetsc.figures.phase import phase
+from vipetsc.figures.regimes import phase_regimes
+from vipetsc.figures.scattering import amplitudes, wavelets
 from vipetsc.figures.spacetime import spacetime
-from vipetsc.figures.style import Drawing
-from vipetsc.io.atomic import atomic_write
+from vipetsc.figures.study import Study
+from vipetsc.figures.transfer import transfer
+from vipetsc.figures.transfer_backbone import ibtet_backbone
+from vipetsc.figures.transfer_curves import ibtet
+from vipetsc.figures.transfer_dispersions import transfer_dispersions
 from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import UnitCell
 
-NOTE = 0.16  # height in inches of the strip that a note takes below a picture
-
-# The dearest first, so that ranks which share the work finish together.
-run_figures: dict[str, Callable[[RunFile, h5py.File | None], Figure]] = {
-    f.__name__: f for f in (spacetime, dispersion, phase, unit_cell, impacts, ledger)
-}
+RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
 
 
-def chosen(names: Sequence[str] | None, figures: Mapping[str, object]) -> list[str]:
-    """``names``, all of ``figures`` if None; raises KeyError for one that is not there, with the nearest that is."""
-    for name in names or ():
-        if name not in figures:
-            near = difflib.get_close_matches(name, figures, 1, 0) or list(figures)
-            raise KeyError(f"no figure {name!r}; did you mean {near[0]!r}? There are {', '.join(figures)}")
-    return list(figures if names is None else names)
+class FigureSpec(NamedTuple):
+    """How a picture is made: ``function`` of what a folder of this ``source`` holds.
+
+    ========  ====================================================  ================================
+    source    function                                              files
+    ========  ====================================================  ================================
+    run       (run, analysis or None) -> Figure                     ``run.h5``, ``analysis.h5``
+    sweep     (Study) -> iterator of (suffix, () -> Figure)         ``ensemble.h5``, branches
+    branches  (paths) -> Figure                                     ``branch-<name>.h5``
+    design    (search) -> Figure                                    ``design.h5``
+    ========  ====================================================  ================================
+
+    A figure of sweeps is drawn from those that have the ``measure``.
+    """
+
+    function: Callable[..., Any]
+    source: str
+    measure: str = ""
 
 
-def draw(
-    folder: str | Path,
-    names: Sequence[str] | None = None,
-    formats: Sequence[str] = ("png",),
-    share: tuple[int, int] = (0, 1),
-) -> list[Path]:
-    """Draw the run in ``folder`` (``run.h5``, ``analysis.h5``) into ``folder/figures/<name>.<format>``.
+def _specs(source: str, functions: Iterable[Callable[..., Any]], measure: str = "") -> dict[str, FigureSpec]:
+    return {f.__name__: FigureSpec(f, source, measure) for f in functions}
 
-    Parameters
-    ----------
-    names
-        Which of ``run_figures``; all by default.
-    share
-        (rank, size): draw every ``size``-th of them from ``rank`` on, so that ranks can share the work.
 
-    Returns
-    -------
-    list of Path
-        The files written, each complete or not there at all.
+# The dearest of a run first, so that ranks which share the work finish together.
+FIGURES: dict[str, FigureSpec] = {
+    **_specs(RUN, (spacetime, dispersion, phase, unit_cell, impacts, ledger)),
+    **_specs(
+        SWEEP,
+        (amplitudes, wavelets, partition, partition_explained, reconstruction,
+         entropy, entropy_all, entropy_maps, entropy_history),
+        "entropy",
+    ),
+    **_specs(SWEEP, (transfer, transfer_dispersions, band_energies, ibtet, ibtet_backbone, phase_regimes), "transfer"),
+    "branch": FigureSpec(backbone.page, BRANCHES),
+    **_specs(
+        DESIGN,
+        (design.deflections, design.cost_maps, design.dispersion_against_lambda, design.dispersion_against_eta),
+    ),
+}  # fmt: skip
+
+
+def figure_names(source: str, names: Sequence[str] | None = None) -> list[str]:
+    """The ``names`` after a check, by default those of all figures of ``source``.
 
     Raises
     ------
     KeyError
-        For a name that is not in ``run_figures``; says the nearest one.
-    OSError, ValueError
-        If the run cannot be read, or the picture not written.
+        For a name that is no figure of ``source``; gives the nearest one and all.
     """
-    names = chosen(names, run_figures)
-    folder = Path(folder)
-    (folder / "figures").mkdir(exist_ok=True)
-    rank, size = share
-    with ExitStack() as stack:
-        stack.enter_context(style.rc_style())
-        run = stack.enter_context(RunFile(folder / "run.h5"))
-        measured = folder / "analysis.h5"
-        analysis = stack.enter_context(h5py.File(measured, "r")) if measured.exists() else None
-        drawings = ((name, partial(run_figures[name], run, analysis)) for name in names)
-        return draw_each(drawings, folder / "figures", formats, itertools.count(rank, size))
+    valid = [name for name, spec in FIGURES.items() if spec.source == source]
+    for name in names or ():
+        if name not in valid:
+            (nearest,) = difflib.get_close_matches(name, valid, 1, 0) or valid[:1]
+            raise KeyError(f"no figure {name!r} of a {source}; did you mean {nearest!r}? There are {', '.join(valid)}")
+    return valid if names is None else list(names)
 
 
-def names() -> tuple[str, ...]:
-    """The names of all pictures of a run."""
-    return tuple(run_figures)
+def draw(
+    source: str,
+    folders: Sequence[Path],
+    names: Sequence[str] | None = None,
+    formats: Sequence[str] = ("png",),
+    share: tuple[int, int] = (0, 1),
+) -> list[Path]:
+    """Draw what the ``folders`` hold into ``figures/`` of the first of them.
+
+    Parameters
+    ----------
+    source
+        What is in the folders: "run" (one folder), "sweep" (with branches beside them), "branches" (of the same
+        names, side by side) or "design" (one folder).
+    names
+        Which figures; by default all that the data allow.
+    share
+        (rank, size): draw every ``size``-th picture from ``rank`` on, so that ranks can share the work.
+
+    Returns
+    -------
+    list of Path
+        The files written, each complete.
+
+    Raises
+    ------
+    KeyError
+        For a name that is no figure of ``source``, with the nearest that is; for a file that lacks something.
+    OSError, ValueError
+        If a file cannot be read, or a picture not written.
+    """
+    drawings = _DRAWINGS[source](folders, figure_names(source, names))
+    with style.rc_style():
+        return draw_each(drawings, folders[0] / "figures", formats, itertools.count(*share))
 
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
@@ -94,50 +139,39 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
         return save(bands(cell, frequency), Path(path))
 
 
-def draw_each(
-    drawings: Iterable[Drawing],
-    target: Path,
-    formats: Sequence[str],
-    turns: Iterator[int],
-    note: str = "",
-    keep: Callable[[Path], bool] = lambda path: False,
-) -> list[Path]:
-    """Draw those of ``drawings`` (stem, figure) whose number is among ``turns``, into ``target/<stem>.<format>``.
-
-    Parameters
-    ----------
-    turns
-        Rising numbers, the next one asked for when a picture is done: every ``size``-th from a rank on shares
-        the work evenly, a counter that all ranks draw from shares it by what it costs.
-    note
-        Words that stand below every picture.
-    keep
-        Whether the file at a path is to stay as it is.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-    """
-    written: list[Path] = []
-    mine = next(turns, None)
-    for number, (stem, make) in enumerate(drawings):
-        if number != mine:
-            continue
-        paths = [target / f"{stem}.{kind}" for kind in formats]
-        if not all(map(keep, paths)):
-            figure = make()
-            written += [save(figure, path, note) for path in paths]
-        mine = next(turns, None)
-    return written
+def study_drawings(study: Study, names: Iterable[str]) -> Iterator[Drawing]:
+    """Every picture of the figures ``names`` that a study allows, each with the stem of its file."""
+    for name in names:
+        spec = FIGURES[name]
+        for suffix, make in spec.function(study.measuring(spec.measure)):
+            yield f"{name}-{suffix}" if suffix else name, make
 
 
-def save(figure: Figure, path: Path, note: str = "") -> Path:
-    """Write ``figure`` to ``path`` in the format of its suffix, under another name first; a ``note`` goes below it."""
-    width, height = figure.get_size_inches()
-    strip = Bbox([[0, -NOTE if note else 0], [width, height]])
-    text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=style.GREY)
-    with atomic_write(path) as aside:
-        figure.savefig(aside, format=path.suffix[1:], dpi=style.DPI, bbox_inches=strip if note else None)
-    text.remove()
-    return path
+def _of_run(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
+    with ExitStack() as stack:
+        run = stack.enter_context(RunFile(folders[0] / "run.h5"))
+        path = folders[0] / "analysis.h5"
+        analysis = stack.enter_context(h5py.File(path, "r")) if path.exists() else None
+        for name in names:
+            yield name, partial(FIGURES[name].function, run, analysis)
+
+
+def _of_sweep(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
+    with Study.open(folders) as study:
+        yield from study_drawings(study, names)
+
+
+def _of_branches(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
+    for name, path in itertools.product(names, sorted(folders[0].glob("branch-*.h5"))):
+        paths = [folder / path.name for folder in folders if (folder / path.name).exists()]
+        stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
+        yield stem, partial(FIGURES[name].function, paths)
+
+
+def _of_design(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
+    with h5py.File(folders[0] / "design.h5", "r") as search:
+        for name in names:
+            yield name, partial(FIGURES[name].function, search)
+
+
+_DRAWINGS = {RUN: _of_run, SWEEP: _of_sweep, BRANCHES: _of_branches, DESIGN: _of_design}

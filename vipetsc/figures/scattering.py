@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.series import Series, WholeRun, series_of
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.spectra import transform
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 DECADES = 5
 KC, NODES = 12.0, 120  # the wavelets of the entropy, on a grid twice as fine

@@ -8,19 +8,17 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
 
 from vipetsc.case import Case
 from vipetsc.case.schema import LatticeTable
+from vipetsc.figures.study import Study
 from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.io.run_file import RunFile
 from vipetsc.lattice.bloch import waves_at
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 AMPLITUDE = "amplitude"
 LEVELS = ("Low", "Medium", "High")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import matplotlib as mpl
@@ -12,9 +12,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-
-Drawing = tuple[str, Callable[[], Figure]]
-"""A picture to come: a suffix for its file's name, and what draws it, to be called before the next is asked for."""
 
 COLUMN, PAGE = 3.4, 7.0  # widths of one and of two journal columns in inches
 DPI = 300

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -13,14 +12,12 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures import style
 from vipetsc.figures.dispersion import bloch_branches
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.members import stem, title, transfer_members
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import TAPER, Parts, part_kinetic_energy, taper
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 DECADES = 5
 INPUT_CELL = 5  # the paper's cell before the sites; the one behind them is the middle of the lattice, its cell 150

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -13,11 +12,9 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.members import configuration, configuration_stem, law_name
-from vipetsc.figures.style import Drawing
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
+from vipetsc.figures.study import Study
 
 NUMERALS = {1: "I", 2: "II", 3: "III", 4: "IV"}
 SHADES = {1: "#FFFFFF", 2: "#E4E4E4", 3: "#FFFFFF", 4: "#F1F1F1"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,12 +12,10 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import style
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.members import configuration
-from vipetsc.figures.style import Drawing
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
-    from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.figures.study import Study
+from vipetsc.io.ensemble_file import EnsembleFile
 
 LINES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.PURPLE, "D"), (style.ORANGE, "v"))
 FEWEST = 6  # amplitudes that make a curve

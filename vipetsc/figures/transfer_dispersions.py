@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -15,13 +14,11 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.dispersion import bloch_branches
+from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.members import configuration, configuration_stem, law_name, transfer_members
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import pass_bands
-
-if TYPE_CHECKING:
-    from vipetsc.figures.studies import Study
 
 DECADES = 5
 MOST_ROWS = 800  # of a spectrum that are kept in memory; a printed panel shows fewer

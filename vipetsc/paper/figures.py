@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures.backbone import BranchFile, backbone
-from vipetsc.figures.design import design_figures
+from vipetsc.figures.drawing import Drawing
+from vipetsc.figures.registry import FIGURES, study_drawings
 from vipetsc.figures.schematics import lattice_page, reduced_model
-from vipetsc.figures.studies import Study, offered
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Study
 from vipetsc.lattice.presets import PRESETS
 
 READINGS = "calibrated", "printed"
@@ -61,11 +61,11 @@ class PaperFigure:
 
 
 def _study(family: str, *steps: str, only: Collection[str] = (), prefix: str = "") -> Part:
-    """The pictures of a family of ``study_figures`` whose name holds all the words of ``only``."""
+    """The pictures of a family of sweeps whose name holds all the words of ``only``."""
 
     def offers(folders: Mapping[str, Path]) -> Iterator[Drawing]:
         with Study.open(folders.values()) as study:
-            for stem, make in offered(study, [family]) if study.ensembles else ():
+            for stem, make in study_drawings(study, [family]) if study.ensembles else ():
                 if all(f"-{word}-" in f"{stem}-" for word in only):
                     yield prefix + stem, make
 
@@ -75,7 +75,7 @@ def _study(family: str, *steps: str, only: Collection[str] = (), prefix: str = "
 def _search(*names: str) -> Part:
     def page(path: Path, name: str) -> Figure:
         with h5py.File(path, "r") as file:
-            return design_figures[name](file)
+            return FIGURES[name].function(file)
 
     def offers(folders: Mapping[str, Path]) -> Iterator[Drawing]:
         for name in names:

@@ -14,8 +14,7 @@ from mpi4py import MPI
 
 from vipetsc import figures
 from vipetsc.figures import style
-from vipetsc.figures.registry import draw_each
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.drawing import Drawing, draw_each
 from vipetsc.io.atomic import write_text
 from vipetsc.io.store import FolderError, provenance
 from vipetsc.paper.figures import PaperFigure, words
