@@ -33,7 +33,7 @@ from bench_scaling import large, scaling, whole_runs
 
 from vipetsc.case import Case
 from vipetsc.io.atomic import write_text
-from vipetsc.io.store import provenance
+from vipetsc.io.folder import provenance
 
 PARTS = ("precision", "whole", "scaling")
 FULL = {

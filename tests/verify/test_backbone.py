@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vipetsc.io.store import FolderError
+from vipetsc.io.folder import FolderError
 from vipetsc.studies.backbone import BRANCH, FEWEST, Initiation, Slope, align, relate_folders
 
 GRAZING = 0.03

@@ -16,7 +16,7 @@ from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.case.schema import read_toml
 from vipetsc.cli.tables import bands_table, doctor_table, run_table, sweep_table, validate_table
 from vipetsc.io.atomic import write_text
-from vipetsc.io.store import FolderError
+from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StopRequest, on_root
 
 T = TypeVar("T")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from vipetsc.io.store import FolderError
+from vipetsc.io.folder import FolderError
 from vipetsc.parallel import on_root
 
 _NOT_OURS = {"design": "design.h5: is not a search", "branches": "branch-*.h5: is not a branch"}

@@ -13,7 +13,8 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case
-from vipetsc.io.store import GATHER_LIMIT, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.store import GATHER_LIMIT
 from vipetsc.lattice import UnitCell, max_group_velocity, pass_bands
 from vipetsc.lattice.bloch import gaps, waves_at
 

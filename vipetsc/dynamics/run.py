@@ -19,7 +19,8 @@ from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
-from vipetsc.io.store import RunFolder, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.store import RunFolder
 from vipetsc.parallel import Progress, StopRequest, on_root
 
 # In the order in which engine = "auto" tries them.

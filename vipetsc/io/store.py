@@ -9,25 +9,21 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
-import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
-from petsc4py import PETSc
 
 import h5py
 import numpy as np
 from numpy.lib import format as npy
 
-import vipetsc
 from vipetsc.case import Case
 from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.folder import FolderError
 
-FORMAT_VERSION = 1
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
 
 _LEDGER = {
@@ -48,25 +44,6 @@ _IMPACTS = {
     "loss": ("J", "energy dissipated in the episode"),
 }
 _FIELDS = {"displacement": "m", "velocity": "m/s"}
-
-
-class FolderError(ValueError):
-    """An output folder that cannot be used as asked."""
-
-
-def provenance(comm: MPI.Comm) -> dict[str, Any]:
-    """Versions, ranks and command, as every output carries them."""
-    return {
-        "format_version": FORMAT_VERSION,
-        "vipetsc_version": vipetsc.__version__,
-        "petsc_version": ".".join(map(str, PETSc.Sys.getVersion())),
-        "mpi_version": MPI.Get_library_version().split(",")[0].strip(),
-        "hdf5_version": h5py.version.hdf5_version,
-        "numpy_version": np.__version__,
-        "python_version": platform.python_version(),
-        "ranks": comm.size,
-        "command": " ".join(["vipetsc", *sys.argv[1:]]),
-    }
 
 
 def claim_folder(path: Path, force: bool, foreign: tuple[str, ...], begun: str = "") -> None:

@@ -13,7 +13,8 @@ import numpy as np
 
 from vipetsc.case.nnm import NnmCase, NnmTable
 from vipetsc.io.atomic import write_text
-from vipetsc.io.store import FolderError, claim_folder, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.store import FolderError, claim_folder
 from vipetsc.modes.audit import Watch, is_jump, suspects
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.compare import compare

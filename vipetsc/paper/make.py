@@ -16,7 +16,7 @@ from vipetsc import figures
 from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing, draw_each
 from vipetsc.io.atomic import write_text
-from vipetsc.io.store import FolderError, provenance
+from vipetsc.io.folder import FolderError, provenance
 from vipetsc.paper.figures import PaperFigure, words
 from vipetsc.paper.plan import Plan
 from vipetsc.paper.report import Picture, Report, Shown, write_report

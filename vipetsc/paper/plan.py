@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vipetsc.io.store import FolderError
+from vipetsc.io.folder import FolderError
 from vipetsc.paper.figures import PAPER_FIGURES, PaperFigure
 from vipetsc.paper.steps import BranchStep, DesignStep, Relation, Step, SweepStep
 

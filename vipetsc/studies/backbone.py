@@ -15,8 +15,8 @@ from vipetsc.case import Case
 from vipetsc.case.sweep import case_id
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.io.folder import FolderError
 from vipetsc.io.run_file import RunFile
-from vipetsc.io.store import FolderError
 from vipetsc.spectra import Fit, power_law
 from vipetsc.studies.datasets import put
 from vipetsc.studies.members import LinearWave, linear_case

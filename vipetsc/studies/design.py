@@ -11,7 +11,8 @@ import numpy as np
 
 from vipetsc.case.design import DesignCase
 from vipetsc.io.atomic import atomic_write, write_text
-from vipetsc.io.store import Coordinates, claim_folder, provenance
+from vipetsc.io.folder import provenance
+from vipetsc.io.store import Coordinates, claim_folder
 from vipetsc.lattice.bloch import bloch
 from vipetsc.lattice.cell import four_band
 from vipetsc.lattice.search import COSTS, Search, search, signed_deflection, unit_vectors

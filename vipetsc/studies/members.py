@@ -18,8 +18,9 @@ from vipetsc.case.sweep import SweepTable, case_id
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.memory import RunMemory
 from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.folder import provenance
 from vipetsc.io.run_file import ENERGIES, IMPACTS, RunFile
-from vipetsc.io.store import Coordinates, provenance
+from vipetsc.io.store import Coordinates
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import FULL, REDUCED, analyse, describe
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from mpi4py import MPI
 
 from vipetsc.case import Sweep
+from vipetsc.io.folder import FolderError
 from vipetsc.io.run_file import RunFile
-from vipetsc.io.store import FolderError
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.members import LinearWave, Members

@@ -15,7 +15,8 @@ import numpy as np
 
 from vipetsc.case import Case, Member, Sweep
 from vipetsc.io.atomic import write_text
-from vipetsc.io.store import FolderError, claim_folder
+from vipetsc.io.folder import FolderError
+from vipetsc.io.store import claim_folder
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_root
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Outcome, assemble
 from vipetsc.studies.members import LinearWave, Members, StoppedError

@@ -1,0 +1,141 @@
+"""The one layout of every HDF5 file: netCDF-4, as xarray reads and writes it, from a flat ``xarray.Dataset``.
+
+The name of a variable is its path in the file: ``energy/kinetic`` is the dataset ``kinetic`` of the group ``energy``.
+The name of a dimension is the path of its coordinate, which is the HDF5 dimension scale: ``time`` for all groups,
+``bands/part`` for one of them. An attribute of a group is ``entropy/start``.
+
+The dataset is flat rather than a ``DataTree`` because there a group inherits the coordinates of its parent:
+``tree["sites/cell"]`` would be the coordinate ``/cell``, not the variable of the group ``sites``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import h5py
+import numpy as np
+import xarray as xr
+
+from vipetsc.io.atomic import atomic_write
+
+
+def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
+    """``values`` over the named dimensions, with ``units``, ``long_name`` and further attributes."""
+    return xr.Variable(dims, np.asarray(values), {"units": units, "long_name": long_name, **attributes})
+
+
+def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
+    """Write ``data`` to ``path``, whole or not at all; an attribute that is a dict becomes JSON.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    ValueError
+        If a dimension has no coordinate.
+    """
+    with atomic_write(Path(path)) as aside, h5py.File(aside, "w") as file:
+        put_dataset(file, data)
+
+
+def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
+    """Lay out ``data`` in ``file``; where several ranks share the file all must call it, and one has to ``write``."""
+    names = [*data.indexes, *(name for name in data.variables if name not in data.indexes)]
+    for name in names:
+        item = data.variables[name]
+        values = item.values
+        dtype = h5py.string_dtype() if values.dtype.kind in "UO" else values.dtype
+        dataset = add_variable(file, name, item.dims, values.shape, dtype, item.attrs)
+        if write and values.size:
+            dataset[...] = values.astype(object) if values.dtype.kind == "U" else values
+    for path, value in data.attrs.items():
+        group, _, key = str(path).rpartition("/")
+        place = file.require_group(group) if group else file
+        place.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
+
+
+def add_variable(
+    file: h5py.File, name: Hashable, dims: Sequence[Hashable], shape: Sequence[int], dtype: Any, attributes: Any
+) -> h5py.Dataset:
+    """An empty dataset over coordinates added before; itself a coordinate if its one dimension has its name."""
+    dataset = file.create_dataset(str(name), tuple(shape), dtype)
+    if tuple(dims) == (name,):
+        dataset.make_scale(PurePosixPath(str(name)).name)
+    else:
+        for axis, dim in enumerate(dims):
+            if dim not in file:
+                raise ValueError(f"{name}: its dimension {dim} has no coordinate")
+            dataset.dims[axis].attach_scale(file[str(dim)])
+    dataset.attrs.update(attributes)
+    return dataset
+
+
+def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Dataset:
+    """The file as a flat dataset, a context manager; values are read where they are used.
+
+    Parameters
+    ----------
+    path
+        The file.
+    kind
+        What it should be, for messages: "run", "branch".
+    needs
+        Variables (by path), groups and root attributes without which it is no such file.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened as HDF5.
+    ValueError
+        If it is not of this kind.
+    """
+    try:
+        groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
+    except OSError as error:
+        raise OSError(f"{path} cannot be opened as a {kind}: {error}") from error
+    data = _flat(groups)
+    data.set_close(_closing(groups))
+    present = {parent for name in data.variables for parent in _parents(str(name))} | set(data.attrs)
+    missing = [name for name in needs if name not in present]
+    if missing:
+        data.close()
+        raise ValueError(f"{path} is not a {kind} of vipetsc: it has no {', '.join(missing)}")
+    return data
+
+
+def _flat(groups: dict[str, xr.Dataset]) -> xr.Dataset:
+    """All groups in one dataset, names of variables, dimensions and attributes by their paths."""
+    variables: dict[str, xr.Variable] = {}
+    attributes: dict[str, Any] = {}
+    for group, data in groups.items():
+        prefix = group.strip("/") + "/" if group.strip("/") else ""
+        for name, item in data.variables.items():
+            dims = [_dimension(groups, PurePosixPath(group), str(dim)) for dim in item.dims]
+            variables[f"{prefix}{name}"] = item._replace(dims=dims)
+        attributes |= {f"{prefix}{key}": value for key, value in data.attrs.items()}
+    return xr.Dataset(variables, attrs=attributes)
+
+
+def _dimension(groups: dict[str, xr.Dataset], group: PurePosixPath, name: str) -> str:
+    """Path of the coordinate ``name`` of a dimension met in ``group``: there, or in the nearest group around it."""
+    for place in (group, *group.parents):
+        around = groups.get(str(place))
+        if around is not None and name in around.variables and around.variables[name].dims == (name,):
+            return str(place / name).strip("/")
+    return str(group / name).strip("/")
+
+
+def _parents(name: str) -> list[str]:
+    path = PurePosixPath(name)
+    return [name, *(str(parent) for parent in path.parents)]
+
+
+def _closing(groups: dict[str, xr.Dataset]) -> Callable[[], None]:
+    def close() -> None:
+        for group in groups.values():
+            group.close()
+
+    return close
