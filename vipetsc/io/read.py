@@ -1,8 +1,8 @@
-"""Results read with xarray: a run, and the ensemble of a sweep.
+"""Results read with xarray: a run, and the ensemble of a sweep; names are paths in the file, as in ``io.netcdf``.
 
-``open_run`` gives the tree of ``run.h5``: ``run["velocity"]``, ``run["energy/kinetic"]``, ``run["impacts/onset"]``;
-fields are read where they are sliced. ``open_ensemble`` gives one dataset with a dimension for every axis of a sweep;
-``select`` picks members by the values of swept keys. Cells and sites count from 1, units stand in the attributes.
+``open_run`` gives ``run["velocity"]``, ``run["energy/kinetic"]``, ``run["impacts/onset"]``. ``open_ensemble`` gives
+measures over one dimension a swept axis; ``select`` picks members by the values of swept keys. Cells and sites count
+from 1, units stand in the attributes.
 """
 
 from __future__ import annotations
@@ -16,91 +16,50 @@ from typing import Any, TypeVar
 import numpy as np
 import xarray as xr
 
+from vipetsc.io.netcdf import open_netcdf
+
 Selectable = TypeVar("Selectable", xr.Dataset, xr.DataArray)
 
 
-def open_tree(path: str | Path, kind: str, needs: tuple[str, ...] = ()) -> xr.DataTree:
-    """The groups of an HDF5 file of ours, for reading; use it as a context manager or close it.
+def open_run(path: str | Path) -> xr.Dataset:
+    """The run in ``path``, a context manager: fields are read where they are sliced.
 
-    Parameters
-    ----------
-    kind
-        What the file should be, for the message: "a run".
-    needs
-        Variables and groups that it has to hold, besides the attribute ``case``.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened.
-    ValueError
-        If something that it needs is missing.
+    ``encoding["source"]`` is the path. Raises OSError or ValueError as ``open_netcdf``.
     """
-    tree = xr.open_datatree(path, engine="h5netcdf", decode_times=False)
-    missing = [name for name in needs if not holds(tree, name)]
-    missing += [] if "case" in tree.attrs else ["case"]
-    if missing:
-        tree.close()
-        raise ValueError(f"{path} is not {kind} of vipetsc: it has no {', '.join(missing)}")
-    for node in tree.subtree:
-        # A variable that is named like a coordinate of a group above, such as sites/cell, would be hidden by it.
-        own = node.to_dataset(inherit=False)
-        hidden = [name for name in own.data_vars if name in node.coords]
-        if hidden:
-            node.dataset = own.set_coords(hidden)
-    return tree
+    run = open_netcdf(path, "run", ("time", "cell", "energy", "case"))
+    run.encoding["source"] = str(path)
+    return run
 
 
-def holds(tree: xr.DataTree, *names: str) -> bool:
-    """Whether ``tree`` has all these variables or groups; a name may be a path, such as ``bands/energy``."""
-    try:
-        return all(tree[name] is not None for name in names)
-    except KeyError:
-        return False
-
-
-def values(tree: xr.DataTree, name: str) -> np.ndarray:
-    """The array of the variable ``name``; raises KeyError."""
-    variable = tree[name]
-    if isinstance(variable, xr.DataTree):
-        raise KeyError(f"{name} is a group, not a variable")
-    return np.asarray(variable.values)
-
-
-def open_run(path: str | Path) -> xr.DataTree:
-    """The run in ``path``; raises OSError or ValueError as ``open_tree``."""
-    return open_tree(path, "a run", ("time", "cell", "energy"))
-
-
-def field_time(run: xr.DataTree) -> np.ndarray:
+def field_time(run: xr.Dataset) -> np.ndarray:
     """Times (t) in s of the fields: ``time``, or every n-th of it."""
-    return values(run, "field_time" if "field_time" in run else "time")
+    return run["field_time" if "field_time" in run else "time"].values
 
 
-def field_interval(run: xr.DataTree) -> float:
+def field_interval(run: xr.Dataset) -> float:
     """Sampling interval of the fields in s; NaN for a single sample."""
     time = field_time(run)
     return float(time[1] - time[0]) if len(time) > 1 else np.nan
 
 
-def leading_site(run: xr.DataTree) -> int | None:
+def leading_site(run: xr.Dataset) -> int | None:
     """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
-    cells = values(run, "sites/cell")
+    cells = run["sites/cell"].values
     drive = tomllib.loads(run.attrs["case"])["drive"]["cell"]
     return int(np.argmin(np.abs(cells - drive))) if len(cells) else None
 
 
-def nearest_cell(run: xr.DataTree, cell: int) -> int:
+def nearest_cell(run: xr.Dataset, cell: int) -> int:
     """Index (0-based) of the recorded cell nearest to ``cell`` (1-based)."""
-    return int(np.argmin(np.abs(values(run, "cell") - cell)))
+    return int(np.argmin(np.abs(run["cell"].values - cell)))
 
 
 def open_ensemble(folder: str | Path) -> xr.Dataset:
     """The ensemble of the sweep in ``folder``, read whole: measures over one dimension a swept axis.
 
-    A dimension is named after its axis' first key; further keys of a zipped axis are coordinates on it. Variables of
-    groups keep their path as name (``entropy/masked``, ``fits/ibtet/exponent``). ``member`` is the name of each
-    member's folder, empty where the case of a member is no valid one; the attribute ``folder`` is the sweep's.
+    A dimension is named after its axis' first key; further keys of a zipped axis are coordinates on it. ``member`` is
+    the name of each member's folder, empty where the case of a member is no valid one; the attribute ``folder`` is
+    the sweep's.
 
     Raises
     ------
@@ -110,12 +69,8 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
         If it is no ensemble of ours.
     """
     folder = Path(folder)
-    with open_tree(folder / "ensemble.h5", "an ensemble", ("status",)) as tree:
-        variables = {}
-        for node in tree.subtree:
-            for name, variable in node.to_dataset(inherit=False).data_vars.items():
-                variables[f"{node.path}/{name}".strip("/")] = variable
-        data = xr.Dataset(variables, tree.coords, tree.attrs | {"folder": str(folder)}).load()
+    with open_netcdf(folder / "ensemble.h5", "sweep's ensemble", ("status", "case")) as file:
+        data = file.assign_attrs(folder=str(folder)).load()
     keys = [key for group in tomllib.loads(data.attrs["case"])["sweep"]["zip"] for key in group]
     data = data.set_coords(
         [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in keys]
