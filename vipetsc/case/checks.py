@@ -1,4 +1,4 @@
-"""Checks between the keys of a case, each of them sound by itself."""
+"""Checks between the keys of a case, each of which is valid by itself."""
 
 from __future__ import annotations
 
@@ -6,123 +6,136 @@ from typing import Any
 
 import numpy as np
 
-from vipetsc.case.schema import ContactsTable, LatticeTable, Problem, Span
+from vipetsc.case.reading import Problem
+from vipetsc.case.resolve import site_cells
+from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, Span, TimeTable
 from vipetsc.lattice.bloch import pass_bands
-from vipetsc.lattice.cell import UnitCell, cell_problems
-from vipetsc.lattice.chain import spread_sites
-from vipetsc.lattice.presets import PRESETS
+from vipetsc.lattice.cell import UnitCell
 
 
-def unit_cell_of(lattice: LatticeTable) -> UnitCell:
-    """The unit cell of a sound ``[lattice]`` section."""
-    if lattice.cell is not None:
-        return lattice.cell.unit_cell()
-    options = {k: v for k, v in (("lam", lattice.lam), ("eta", lattice.eta)) if v is not None}
-    return PRESETS[lattice.preset].cell(lattice.reading, **options)
+class Checks:
+    """Problems between keys; a check that rests on a key in ``invalid`` is left out."""
+
+    def __init__(self, invalid: set[str]) -> None:
+        self.invalid = invalid
+        self.problems: list[Problem] = []
+
+    def valid(self, *keys: str) -> bool:
+        """Whether neither any of ``keys`` nor a key inside it is invalid."""
+        return not any(i == k or i.startswith((f"{k}.", f"{k}[")) for i in self.invalid for k in keys)
+
+    def require(self, condition: bool, key: str, value: Any, remedy: str) -> None:
+        """Note a problem of ``key`` unless ``condition`` holds."""
+        if not condition and self.valid(key):
+            self.problems.append(Problem(key, value, remedy))
 
 
-def cross_problems(sections: dict[str, Any], bad: set[str]) -> list[Problem]:
-    """What is wrong between sound keys; a check that rests on a key in ``bad`` is left out."""
+def lattice_run_problems(sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
+    """What is wrong between the keys of a lattice run's sections."""
     lattice, contacts, drive = sections["lattice"], sections["contacts"], sections["drive"]
-    time, output = sections["time"], sections["output"]
-    problems: list[Problem] = []
+    checks = Checks(invalid)
+    cell = check_lattice(checks, lattice)
+    if checks.valid("lattice.cells", "contacts.sites"):
+        check_sites(checks, lattice, contacts)
+        check_stiffness(checks, lattice, contacts)
+    check_drive(checks, drive, lattice, cell)
+    check_time(checks, sections["time"], cell)
+    check_output(checks, sections["output"], lattice)
+    return checks.problems
 
-    def sound(*keys: str) -> bool:
-        return not any(b == k or b.startswith((f"{k}.", f"{k}[")) for b in bad for k in keys)
 
-    def check(fine: bool, key: str, value: Any, remedy: str) -> None:
-        if not fine and sound(key):
-            problems.append(Problem(key, value, remedy))
+def check_lattice(checks: Checks, lattice: LatticeTable) -> UnitCell | None:
+    """Check the unit cell; returns it if it is valid."""
+    keys = ("lattice", "lattice.preset", "lattice.cell", "lattice.reading", "lattice.lambda", "lattice.eta")
+    if not checks.valid(*keys):
+        return None
+    both = lattice.preset is not None and lattice.cell is not None
+    checks.require(not both, "lattice.preset", lattice.preset, "give a preset or [lattice.cell], not both")
+    for key, value in (("lattice.lambda", lattice.lam), ("lattice.eta", lattice.eta)):
+        fits = value is None or lattice.preset == "four-band"
+        checks.require(fits, key, value, "only the four-band preset has it")
+    wrong = lattice.cell.problems() if lattice.cell else []
+    checks.problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
+    return None if any(p.key.startswith("lattice.") for p in checks.problems) else lattice.unit_cell()
 
-    cell = None
-    if sound("lattice", "lattice.preset", "lattice.cell", "lattice.reading", "lattice.lambda", "lattice.eta"):
-        both = lattice.preset is not None and lattice.cell is not None
-        check(not both, "lattice.preset", lattice.preset, "give a preset or [lattice.cell], not both")
-        for key, value in (("lattice.lambda", lattice.lam), ("lattice.eta", lattice.eta)):
-            check(value is None or lattice.preset == "four-band", key, value, "only the four-band preset has it")
-        wrong = cell_problems(*lattice.cell.parts()) if lattice.cell else []
-        problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
-        cell = None if both or wrong or any(p.key.startswith("lattice.") for p in problems) else unit_cell_of(lattice)
 
-    if sound("lattice.cells", "contacts.sites"):
-        sites = sites_of(lattice, contacts)
-        outside = [c for c in sites if not 1 <= c <= lattice.cells]
-        check(
-            not outside,
-            "contacts.sites",
-            outside,
-            f"outside the lattice; cells count from 1 to {lattice.cells}",
-        )
-        doubled = isinstance(contacts.sites, Span) and None not in (contacts.sites.last, contacts.sites.spacing)
-        check(not doubled, "contacts.sites.spacing", None, "give last or spacing, not both")
-        twice = sorted({c for c in sites if sites.count(c) > 1})
-        check(not twice, "contacts.sites", twice, "named twice; a cell carries one contact pair")
-        needs_span = isinstance(contacts.sites, int) and contacts.sites > 0 and lattice.preset is None
-        remedy = "a count needs a preset; list the cells or give {first, last, count}"
-        check(not needs_span, "contacts.sites", contacts.sites, remedy)
-        clearance = contacts.clearance
-        if isinstance(clearance, list):
-            remedy = f"one clearance for each of the {len(sites)} sites is needed"
-            check(len(clearance) == len(sites), "contacts.clearance", clearance, remedy)
-        missing = clearance is None and lattice.preset is None and len(sites) > 0
-        check(not missing, "contacts.clearance", None, "missing; give the clearance in m")
-        elastic = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
-        given = [k for k, v in elastic.items() if v is not None]
-        if contacts.stiffness is not None:
-            check(
-                not given,
-                "contacts.stiffness",
-                contacts.stiffness,
-                f"give it or {', '.join(given)}, not both",
-            )
-        elif sites and len(given) < 3 and sound(*(f"contacts.{k}" for k in elastic)):
-            lacking = [k for k in elastic if k not in given]
-            check(False, "contacts.stiffness", None, f"missing; give it or also {', '.join(lacking)}")
+def check_sites(checks: Checks, lattice: LatticeTable, contacts: ContactsTable) -> None:
+    """Check where the contacts are, and that each has a clearance."""
+    cells = site_cells(lattice, contacts)
+    given, clearance = contacts.sites, contacts.clearance
+    outside = [c for c in cells if not 1 <= c <= lattice.cells]
+    remedy = f"outside the lattice; cells count from 1 to {lattice.cells}"
+    checks.require(not outside, "contacts.sites", outside, remedy)
+    overdetermined = isinstance(given, Span) and None not in (given.last, given.spacing)
+    checks.require(not overdetermined, "contacts.sites.spacing", None, "give last or spacing, not both")
+    twice = sorted({c for c in cells if cells.count(c) > 1})
+    checks.require(not twice, "contacts.sites", twice, "named twice; a cell carries one contact pair")
+    needs_span = isinstance(given, int) and given > 0 and lattice.preset is None
+    remedy = "a count needs a preset; list the cells or give {first, last, count}"
+    checks.require(not needs_span, "contacts.sites", given, remedy)
+    if isinstance(clearance, list):
+        remedy = f"one clearance for each of the {len(cells)} sites is needed"
+        checks.require(len(clearance) == len(cells), "contacts.clearance", clearance, remedy)
+    missing = clearance is None and lattice.preset is None and len(cells) > 0
+    checks.require(not missing, "contacts.clearance", None, "missing; give the clearance in m")
 
-    ways = [drive.frequency is not None, drive.wavenumber is not None, drive.at is not None]
-    if sound("drive.frequency", "drive.wavenumber", "drive.at", "drive.band", "drive"):
+
+def check_stiffness(checks: Checks, lattice: LatticeTable, contacts: ContactsTable) -> None:
+    """Check that the contact stiffness is given once: as a number, or by the material."""
+    elastic = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
+    given = [key for key, value in elastic.items() if value is not None]
+    if contacts.stiffness is not None:
+        remedy = f"give it or {', '.join(given)}, not both"
+        checks.require(not given, "contacts.stiffness", contacts.stiffness, remedy)
+    elif site_cells(lattice, contacts) and checks.valid(*(f"contacts.{key}" for key in elastic)):
+        missing = [key for key in elastic if key not in given]
+        remedy = f"missing; give it or also {', '.join(missing)}"
+        checks.require(not missing, "contacts.stiffness", None, remedy)
+
+
+def check_drive(checks: Checks, drive: DriveTable, lattice: LatticeTable, cell: UnitCell | None) -> None:
+    """Check that the frequency is given in one way, and that the driven mass exists."""
+    if checks.valid("drive.frequency", "drive.wavenumber", "drive.at", "drive.band", "drive"):
+        by_band = drive.wavenumber is not None, drive.at is not None
+        ways = (drive.frequency is not None) + sum(by_band)
         remedy = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
-        check(sum(ways) == 1, "drive.frequency", drive.frequency, remedy)
-        needs = ways[1] or ways[2]
-        check(needs == (drive.band is not None) or sum(ways) != 1, "drive.band", drive.band, remedy)
+        checks.require(ways == 1, "drive.frequency", drive.frequency, remedy)
+        checks.require(any(by_band) == (drive.band is not None) or ways != 1, "drive.band", drive.band, remedy)
         if cell:
             fits = drive.band is None or drive.band <= cell.dofs
-            check(fits, "drive.band", drive.band, f"the cell has {cell.dofs} bands")
-    check(not sound("lattice.cells") or drive.cell <= lattice.cells, "drive.cell", drive.cell,
-          f"outside the lattice; cells count from 1 to {lattice.cells}")  # fmt: skip
+            checks.require(fits, "drive.band", drive.band, f"the cell has {cell.dofs} bands")
+    inside = not checks.valid("lattice.cells") or drive.cell <= lattice.cells
+    checks.require(inside, "drive.cell", drive.cell, f"outside the lattice; cells count from 1 to {lattice.cells}")
     if cell:
-        check(drive.mass <= cell.dofs, "drive.mass", drive.mass, f"the cell has {cell.dofs} masses")
-        if sound("time.sample_interval") and time.sample_interval != "auto":
-            problems += too_coarse(cell, time.sample_interval, "time.sample_interval", time.sample_interval)
-    if sound("time.sample_interval", "time.samples"):
-        both = time.samples is not None and time.sample_interval != "auto"
-        check(not both, "time.samples", time.samples, "give it or time.sample_interval, not both")
-    if sound("time.sample_interval", "time.end") and time.sample_interval != "auto" and time.end != "traverse":
-        check(time.end >= time.sample_interval, "time.end", time.end, "shorter than one sample interval")
-    if output.window is not None and sound("lattice.cells"):
+        checks.require(drive.mass <= cell.dofs, "drive.mass", drive.mass, f"the cell has {cell.dofs} masses")
+
+
+def check_time(checks: Checks, time: TimeTable, cell: UnitCell | None) -> None:
+    """Check the sampling against the bands and against the end."""
+    interval = time.sample_interval
+    if not checks.valid("time.sample_interval"):
+        return
+    if cell and interval != "auto":
+        checks.problems += too_coarse(cell, interval, "time.sample_interval", interval)
+    if checks.valid("time.samples"):
+        both = time.samples is not None and interval != "auto"
+        checks.require(not both, "time.samples", time.samples, "give it or time.sample_interval, not both")
+    if checks.valid("time.end") and interval != "auto" and time.end != "traverse":
+        checks.require(time.end >= interval, "time.end", time.end, "shorter than one sample interval")
+
+
+def check_output(checks: Checks, output: OutputTable, lattice: LatticeTable) -> None:
+    """Check that the recorded window lies in the lattice."""
+    if output.window is not None and checks.valid("lattice.cells"):
         first, last = output.window
-        fits = 1 <= first <= last <= lattice.cells
-        check(fits, "output.window", output.window, f"must be [first, last] within cells 1 to {lattice.cells}")
-    return problems
+        remedy = f"must be [first, last] within cells 1 to {lattice.cells}"
+        checks.require(1 <= first <= last <= lattice.cells, "output.window", output.window, remedy)
 
 
 def too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
-    """The problem of samples every ``interval`` s, asked for by ``key``, that miss the bands' frequencies."""
+    """The problem of samples every ``interval`` s, asked for by ``key``, beyond the top band's Nyquist interval."""
     nyquist = np.pi / pass_bands(cell)[-1].high
     if interval < nyquist:
         return []
-    seen = "" if interval == value else f"an interval of {interval:.4g} s is "
-    return [Problem(key, value, f"{seen}too coarse for the bands; the top band's Nyquist interval is {nyquist:.4g} s")]
-
-
-def sites_of(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
-    """Sites as 1-based cells."""
-    sites = contacts.sites
-    if isinstance(sites, Span) and sites.last is None:
-        return [sites.first + (sites.spacing or 1) * i for i in range(sites.count)]
-    if isinstance(sites, Span):
-        return [c + 1 for c in spread_sites(sites.first, sites.last, sites.count)]
-    if isinstance(sites, int):
-        preset = PRESETS.get(str(lattice.preset))
-        return [c + 1 for c in preset.sites(lattice.cells, sites)] if preset and sites else []
-    return list(sites)
+    given = "" if interval == value else f"an interval of {interval:.4g} s is "
+    return [Problem(key, value, f"{given}too coarse for the bands; the top band's Nyquist interval is {nyquist:.4g} s")]

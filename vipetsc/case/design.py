@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import tomli_w
+from numpy.typing import NDArray
 from pydantic import Field
 
-from vipetsc.case.schema import (
-    CaseError,
-    Positive,
-    Problem,
-    Section,
-    read_section,
-    read_toml,
-    unknown_key,
-    with_overrides,
-)
-
-BESIDE = {"lattice", "contacts", "drive", "time", "output", "sweep", "nnm"}
-"""Sections of other verbs that may stand in the same file; the search is always of the paper's four-band cell."""
+from vipetsc.case.reading import CaseFile, Problem, Section, Table
+from vipetsc.case.schema import Positive
 
 LARGEST = 20_000_000  # Bloch problems (lambda, eta, kappa) of a reading whose bands fit in memory and on disk
 
@@ -34,7 +21,7 @@ class GridTable(Section):
     last: Positive = 1.0
     count: Annotated[int, Field(ge=2)] = 37
 
-    def values(self) -> np.ndarray:
+    def values(self) -> NDArray[np.float64]:
         """The values (count,), free of the last digits' noise."""
         return np.round(np.linspace(self.first, self.last, self.count), 12)
 
@@ -45,10 +32,10 @@ class EtaTable(GridTable):
     first: Annotated[float, Field(gt=0, lt=1)] = 0.1
     last: Annotated[float, Field(gt=0, le=1)] = 1.0
 
-    def values(self) -> np.ndarray:
+    def values(self) -> NDArray[np.float64]:
         """The values below 1."""
-        found = super().values()
-        return found[found < 1]
+        eta = super().values()
+        return eta[eta < 1]
 
 
 class DesignTable(Section):
@@ -60,53 +47,37 @@ class DesignTable(Section):
     wavenumbers: Annotated[int, Field(ge=3)] = 101
 
 
-class DesignCase(Section):
-    """A case of the verb ``design``: the section ``[design]``; everything in it may be left out."""
+class DesignCase(CaseFile):
+    """A case of the verb ``design``, all of whose keys have defaults; the search is of the four-band cell."""
 
-    name: str
     design: DesignTable
 
-    @classmethod
-    def load(cls, path: str | Path | None, overrides: Iterable[str] = ()) -> DesignCase:
-        """The case in file ``path``, or the paper's search, with overrides; raises CaseError or OSError."""
-        if path is None:
-            return cls.from_table({"name": "design"}, overrides, "built-in search")
-        return cls.from_table(read_toml(path), overrides, str(path))
+    builtin_table: ClassVar[Table] = {"name": "design"}
 
     @classmethod
-    def from_table(cls, table: dict[str, Any], overrides: Iterable[str] = (), source: str = "case") -> DesignCase:
-        """The case of a parsed table; raises CaseError with everything that is wrong."""
-        table, problems = with_overrides(table, overrides)
-        known = {"name", "design", *BESIDE}
-        problems += [unknown_key(key, table[key], known) for key in table if key not in known]
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The section, and everything that is wrong with it or with a ``[lattice]`` beside it."""
+        fields, problems = super().read(table)
         lattice = table.get("lattice", {})
         if isinstance(lattice, dict) and ("cell" in lattice or lattice.get("preset", "four-band") != "four-band"):
-            found = lattice.get("preset", "a cell of one's own")
-            problems.append(Problem("lattice", found, "only the four-band preset has a lambda and an eta to search"))
-        name = table.get("name", "design")
-        if not isinstance(name, str) or not name:
-            problems.append(Problem("name", name, "must be a non-empty string"))
-        design, wrong = read_section(DesignTable, table.get("design", {}), "design")
-        problems += wrong or _cross_problems(design)
-        if problems:
-            raise CaseError(problems, source)
-        return cls(name=name, design=design)
+            remedy = "only the four-band preset has a lambda and an eta to search"
+            problems.append(Problem("lattice", lattice.get("preset", "a cell of one's own"), remedy))
+        return fields, problems
 
-    def to_toml(self) -> str:
-        """The resolved case as TOML; reading it back gives the same case."""
-        return tomli_w.dumps(self.model_dump(by_alias=True))
-
-
-def _cross_problems(design: DesignTable) -> list[Problem]:
-    problems = []
-    for key, grid in (("lambda", design.lam), ("eta", design.eta)):
-        if not grid.first < grid.last:
-            remedy = f"must be above design.{key}.first = {grid.first}"
-            problems.append(Problem(f"design.{key}.last", grid.last, remedy))
-    if len(set(design.readings)) < len(design.readings):
-        problems.append(Problem("design.readings", design.readings, "name each reading once"))
-    size = design.lam.count * design.eta.count * design.wavenumbers
-    if size > LARGEST:
-        remedy = f"times design.eta.count and design.wavenumbers it is {size}; at most {LARGEST} fit"
-        problems.append(Problem("design.lambda.count", design.lam.count, remedy))
-    return problems
+    @classmethod
+    def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
+        """What is wrong between the keys of a valid section."""
+        if invalid:
+            return []
+        design, problems = sections["design"], []
+        for key, grid in (("lambda", design.lam), ("eta", design.eta)):
+            if not grid.first < grid.last:
+                remedy = f"must be above design.{key}.first = {grid.first}"
+                problems.append(Problem(f"design.{key}.last", grid.last, remedy))
+        if len(set(design.readings)) < len(design.readings):
+            problems.append(Problem("design.readings", design.readings, "name each reading once"))
+        size = design.lam.count * design.eta.count * design.wavenumbers
+        if size > LARGEST:
+            remedy = f"times design.eta.count and design.wavenumbers it is {size}; at most {LARGEST} fit"
+            problems.append(Problem("design.lambda.count", design.lam.count, remedy))
+        return problems

@@ -1,31 +1,20 @@
-"""The case of the verb ``nnm``: which system, which branches, how they are followed. No PETSc here."""
+"""The case of the verb ``nnm``: which system, which branches, how they are followed.
+
+The system itself is built by ``vipetsc.modes.system.System.from_case``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tomli_w
 from pydantic import Field
 
-from vipetsc.case.checks import sites_of, unit_cell_of
-from vipetsc.case.schema import (
-    CaseError,
-    ContactsTable,
-    Finite,
-    LatticeTable,
-    Positive,
-    Problem,
-    Section,
-    read_section,
-    read_toml,
-    unknown_key,
-    with_overrides,
-)
-
-BESIDE = {"drive", "time", "output", "sweep", "design"}
-"""Sections of a lattice run that may stand in the same file; ``nnm`` does not read them."""
+from vipetsc.case.checks import Checks, check_lattice, check_sites
+from vipetsc.case.reading import CaseFile, Problem, Section, Table
+from vipetsc.case.resolve import clearances, site_cells, with_default_preset
+from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive
+from vipetsc.lattice import Chain, Contact, ContactLaw, contact_stiffness
+from vipetsc.lattice.presets import PRESETS
 
 
 class LinearSpringTable(Section):
@@ -54,7 +43,7 @@ class PairTable(Section):
 
 
 class SystemTable(Section):
-    """A system of one's own: masses in kg, linear and smooth springs, contact pairs (law: ``[contacts]``)."""
+    """The section [nnm.own]: masses in kg, linear and smooth springs, contact pairs (law: ``[contacts]``)."""
 
     masses: list[Positive] = Field(min_length=1)
     springs: list[LinearSpringTable] = Field(min_length=1)
@@ -82,7 +71,7 @@ class NnmTable(Section):
     """
 
     system: Literal["reduced", "chain", "own"] = "reduced"
-    own: SystemTable | None = None
+    custom: SystemTable | None = Field(None, alias="own")
     modes: list[Annotated[int, Field(ge=1)]] = Field([1, 2], min_length=1)
     map: Literal["auto", "quarter", "half", "whole"] = "auto"
     flow: Literal["compiled", "tsrk", "newmark"] = "compiled"
@@ -108,108 +97,91 @@ class NnmTable(Section):
     guards: GuardsTable = GuardsTable()
 
 
-class NnmCase(Section):
+class NnmCase(CaseFile):
     """A case of the verb ``nnm``: sections ``[lattice]``, ``[contacts]`` and ``[nnm]``."""
 
-    name: str
     lattice: LatticeTable
     contacts: ContactsTable
     nnm: NnmTable
 
     @classmethod
-    def load(cls, path: str | Path, overrides: Iterable[str] = ()) -> NnmCase:
-        """The case in file ``path`` with ``a.b=value`` overrides; raises CaseError or OSError."""
-        return cls.from_table(read_toml(path), overrides, str(path))
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The sections, and everything that is wrong with them."""
+        return super().read(with_default_preset(table))
 
     @classmethod
-    def from_table(cls, table: dict[str, Any], overrides: Iterable[str] = (), source: str = "case") -> NnmCase:
-        """The case of a parsed table; raises CaseError with everything that is wrong."""
-        table, problems = with_overrides(table, overrides)
-        kinds = {"lattice": LatticeTable, "contacts": ContactsTable, "nnm": NnmTable}
-        known = {"name", *kinds, *BESIDE}
-        problems += [unknown_key(key, table[key], known) for key in table if key not in known]
-        lattice = table.get("lattice", {})
-        if isinstance(lattice, dict) and "cell" not in lattice:
-            table["lattice"] = {"preset": "four-band"} | lattice
-        sections = {}
-        for key, kind in kinds.items():
-            sections[key], wrong = read_section(kind, table.get(key, {}), key)
-            problems += wrong
-        name = table.get("name", "case")
-        if not isinstance(name, str) or not name:
-            problems.append(Problem("name", name, "must be a non-empty string"))
-        if not problems:
-            problems += _cross_problems(sections["lattice"], sections["contacts"], sections["nnm"])
-        if not problems:
-            case = cls(name=name, **sections)
-            try:
-                dofs = _count_dofs(case.lattice, case.nnm)
-            except ValueError as error:
-                problems.append(Problem("lattice.cell", None, str(error)))
-            else:
-                beyond = [m for m in case.nnm.modes if m > dofs]
-                if not beyond:
-                    return case
-                problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))
-        raise CaseError(problems, source)
+    def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
+        """What is wrong between keys."""
+        return _problems(sections["lattice"], sections["contacts"], sections["nnm"]) if not invalid else []
 
-    def to_toml(self) -> str:
-        """The resolved case as TOML; reading it back gives the same case."""
-        return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
-
-    def physics(self) -> tuple:
+    def physics(self) -> tuple[Any, ...]:
         """What a branch that is resumed must keep: the system, the shooting map and the flow."""
         nnm = self.nnm
-        return self.lattice, self.contacts, nnm.system, nnm.own, nnm.map, nnm.flow, nnm.jacobian
+        return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian
+
+    def contact(self) -> Contact:
+        """The contact law without dissipation; stiffness from the paper's material where none is given."""
+        given, preset = self.contacts, PRESETS[self.lattice.preset or "four-band"].contacts
+        stiffness = given.stiffness
+        if stiffness is None:
+            material = (getattr(given, key) for key in ("modulus", "radius", "poisson"))
+            defaults = (preset[key] for key in ("modulus", "radius", "poisson"))
+            values = (d if v is None else v for v, d in zip(material, defaults, strict=True))
+            stiffness = float(contact_stiffness(*values))
+        return Contact(ContactLaw.named(given.law), stiffness)
+
+    def clearance(self) -> float:
+        """The clearance in m of the reduced model's contact."""
+        return clearances(self.lattice, self.contacts, 1)[0]
+
+    def chain(self) -> Chain:
+        """The lattice with its contact sites."""
+        sites = tuple(c - 1 for c in site_cells(self.lattice, self.contacts))
+        gaps = tuple(clearances(self.lattice, self.contacts, len(sites)))
+        return Chain(self.lattice.unit_cell(), self.lattice.cells, self.lattice.ends, sites, gaps)
 
 
-def _cross_problems(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable) -> list[Problem]:
-    problems = []
-    if (nnm.system == "own") != (nnm.own is not None):
-        problems.append(Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]'))
-    elif nnm.own is not None:
-        problems += _pair_problems(nnm.own)
-    if nnm.own is None and lattice.preset is None and contacts.clearance is None:
-        problems.append(Problem("contacts.clearance", None, "is needed (m): the lattice is no preset"))
+def _problems(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable) -> list[Problem]:
+    checks = Checks(set())
+    remedy = 'a system of one\'s own needs "own" and [nnm.own]'
+    checks.require((nnm.system == "own") == (nnm.custom is not None), "nnm.system", nnm.system, remedy)
     for key in ("energy", "frequency"):
         low, high = getattr(nnm, key)
-        if not low < high:
-            problems.append(Problem(f"nnm.{key}", [low, high], "must be [low, high]"))
-    if nnm.direction != "up" and nnm.energy[0] == 0:
-        problems.append(Problem("nnm.energy", nnm.energy, "going down needs a lowest energy above 0 (J)"))
-    if nnm.smallest_step >= nnm.largest_step:
-        problems.append(Problem("nnm.smallest_step", nnm.smallest_step, "must be below nnm.largest_step"))
+        checks.require(low < high, f"nnm.{key}", [low, high], "must be [low, high]")
+    goes_down = nnm.direction != "up"
+    remedy = "going down needs a lowest energy above 0 (J)"
+    checks.require(not goes_down or nnm.energy[0] > 0, "nnm.energy", nnm.energy, remedy)
+    remedy = "must be below nnm.largest_step"
+    checks.require(nnm.smallest_step < nnm.largest_step, "nnm.smallest_step", nnm.smallest_step, remedy)
+    cell = None
+    if nnm.system == "own":
+        dofs = _check_custom(checks, nnm.custom) if nnm.custom else 0
+    else:
+        cell = check_lattice(checks, lattice)
+        dofs = cell.dofs * lattice.cells if cell and nnm.system == "chain" else 2
     if nnm.system == "chain":
-        sites = sites_of(lattice, contacts)
-        if not sites or any(not 1 <= c <= lattice.cells for c in sites):
-            problems.append(Problem("contacts.sites", sites, f"name cells from 1 to {lattice.cells}"))
-        if isinstance(contacts.clearance, list) and len(contacts.clearance) != len(sites):
-            remedy = f"one clearance for each of the {len(sites)} sites is needed"
-            problems.append(Problem("contacts.clearance", contacts.clearance, remedy))
-    if nnm.system == "reduced" and isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
-        problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
-    return problems
+        sites = site_cells(lattice, contacts)
+        checks.require(bool(sites), "contacts.sites", sites, f"name cells from 1 to {lattice.cells}")
+        check_sites(checks, lattice, contacts)
+    elif nnm.system == "reduced":
+        given = contacts.clearance
+        fits = not isinstance(given, list) or len(given) == 1
+        checks.require(fits, "contacts.clearance", given, "the reduced model has one contact")
+        missing = given is None and lattice.preset is None
+        checks.require(not missing, "contacts.clearance", None, "missing; give the clearance in m")
+    beyond = [mode for mode in nnm.modes if mode > dofs]
+    checks.require(not beyond or bool(checks.problems), "nnm.modes", beyond, f"the system has {dofs} modes")
+    return checks.problems
 
 
-def _pair_problems(system: SystemTable) -> list[Problem]:
-    """Springs and contacts that do not join two of the system's masses, or one of them and the ground."""
+def _check_custom(checks: Checks, system: SystemTable) -> int:
+    """Check that springs and contacts join two masses, or a mass and the ground; returns the number of masses."""
     count = len(system.masses)
-    ends = {
-        "springs": [(s.start, s.end) for s in system.springs],
-        "smooth": [(s.start, s.end) for s in system.smooth],
-        "contacts": [(p.host, p.resonator) for p in system.contacts],
-    }
-    return [
-        Problem(f"nnm.own.{key}", list(pair), f"is not a pair of the system's {count} masses (0 is the ground)")
-        for key, pairs in ends.items()
-        for pair in pairs
-        if pair[0] == pair[1] or max(pair) > count
-    ]
-
-
-def _count_dofs(lattice: LatticeTable, nnm: NnmTable) -> int:
-    """Degrees of freedom of the system; raises ValueError if the lattice's cell is impossible."""
-    if nnm.own is not None:
-        return len(nnm.own.masses)
-    cell = unit_cell_of(lattice)
-    return 2 if nnm.system == "reduced" else lattice.cells * cell.dofs
+    pairs = [(f"springs[{i}]", s.start, s.end) for i, s in enumerate(system.springs, 1)]
+    pairs += [(f"smooth[{i}]", s.start, s.end) for i, s in enumerate(system.smooth, 1)]
+    pairs += [(f"contacts[{i}]", p.host, p.resonator) for i, p in enumerate(system.contacts, 1)]
+    for key, start, end in pairs:
+        fits = start != end and max(start, end) <= count
+        remedy = f"is not a pair of the system's {count} masses (0 is the ground)"
+        checks.require(fits, f"nnm.own.{key}", [start, end], remedy)
+    return count

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import itertools
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import tomli_w
 from pydantic import Field
 
-from vipetsc.case.case import Case
-from vipetsc.case.schema import CaseError, Problem, Section, number, read_section, read_toml, with_overrides
+from vipetsc.case.case import Case, case_id
+from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, put, read_section
+from vipetsc.case.schema import number
 
 RANGES = ("log", "linear")
 
@@ -38,7 +37,7 @@ class SweepTable(Section):
 
 @dataclass(frozen=True)
 class Axis:
-    """Keys that vary together: ``values[i][j]`` is what key ``keys[i]`` takes at the j-th place."""
+    """Keys that vary together: ``values[i][j]`` is what key ``keys[i]`` takes at the j-th index."""
 
     keys: tuple[str, ...]
     values: tuple[tuple[Any, ...], ...]
@@ -48,10 +47,10 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Member:
-    """One run of a sweep: its place on every axis; the resolved case, or why there is none."""
+class SweepMember:
+    """One run of a sweep: its index on every axis; the resolved case, or why there is none."""
 
-    place: tuple[int, ...]
+    index: tuple[int, ...]
     case: Case | None
     problem: str = ""
 
@@ -61,50 +60,38 @@ class Member:
         return case_id(self.case) if self.case else ""
 
 
-@dataclass(frozen=True)
-class Sweep:
+class Sweep(CaseFile):
     """A sweep: the table of its case file without ``[sweep]``, the options, and the axes in the file's order."""
 
-    name: str
-    table: dict[str, Any]
+    table: Table
     options: SweepTable
     axes: tuple[Axis, ...]
 
     @classmethod
-    def load(cls, path: str | Path, overrides: Iterable[str] = ()) -> Sweep:
-        """The sweep in file ``path`` with ``a.b=value`` overrides; raises CaseError or OSError."""
-        return cls.from_table(read_toml(path), overrides, str(path))
-
-    @classmethod
-    def from_table(cls, table: dict[str, Any], overrides: Iterable[str] = (), source: str = "case") -> Sweep:
-        """The sweep of a parsed TOML table; raises CaseError with everything that is wrong with ``[sweep]``."""
-        table, problems = with_overrides(table, overrides)
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The fields, and everything that is wrong with ``[sweep]``; the members' cases are read by ``members``."""
+        table = dict(table)
         section = table.pop("sweep", None)
         if not isinstance(section, dict):
             remedy = "missing; list what varies, as in: [sweep.drive] amplitude = { log = [1.0, 100.0], count = 9 }"
-            raise CaseError([*problems, Problem("sweep", section, remedy)], source)
+            return {}, [Problem("sweep", section, remedy)]
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
             table["time"] = {"engine": "auto"} | table.get("time", {})
         sections = Case.model_fields.keys() - {"name"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
-        options, wrong = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
-        problems += wrong
-        found: dict[str, tuple[Any, ...]] = {}
+        options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
+        values: dict[str, tuple[Any, ...]] = {}
         for key, value in _leaves("", varying):
             try:
-                found[key] = _values(value)
+                values[key] = _values(value)
             except ValueError as error:
                 problems.append(Problem(f"sweep.{key}", value, str(error)))
         if not varying:
-            problems.append(
-                Problem("sweep", None, "names no key that varies, as in [sweep.drive] amplitude = [1.0, 2.0]")
-            )
-        axes, wrong = _axes(found, options.zip)
-        problems += wrong
-        if problems:
-            raise CaseError(problems, source)
-        return cls(str(table.get("name", "sweep")), table, options, axes)
+            remedy = "names no key that varies, as in [sweep.drive] amplitude = [1.0, 2.0]"
+            problems.append(Problem("sweep", None, remedy))
+        axes, wrong = _axes(values, options.zip)
+        return {"table": table, "options": options, "axes": axes}, problems + wrong
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -116,25 +103,29 @@ class Sweep:
         section = self.options.model_dump()
         for axis in self.axes:
             for key, values in zip(axis.keys, axis.values, strict=True):
-                _put(section, key, list(values))
+                put(section, key, list(values))
         return tomli_w.dumps(self.table | {"sweep": section})
 
-    def members(self) -> list[Member]:
-        """All members in the order of the axes, the last varying fastest; raises CaseError if none is sound."""
+    def members(self) -> list[SweepMember]:
+        """All members in the order of the axes, the last varying fastest; raises CaseError if none is valid."""
         members, first = [], None
-        for place in itertools.product(*(range(n) for n in self.shape)):
-            table = copy.deepcopy(self.table)
-            for axis, i in zip(self.axes, place, strict=True):
-                for key, values in zip(axis.keys, axis.values, strict=True):
-                    _put(table, key, values[i])
+        for index in itertools.product(*(range(n) for n in self.shape)):
             try:
-                members.append(Member(place, Case.from_table(table)))
+                members.append(SweepMember(index, self._case_at(index)))
             except CaseError as error:
                 first = first or error
-                members.append(Member(place, None, "; ".join(map(str, error.problems))))
+                members.append(SweepMember(index, None, "; ".join(map(str, error.problems))))
         if first and not any(m.case for m in members):
             raise CaseError(first.problems, self.name)
         return members
+
+    def _case_at(self, index: tuple[int, ...]) -> Case:
+        table = copy.deepcopy(self.table)
+        for axis, i in zip(self.axes, index, strict=True):
+            for key, values in zip(axis.keys, axis.values, strict=True):
+                if problems := put(table, key, copy.deepcopy(values[i])):
+                    raise CaseError(problems, self.name)
+        return Case.from_table(table)
 
     @property
     def figures(self) -> bool:
@@ -149,18 +140,14 @@ class Sweep:
         return {key: key.replace(".", "_") if name in common else name for key, name in short.items()}
 
 
-def case_id(case: Case) -> str:
-    """The first 16 digits of the SHA-256 of the resolved case."""
-    return hashlib.sha256(case.to_toml().encode()).hexdigest()[:16]
-
-
-def _leaves(path: str, tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+def _leaves(path: str, tree: Table) -> Iterator[tuple[str, Any]]:
+    """Every key with its value, as "a.b.c"; a range is one value."""
     for key, value in tree.items():
-        here = f"{path}.{key}" if path else key
+        inner = f"{path}.{key}" if path else key
         if isinstance(value, dict) and not any(kind in value for kind in RANGES):
-            yield from _leaves(here, value)
+            yield from _leaves(inner, value)
         else:
-            yield here, value
+            yield inner, value
 
 
 def _values(value: Any) -> tuple[Any, ...]:
@@ -177,37 +164,28 @@ def _values(value: Any) -> tuple[Any, ...]:
         raise ValueError(remedy)
     if kind == "log" and min(ends) <= 0:
         raise ValueError("the ends of a log range must be positive")
-    spaced = np.geomspace if kind == "log" else np.linspace
-    return tuple(spaced(*map(float, ends), count).tolist())
+    first, last = map(float, ends)
+    return tuple((np.geomspace if kind == "log" else np.linspace)(first, last, count).tolist())
 
 
-def _axes(found: dict[str, tuple[Any, ...]], groups: list[list[str]]) -> tuple[tuple[Axis, ...], list[Problem]]:
+def _axes(values: dict[str, tuple[Any, ...]], groups: list[list[str]]) -> tuple[tuple[Axis, ...], list[Problem]]:
     """One axis a key, or a group of keys that vary together."""
-    problems, group_of = [], {}
+    problems: list[Problem] = []
+    group_of: dict[str, tuple[str, ...]] = {}
     for group in groups:
-        missing = [key for key in group if key not in found]
-        lengths = {key: len(found[key]) for key in group if key in found}
+        missing = [key for key in group if key not in values]
+        lengths = {key: len(values[key]) for key in group if key in values}
         if missing:
-            problems.append(Problem("sweep.zip", missing, f"not among the keys that vary: {', '.join(found)}"))
+            problems.append(Problem("sweep.zip", missing, f"not among the keys that vary: {', '.join(values)}"))
         elif len(set(lengths.values())) > 1:
             problems.append(Problem("sweep.zip", lengths, "keys that vary together need as many values each"))
         elif any(key in group_of for key in group):
             problems.append(Problem("sweep.zip", group, "a key can be in one group only"))
         group_of |= dict.fromkeys(group, tuple(group))
-    axes: dict[tuple[str, ...], Axis] = {}
-    for key in found:
-        keys = group_of.get(key, (key,))
-        if keys not in axes and not problems:
-            axes[keys] = Axis(keys, tuple(found[k] for k in keys))
-    return tuple(axes.values()), problems
-
-
-def _put(table: dict[str, Any], key: str, value: Any) -> None:
-    *parents, last = key.split(".")
-    for parent in parents:
-        inner = table.get(parent)
-        table[parent] = table = dict(inner) if isinstance(inner, dict) else {}
-    table[last] = value
+    if problems:
+        return (), problems
+    axes = dict.fromkeys(group_of.get(key, (key,)) for key in values)
+    return tuple(Axis(keys, tuple(values[key] for key in keys)) for keys in axes), []
 
 
 def coordinate(values: Iterable[Any]) -> np.ndarray:

@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.schema import read_toml
+from vipetsc.case.reading import read_toml
 from vipetsc.cli.tables import bands_table, doctor_table, run_table, sweep_table, validate_table
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -42,7 +41,7 @@ class EnsembleFile:
     @cached_property
     def sweep(self) -> Sweep:
         """The sweep with every range written out."""
-        return Sweep.from_table(tomllib.loads(self.file.attrs["case"]))
+        return Sweep.from_toml(self.file.attrs["case"])
 
     @cached_property
     def dimensions(self) -> tuple[str, ...]:

@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from vipetsc.case.checks import sites_of, unit_cell_of
 from vipetsc.case.nnm import NnmCase, SystemTable
-from vipetsc.case.schema import ClearanceSpan, ContactsTable, LatticeTable
-from vipetsc.lattice import Chain, Contact, ContactLaw, UnitCell, contact_stiffness, log_clearances
-from vipetsc.lattice.presets import PRESETS
+from vipetsc.lattice import Chain, Contact, UnitCell
 
 
 @dataclass(frozen=True)
@@ -102,16 +99,13 @@ class System:
 
     @classmethod
     def from_case(cls, case: NnmCase) -> System:
-        """The system of a case: its own one, the reduced model of the lattice's cell, or the lattice."""
-        law = _conservative_contact(case.lattice, case.contacts)
-        if case.nnm.own is not None:
-            return cls._from_table(case.nnm.own, law)
-        cell = unit_cell_of(case.lattice)
+        """The system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
+        law = case.contact()
+        if case.nnm.custom is not None:
+            return cls._from_table(case.nnm.custom, law)
         if case.nnm.system == "reduced":
-            return cls.reduced(cell, _clearances(case.lattice, case.contacts, 1)[0], law)
-        sites = tuple(number - 1 for number in sites_of(case.lattice, case.contacts))
-        clearances = _clearances(case.lattice, case.contacts, len(sites))
-        return cls.from_chain(Chain(cell, case.lattice.cells, case.lattice.ends, sites, clearances), law)
+            return cls.reduced(case.lattice.unit_cell(), case.clearance(), law)
+        return cls.from_chain(case.chain(), law)
 
     @classmethod
     def _from_table(cls, table: SystemTable, law: Contact) -> System:
@@ -231,23 +225,3 @@ def contact_directions(system: System) -> np.ndarray:
     """Rows (contacts, n) with w = rows @ u."""
     rows = [direction(p.host, p.resonator, system.dofs) for p in system.contacts]
     return np.array(rows).reshape(len(rows), system.dofs)
-
-
-def _conservative_contact(lattice: LatticeTable, contacts: ContactsTable) -> Contact:
-    """The contact law without dissipation; stiffness from the preset's material where none is given."""
-    stiffness = contacts.stiffness
-    if stiffness is None:
-        preset = PRESETS[lattice.preset or "four-band"].contacts
-        given = {key: getattr(contacts, key) for key in ("modulus", "radius", "poisson")}
-        stiffness = contact_stiffness(*(preset[key] if value is None else value for key, value in given.items()))
-    return Contact(ContactLaw.named(contacts.law), float(stiffness))
-
-
-def _clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> tuple[float, ...]:
-    """Clearances in m of ``count`` sites, the preset's where none are given."""
-    given = contacts.clearance
-    if given is None:
-        return tuple(PRESETS[str(lattice.preset)].clearances(count))
-    if isinstance(given, ClearanceSpan):
-        return tuple(log_clearances(given.first, given.last, count))
-    return (given,) * count if isinstance(given, float) else tuple(given)

@@ -11,8 +11,7 @@ import h5py
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from vipetsc.case import Case
-from vipetsc.case.sweep import case_id
+from vipetsc.case import Case, case_id
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.io.folder import FolderError

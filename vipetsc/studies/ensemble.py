@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 import vipetsc
-from vipetsc.case import Member, Sweep
+from vipetsc.case import Sweep, SweepMember
 from vipetsc.case.sweep import coordinate
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.store import Coordinates
@@ -54,7 +54,7 @@ class Outcome:
         return STATUS[self.status]
 
 
-def assemble(plan: Sweep, members: Sequence[Member], outcomes: Sequence[Outcome], folder: Path) -> Path:
+def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> Path:
     """Write ``folder/ensemble.h5`` from the members' files, whole or not at all; returns its path.
 
     A dimension for every axis, named after its first key, with a coordinate for every key; NaN where a member
@@ -88,11 +88,11 @@ def assemble(plan: Sweep, members: Sequence[Member], outcomes: Sequence[Outcome]
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["vipetsc_version"] = vipetsc.__version__
         file.attrs["case"] = plan.to_toml()
-        file.attrs["failed"] = [f"{m.place}: {o.reason}" for m, o in _failed(members, outcomes)]
+        file.attrs["failed"] = [f"{m.index}: {o.reason}" for m, o in _failed(members, outcomes)]
     return path
 
 
-def _failed(members: Sequence[Member], outcomes: Sequence[Outcome]) -> Iterator[tuple[Member, Outcome]]:
+def _failed(members: Sequence[SweepMember], outcomes: Sequence[Outcome]) -> Iterator[tuple[SweepMember, Outcome]]:
     return ((m, o) for m, o in zip(members, outcomes, strict=True) if o.status == FAILED)
 
 
@@ -125,7 +125,7 @@ UNITS = {
 }
 
 
-def _read(plan: Sweep, members: Sequence[Member], outcomes: Sequence[Outcome], folder: Path) -> tuple:
+def _read(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> tuple:
     """Scalars (name -> array of the sweep's shape), histories padded with NaN, and shares of the parts."""
     count = len(members)
     values = {name: np.full(count, np.nan) for name in (*MEASURES, *STATISTICS)}

@@ -13,8 +13,8 @@ from mpi4py import MPI
 import h5py
 import numpy as np
 
-from vipetsc.case import Case
-from vipetsc.case.sweep import SweepTable, case_id
+from vipetsc.case import Case, case_id
+from vipetsc.case.sweep import SweepTable
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.memory import RunMemory
 from vipetsc.io.atomic import atomic_write, write_text

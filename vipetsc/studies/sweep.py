@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case import Case, Member, Sweep
+from vipetsc.case import Case, Sweep, SweepMember
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError
 from vipetsc.io.store import claim_folder
@@ -101,7 +101,7 @@ def sweep(
 
 
 def conclude(
-    plan: Sweep, members: list[Member], shop: Members, reasons: dict[str, str | None]
+    plan: Sweep, members: list[SweepMember], shop: Members, reasons: dict[str, str | None]
 ) -> tuple[Outcome | None, ...]:
     """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns how the members ended.
 
@@ -181,7 +181,7 @@ def _cost(case: Case, wave: LinearWave) -> float:
     return float(np.minimum(wave.reached(case), 10.0).sum()) + 1e-3 * case.time.end
 
 
-def _outcome(member: Member, shop: Members, reasons: dict[str, str | None]) -> Outcome | None:
+def _outcome(member: SweepMember, shop: Members, reasons: dict[str, str | None]) -> Outcome | None:
     if member.case is None:
         return Outcome(FAILED, member.problem)
     summary = shop.summary(member.case)
@@ -194,12 +194,12 @@ def _outcome(member: Member, shop: Members, reasons: dict[str, str | None]) -> O
     )
 
 
-def _write_index(plan: Sweep, members: list[Member], outcomes: tuple[Outcome | None, ...], folder: Path) -> None:
+def _write_index(plan: Sweep, members: list[SweepMember], outcomes: tuple[Outcome | None, ...], folder: Path) -> None:
     names = plan.names()
     axes = [{"keys": axis.keys, "names": [names[k] for k in axis.keys], "values": axis.values} for axis in plan.axes]
     rows = []
     for member, outcome in zip(members, outcomes, strict=True):
-        row = {"place": member.place, "id": member.id}
+        row = {"place": member.index, "id": member.id}
         row |= {"status": outcome.name, "reason": outcome.reason} if outcome else {"status": "missing", "reason": ""}
         rows.append(row)
     index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}

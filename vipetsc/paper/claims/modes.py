@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from dataclasses import dataclass
 
 import numpy as np
 
-from vipetsc.case import Case
-from vipetsc.case.nnm import NnmCase
+from vipetsc.case import Case, NnmCase
 from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.bloch import waves_at
@@ -38,7 +36,7 @@ def branches(evidence: Evidence, reading: str, finding: Measurement) -> None:
     for law in LAWS:
         step = f"nnm-{law}" + ("" if reading == "printed" else f"-{reading}")
         file = evidence.hdf5(step, BRANCH)
-        case = NnmCase.from_table(tomllib.loads(file.attrs["case"]))
+        case = NnmCase.from_toml(file.attrs["case"])
         if case.lattice.reading != reading or case.contacts.law != law:
             raise MissingEvidence(f"{step} holds a branch of the law {case.contacts.law}, {case.lattice.reading}")
         names = ("energy", "frequency", "slope", "region", "multiplier_max", "kind")

@@ -1,0 +1,251 @@
+"""Strict reading of case files: TOML tables into typed sections, every problem reported at once.
+
+A key that is unknown, of the wrong type or impossible becomes a ``Problem``: the key's path, the value, what to do
+and, where there is one, the nearest valid key. ``CaseFile`` is the one way from a TOML file to a case; every verb's
+case is a subclass that declares the sections it reads.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import difflib
+import re
+import tomllib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "design")
+"""Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
+
+Table = dict[str, Any]
+"""A parsed TOML table."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong with a case: the key's path, its value, and what to do."""
+
+    key: str
+    value: Any
+    remedy: str
+
+    def __str__(self) -> str:
+        value = "" if self.value is None else f" = {self.value!r}"
+        return f"{self.key}{value}: {self.remedy}"
+
+
+class CaseError(ValueError):
+    """A case that cannot be used; ``problems`` holds all reasons."""
+
+    def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
+        self.problems = list(problems)
+        self.source = source
+        count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
+        super().__init__(f"{source}: {count}\n" + "\n".join(f"  {p}" for p in self.problems))
+
+    def __reduce__(self) -> tuple[type[CaseError], tuple[list[Problem], str]]:
+        return type(self), (self.problems, self.source)
+
+
+class Section(BaseModel):
+    """A table of a case file: strict types, no unknown keys, immutable."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+class CaseFile(Section):
+    """What a verb reads from a case file: a ``name`` and the sections that a subclass declares as its fields.
+
+    Hooks of a subclass: ``check`` finds what is wrong between valid keys; ``read`` may fill in the table before its
+    sections are read, and resolve them afterwards. ``builtin_table`` is the case without a file, if there is one.
+    """
+
+    name: str
+
+    builtin_table: ClassVar[Table] = {}
+
+    @classmethod
+    def load(cls, path: str | Path | None, overrides: Iterable[str] = ()) -> Self:
+        """The case in file ``path``, or the built-in one, with ``a.b=value`` overrides; raises CaseError."""
+        if path is None:
+            return cls.builtin(overrides)
+        return cls.from_table(read_toml(path), overrides, str(path))
+
+    @classmethod
+    def builtin(cls, overrides: Iterable[str] = ()) -> Self:
+        """The case without a file, with ``a.b=value`` overrides; raises CaseError."""
+        return cls.from_table(cls.builtin_table, overrides, "built-in case")
+
+    @classmethod
+    def from_toml(cls, text: str) -> Self:
+        """The case written in ``text``."""
+        return cls.from_table(tomllib.loads(text))
+
+    @classmethod
+    def of(cls, run: xr.DataTree | xr.Dataset) -> Self:
+        """The resolved case that a file of results carries in its attribute ``case``."""
+        return cls.from_toml(run.attrs["case"])
+
+    @classmethod
+    def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
+        """The resolved case of a parsed table; raises CaseError with everything that is wrong."""
+        table, problems = with_overrides(table, overrides)
+        valid = ("name", *SECTIONS)
+        problems += [unknown_key(key, table[key], valid) for key in table if key not in valid]
+        name = table.get("name", "case")
+        if not isinstance(name, str) or not name:
+            problems.append(Problem("name", name, "must be a non-empty string"))
+        fields, wrong = cls.read(table)
+        problems += wrong
+        if problems:
+            raise CaseError(problems, source)
+        return cls(name=name, **fields)
+
+    @classmethod
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The fields besides ``name``, and everything wrong with the sections they come from."""
+        fields, problems = {}, []
+        for key, field in cls.model_fields.items():
+            if key != "name":
+                kind: Any = field.annotation
+                fields[key], wrong = read_section(kind, table.get(key, {}), key)
+                problems += wrong
+        return fields, problems + cls.check(fields, {p.key for p in problems})
+
+    @classmethod
+    def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
+        """What is wrong between keys; the keys in ``invalid`` are reported already and hold their defaults."""
+        return []
+
+    def to_toml(self) -> str:
+        """The resolved case as TOML; reading it back gives the same case."""
+        return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
+
+
+def read_toml(path: str | Path) -> Table:
+    """The table in a TOML file, named after the file if it has no name; raises CaseError."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        remedy = f"{error.strerror}; a case file (TOML) is needed"
+        raise CaseError([Problem(str(path), None, remedy)]) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CaseError([Problem(str(path), None, f"not a TOML file ({error})")]) from None
+    return {"name": path.stem} | table
+
+
+def unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
+    """The problem of a key that is not one of ``valid``, with the nearest one that is."""
+    *parents, key = path.split(".")
+    near = difflib.get_close_matches(key, list(valid), n=1, cutoff=0.5)
+    prefix = "".join(f"{p}." for p in parents)
+    remedy = f"did you mean {prefix}{near[0]}?" if near else f"valid keys: {', '.join(sorted(valid))}"
+    return Problem(path, value, f"unknown key; {remedy}")
+
+
+def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[Problem]]:
+    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and what cannot be."""
+    table, problems = copy.deepcopy(table), []
+    for override in overrides:
+        path, equals, text = (part.strip() for part in override.partition("="))
+        if not equals or not all(path.split(".")):
+            problems.append(Problem("--set", override, "write section.key=value"))
+            continue
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = _bare(text)
+        problems += [dataclasses.replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
+    return table, problems
+
+
+def put(table: Table, path: str, value: Any) -> list[Problem]:
+    """Set the key ``path`` ("a.b.c") of ``table`` in place; the problem if a parent is no section."""
+    *parents, key = path.split(".")
+    section: Any = table
+    for parent in parents:
+        section = section.setdefault(parent, {}) if isinstance(section, dict) else section
+    if not isinstance(section, dict):
+        return [Problem(path, value, f"{'.'.join(parents)} is a value, not a section")]
+    section[key] = value
+    return []
+
+
+def _bare(text: str) -> float | str:
+    """A value that TOML would not take: a number such as .5, or a word."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySection, list[Problem]]:
+    """The section ``name`` and its problems; with problems, the section holds the valid keys and defaults."""
+    if not isinstance(table, dict):
+        return kind(), [Problem(name, table, f"must be a section [{name}]")]
+    try:
+        return kind(**table), []
+    except ValidationError as error:
+        problems: dict[str, Problem] = {}
+        invalid = set()
+        for item in error.errors(include_url=False):
+            invalid.add(item["loc"][0])
+            problem = _problem_of(kind, name, dict(item))
+            problems.setdefault(problem.key, problem)
+        section, _ = read_section(kind, {k: v for k, v in table.items() if k not in invalid}, name)
+        return section, list(problems.values())
+
+
+def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem:
+    """The problem behind one of pydantic's errors in section ``name``."""
+    keys = [part for part in item["loc"] if not _is_union_branch(part)]
+    path = name
+    for part in keys:
+        path += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
+    if item["type"] == "extra_forbidden":
+        fields = _section_at(kind, keys[:-1]).model_fields
+        return unknown_key(path, item["input"], [field.alias or key for key, field in fields.items()])
+    message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    value = None if item["type"] == "missing" else item["input"]
+    choices = item.get("ctx", {}).get("expected")
+    if isinstance(value, str) and choices:
+        near = difflib.get_close_matches(value, re.findall(r"'([^']+)'", choices), n=1, cutoff=0.4)
+        message += f"; did you mean {near[0]!r}?" if near else ""
+    return Problem(path, value, message)
+
+
+def _is_union_branch(part: int | str) -> bool:
+    """Whether pydantic put ``part`` into the path for the branch of a union it tried: "float", "list[int]", "Span"."""
+    return isinstance(part, str) and (
+        part in {"int", "float", "str", "bool", "Span", "ClearanceSpan"}
+        or "[" in part
+        or part.startswith("constrained")
+    )
+
+
+def _section_at(kind: type[Section], keys: list[int | str]) -> type[Section]:
+    """The section that a path of keys below ``kind`` leads to."""
+    for key in keys:
+        fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
+        kind = next(_sections_in(fields.get(str(key))), kind)
+    return kind
+
+
+def _sections_in(annotation: Any) -> Iterator[type[Section]]:
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _sections_in(argument)
