@@ -238,7 +238,6 @@ def effective_restitution(r: float) -> float:
 def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     from mpi4py import MPI
 
-    from vipetsc.contact.episodes import ImpactTracker
     from vipetsc.dynamics.layout import Layout
     from vipetsc.dynamics.operator import LatticeOperator
     from vipetsc.dynamics.ts.integrator import Integrator
@@ -261,12 +260,12 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     model = case.model()
     layout = Layout.of(model, MPI.COMM_SELF)
     operator = LatticeOperator(model, layout)
-    tracker = ImpactTracker(operator, model.contact)
-    integrator = Integrator(model, layout, operator, tracker)
+    integrator = Integrator.create(model, layout, operator, True, None)
+    tracker = integrator.tracker
     # Velocities lie behind the displacements, mass by mass: host and resonator of cell 1.
     integrator.state.array[layout.dofs * layout.owned + layout.owned] = 1.0
     integrator.step = integrator.free_step = 1e-5
-    tracker.observe(0.0, integrator.state, tracker.start)
+    operator.observe(0.0, integrator.state, tracker.start)
     integrator._first_step = 1e-5
     integrator.advance(0.0025)  # before the rebound meets the other side
     (episode,) = tracker.closed

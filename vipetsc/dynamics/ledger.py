@@ -10,12 +10,11 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
+from vipetsc.dynamics.energies import FINE, measure
 from vipetsc.dynamics.operator import LatticeOperator
-from vipetsc.dynamics.ts import kernel
 
 # A ledger that misses by this share of the largest work is no longer a solution but an instability.
 RUNAWAY = 0.1
-_FINE = 2.0**40
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,10 @@ class Ledger:
         """Energies of ``state``, whose ghosts must be up to date; all ranks must call it."""
         total = self._total
         with state.localForm() as local:
-            kernel.measure(local.array, self.operator.q, self.operator.p, self.unit, total)
+            measure(local.array, self.operator.lattice, self.unit, total)
         self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         *parts, work = total.tolist()
-        held = [a * self.unit + b * (self.unit / _FINE) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+        held = [a * self.unit + b * (self.unit / FINE) for a, b in zip(parts[::2], parts[1::2], strict=True)]
         kinetic, spring, contact, dissipated = held
         return Energies(kinetic, spring, contact, work, dissipated)
 

@@ -10,51 +10,58 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.records import create_context, create_record
 from vipetsc.dynamics.ts import kernel, native
+from vipetsc.dynamics.ts.right_hand_side import observe, right_hand_side
 from vipetsc.lattice import Hertz
 
 
 class LatticeOperator:
-    """Right-hand side, energies and relative motions of the owned part of a lattice.
+    """Right-hand side and relative motions of the owned part of a lattice.
 
-    ``q`` and ``p`` are the kernel's block seen as integers and as floats; ``mode``, ``approach`` and
-    ``clearance`` are views of it, one entry an owned site, which the impact tracker writes.
+    ``lattice`` is its record; the impact tracker sets the modes and approach velocities of its ``contacts``.
     """
 
     def __init__(self, model: Model, layout: Layout) -> None:
         self.layout = layout
+        self.lattice = create_record(model, layout)
         self.q, self.p = _block(model, layout)
         sites = slice(0, len(layout.sites))
         self.mode = self.q[self.q[kernel.SITE_MODE] :][sites]
         self.approach = self.p[self.q[kernel.APPROACH] :][sites]
-        self.clearance = self.p[self.q[kernel.CLEARANCE] :][sites]
 
     def register(self, ts: PETSc.TS, use_native: bool = True) -> str:
         """Make this the right-hand side of ``ts``; returns "native" or "python", which give the same bits."""
-        if use_native:
-            callback = native.compile_callback()
-            ts.setAttr("callback", (callback, self))  # PETSc holds bare pointers: both must live as long as ts
-            error = native.petsc_library().TSSetRHSFunction(
-                ctypes.c_void_p(ts.handle),
-                None,
-                ctypes.c_void_p(callback.address),
-                ctypes.c_void_p(self.q.ctypes.data),
-            )
-            if error:
-                raise RuntimeError(f"TSSetRHSFunction failed with PETSc error {error}")
-            return "native"
-        ts.setRHSFunction(self)
-        return "python"
+        if not use_native:
+            ts.setRHSFunction(self)
+            return "python"
+        callback, context = native.compile_callback(), create_context(self.lattice)
+        ts.setAttr("callback", (callback, context, self))  # PETSc holds bare pointers: all must live as long as ts
+        error = native.petsc_library().TSSetRHSFunction(
+            ctypes.c_void_p(ts.handle),
+            None,
+            ctypes.c_void_p(callback.address),
+            ctypes.c_void_p(context.ctypes.data),
+        )
+        if error:
+            raise RuntimeError(f"TSSetRHSFunction failed with PETSc error {error}")
+        return "native"
 
     def __call__(self, ts: PETSc.TS, t: float, u: PETSc.Vec, f: PETSc.Vec) -> None:
         """Evaluate as petsc4py calls it."""
         self.exchange(u)
         with u.localForm() as local:
-            kernel.right_hand_side(t, local.array, f.array, self.q, self.p)
+            right_hand_side(t, local.array, f.array, self.lattice)
+
+    def observe(self, t: float, state: PETSc.Vec, motion: np.ndarray) -> None:
+        """Relative motion (sites, 3) of all owned sites at time t; fetches ghosts, so all ranks must call it."""
+        self.exchange(state)
+        with state.localForm() as local:
+            observe(t, local.array, self.lattice, motion)
 
     def exchange(self, u: PETSc.Vec) -> None:
         """Fetch the neighbouring cells' displacements into the ghosts of ``u``."""
-        if self.q[kernel.EXCHANGE]:
+        if self.lattice.shape.exchange:
             u.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
 
 

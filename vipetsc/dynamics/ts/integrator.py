@@ -20,7 +20,10 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.episodes import Episode, ImpactTracker
+from vipetsc.contact import landing
+from vipetsc.contact.changes import Change
+from vipetsc.contact.episodes import Episode
+from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
@@ -30,8 +33,6 @@ from vipetsc.parallel import StopRequest
 # PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
 # and often saves a step on the way to a sample.
 STRETCH = 1.08
-# Newton steps for one landing before the search is repeated on a shorter step.
-LANDING_STEPS = 8
 # Steps and rejected trials on the way to one time beyond which a run counts as stalled.
 MOST_TRIALS = 200_000
 # A time step below this many rounding units of the time does not advance it reliably.
@@ -97,14 +98,17 @@ class Integrator(Engine):
         hertz = model.contact.law is Hertz
         share, order = (1 / 200, 2.5) if hertz else (1 / 20, 8)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
-        tracker.observe(0.0, self.state, tracker.start)
+        operator.observe(0.0, self.state, tracker.start)
 
     @classmethod
     def create(
         cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
     ) -> Integrator:
         """An integrator at rest at t = 0 with its own impact tracker."""
-        return cls(model, layout, operator, ImpactTracker(operator, model.contact), native, stop)
+        cell = model.chain.cell
+        reduced_mass = 1 / (1 / cell.masses[cell.host] + 1 / cell.masses[cell.resonator])
+        tracker = ImpactTracker(operator.lattice.contacts, layout.sites, reduced_mass)
+        return cls(model, layout, operator, tracker, native, stop)
 
     @classmethod
     def refusal(cls, model: Model) -> None:
@@ -180,14 +184,14 @@ class Integrator(Engine):
             self.step = suggestion
         self.counts.steps += 1
         end = target if parts == 1 else self.time + h
-        self.tracker.observe(end, self.state, self.tracker.end)
-        share, site, row = self.tracker.first_change(h)
-        self._buffer[:] = share, -float(self._stop.requested)
+        self.operator.observe(end, self.state, self.tracker.end)
+        change = self.tracker.first_change(h)
+        self._buffer[:] = change.share, -float(self._stop.requested)
         self.comm.Allreduce(MPI.IN_PLACE, self._buffer, MPI.MIN)
         if self._buffer[0] <= 1.0:
-            self._land(h, float(self._buffer[0]), share, site, row)
+            self._land(h, float(self._buffer[0]), change)
         else:
-            self.tracker.follow(h)
+            self.tracker.accept_step(h)
             self.time = end
         return self._buffer[1] == 0.0
 
@@ -202,41 +206,45 @@ class Integrator(Engine):
             return False, 0.1 * h
         return ts.getConvergedReason() >= 0, suggestion
 
-    def _land(self, h: float, share: float, own_share: float, site: int, row: int) -> None:
-        """Step from the saved state onto the change at ``share`` of the step just tried, and switch there."""
+    def _land(self, h: float, share: float, change: Change) -> None:
+        """Step from the saved state onto the change at ``share`` of the step just tried, and switch there.
+
+        ``change`` is this rank's first one; the rank whose share is the smallest judges the landing for all.
+        """
         comm, tracker = self.comm, self.tracker
-        owner = comm.allreduce(comm.rank if own_share == share else comm.size, MPI.MIN)
-        landing, last = share * h, np.inf
+        owner = comm.allreduce(comm.rank if change.share == share else comm.size, MPI.MIN)
+        attempt, outcome = landing.begin_landing(share, h), landing.RETRY
         self.counts.landings += 1
-        for attempt in range(2 * LANDING_STEPS):
+        while outcome == landing.RETRY:
+            length = attempt.length
             self.saved.copy(self.state)
             self.ts.restartStep()
-            if landing <= SHORTEST_STEP * max(self.time, self.free_step):
+            if length <= SHORTEST_STEP * max(self.time, self.free_step):
                 self._switch()  # the change lies at the start of the step
                 return
-            accepted, suggestion = self._trial(landing)
+            accepted, suggestion = self._trial(length)
             if not accepted:
                 self.step = suggestion
                 self.saved.copy(self.state)
                 return
-            tracker.observe(self.time + landing, self.state, tracker.end)
-            value, rate, tolerance = comm.bcast(tracker.distance(site, row) if comm.rank == owner else None, owner)
-            if abs(value) <= tolerance:
-                tracker.follow(landing)
-                self.time += landing
-                self._switch()
-                return
-            newton = landing - value / rate if rate else np.inf
-            if attempt < LANDING_STEPS and 0 < newton <= h and abs(value) < 0.5 * last:
-                landing, last = newton, abs(value)
-                continue
-            # A graze: short of it, go on from here; beyond it, search again on the shorter step.
-            again = comm.bcast(tracker.first_change(landing)[0] if comm.rank == owner else None, owner)
-            if again > 1.0:
-                break
-            landing *= again
-        tracker.follow(landing)
-        self.time += landing
+            self.operator.observe(self.time + length, self.state, tracker.end)
+            attempt, outcome = comm.bcast(self._judge(attempt, change) if comm.rank == owner else None, owner)
+        tracker.accept_step(length)
+        self.time += length
+        if outcome == landing.LANDED:
+            self._switch()
+
+    def _judge(self, attempt: landing.Landing, change: Change) -> tuple[landing.Landing, int]:
+        """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it."""
+        function = self.tracker.switching(change)
+        attempt, outcome = landing.correct(
+            attempt, function.value, function.rate, function.tolerance, function.tolerance
+        )
+        if outcome != landing.SEARCH:
+            return attempt, outcome
+        # A graze: short of it, go on from here; beyond it, search again on the shorter step.
+        share = self.tracker.first_change(attempt.length).share
+        return (landing.shorten(attempt, share), landing.RETRY) if share <= 1.0 else (attempt, landing.MISSED)
 
     def _switch(self) -> None:
         """Switch modes of all landed sites and set the step with which to go on."""
@@ -251,13 +259,12 @@ class Integrator(Engine):
             self.step = min(self.step, self._first_share * shortest)
         elif not was_free:
             self.step = self.free_step
-        tracker.observe(self.time, self.state, tracker.start)
+        self.operator.observe(self.time, self.state, tracker.start)
         self.ts.restartStep()
 
     def take_episodes(self) -> list[Episode]:
         """Episodes closed since the last call, of the owned sites."""
-        closed, self.tracker.closed = self.tracker.closed, []
-        return closed
+        return self.tracker.take_closed()
 
     def unfinished(self) -> list[Episode]:
         """Copies of the owned sites' open episodes."""
@@ -288,7 +295,7 @@ class Integrator(Engine):
         self._any_open = bool(any_open)
         self.counts = StepCounts(*checkpoint["counts"].tolist())
         self.ts.restartStep()
-        self.tracker.observe(self.time, self.state, self.tracker.start)
+        self.operator.observe(self.time, self.state, self.tracker.start)
 
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""

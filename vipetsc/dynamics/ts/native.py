@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
+from typing import Any
 
 from petsc4py import PETSc
 
 import numba
 import numpy as np
 from llvmlite import binding
-from numba import types
+from numba import carray, njit, types
+from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 
-from vipetsc.dynamics.ts import kernel
+from vipetsc.contact.law import SITE, Contacts, ForceLaw
+from vipetsc.dynamics.records import CONTEXT, COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
+from vipetsc.dynamics.ts.right_hand_side import right_hand_side
 
 _CALLS = {
     "VecGhostUpdateBegin": types.int32(types.int64, types.int32, types.int32),
@@ -29,61 +34,74 @@ def petsc_library() -> ctypes.CDLL:
     return ctypes.CDLL(PETSc.__file__)
 
 
-@intrinsic
-def _pointer(typing_context, address):
+def _pointer_of(typing_context: Any, address: Any) -> tuple[Any, Callable]:
     """An int64 address as a void pointer."""
 
-    def generate(context, builder, signature, arguments):
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.int64), generate
 
 
-def compile_callback() -> numba.core.ccallback.CFunc:
-    """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *block)``, compiled or taken from numba's cache.
+_pointer: Any = intrinsic(_pointer_of)
 
-    ``block`` is the address of the kernel's words; the header holds their number and a slot that receives array
-    pointers. Raises AttributeError where PETSc hides its symbols.
+
+@njit(cache=True, error_model="numpy")
+def _lattice(context: Any) -> LatticeRecord:
+    """The record whose tables stand at the context's addresses."""
+    shape, law, burst, at, size = context.shape, context.law, context.burst, context.address, context.length
+    return LatticeRecord(
+        Shape(
+            shape.cells, shape.dofs, shape.host, shape.resonator, shape.owned, shape.ghosted, shape.exchange,
+            shape.left_ghost, shape.right_ghost, shape.left_free, shape.right_free, shape.driven, shape.work,
+            shape.dissipated,
+        ),
+        carray(_pointer(at.masses), (size.masses,), MASS),
+        carray(_pointer(at.couplings), (size.couplings,), COUPLING),
+        carray(_pointer(at.springs), (size.springs,), SPRING),
+        carray(_pointer(at.site_cells), (size.site_cells,), np.int64),
+        Contacts(
+            ForceLaw(law.stiffness, law.exponent, law.damping, law.clip, law.approach_floor),
+            carray(_pointer(at.sites), (size.sites,), SITE),
+        ),
+        Burst(burst.amplitude, burst.frequency, burst.cycles, burst.duration),
+    )  # fmt: skip
+
+
+def compile_callback() -> CFunc:
+    """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
+
+    ``context`` is the address of a ``CONTEXT`` record. Raises AttributeError where PETSc hides its symbols.
     """
     library = petsc_library()
     for name in _CALLS:
         binding.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
-    begin, end, get, restore, get_write, restore_write = (types.ExternalFunction(n, s) for n, s in _CALLS.items())
-    words, exchange, slot, owned, ghosted = (
-        kernel.WORDS,
-        kernel.EXCHANGE,
-        kernel.SLOT,
-        kernel.OWNED,
-        kernel.GHOSTED,
-    )
-    rhs, header = kernel.right_hand_side, kernel.HEADER
+    functions: list[Any] = [types.ExternalFunction(name, signature) for name, signature in _CALLS.items()]
+    begin, end, get, restore, get_write, restore_write = functions
 
     @numba.cfunc("i4(i8, f8, i8, i8, i8)", cache=True)
-    def callback(ts, t, u, f, block):
-        head = numba.carray(_pointer(block), (header,), np.int64)
-        q = numba.carray(_pointer(block), (head[words],), np.int64)
-        p = numba.carray(_pointer(block), (head[words],), np.float64)
-        if q[exchange] == 1:
+    def callback(ts: int, t: float, u: int, f: int, address: int) -> int:
+        context: Any = carray(_pointer(address), (1,), CONTEXT)[0]
+        shape = context.shape
+        if shape.exchange:
             error = begin(u, 1, 0)
             if error == 0:
                 error = end(u, 1, 0)
             if error != 0:
                 return error
-        pointer = block + 8 * slot
-        error = get(u, pointer)
+        error = get(u, address)
         if error != 0:
             return error
-        at_u = q[slot]
-        y = numba.carray(_pointer(at_u), (q[ghosted],), np.float64)
-        error = get_write(f, pointer)
+        state = context.array
+        error = get_write(f, address)
         if error != 0:
             return error
-        at_f = q[slot]
-        rhs(t, y, numba.carray(_pointer(at_f), (q[owned],), np.float64), q, p)
-        error = restore_write(f, pointer)
+        rate = carray(_pointer(context.array), (shape.owned,), np.float64)
+        right_hand_side(t, carray(_pointer(state), (shape.ghosted,), np.float64), rate, _lattice(context))
+        error = restore_write(f, address)
         if error != 0:
             return error
-        q[slot] = at_u
-        return restore(u, pointer)
+        context.array = state
+        return restore(u, address)
 
     return callback

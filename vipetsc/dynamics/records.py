@@ -1,0 +1,153 @@
+"""The lattice as compiled kernels see it: tables of masses, springs and sites, and the drive.
+
+A rank's part of the state is ordered as ``layout`` says. The tables are structured arrays; ``LatticeRecord`` holds them
+for functions compiled by numba, ``CONTEXT`` their addresses for a callback that PETSc hands one pointer.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple, get_type_hints
+
+import numpy as np
+from numba import njit
+
+from vipetsc.case import Model
+from vipetsc.contact.law import Contacts, ForceLaw, create_contacts
+from vipetsc.dynamics.layout import Layout
+
+_INT, _FLOAT = np.int64, np.float64
+
+MASS = np.dtype([("inverse_mass", _FLOAT), ("first", _INT), ("last", _INT)])
+"""A mass of the cell: 1/kg; its rows of the couplings, half open."""
+COUPLING = np.dtype([("offset", _INT), ("other", _INT), ("stiffness", _FLOAT)])
+"""A spring as one of its masses sees it: cells to the other mass, that mass, N/m."""
+SPRING = np.dtype([("start", _INT), ("end", _INT), ("next_cell", _INT), ("stiffness", _FLOAT)])
+"""A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
+
+
+class Shape(NamedTuple):
+    """Sizes and indices of a rank's part of the lattice; an index is -1 where the rank has no such thing.
+
+    ``owned`` and ``ghosted`` count the state's components without and with ghosts, ``exchange`` tells whether ghosts
+    must be fetched. ``left_ghost`` and ``right_ghost`` are the first components of the neighbouring cells,
+    ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``driven``, ``work`` and
+    ``dissipated`` are the components of the driven mass's velocity, the work, the first site's dissipated energy.
+    """
+
+    cells: int
+    dofs: int
+    host: int
+    resonator: int
+    owned: int
+    ghosted: int
+    exchange: bool
+    left_ghost: int
+    right_ghost: int
+    left_free: bool
+    right_free: bool
+    driven: int
+    work: int
+    dissipated: int
+
+
+class Burst(NamedTuple):
+    """A tone burst: factor before 1 - cos in N, frequency in rad/s, cycles, duration in s."""
+
+    amplitude: float
+    frequency: float
+    cycles: float
+    duration: float
+
+
+class LatticeRecord(NamedTuple):
+    """A rank's part of a lattice: sizes, tables of the dtypes above, the sites' local cells, the drive."""
+
+    shape: Shape
+    masses: np.ndarray
+    couplings: np.ndarray
+    springs: np.ndarray
+    site_cells: np.ndarray
+    contacts: Contacts
+    burst: Burst
+
+
+_TABLES = ("masses", "couplings", "springs", "site_cells", "sites")
+
+
+def _c_struct(record: type) -> np.dtype:
+    """The fields of a record of numbers, in their order."""
+    return np.dtype(list(get_type_hints(record).items()), align=True)
+
+
+CONTEXT = np.dtype(
+    [
+        ("array", _INT),  # receives the address of a vector's array; first, so that its address is the context's
+        ("shape", _c_struct(Shape)),
+        ("law", _c_struct(ForceLaw)),
+        ("burst", _c_struct(Burst)),
+        ("address", np.dtype([(name, _INT) for name in _TABLES])),
+        ("length", np.dtype([(name, _INT) for name in _TABLES])),
+    ],
+    align=True,
+)
+"""A ``LatticeRecord`` for C: its values, and the addresses and lengths of its tables."""
+
+
+def create_record(model: Model, layout: Layout) -> LatticeRecord:
+    """The record of the part of ``model`` that ``layout`` gives to this rank; all sites are free."""
+    chain, cell, drive = model.chain, model.chain.cell, model.drive
+    couplings = cell.couplings()
+    rows = np.searchsorted([c[0] for c in couplings], np.arange(cell.dofs + 1)).tolist()
+    masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
+    springs = [(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs]
+    return LatticeRecord(
+        shape=_shape(model, layout),
+        masses=np.array(masses, MASS),
+        couplings=np.array([c[1:] for c in couplings], COUPLING),
+        springs=np.array(springs, SPRING),
+        site_cells=np.array([chain.sites[i] - layout.start for i in layout.sites], _INT),
+        contacts=create_contacts(model.contact, [chain.clearances[i] for i in layout.sites]),
+        burst=Burst(drive.window_amplitude, drive.frequency, float(drive.cycles), drive.duration),
+    )
+
+
+def _shape(model: Model, layout: Layout) -> Shape:
+    left, right = layout.neighbours()
+    free = model.chain.ends == "free"
+    n, d = layout.owned, layout.dofs
+    return Shape(
+        cells=n,
+        dofs=d,
+        host=model.chain.cell.host,
+        resonator=model.chain.cell.resonator,
+        owned=layout.size,
+        ghosted=layout.size + d * ((left is not None) + (right is not None)),
+        exchange=layout.comm.size > 1 or layout.periodic,
+        left_ghost=-1 if left is None else layout.size,
+        right_ghost=-1 if right is None else layout.size + d * (left is not None),
+        left_free=free and left is None,
+        right_free=free and right is None,
+        driven=(d + model.drive_mass) * n + model.drive_cell - layout.start if layout.owns_drive else -1,
+        work=layout.work,
+        dissipated=layout.dissipated,
+    )
+
+
+def create_context(lattice: LatticeRecord) -> np.ndarray:
+    """The context (1,) of a record, which must outlive it."""
+    context = np.zeros(1, CONTEXT)
+    tables = lattice._asdict() | {"sites": lattice.contacts.sites}
+    context["shape"], context["law"], context["burst"] = lattice.shape, lattice.contacts.law, lattice.burst
+    context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
+    context["length"] = tuple(tables[name].size for name in _TABLES)
+    return context
+
+
+@njit(cache=True, error_model="numpy")
+def drive_force(burst: Burst, t: float) -> float:
+    """Force in N of the tone burst at time t in s, Eq. (3)."""
+    if t <= 0.0 or t >= burst.duration:
+        return 0.0
+    phase = burst.frequency * t
+    return burst.amplitude * (1.0 - np.cos(phase / burst.cycles)) * np.sin(phase)

@@ -1,0 +1,120 @@
+"""Compiled right-hand side of the lattice, and the sites' relative motions.
+
+A cell's sums run over its springs in the cell's order, whichever rank owns it and wherever in the loop it falls: the
+result does not depend on the partition, to the last bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from vipetsc.contact.law import FREE, contact_force
+from vipetsc.dynamics.records import LatticeRecord, drive_force
+
+# Cells in one pass: what a pass touches stays in the first-level cache.
+CHUNK = 512
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
+    """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall."""
+    shape = lattice.shape
+    if cell < 0:
+        return y[shape.left_ghost + mass] if shape.left_ghost >= 0 else 0.0
+    if cell >= shape.cells:
+        return y[shape.right_ghost + mass] if shape.right_ghost >= 0 else 0.0
+    return y[mass * shape.cells + cell]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
+    """Acceleration in m/s^2 of one mass by its springs; the same sums as the chunked loop, bit for bit."""
+    shape = lattice.shape
+    here = y[mass * shape.cells + cell]
+    total = 0.0
+    for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
+        coupling = lattice.couplings[s]
+        c = cell + coupling.offset
+        if (c < 0 and shape.left_free) or (c >= shape.cells and shape.right_free):
+            continue
+        total += coupling.stiffness * (displacement(y, lattice, c, coupling.other) - here)
+    return total * lattice.masses[mass].inverse_mass
+
+
+@njit(cache=True, error_model="numpy")
+def relative_motion(t: float, y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[float, float, float]:
+    """w, w', w'' of site ``i`` at time ``t``, w = u_resonator - u_host."""
+    shape, masses = lattice.shape, lattice.masses
+    n, d, host, resonator = shape.cells, shape.dofs, shape.host, shape.resonator
+    cell = lattice.site_cells[i]
+    w = y[resonator * n + cell] - y[host * n + cell]
+    rate = y[(d + resonator) * n + cell] - y[(d + host) * n + cell]
+    force, _ = contact_force(lattice.contacts, i, w, rate)
+    at_host = spring_acceleration(y, lattice, cell, host) + force * masses[host].inverse_mass
+    at_resonator = spring_acceleration(y, lattice, cell, resonator) - force * masses[resonator].inverse_mass
+    if shape.driven == (d + host) * n + cell:
+        at_host += drive_force(lattice.burst, t) * masses[host].inverse_mass
+    if shape.driven == (d + resonator) * n + cell:
+        at_resonator += drive_force(lattice.burst, t) * masses[resonator].inverse_mass
+    return w, rate, at_resonator - at_host
+
+
+@njit(cache=True, error_model="numpy")
+def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
+    """Fill ``motion`` (sites, 3) with w, w', w'' of every owned site."""
+    for i in range(motion.shape[0]):
+        motion[i, 0], motion[i, 1], motion[i, 2] = relative_motion(t, y, lattice, i)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_spring(out: np.ndarray, other: np.ndarray, here: np.ndarray, stiffness: float) -> None:
+    for i in range(out.size):
+        out[i] += stiffness * (other[i] - here[i])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acceleration: np.ndarray) -> None:
+    """Accelerations (cells,) of a mass by its springs, in chunks of cells whose neighbours are all owned."""
+    n = acceleration.size
+    here = y[mass * n : (mass + 1) * n]
+    row = lattice.masses[mass]
+    for a in range(1, n - 1, CHUNK):
+        b = min(a + CHUNK, n - 1)
+        out = acceleration[a:b]
+        out[:] = 0.0
+        for s in range(row.first, row.last):
+            coupling = lattice.couplings[s]
+            first = coupling.other * n + coupling.offset
+            _add_spring(out, y[first + a : first + b], here[a:b], coupling.stiffness)
+        for i in range(out.size):
+            out[i] *= row.inverse_mass
+    if n > 0:
+        acceleration[0] = spring_acceleration(y, lattice, 0, mass)
+    if n > 1:
+        acceleration[n - 1] = spring_acceleration(y, lattice, n - 1, mass)
+
+
+@njit(cache=True, error_model="numpy")
+def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
+    """Time derivative ``f`` (owned,) of the state ``y`` (ghosted,): velocities, accelerations, powers."""
+    shape, masses = lattice.shape, lattice.masses
+    n, d, host, resonator = shape.cells, shape.dofs, shape.host, shape.resonator
+    f[: d * n] = y[d * n : 2 * d * n]
+    for mass in range(d):
+        _spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
+    for i in range(lattice.site_cells.size):
+        power = 0.0
+        if lattice.contacts.sites[i].mode != FREE:
+            cell = lattice.site_cells[i]
+            w = y[resonator * n + cell] - y[host * n + cell]
+            rate = y[(d + resonator) * n + cell] - y[(d + host) * n + cell]
+            force, power = contact_force(lattice.contacts, i, w, rate)
+            f[(d + host) * n + cell] += force * masses[host].inverse_mass
+            f[(d + resonator) * n + cell] -= force * masses[resonator].inverse_mass
+        f[shape.dissipated + i] = power
+    driven = shape.driven
+    if driven >= 0:
+        force = drive_force(lattice.burst, t)
+        f[driven] += force * masses[driven // n - d].inverse_mass
+        f[shape.work] = force * y[driven]
