@@ -260,7 +260,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     model = case.model()
     layout = Layout.of(model, MPI.COMM_SELF)
     operator = LatticeOperator(model, layout)
-    integrator = Integrator.create(model, layout, operator, True, None)
+    integrator = Integrator(model, layout, operator)
     tracker = integrator.tracker
     # Velocities lie behind the displacements, mass by mass: host and resonator of cell 1.
     integrator.state.array[layout.dofs * layout.owned + layout.owned] = 1.0

@@ -1,4 +1,4 @@
-"""Where everything lives: cells over ranks, the state's order on a rank, and its ghosts.
+"""The partition of cells over ranks, the order of a rank's part of the state, and its ghosts.
 
 A rank's part of the state holds, one after another: displacements by mass (all owned cells of mass 1, then of
 mass 2, ...), velocities likewise, then its ledger components (work of the drive if it owns the driven cell,

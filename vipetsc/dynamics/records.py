@@ -15,6 +15,7 @@ from numba import njit
 from vipetsc.case import Model
 from vipetsc.contact.law import Contacts, ForceLaw, create_contacts
 from vipetsc.dynamics.layout import Layout
+from vipetsc.lattice import ToneBurst
 
 _INT, _FLOAT = np.int64, np.float64
 
@@ -94,9 +95,14 @@ CONTEXT = np.dtype(
 """A ``LatticeRecord`` for C: its values, and the addresses and lengths of its tables."""
 
 
+def create_burst(drive: ToneBurst) -> Burst:
+    """The record of a tone burst."""
+    return Burst(drive.window_amplitude, drive.frequency, float(drive.cycles), drive.duration)
+
+
 def create_record(model: Model, layout: Layout) -> LatticeRecord:
     """The record of the part of ``model`` that ``layout`` gives to this rank; all sites are free."""
-    chain, cell, drive = model.chain, model.chain.cell, model.drive
+    chain, cell = model.chain, model.chain.cell
     couplings = cell.couplings()
     rows = np.searchsorted([c[0] for c in couplings], np.arange(cell.dofs + 1)).tolist()
     masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
@@ -108,7 +114,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         springs=np.array(springs, SPRING),
         site_cells=np.array([chain.sites[i] - layout.start for i in layout.sites], _INT),
         contacts=create_contacts(model.contact, [chain.clearances[i] for i in layout.sites]),
-        burst=Burst(drive.window_amplitude, drive.frequency, float(drive.cycles), drive.duration),
+        burst=create_burst(model.drive),
     )
 
 

@@ -51,6 +51,11 @@ class UnitCell:
         return len(self.masses)
 
     @property
+    def reduced_mass(self) -> float:
+        """Mass in kg of the contact pair's relative motion, 1/(1/m_host + 1/m_resonator)."""
+        return 1 / (1 / self.masses[self.host] + 1 / self.masses[self.resonator])
+
+    @property
     def wall_stiffness(self) -> tuple[np.ndarray, np.ndarray]:
         """Stiffness (dofs,) in N/m of the inter-cell springs cut at the left and at the right end."""
         left, right = np.zeros(self.dofs), np.zeros(self.dofs)

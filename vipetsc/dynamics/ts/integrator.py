@@ -1,12 +1,6 @@
-"""Time stepping: PETSc's explicit Runge-Kutta, one trial at a time, landing on every contact change.
+"""The engine ``ts``: one trial of PETSc's explicit Runge-Kutta at a time, landing on every contact change.
 
-The route (PETSc's own event handling loses short contacts and its error control around them):
-
-- contact modes are frozen inside a step, so that no kink lies in it;
-- after each accepted step every site is searched for a change; the state goes back to its saved copy and steps
-  exactly onto the earliest one, where modes switch;
-- a rejected trial also goes back to the saved copy: PETSc rolls back by subtraction, which loses digits when a
-  trial was far too long for a contact.
+The method stands in the package's docstring.
 """
 
 from __future__ import annotations
@@ -54,8 +48,8 @@ class Integrator(Engine):
 
     Parameters
     ----------
-    model, layout, operator, tracker
-        The lattice, its distribution, right-hand side and contact state.
+    model, layout, operator
+        The lattice, its distribution and its right-hand side.
     native
         Register the compiled right-hand side directly (default), or through Python with the same bits.
     stop
@@ -72,14 +66,13 @@ class Integrator(Engine):
         model: Model,
         layout: Layout,
         operator: LatticeOperator,
-        tracker: ImpactTracker,
         native: bool = True,
         stop: StopRequest | None = None,
     ) -> None:
         self.comm = layout.comm
-        self.tracker = tracker
         self.operator = operator
-        self._burst = model.drive.duration
+        self.tracker = ImpactTracker(operator.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
+        self._burst_end = model.drive.duration
         self._dissipated = layout.dissipated
         self.counts = StepCounts()
         self.time = 0.0
@@ -98,17 +91,14 @@ class Integrator(Engine):
         hertz = model.contact.law is Hertz
         share, order = (1 / 200, 2.5) if hertz else (1 / 20, 8)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
-        operator.observe(0.0, self.state, tracker.start)
+        operator.observe(0.0, self.state, self.tracker.start)
 
     @classmethod
     def create(
         cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
     ) -> Integrator:
-        """An integrator at rest at t = 0 with its own impact tracker."""
-        cell = model.chain.cell
-        reduced_mass = 1 / (1 / cell.masses[cell.host] + 1 / cell.masses[cell.resonator])
-        tracker = ImpactTracker(operator.lattice.contacts, layout.sites, reduced_mass)
-        return cls(model, layout, operator, tracker, native, stop)
+        """An integrator at rest at t = 0; see ``Engine``."""
+        return cls(model, layout, operator, native, stop)
 
     @classmethod
     def refusal(cls, model: Model) -> None:
@@ -149,11 +139,11 @@ class Integrator(Engine):
         Raises StalledError where no step can be taken.
         """
         # The drive's end is a kink of its third derivative: a step ends there.
-        if self.time < self._burst < target and not self.advance(self._burst):
+        if self.time < self._burst_end < target and not self.advance(self._burst_end):
             return False
-        tried = self.counts.steps + self.counts.rejected
+        before = self.counts.steps + self.counts.rejected
         while self.time < target:
-            if self.counts.steps + self.counts.rejected - tried > MOST_TRIALS:
+            if self.counts.steps + self.counts.rejected - before > MOST_TRIALS:
                 raise StalledError(f"{MOST_TRIALS} steps did not reach t = {target:.6g} s")
             if not self._step(target):
                 return False
@@ -167,8 +157,8 @@ class Integrator(Engine):
             return True
         # The burst rises as t^3: steps that grow with t keep even the first samples' ledger small beside the work.
         step = min(STRETCH * self.step, self._first_step + 0.25 * self.time)
-        parts = np.ceil(remaining / step)
-        h = remaining / parts
+        count = np.ceil(remaining / step)
+        h = remaining / count
         if h < shortest:
             raise StalledError(f"the step fell to {h:.3g} s")
         self.state.copy(self.saved)
@@ -183,7 +173,7 @@ class Integrator(Engine):
         if not self._fixed and (suggestion < 4 * h or suggestion > self.step):
             self.step = suggestion
         self.counts.steps += 1
-        end = target if parts == 1 else self.time + h
+        end = target if count == 1 else self.time + h
         self.operator.observe(end, self.state, self.tracker.end)
         change = self.tracker.first_change(h)
         self._buffer[:] = change.share, -float(self._stop.requested)
@@ -299,5 +289,5 @@ class Integrator(Engine):
 
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
-        for thing in (self.ts, self.state, self.saved):
-            thing.destroy()
+        for petsc_object in (self.ts, self.state, self.saved):
+            petsc_object.destroy()
