@@ -1,20 +1,89 @@
-"""Where compiled kernels are kept between runs."""
+"""Compiled kernels, kept between runs until the source of any of them changes: ``njit`` and ``cfunc`` as in numba.
+
+Numba's own cache looks at the file of a kernel alone: a kernel that calls a changed one of another file, or uses a
+constant of it, would go on with the old code. Here the folder of the cache bears a hash of all files with kernels,
+and of the modules that they import: constants are frozen into compiled code.
+"""
 
 from __future__ import annotations
 
+import ast
 import hashlib
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from typing import Any, TypeVar, overload
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+config: Any = numba.config
+
+HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
 
 
-def kernel_cache(package: Path) -> Path:
-    """The cache folder for the kernels of ``package``, named by the hash of all its sources that numba compiles.
+@overload
+def njit(function: Function, /) -> Function: ...
+@overload
+def njit(*signature: str, **options: Any) -> Callable[[Function], Function]: ...
+def njit(*signature: Any, **options: Any) -> Any:
+    """``numba.njit`` with a cache; without a signature, it compiles at the first call."""
+    if signature and callable(signature[0]):
+        return _decorator(numba.njit)(signature[0])
+    return _decorator(numba.njit, *signature, **options)
 
-    Numba looks at a kernel's own file alone: a kernel that calls a changed one in another file would go on with the
-    old code.
+
+def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.cfunc`` with a cache: a function that C code can call, at its ``address``."""
+    return _decorator(numba.cfunc, signature, **options)
+
+
+def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    def decorate(function: Callable[..., Any]) -> Any:
+        with _cache_folder():
+            return compiler(*signature, **{"cache": True} | options)(function)
+
+    return decorate
+
+
+@contextmanager
+def _cache_folder() -> Iterator[None]:
+    """Have numba keep what is compiled meanwhile in ``kernel_cache``; a NUMBA_CACHE_DIR stays the parent."""
+    chosen = config.CACHE_DIR
+    config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, chosen))
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = chosen
+
+
+@cache
+def kernel_cache(package: Path, chosen: str = "") -> Path:
+    """The folder for the compiled kernels of ``package``, named by the hash of ``kernel_sources``.
+
+    It is in ``chosen``, else in the package, else (a package that may not be written to) in the user's cache.
     """
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
+    for path in kernel_sources(package):
+        digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+    parent = package / "__pycache__" if os.access(package, os.W_OK) else Path.home() / ".cache" / package.name
+    return Path(chosen or parent) / f"kernels-{digest.hexdigest()[:16]}"
+
+
+def kernel_sources(package: Path) -> list[Path]:
+    """The files of ``package`` with kernels, and those that they import from it."""
+    sources = set()
+    for path in package.rglob("*.py"):
         text = path.read_bytes()
-        if b"numba" in text:
-            digest.update(str(path.relative_to(package)).encode() + b"\0" + text)
-    return package / "__pycache__" / f"kernels-{digest.hexdigest()[:16]}"
+        if HAS_KERNELS.search(text):
+            sources.add(path)
+            for node in ast.walk(ast.parse(text)):
+                if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
+                    names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+                    files = (package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names)
+                    sources |= {file for file in files if file.exists()}
+    return sorted(sources)

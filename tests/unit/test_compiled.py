@@ -1,31 +1,96 @@
-"""Compiled kernels are kept until any of their sources changes."""
+"""Compiled kernels are kept until the source of any of them changes; importing the package changes nothing outside."""
 
 from __future__ import annotations
 
-import os
+import json
+import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import pytest
+
 import vipetsc
-from vipetsc.compiled import kernel_cache
+from vipetsc import compiled
+
+ROOT = Path(vipetsc.__file__).parent
+CONSTANTS = "SCALE = 2.0\n"
+INNER = """
+from vipetsc.compiled import njit
+from vipetsc.constants import SCALE
+@njit('f8(f8)', error_model="numpy")
+def scaled(x):
+    return SCALE * x
+"""
+OUTER = """
+from vipetsc.compiled import cfunc, njit
+from vipetsc.inner import scaled
+@njit
+def twice(x):
+    return scaled(scaled(x))
+@cfunc("f8(f8)")
+def callback(x):
+    return scaled(x) + 1.0
+"""
+ASK = """
+import json, os, sys, numba
+environment, folder = dict(os.environ), numba.config.CACHE_DIR
+from vipetsc.outer import callback, scaled, twice
+values = [twice(3.0), callback.ctypes(3.0)]
+hits = [sum(scaled.stats.cache_hits.values()), sum(twice.stats.cache_hits.values()), callback.cache_hits]
+print(json.dumps([values, hits, environment == dict(os.environ) and folder == numba.config.CACHE_DIR]))
+"""
 
 
-def test_the_folder_follows_the_sources_that_numba_compiles(tmp_path):
-    (tmp_path / "sub").mkdir()
-    kernel, caller, other = tmp_path / "kernel.py", tmp_path / "sub" / "caller.py", tmp_path / "other.py"
-    kernel.write_text("from numba import njit\n")
-    caller.write_text("from numba import njit\nimport kernel\n")
-    other.write_text("import numpy\n")
-    first = kernel_cache(tmp_path)
-    other.write_text("import scipy\n")
-    assert kernel_cache(tmp_path) == first
-    kernel.write_text("from numba import njit  # changed\n")
-    second = kernel_cache(tmp_path)
-    assert second != first
-    kernel.write_text("from numba import njit\n")
-    caller.rename(tmp_path / "caller.py")
-    assert kernel_cache(tmp_path) not in (first, second)
+@pytest.fixture
+def package(tmp_path):
+    """A package with kernels of two files, and what a fresh Python gets from it: values, cache hits, no traces."""
+    folder = tmp_path / "vipetsc"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    (folder / "constants.py").write_text(CONSTANTS)
+    (folder / "inner.py").write_text(INNER)
+    (folder / "outer.py").write_text(OUTER)
+    (folder / "plain.py").write_text("import numpy\n")
+    shutil.copy(compiled.__file__, folder)
+
+    def ask():
+        done = subprocess.run([sys.executable, "-c", ASK], cwd=tmp_path, env={"PYTHONPATH": "."}, capture_output=True)
+        assert done.returncode == 0, done.stderr.decode()
+        return json.loads(done.stdout)
+
+    return folder, ask
 
 
-def test_numba_is_told():
-    own = str(kernel_cache(Path(vipetsc.__file__).parent))
-    assert os.environ["NUMBA_CACHE_DIR"] == own or "kernels-" not in os.environ["NUMBA_CACHE_DIR"]
+def test_kernels_are_found_again_until_the_source_of_any_changes(package):
+    folder, ask = package
+    assert ask() == [[12.0, 7.0], [0, 0, 0], True]
+    assert ask() == [[12.0, 7.0], [1, 1, 1], True]
+    (folder / "plain.py").write_text("import scipy\n")
+    assert ask() == [[12.0, 7.0], [1, 1, 1], True]
+    (folder / "inner.py").write_text(INNER.replace("SCALE * x", "SCALE * x + 1.0"))
+    assert ask() == [[15.0, 8.0], [0, 0, 0], True]
+    (folder / "constants.py").write_text(CONSTANTS.replace("2.0", "3.0"))
+    assert ask() == [[31.0, 11.0], [0, 0, 0], True]
+    assert len(list(folder.glob("__pycache__/kernels-*"))) == 3
+
+
+def test_a_chosen_folder_holds_them(package, tmp_path):
+    folder, _ = package
+    chosen = compiled.kernel_cache(folder, str(tmp_path / "chosen"))
+    assert chosen == tmp_path / "chosen" / compiled.kernel_cache(folder).name
+
+
+def test_importing_the_package_changes_no_environment():
+    code = "import os; before = dict(os.environ); import vipetsc; assert before == dict(os.environ); import sys; "
+    code += "assert not {'numba', 'petsc4py', 'mpi4py'} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT.parent)
+
+
+def test_every_kernel_is_kept_this_way():
+    for path in ROOT.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert path.name == "compiled.py" or not re.search(r"from numba import .*jit|numba\.(n?jit|cfunc)\b", text), (
+            path
+        )

@@ -13,8 +13,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.contact.law import CLIPPED, CLOSED, FREE, Contacts, contact_force
 from vipetsc.contact.search import bernstein, derivative, evaluate, first_upcrossing, first_upcrossing_after_start
 

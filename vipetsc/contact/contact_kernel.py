@@ -11,8 +11,8 @@ change is the rise of a switching function through zero:
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing
 from vipetsc.dynamics.ts.kernel import (
     APPROACH,

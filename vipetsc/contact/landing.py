@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from vipetsc.compiled import njit
 
 # Newton steps for one landing before the search is repeated on a shorter step, and all attempts.
 NEWTON_STEPS = 8

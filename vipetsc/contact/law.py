@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.lattice import Contact
 
 # Modes of a site; the sign is the side.

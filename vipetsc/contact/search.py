@@ -6,7 +6,8 @@ Method and references: the package's docstring.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from vipetsc.compiled import njit
 
 # Halvings of [0, 1] are at most 2^-44 = 6e-14 wide; each leaves one half to be searched later.
 _DEPTH = 64

@@ -7,8 +7,8 @@ that neither the order nor the partition shows in the result.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.contact.law import elastic_energy
 from vipetsc.dynamics.records import LatticeRecord
 from vipetsc.dynamics.ts.right_hand_side import CHUNK, displacement

@@ -10,9 +10,9 @@ from itertools import pairwise
 from typing import NamedTuple, get_type_hints
 
 import numpy as np
-from numba import njit
 
 from vipetsc.case import Model
+from vipetsc.compiled import njit
 from vipetsc.contact.law import Contacts, ForceLaw, create_contacts
 from vipetsc.dynamics.layout import Layout
 from vipetsc.lattice import ToneBurst

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
+from vipetsc.compiled import njit
 
 
 @njit("f8(f8[::1], f8)", cache=True)

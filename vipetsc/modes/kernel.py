@@ -11,9 +11,9 @@ Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equation
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.integrate._ivp import dop853_coefficients as pair
 
+from vipetsc.compiled import njit
 from vipetsc.modes.interpolant import first_upcrossing, hermite
 
 _A = np.ascontiguousarray(pair.A[:12, :12])

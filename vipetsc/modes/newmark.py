@@ -7,8 +7,8 @@ at the ends of steps only, which is this method's known error.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.modes.orbit import Arc, Flow, FlowError, kernel_arrays
 
 

@@ -7,9 +7,9 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from scipy import fft
 
+from vipetsc.compiled import njit
 from vipetsc.spectra.wavelet import padded_length, wavenumbers, window
 
 NODES = 60

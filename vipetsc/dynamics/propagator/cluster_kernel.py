@@ -10,9 +10,9 @@ While nothing acts, jets are exact. Otherwise forces are collocated at Gauss nod
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.special import binom
 
+from vipetsc.compiled import njit
 from vipetsc.contact.contact_kernel import LANDED
 from vipetsc.dynamics.propagator.collocation import NODES
 from vipetsc.dynamics.propagator.series import MOST_TERMS

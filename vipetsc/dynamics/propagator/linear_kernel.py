@@ -7,7 +7,8 @@ cell alone, so that results have the same bits on any partition.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from vipetsc.compiled import njit
 
 # Cells in one pass: what a pass reads stays in the first-level cache.
 CHUNK = 512

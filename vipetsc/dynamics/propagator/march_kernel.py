@@ -9,8 +9,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.contact.contact_kernel import first_change, peaks, switching
 from vipetsc.dynamics.propagator.cluster_kernel import (
     BEGIN,

@@ -11,7 +11,8 @@ falls: the result does not depend on the partition, to the last bit.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from vipetsc.compiled import njit
 
 # Words of the header: sizes and indices, then where each table starts.
 CELLS, DOFS, SPRINGS, SITES, WORK, DISSIPATED, DRIVEN, LEFT_GHOST, RIGHT_GHOST = range(9)

@@ -8,13 +8,13 @@ from typing import Any
 
 from petsc4py import PETSc
 
-import numba
 import numpy as np
 from llvmlite import binding
-from numba import carray, njit, types
+from numba import carray, types
 from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 
+from vipetsc.compiled import cfunc, njit
 from vipetsc.contact.law import SITE, Contacts, ForceLaw
 from vipetsc.dynamics.records import CONTEXT, COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
 from vipetsc.dynamics.ts.right_hand_side import right_hand_side
@@ -79,7 +79,7 @@ def compile_callback() -> CFunc:
     functions: list[Any] = [types.ExternalFunction(name, signature) for name, signature in _CALLS.items()]
     begin, end, get, restore, get_write, restore_write = functions
 
-    @numba.cfunc("i4(i8, f8, i8, i8, i8)", cache=True)
+    @cfunc("i4(i8, f8, i8, i8, i8)")
     def callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         context: Any = carray(_pointer(address), (1,), CONTEXT)[0]
         shape = context.shape

@@ -7,8 +7,8 @@ result does not depend on the partition, to the last bit.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.contact.law import FREE, contact_force
 from vipetsc.dynamics.records import LatticeRecord, drive_force
 
