@@ -94,3 +94,10 @@ def test_every_kernel_is_kept_this_way():
         assert path.name == "compiled.py" or not re.search(r"from numba import .*jit|numba\.(n?jit|cfunc)\b", text), (
             path
         )
+
+
+def test_the_callback_of_petsc_is_found_again():
+    code = "import petsc4py; petsc4py.init([]); from vipetsc.dynamics.run import simulate; "
+    code += "from vipetsc.dynamics.ts.native import compile_callback; print(compile_callback().cache_hits)"
+    hits = [subprocess.check_output([sys.executable, "-c", code], cwd=ROOT.parent) for _ in range(2)]
+    assert int(hits[-1]) == 1

@@ -19,14 +19,12 @@ from vipetsc.contact.law import SITE, Contacts, ForceLaw
 from vipetsc.dynamics.records import CONTEXT, COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
 from vipetsc.dynamics.ts.right_hand_side import right_hand_side
 
-_CALLS = {
-    "VecGhostUpdateBegin": types.int32(types.int64, types.int32, types.int32),
-    "VecGhostUpdateEnd": types.int32(types.int64, types.int32, types.int32),
-    "VecGetArrayRead": types.int32(types.int64, types.int64),
-    "VecRestoreArrayRead": types.int32(types.int64, types.int64),
-    "VecGetArrayWrite": types.int32(types.int64, types.int64),
-    "VecRestoreArrayWrite": types.int32(types.int64, types.int64),
-}
+_BEGIN = types.ExternalFunction("VecGhostUpdateBegin", types.int32(types.int64, types.int32, types.int32))
+_END = types.ExternalFunction("VecGhostUpdateEnd", types.int32(types.int64, types.int32, types.int32))
+_GET = types.ExternalFunction("VecGetArrayRead", types.int32(types.int64, types.int64))
+_RESTORE = types.ExternalFunction("VecRestoreArrayRead", types.int32(types.int64, types.int64))
+_GET_WRITE = types.ExternalFunction("VecGetArrayWrite", types.int32(types.int64, types.int64))
+_RESTORE_WRITE = types.ExternalFunction("VecRestoreArrayWrite", types.int32(types.int64, types.int64))
 
 
 def petsc_library() -> ctypes.CDLL:
@@ -68,40 +66,39 @@ def _lattice(context: Any) -> LatticeRecord:
     )  # fmt: skip
 
 
+def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
+    """The right-hand side between PETSc's vectors; not a closure, whose cache numba would not find again."""
+    context: Any = carray(_pointer(address), (1,), CONTEXT)[0]
+    shape = context.shape
+    if shape.exchange:
+        error = _BEGIN(u, 1, 0)
+        if error == 0:
+            error = _END(u, 1, 0)
+        if error != 0:
+            return error
+    error = _GET(u, address)
+    if error != 0:
+        return error
+    state = context.array
+    error = _GET_WRITE(f, address)
+    if error != 0:
+        return error
+    rate = carray(_pointer(context.array), (shape.owned,), np.float64)
+    right_hand_side(t, carray(_pointer(state), (shape.ghosted,), np.float64), rate, _lattice(context))
+    error = _RESTORE_WRITE(f, address)
+    if error != 0:
+        return error
+    context.array = state
+    return _RESTORE(u, address)
+
+
 def compile_callback() -> CFunc:
     """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
 
     ``context`` is the address of a ``CONTEXT`` record. Raises AttributeError where PETSc hides its symbols.
     """
     library = petsc_library()
-    for name in _CALLS:
-        binding.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
-    functions: list[Any] = [types.ExternalFunction(name, signature) for name, signature in _CALLS.items()]
-    begin, end, get, restore, get_write, restore_write = functions
-
-    @cfunc("i4(i8, f8, i8, i8, i8)")
-    def callback(ts: int, t: float, u: int, f: int, address: int) -> int:
-        context: Any = carray(_pointer(address), (1,), CONTEXT)[0]
-        shape = context.shape
-        if shape.exchange:
-            error = begin(u, 1, 0)
-            if error == 0:
-                error = end(u, 1, 0)
-            if error != 0:
-                return error
-        error = get(u, address)
-        if error != 0:
-            return error
-        state = context.array
-        error = get_write(f, address)
-        if error != 0:
-            return error
-        rate = carray(_pointer(context.array), (shape.owned,), np.float64)
-        right_hand_side(t, carray(_pointer(state), (shape.ghosted,), np.float64), rate, _lattice(context))
-        error = restore_write(f, address)
-        if error != 0:
-            return error
-        context.array = state
-        return restore(u, address)
-
-    return callback
+    for function in (_BEGIN, _END, _GET, _RESTORE, _GET_WRITE, _RESTORE_WRITE):
+        address = ctypes.cast(getattr(library, function.symbol), ctypes.c_void_p).value
+        binding.add_symbol(function.symbol, address)
+    return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)
