@@ -1,32 +1,105 @@
-"""The compiled flow: Dormand and Prince's 8(5,3) pair between contact changes, landing on every change.
+"""The compiled flow: DOP853 between contact changes, landing on every change.
 
-The set of active contacts is frozen inside a step, so the force is smooth there. After each step the gap of
-every contact is searched on its quintic Hermite interpolant, interior extrema included, so that a pair of
-changes inside one step is found; the step is then repeated so that it ends exactly on the first change. Contact
-forces are continuous, hence so are the variational equations' solutions (saltation is the identity).
-
-Coefficients: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, code DOP853.
+The set of closed contacts is frozen inside a step, so the force is smooth there; after each step the gap of every
+contact is searched, and the step is repeated so that it ends on the first change. Contact forces are continuous,
+hence so are the variational equations' solutions (saltation is the identity, see the package's docstring).
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from scipy.integrate._ivp import dop853_coefficients as pair
 
 from vipetsc.compiled import njit
-from vipetsc.modes.interpolant import first_upcrossing, hermite
+from vipetsc.contact.law import ForceLaw, elastic_force_and_slope
+from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Landing, correct, first_rise, hermite
+from vipetsc.modes.tableau import E3, E5, STAGES, A, B
 
-_A = np.ascontiguousarray(pair.A[:12, :12])
-_B = np.ascontiguousarray(pair.B)
-_E3 = np.ascontiguousarray(pair.E3[:12])
-_E5 = np.ascontiguousarray(pair.E5[:12])
+DONE, STUCK, FULL = range(3)
+"""Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed."""
 
 SMALLEST_STEP = 1e-15
 """A step below this fraction of the interval means that the flow is stuck."""
 
+CONTACT = np.dtype([("clearance", np.float64), ("stiffness", np.float64), ("exponent", np.float64)])
+SPRING = np.dtype([("quadratic", np.float64), ("cubic", np.float64)])
 
-@njit("void(f8[:,::1], f8[:,::1], f8[::1], f8, f8)", cache=True)
-def _add(y, dy, row, force, slope):
+
+class CompiledSystem(NamedTuple):
+    """A ``System`` for kernels: ``rows`` (contacts, n) with w = rows u, ``spring_rows`` (springs, n) likewise."""
+
+    inverse_mass: np.ndarray
+    stiffness: np.ndarray
+    rows: np.ndarray
+    contacts: np.ndarray
+    spring_rows: np.ndarray
+    springs: np.ndarray
+
+
+class Tolerances(NamedTuple):
+    """Errors allowed per step, relative to the size of the orbit and of each variation.
+
+    ``omega_ref`` in rad/s: velocities count as displacements over a radian of it, and a step is at most one radian.
+    """
+
+    rtol: float
+    rtol_sensitivity: float
+    omega_ref: float
+
+
+class Stepper(NamedTuple):
+    """What a step reads and writes.
+
+    The ``side`` (contacts,) of each contact (-1, 0, 1), stages, state and rates at the end (2n, 1 + m), (w, w', w'')
+    of each contact (contacts, 3) at the start and at the end.
+    """
+
+    system: CompiledSystem
+    tolerances: Tolerances
+    side: np.ndarray
+    stages: np.ndarray
+    end: np.ndarray
+    end_rates: np.ndarray
+    start_motion: np.ndarray
+    end_motion: np.ndarray
+
+
+class Change(NamedTuple):
+    """The first change in a step: its share of the step, the outcome of the search, contact and side."""
+
+    share: float
+    outcome: int
+    contact: int
+    side: int
+
+
+@njit
+def create_stepper(system: CompiledSystem, tolerances: Tolerances, shape: tuple[int, int]) -> Stepper:
+    """A stepper for states and variations of a ``shape``; its arrays are not filled."""
+    contacts = system.contacts.size
+    side, stages = np.empty(contacts, np.int64), np.empty((STAGES, shape[0], shape[1]))
+    end, end_rates = np.empty(shape), np.empty(shape)
+    return Stepper(system, tolerances, side, stages, end, end_rates, np.empty((contacts, 3)), np.empty((contacts, 3)))
+
+
+@njit
+def contact_force(system: CompiledSystem, c: int, x: float) -> tuple[float, float]:
+    """Force in N and its slope in N/m of contact ``c`` at the indentation x in m, odd in x."""
+    contact = system.contacts[c]
+    return elastic_force_and_slope(ForceLaw(contact.stiffness, contact.exponent, 0.0, False, 0.0), x)
+
+
+@njit
+def spring_force(system: CompiledSystem, s: int, z: float) -> tuple[float, float]:
+    """Force in N and its slope in N/m of the smooth spring ``s`` at the elongation z in m."""
+    spring = system.springs[s]
+    return (spring.quadratic + spring.cubic * z) * z * z, (2.0 * spring.quadratic + 3.0 * spring.cubic * z) * z
+
+
+@njit
+def _add(y: np.ndarray, dy: np.ndarray, row: np.ndarray, force: float, slope: float) -> None:
+    """Add a force along ``row`` to the orbit's accelerations, its slope to the variations'."""
     n, columns = y.shape[0] // 2, y.shape[1]
     for i in range(n):
         if row[i] != 0.0:
@@ -40,13 +113,20 @@ def _add(y, dy, row, force, slope):
             dy[n + i, j] -= row[i] * z
 
 
-@njit("void(f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[::1])", cache=True)
-def rates(y, dy, inverse_mass, stiffness, rows, law, spring_rows, springs, side):
-    """Time derivative of state and variations for a frozen contact set.
+@njit
+def elongation(row: np.ndarray, u: np.ndarray) -> float:
+    """Row times displacements (n,)."""
+    z = 0.0
+    for k in range(row.size):
+        z += row[k] * u[k]
+    return z
 
-    ``y`` (2n, 1 + m): displacements over velocities; column 0 the orbit, the others variations. ``rows``
-    (contacts, n), ``law`` (contacts, 3) = clearance, stiffness, exponent; ``springs`` (springs, 2) =
-    quadratic, cubic; ``side`` (contacts,) is -1, 0 or 1.
+
+@njit
+def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarray) -> None:
+    """Time derivative ``dy`` of state and variations ``y`` (2n, 1 + m): displacements over velocities.
+
+    Column 0 is the orbit, the others are variations; ``side`` (contacts,) is frozen.
     """
     n, columns = y.shape[0] // 2, y.shape[1]
     for i in range(n):
@@ -54,214 +134,173 @@ def rates(y, dy, inverse_mass, stiffness, rows, law, spring_rows, springs, side)
             dy[i, j] = y[n + i, j]
             dy[n + i, j] = 0.0
         for k in range(n):
-            s = stiffness[i, k]
+            s = system.stiffness[i, k]
             if s != 0.0:
                 for j in range(columns):
                     dy[n + i, j] -= s * y[k, j]
-    for c in range(rows.shape[0]):
+    for c in range(side.size):
         if side[c] != 0:
-            w = 0.0
-            for k in range(n):
-                w += rows[c, k] * y[k, 0]
-            x = side[c] * w - law[c, 0]
-            if law[c, 2] == 1.0:
-                force, slope = law[c, 1] * x, law[c, 1]
-            else:  # odd continuation past the exit, which is landed on anyway
-                size = abs(x)
-                slope = law[c, 1] * law[c, 2] * size ** (law[c, 2] - 1.0)
-                force = slope * x / law[c, 2]
-            _add(y, dy, rows[c], side[c] * force, slope)
-    for c in range(spring_rows.shape[0]):
-        z = 0.0
-        for k in range(n):
-            z += spring_rows[c, k] * y[k, 0]
-        _add(
-            y, dy, spring_rows[c],
-            (springs[c, 0] + springs[c, 1] * z) * z * z,
-            (2.0 * springs[c, 0] + 3.0 * springs[c, 1] * z) * z,
-        )  # fmt: skip
+            x = side[c] * elongation(system.rows[c], y[:n, 0]) - system.contacts[c].clearance
+            force, slope = contact_force(system, c, x)  # past the exit, which is landed on anyway, it is odd
+            _add(y, dy, system.rows[c], side[c] * force, slope)
+    for c in range(system.springs.size):
+        force, slope = spring_force(system, c, elongation(system.spring_rows[c], y[:n, 0]))
+        _add(y, dy, system.spring_rows[c], force, slope)
     for i in range(n):
         for j in range(columns):
-            dy[n + i, j] *= inverse_mass[i]
+            dy[n + i, j] *= system.inverse_mass[i]
 
 
-@njit(
-    "f8(f8[:,::1], f8[:,::1], f8[:,:,::1], f8, f8, f8, f8, f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1],"
-    "f8[:,::1], i8[::1])",
-    cache=True,
-)
-def _step(y, out, k, h, rtol, loose, pace, inverse_mass, stiffness, rows, law, spring_rows, springs, side):
-    """One step of length ``h`` from ``y`` (whose rates are in k[0]) to ``out``; returns the scaled error."""
+@njit
+def relative_motion(system: CompiledSystem, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
+    """w, w' and w'' of every contact into ``motion`` (contacts, 3)."""
+    n = y.shape[0] // 2
+    for c in range(motion.shape[0]):
+        motion[c, 0] = elongation(system.rows[c], y[:n, 0])
+        motion[c, 1] = elongation(system.rows[c], y[n:, 0])
+        motion[c, 2] = elongation(system.rows[c], dy[n:, 0])
+
+
+@njit
+def closed_sides(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
+    """The sides on which the contacts of a state are closed, 0 for open ones."""
+    for c in range(side.size):
+        w, clearance = elongation(system.rows[c], y[: y.shape[0] // 2, 0]), system.contacts[c].clearance
+        side[c] = 1 if w > clearance else (-1 if w < -clearance else 0)
+
+
+@njit
+def _scaled_error(stepper: Stepper, y: np.ndarray, h: float) -> float:
+    """The new state from the stages, and the largest error of a column over what is allowed."""
+    k, out, tolerances = stepper.stages, stepper.end, stepper.tolerances
     size, columns = y.shape
-    for s in range(1, 12):
-        for i in range(size):
-            for j in range(columns):
-                total = 0.0
-                for r in range(s):
-                    total += _A[s, r] * k[r, i, j]
-                out[i, j] = y[i, j] + h * total
-        rates(out, k[s], inverse_mass, stiffness, rows, law, spring_rows, springs, side)
-    n = size // 2
     error = 0.0
     for j in range(columns):
         fifth, third, scale = 0.0, 0.0, 0.0
         for i in range(size):
             total, e5, e3 = 0.0, 0.0, 0.0
-            for r in range(12):
-                total += _B[r] * k[r, i, j]
-                e5 += _E5[r] * k[r, i, j]
-                e3 += _E3[r] * k[r, i, j]
+            for r in range(STAGES):
+                total += B[r] * k[r, i, j]
+                e5 += E5[r] * k[r, i, j]
+                e3 += E3[r] * k[r, i, j]
             out[i, j] = y[i, j] + h * total
-            unit = 1.0 if i < n else 1.0 / pace  # velocities count as displacements over a radian
+            unit = 1.0 if i < size // 2 else 1.0 / tolerances.omega_ref
             fifth = max(fifth, abs(e5) * unit)
             third = max(third, abs(e3) * unit)
             scale = max(scale, abs(out[i, j]) * unit, abs(y[i, j]) * unit)
         if fifth > 0.0:
-            tolerance = rtol if j == 0 else loose
-            error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / (tolerance * scale))
+            allowed = (tolerances.rtol if j == 0 else tolerances.rtol_sensitivity) * scale
+            error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / allowed)
     return error
 
 
-@njit("void(f8[:,::1], f8[:,::1], f8[::1], f8[::1])", cache=True)
-def _relative(y, dy, row, out):
-    """Relative displacement w, its rate and its acceleration into ``out`` (3,)."""
-    n = y.shape[0] // 2
-    out[:] = 0.0
-    for i in range(n):
-        out[0] += row[i] * y[i, 0]
-        out[1] += row[i] * y[n + i, 0]
-        out[2] += row[i] * dy[n + i, 0]
+@njit
+def step(stepper: Stepper, y: np.ndarray, h: float) -> float:
+    """One step of length ``h`` from ``y``, whose rates are the first stage; returns the scaled error."""
+    k, out = stepper.stages, stepper.end
+    size, columns = y.shape
+    for s in range(1, STAGES):
+        for i in range(size):
+            for j in range(columns):
+                total = 0.0
+                for r in range(s):
+                    total += A[s, r] * k[r, i, j]
+                out[i, j] = y[i, j] + h * total
+        rates(stepper.system, stepper.side, out, k[s])
+    error = _scaled_error(stepper, y, h)
+    rates(stepper.system, stepper.side, out, stepper.end_rates)
+    relative_motion(stepper.system, out, stepper.end_rates, stepper.end_motion)
+    return error
 
 
-@njit(
-    "Tuple((i8, i8, f8, i8))(f8[:,::1], f8, f8, f8, f8, f8, f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1],"
-    "f8[:,::1], f8[:,::1])",
-    cache=True,
-)
-def flow(y, duration, rtol, loose, pace, reach, inverse_mass, stiffness, rows, law, spring_rows, springs, events):
+@njit
+def gap_of(system: CompiledSystem, side: np.ndarray, c: int, s: int) -> tuple[float, float]:
+    """(sign, offset) of the gap sign w - offset of contact ``c`` on side ``s``, whose rise through zero changes it."""
+    clearance = system.contacts[c].clearance
+    return (float(s), clearance) if side[c] == 0 else (-float(s), -clearance)
+
+
+@njit
+def first_change(stepper: Stepper, h: float) -> Change:
+    """The first change of a contact in the step of length ``h``."""
+    system, side = stepper.system, stepper.side
+    gap = np.empty(6)
+    change = Change(1.0, NONE, -1, 0)
+    for c in range(side.size):
+        for s in (-1, 1):
+            if side[c] == 0 or side[c] == s:
+                sign, offset = gap_of(system, side, c, s)
+                hermite(stepper.start_motion[c], stepper.end_motion[c], h, sign, offset, gap)
+                share, outcome = first_rise(gap)
+                if outcome != NONE and share < change.share:
+                    change = Change(share, outcome, c, s)
+    return change
+
+
+@njit
+def begin_landing(stepper: Stepper, change: Change, h: float) -> Landing:
+    """The first attempt at a change that was found in a step of length ``h``."""
+    sign, offset = gap_of(stepper.system, stepper.side, change.contact, change.side)
+    return Landing(sign, offset, change.outcome == EXTREMUM, 0.0, h, change.share * h, 0)
+
+
+@njit
+def _land(stepper: Stepper, y: np.ndarray, t: float, h: float, change: Change) -> tuple[float, bool]:
+    """Repeat the step of length ``h`` at time ``t`` so that it ends on a change: its length, whether it is one."""
+    landing = begin_landing(stepper, change, h)
+    for _ in range(MOST_ATTEMPTS):
+        length = landing.length
+        step(stepper, y, length)
+        floor = 1e-15 * h if landing.extremum else 1e-16 * (t + h)
+        landing, outcome = correct(landing, stepper.end_motion[change.contact], floor)
+        if outcome != NONE:
+            break
+    return length, outcome != EXTREMUM
+
+
+@njit
+def flow(
+    system: CompiledSystem, tolerances: Tolerances, y: np.ndarray, duration: float, events: np.ndarray
+) -> tuple[int, int, float, int]:
     """Advance ``y`` (2n, 1 + m) in place over ``duration`` seconds.
 
-    Parameters
-    ----------
-    rtol, loose
-        Error allowed per step, relative to each column's size: of the orbit, and of the variations.
-    pace
-        Frequency in rad/s that makes velocities comparable to displacements.
-    reach
-        Frequency in rad/s that bounds the step: at most one radian of it, so that interpolation resolves w.
-    events
-        (capacity, 4), filled with time, contact, side and kind (1 onset, -1 separation).
-
-    Returns
-    -------
-    status, events, closed, steps
-        status 0 done, 1 step too small, 2 more events than fit; number of events; seconds with any contact
-        closed; steps taken.
+    Returns the outcome (DONE, STUCK or FULL), the number of ``events`` (capacity, 4) filled with time, contact, side
+    and kind (1 onset, -1 separation), the seconds with a contact closed, and the steps taken.
     """
-    size, columns = y.shape
-    contacts = rows.shape[0]
-    k = np.empty((12, size, columns))
-    out, dy = np.empty((size, columns)), np.empty((size, columns))
-    a, b, c = np.empty((contacts, 3)), np.empty(3), np.empty(6)
-    side = np.zeros(contacts, np.int64)
-    for i in range(contacts):
-        w = 0.0
-        for j in range(size // 2):
-            w += rows[i, j] * y[j, 0]
-        side[i] = 1 if w > law[i, 0] else (-1 if w < -law[i, 0] else 0)
+    stepper = create_stepper(system, tolerances, y.shape)
+    side = stepper.side
+    closed_sides(system, y, side)
     t, closed, count, steps = 0.0, 0.0, 0, 0
-    largest = 1.0 / reach
+    largest = 1.0 / tolerances.omega_ref
     h = min(0.1 * largest, duration)
     while t < duration:
-        rates(y, k[0], inverse_mass, stiffness, rows, law, spring_rows, springs, side)
-        for i in range(contacts):
-            _relative(y, k[0], rows[i], a[i])
+        rates(system, side, y, stepper.stages[0])
+        relative_motion(system, y, stepper.stages[0], stepper.start_motion)
         last = t + h >= duration * (1.0 - 1e-15)
         if last:
             h = duration - t
-        if h < SMALLEST_STEP * duration and not last:
-            return 1, count, closed, steps
-        error = _step(y, out, k, h, rtol, loose, pace, inverse_mass, stiffness, rows, law, spring_rows, springs, side)
+        elif h < SMALLEST_STEP * duration:
+            return STUCK, count, closed, steps
+        error = step(stepper, y, h)
         steps += 1
         if not error < 1.0:
             h *= max(0.2, 0.9 * error ** (-0.125)) if error < 1e300 else 0.1
             continue
         grown = min(largest, h * min(6.0, 0.9 * max(error, 1e-12) ** (-0.125)))
-        rates(out, dy, inverse_mass, stiffness, rows, law, spring_rows, springs, side)
-        place, verdict, which, sense = 1.0, 0, -1, 0
-        for i in range(contacts):
-            _relative(out, dy, rows[i], b)
-            for s in (-1, 1):
-                if side[i] == 0:  # the gap s w - D must not rise through zero
-                    hermite(a[i], b, h, float(s), law[i, 0], c)
-                elif side[i] == s:  # the indentation must not fall through zero
-                    hermite(a[i], b, h, -float(s), -law[i, 0], c)
-                else:
-                    continue
-                # a contact that changed a moment ago sits on zero and moves away from it
-                x, found = first_upcrossing(c)
-                if found > 0 and x < place:
-                    place, verdict, which, sense = x, found, i, s
-        if verdict == 0:
-            y[:] = out
-            if np.any(side != 0):
-                closed += h
-            t = duration if last else t + h
-            h = grown
-            continue
-        # repeat the step so that it ends on the extremum, or on the change
-        sign = float(sense) if side[which] == 0 else -float(sense)
-        offset = law[which, 0] if side[which] == 0 else -law[which, 0]
-        low, high, target = 0.0, h, place * h
-        if verdict == 2:
-            for _ in range(40):
-                _step(
-                    y, out, k, target, rtol, loose, pace, inverse_mass, stiffness, rows, law, spring_rows, springs, side
-                )
-                rates(out, dy, inverse_mass, stiffness, rows, law, spring_rows, springs, side)
-                _relative(out, dy, rows[which], b)
-                if sign * b[1] > 0.0:
-                    low = target
-                else:
-                    high = target
-                shift = -b[1] / b[2] if b[2] != 0.0 else 0.0
-                if abs(shift) <= 1e-15 * h:
-                    break
-                trial = target + shift
-                target = trial if low < trial < high else 0.5 * (low + high)
-            if sign * b[0] - offset <= 0.0:  # only a near miss: the step may end here
-                y[:] = out
-                if np.any(side != 0):
-                    closed += target
-                t += target
-                h = grown
-                continue
-            low, high, target = 0.0, target, 0.5 * target
-        else:
-            high = h
-        for _ in range(80):
-            _step(y, out, k, target, rtol, loose, pace, inverse_mass, stiffness, rows, law, spring_rows, springs, side)
-            _relative(out, dy, rows[which], b)
-            g = sign * b[0] - offset
-            if g > 0.0:
-                high = min(high, target)
-            else:
-                low = max(low, target)
-            rate = sign * b[1]
-            shift = -g / rate if rate > 0.0 else h
-            if abs(shift) <= 1e-16 * (t + h) or high - low <= 1e-16 * (t + h):
-                break
-            trial = target + shift
-            target = trial if low < trial < high else 0.5 * (low + high)
-        y[:] = out
-        if np.any(side != 0):
-            closed += target
-        t += target
-        if count >= events.shape[0]:
-            return 2, count, closed, steps
-        kind = 1 if side[which] == 0 else -1
-        events[count, 0], events[count, 1], events[count, 2], events[count, 3] = t, which, sense, kind
-        count += 1
-        side[which] = sense if kind == 1 else 0
-        h = min(grown, largest)
-    return 0, count, closed, steps
+        change = first_change(stepper, h)
+        changed = False
+        if change.outcome != NONE:
+            h, changed = _land(stepper, y, t, h, change)
+        y[:] = stepper.end
+        closed += h if np.any(side != 0) else 0.0
+        t = duration if last and change.outcome == NONE else t + h
+        h = grown
+        if changed:
+            if count >= events.shape[0]:
+                return FULL, count, closed, steps
+            onset = side[change.contact] == 0
+            events[count, 0], events[count, 1] = t, change.contact
+            events[count, 2], events[count, 3] = change.side, 1 if onset else -1
+            side[change.contact] = change.side if onset else 0
+            count += 1
+    return DONE, count, closed, steps

@@ -70,18 +70,22 @@ class Flow:
         """
         raise NotImplementedError
 
+    def with_variations(self, start: np.ndarray) -> np.ndarray:
+        """The state (2n,) and the identity's columns beside it (2n, 1 + 2n)."""
+        return np.hstack([np.asarray(start, float)[:, None], np.eye(len(start))])
+
     def finish(
         self,
         start: np.ndarray,
-        end: np.ndarray,
-        sensitivity: np.ndarray,
+        y: np.ndarray,
         duration: float,
         events: np.ndarray,
         closed: float,
         steps: int,
     ) -> Arc:
-        """An arc with the quantities that follow from the others."""
+        """An arc from its start, state and variations ``y`` (2n, 1 + 2n) at its end, and what happened on the way."""
         n, system = self.system.dofs, self.system
+        end, sensitivity = y[:, 0].copy(), y[:, 1:].copy()
         acceleration = np.array([-system.forces(z[:n]) / system.masses for z in (start, end)])
         episodes = int(np.sum(system.gaps(start[:n]) > 0) + np.sum(events[:, 3] == 1))
         return Arc(duration, start, end, sensitivity, acceleration, events, episodes, closed, steps)
@@ -90,44 +94,42 @@ class Flow:
 class Dop853Flow(Flow):
     """Dormand and Prince's 8(5,3) pair, landing on every contact change; see ``kernel``.
 
-    ``rtol`` is the error per step relative to the orbit's size, ``loose`` that of the sensitivities.
+    ``rtol`` is the error per step relative to the orbit's size, ``rtol_sensitivity`` that of the sensitivities.
     """
 
     name = "compiled"
 
-    def __init__(self, system: System, rtol: float = 1e-13, loose: float = 1e-11, capacity: int = 2000) -> None:
+    def __init__(
+        self, system: System, rtol: float = 1e-13, rtol_sensitivity: float = 1e-11, capacity: int = 2000
+    ) -> None:
         super().__init__(system)
-        self.rtol, self.loose, self.capacity = rtol, loose, capacity
-        self._arrays = kernel_arrays(system)
-        self._pace = float(system.linear_modes()[0][-1])
+        self.rtol, self.rtol_sensitivity, self.capacity = rtol, rtol_sensitivity, capacity
+        self._compiled = compile_system(system)
+        self._omega = float(system.linear_modes()[0][-1])
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """See ``Flow.arc``."""
-        n = self.system.dofs
-        y = np.hstack([np.asarray(start, float)[:, None], np.eye(2 * n)])
+        y = self.with_variations(start)
         events = np.empty((self.capacity, 4))
-        pace = max(self._pace, 2 * np.pi / period)
-        status, count, closed, steps = kernel.flow(
-            y, duration, self.rtol, self.loose, pace, pace, *self._arrays, events
-        )
-        if status:
-            why = {1: "the step became too small", 2: f"more than {self.capacity} contact changes"}[status]
-            raise FlowError(f"the flow stopped after {count} contact changes in {duration:.6g} s: {why}")
-        return self.finish(start, y[:, 0].copy(), y[:, 1:].copy(), duration, events[:count].copy(), closed, steps)
+        tolerances = kernel.Tolerances(self.rtol, self.rtol_sensitivity, max(self._omega, 2 * np.pi / period))
+        outcome, count, closed, steps = kernel.flow(self._compiled, tolerances, y, duration, events)
+        if outcome != kernel.DONE:
+            why = {kernel.STUCK: "the step became too small", kernel.FULL: f"more than {self.capacity} contact changes"}
+            raise FlowError(f"the flow stopped after {count} contact changes in {duration:.6g} s: {why[outcome]}")
+        return self.finish(start, y, duration, events[:count].copy(), closed, steps)
 
 
-def kernel_arrays(system: System) -> tuple[np.ndarray, ...]:
-    """The system as the arrays that the compiled kernels take, in their order."""
-    law = [(p.clearance, p.law.stiffness, p.law.law.exponent) for p in system.contacts]
-    springs = [(s.quadratic, s.cubic) for s in system.springs]
+def compile_system(system: System) -> kernel.CompiledSystem:
+    """The record of a system."""
+    contacts = [(p.clearance, p.law.stiffness, p.law.law.exponent) for p in system.contacts]
     spring_rows = [direction(s.start, s.end, system.dofs) for s in system.springs]
-    return (
+    return kernel.CompiledSystem(
         1 / np.asarray(system.masses, float),
         np.ascontiguousarray(system.stiffness, float),
         contact_directions(system),
-        np.array(law).reshape(len(law), 3),
-        np.array(spring_rows).reshape(len(springs), system.dofs),
-        np.array(springs).reshape(len(springs), 2),
+        np.array(contacts, kernel.CONTACT),
+        np.array(spring_rows, float).reshape(len(spring_rows), system.dofs),
+        np.array([(s.quadratic, s.cubic) for s in system.springs], kernel.SPRING),
     )
 
 

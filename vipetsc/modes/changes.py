@@ -1,0 +1,186 @@
+"""Contact changes within a step: where they are on the interpolant, and Newton's method for landing on them.
+
+A contact changes when its gap rises through zero: sigma w - D while it is open, D - sigma w while it is closed. A
+step's quintic Hermite interpolant of the gap is cut into its monotone pieces by ``contact.search``, so that no pair
+of changes is missed, however short. A largest value within the interpolant's error of zero is left to the flow.
+
+The roots are bisected in monomial form on the quarters of the step. Which of two neighbouring floats is taken for a
+root decides, through the number of Newton steps of a later orbit, on the points of a branch.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.compiled import njit
+from vipetsc.contact.search import first_upcrossing_after_start
+
+NONE, CROSSING, EXTREMUM = 0, 1, 2
+"""Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell."""
+
+EXTREMUM_ATTEMPTS, MOST_ATTEMPTS = 40, 120
+"""Attempts at an extremum, and of one landing in all."""
+
+ROUNDING = 1e-8
+"""A slope at the start below this share of the curvature is the rounding of an extremum."""
+
+
+class Landing(NamedTuple):
+    """An attempt to end a step of ``length`` s, between ``low`` and ``high``, where sign w - offset rises through zero.
+
+    With ``extremum`` it is to end where that gap is largest. ``attempts`` were made at it.
+    """
+
+    sign: float
+    offset: float
+    extremum: bool
+    low: float
+    high: float
+    length: float
+    attempts: int
+
+
+@njit
+def correct(landing: Landing, motion: np.ndarray, floor: float) -> tuple[Landing, int]:
+    """The next attempt after one that ended with (w, w', w'') = ``motion``: Newton's method, or bisection.
+
+    The outcome is CROSSING when the length is known to ``floor`` seconds, EXTREMUM when the gap's largest value is
+    known so and not above zero, and NONE when another attempt is needed. ``contact.landing`` stops at a tolerance on
+    w; the sensitivities of an orbit with many contacts need the length to rounding.
+    """
+    sign, offset, extremum, low, high, length, attempts = landing
+    gap = sign * motion[0] - offset
+    value, rate = (-sign * motion[1], -sign * motion[2]) if extremum else (gap, sign * motion[1])
+    if value > 0.0:
+        high = min(high, length)
+    else:
+        low = max(low, length)
+    newton = -value / rate if rate > 0.0 else high
+    attempts += 1
+    # rounding of w' may keep Newton's method from the extremum for ever
+    unknown = abs(newton) > floor and (attempts < EXTREMUM_ATTEMPTS if extremum else high - low > floor)
+    if unknown:
+        target = length + newton
+        if not low < target < high:
+            target = 0.5 * (low + high)
+        return Landing(sign, offset, extremum, low, high, target, attempts), NONE
+    if not extremum:
+        return landing, CROSSING
+    if gap <= 0.0:
+        return landing, EXTREMUM
+    return Landing(sign, offset, False, 0.0, length, 0.5 * length, 0), NONE
+
+
+@njit
+def hermite(a: np.ndarray, b: np.ndarray, h: float, sign: float, offset: float, c: np.ndarray) -> None:
+    """Coefficients c (6,) of sign * w - offset on [0, 1] from (w, w', w'') at both ends of a step h."""
+    g0, r0, s0 = sign * a[0] - offset, sign * a[1] * h, sign * a[2] * h * h
+    g1, r1, s1 = sign * b[0] - offset, sign * b[1] * h, sign * b[2] * h * h
+    d = g1 - g0 - r0 - 0.5 * s0
+    e = r1 - r0 - s0
+    f = s1 - s0
+    c[0], c[1], c[2] = g0, r0, 0.5 * s0
+    c[3] = 10.0 * d - 4.0 * e + 0.5 * f
+    c[4] = -15.0 * d + 7.0 * e - f
+    c[5] = 6.0 * d - 3.0 * e + 0.5 * f
+
+
+@njit
+def _value(c: np.ndarray, x: float) -> float:
+    return c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * c[5]))))
+
+
+@njit
+def _slope(c: np.ndarray, x: float) -> float:
+    """Slope at x; just after 0, for a step that starts on an extremum."""
+    if x == 0.0 and abs(c[1]) <= ROUNDING * abs(c[2]):
+        return c[2]
+    return c[1] + x * (2.0 * c[2] + x * (3.0 * c[3] + x * (4.0 * c[4] + x * 5.0 * c[5])))
+
+
+@njit
+def _root(c: np.ndarray, low: float, high: float) -> float:
+    """Where the polynomial turns positive between low and high."""
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if middle in (low, high):
+            break
+        if _value(c, middle) > 0.0:
+            high = middle
+        else:
+            low = middle
+    return 0.5 * (low + high)
+
+
+@njit
+def _extremum(c: np.ndarray, share: float) -> float:
+    """The zero of the slope near ``share``, in its quarter of the step."""
+    low = 0.25 * min(np.floor(4.0 * share), 3.0)
+    high = low + 0.25
+    sign = _slope(c, low)
+    if sign * _slope(c, high) >= 0.0:  # two of them in one quarter
+        return share
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if middle in (low, high):
+            break
+        if _slope(c, middle) * sign > 0.0:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+@njit
+def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
+    """Where ``sign`` times the slope (5,) on [low, 1] turns positive, 2 if it does not; restricts it to [there, 1]."""
+    share = first_upcrossing_after_start(sign * slope, 0.0)
+    if share > 1.0:
+        return share
+    if share > 0.0:
+        for k in range(1, slope.size):
+            for i in range(slope.size - k):
+                slope[i] = (1.0 - share) * slope[i] + share * slope[i + 1]
+        slope[0] = 0.0
+    return low + share * (1.0 - low)
+
+
+@njit
+def first_rise(c: np.ndarray) -> tuple[float, int]:
+    """Where a gap that starts at or below zero first rises through it: share of the step, outcome."""
+    margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))  # above the interpolant's error
+    b1 = c[0] + c[1] / 5.0  # Bernstein coefficients bound the gap
+    b2 = c[0] + (4.0 * c[1] + c[2]) / 10.0
+    b3 = c[0] + (6.0 * c[1] + 3.0 * c[2] + c[3]) / 10.0
+    b4 = c[0] + (4.0 * c[1] + 3.0 * c[2] + 2.0 * c[3] + c[4]) / 5.0
+    b5 = _value(c, 1.0)
+    if max(b1, b2, b3, b4, b5) <= -margin:
+        return 1.0, NONE
+    start = 0.0 if abs(c[1]) <= ROUNDING * abs(c[2]) else b1 - c[0]
+    slope = np.array([start, b2 - b1, b3 - b2, b4 - b3, b5 - b4])
+    high = 0.0
+    for _ in range(3):  # a quartic slope has at most two pairs of zeros
+        low = _next_turn(slope, high, 1.0)
+        if low > 1.0:
+            break
+        high = _next_turn(slope, low, -1.0)
+        top = _extremum(c, high) if high <= 1.0 else 1.0
+        left = _extremum(c, low) if low > 0.0 else 0.0
+        for part in range(1, 5):  # the first quarter of the step that ends above zero
+            end = 0.25 * part
+            if end > left:
+                if _value(c, end) > 0.0:
+                    return _root(c, left, end), CROSSING
+                if end >= top:
+                    break
+                left = end
+        if high > 1.0:
+            break
+        peak = _value(c, top)
+        if peak > margin:
+            return _root(c, left, top), CROSSING
+        if peak > -margin:
+            return top, EXTREMUM
+    return 1.0, NONE
