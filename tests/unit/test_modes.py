@@ -15,6 +15,7 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Bilinear, Contact, Hertz, contact_stiffness, diatomic, four_band
 from vipetsc.modes.branch import Branch
+from vipetsc.modes.changes import CROSSING, NONE, first_rise
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.continuation import Continuation, StepControl
 from vipetsc.modes.orbit import Dop853Flow
@@ -108,6 +109,44 @@ def test_charts_encode_decode_and_differentiate(x, period, kind):
         forward, backward = (np.append(*chart.decode(xi + s * move)) for s in (1, -1))
         difference = (forward - backward) / (2 * step)
         assert column == pytest.approx(difference, rel=1e-5, abs=1e-5 * np.abs(column).max())
+
+
+@given(
+    c=st.tuples(*[st.floats(-1, 1)] * 6),
+    size=st.tuples(*[st.floats(-3, 0)] * 6),
+    start=st.sampled_from(["below", "landed", "extremum"]),
+)
+@settings(max_examples=400, deadline=None)
+def test_the_first_change_of_a_gap_is_found(c, size, start):
+    """Against dense sampling: nothing is missed, and nothing comes before what is found."""
+    c = np.array(c) * 10.0 ** np.array(size)
+    c[0] = -abs(c[0])
+    if start == "landed":
+        c[0], c[1] = 0.0, -abs(c[1])
+    if start == "extremum":
+        c[1] = 0.0
+    margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))
+    share, outcome = first_rise(c)
+    s = np.linspace(0, 1, 4001)[1:]
+    gap = np.polynomial.Polynomial(c)(s)
+    clear = np.nonzero(gap > 1.01 * margin + 1e-12)[0]
+    if clear.size:
+        assert outcome != NONE
+        assert share <= s[clear[0]]
+    if outcome == NONE:
+        assert gap.max() <= 1e-12 + 1.01 * margin
+    else:
+        before = gap[s < share - 1e-9]
+        assert before.max(initial=-1.0) <= 1e-12 + (0.0 if outcome == CROSSING else margin)
+        assert abs(np.polynomial.Polynomial(c)(share)) <= (1e-12 if outcome == CROSSING else margin + 1e-12)
+
+
+def test_a_hump_beside_a_dip_in_one_quarter_of_a_step_is_found():
+    """A contact that has just opened closes again and opens, all within the first fifth of a step."""
+    c = np.array([0.0, -4.6e-4, 5.0e-2, -0.31, 2.2e-4, 1.4e-3])
+    share, outcome = first_rise(c)
+    assert outcome == CROSSING
+    assert 0 < share < 0.02
 
 
 @pytest.mark.parametrize("name", ["quarter", "half", "whole"])

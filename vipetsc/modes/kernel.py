@@ -75,8 +75,9 @@ class Change(NamedTuple):
 
 
 @njit
-def create_stepper(system: CompiledSystem, tolerances: Tolerances, shape: tuple[int, int]) -> Stepper:
-    """A stepper for states and variations of a ``shape``; its arrays are not filled."""
+def create_stepper(system: CompiledSystem, tolerances: Tolerances, columns: int) -> Stepper:
+    """A stepper for states with ``columns`` - 1 variations; its arrays are not filled."""
+    shape = 2 * system.inverse_mass.size, columns
     contacts = system.contacts.size
     side, stages = np.empty(contacts, np.int64), np.empty((STAGES, shape[0], shape[1]))
     end, end_rates = np.empty(shape), np.empty(shape)
@@ -267,7 +268,7 @@ def flow(
     Returns the outcome (DONE, STUCK or FULL), the number of ``events`` (capacity, 4) filled with time, contact, side
     and kind (1 onset, -1 separation), the seconds with a contact closed, and the steps taken.
     """
-    stepper = create_stepper(system, tolerances, y.shape)
+    stepper = create_stepper(system, tolerances, y.shape[1])
     side = stepper.side
     closed_sides(system, y, side)
     t, closed, count, steps = 0.0, 0.0, 0, 0

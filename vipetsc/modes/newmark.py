@@ -80,7 +80,7 @@ def _solve_step(
 
 @njit
 def _newmark(system: CompiledSystem, y: np.ndarray, duration: float, steps: int, w: np.ndarray) -> bool:
-    """Advance ``y`` (2n, 1 + m) in place; ``w`` (steps + 1, contacts) is filled; returns whether all steps converged."""
+    """Advance ``y`` (2n, 1 + m) in place; ``w`` (steps + 1, contacts) is filled; returns whether it converged."""
     n = y.shape[0] // 2
     h = duration / steps
     quarter = 0.25 * h * h

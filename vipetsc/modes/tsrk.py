@@ -31,10 +31,9 @@ class Tsrk(Flow):
         super().__init__(system)
         self.rtol, self.rtol_sensitivity = rtol, rtol_sensitivity
         self._omega = float(system.linear_modes()[0][-1])
-        shape = 2 * system.dofs, 1 + 2 * system.dofs
         tolerances = kernel.Tolerances(rtol, rtol_sensitivity, self._omega)
-        self._stepper = kernel.create_stepper(compile_system(system), tolerances, shape)
-        self._y = PETSc.Vec().createSeq(shape[0] * shape[1], comm=PETSc.COMM_SELF)
+        self._stepper = kernel.create_stepper(compile_system(system), tolerances, 1 + 2 * system.dofs)
+        self._y = PETSc.Vec().createSeq(self._stepper.end.size, comm=PETSc.COMM_SELF)
         self._adaptive = self._solver(method, "basic")
         self._fixed = self._solver(method, "none")
 
