@@ -12,7 +12,7 @@ from bench_peers import Solution, Solver
 
 from vipetsc.case import Case
 from vipetsc.case.schema import TimeTable
-from vipetsc.dynamics.engine import choose
+from vipetsc.dynamics.engine import select_engine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.run import ENGINES
@@ -32,7 +32,7 @@ class Flight:
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
         self.model = case.model()
         self.layout = Layout.of(self.model, comm)
-        kind, refused = choose(case.time.engine, self.model, ENGINES)
+        kind, refused = select_engine(case.time.engine, self.model, ENGINES)
         if refused:
             raise RuntimeError(refused)
         self.engine = kind.create(self.model, self.layout, LatticeOperator(self.model, self.layout), True, None)

@@ -57,6 +57,21 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     return value
 
 
+def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
+    """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
+    value: list[T] = []
+    error: Any = None
+    try:
+        value.append(function())
+    except Exception as caught:
+        error = caught
+    first = next((e for e in comm.allgather(error) if e is not None), None)
+    if first is not None:
+        first.from_root = True
+        raise first
+    return value[0]
+
+
 class SharedCounter:
     """A count that all ranks of ``comm`` draw from, one-sided: no rank has to wait on another to hand out work."""
 

@@ -38,7 +38,6 @@ UPWARD = {
     "contact.episodes -> dynamics.ts.kernel",
     "io.ensemble_file -> case",
     "io.run_file -> case",
-    "io.store -> case",
 }
 
 

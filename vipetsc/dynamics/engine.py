@@ -74,7 +74,7 @@ class Engine(ABC):
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
 
 
-def choose(name: str, model: Model, engines: tuple[type[Engine], ...]) -> tuple[type[Engine], str | None]:
+def select_engine(name: str, model: Model, engines: tuple[type[Engine], ...]) -> tuple[type[Engine], str | None]:
     """The engine called ``name``, or for ``auto`` the first, and None; or the last of ``engines``, and why.
 
     The last one suits every model.

@@ -1,8 +1,9 @@
-"""A case in, a result out."""
+"""A case in, a result out: the loop over a run's samples."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,23 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case, Model
-from vipetsc.dynamics.engine import StalledError, choose
+from vipetsc.dynamics.engine import StalledError, select_engine
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.ledger import Ledger
+from vipetsc.dynamics.meter import EnergyMeter
+from vipetsc.dynamics.observers import Observer, Recorder, RunawayError, Sample, Setup
+from vipetsc.dynamics.observers.guard import fastest_place
+from vipetsc.dynamics.observers.recorder import recorded_cells
 from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import provenance
-from vipetsc.io.store import RunFolder
-from vipetsc.parallel import Progress, StopRequest, on_root
+from vipetsc.io.store import RunDescription, RunFolder, RunOutput
+from vipetsc.parallel import StopRequest
 
 # In the order in which engine = "auto" tries them.
 ENGINES = (Propagator, Integrator)
+# The guard first: a sample that it refuses is not recorded.
+OBSERVERS = ("guard", "ledger", "recorder")
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class Result:
 
     ``complete``: the whole case was simulated; ``resumable``: it was stopped and can go on from its last
     checkpoint; neither: it failed, and ``run.h5`` holds the samples up to the last good one. ``sentence`` says
-    it in words, ``statistics`` in numbers.
+    it in words, ``statistics`` in numbers, the same on all ranks.
     """
 
     complete: bool
@@ -45,7 +50,7 @@ class Result:
 
 def simulate(
     case: Case,
-    folder: str | Path | RunFolder,
+    folder: str | Path | RunOutput,
     comm: MPI.Comm = MPI.COMM_WORLD,
     *,
     force: bool = False,
@@ -53,6 +58,7 @@ def simulate(
     native: bool = True,
     stop: StopRequest | None = None,
     progress: bool = False,
+    observers: Sequence[str] = (),
 ) -> Result:
     """Simulate ``case`` on all ranks of ``comm`` and leave ``run.h5`` and ``summary.json`` in ``folder``.
 
@@ -71,152 +77,151 @@ def simulate(
         A request that ends the run after the step at hand.
     progress
         Report progress on stderr of rank 0.
+    observers
+        Names of further observers (subclasses of ``dynamics.observers.Observer``), which see every good sample.
 
     Raises
     ------
     FolderError
         If the folder cannot be used as asked.
+    OSError
+        If a file cannot be written, on all ranks.
     """
-    begin = time.perf_counter(), time.process_time()
+    clock = Clock()
+    output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
+    names = [*OBSERVERS, *(["progress"] if progress else []), *observers]
     model = case.model()
-    home = folder if isinstance(folder, RunFolder) else RunFolder(Path(folder), comm)
-    comm = home.comm
-    on_root(comm, lambda: home.prepare(case, force, resume))
-    run = _Run(case, model, home, native, stop, Progress(comm, model.end, "s", show=progress))
-    if resume:
-        run.restore(on_root(comm, home.last_state))
-    complete, sentence = run.go()
-    return run.finish(complete, sentence, begin)
+    output.begin(describe(case, model), force, resume)
+    run = Run(case, model, output, native, stop, [Observer.registry[name]() for name in names])
+    state = output.chunks.last_state() if resume else None
+    if state is not None:
+        run.restore(state)
+    ending = run.advance()
+    return run.finish(ending, clock)
 
 
-class _Run:
-    """The parts of one simulation and the loop over its samples."""
+def describe(case: Case, model: Model) -> RunDescription:
+    """What the run's file tells of ``case``."""
+    return RunDescription(
+        case=case.to_toml(),
+        cells=recorded_cells(case) + 1,
+        dofs=model.chain.cell.dofs,
+        sites=tuple(cell + 1 for cell in model.chain.sites),
+        clearances=tuple(model.chain.clearances),
+        fields=tuple(case.output.fields),
+    )
+
+
+class Clock:
+    """Wall and processor time since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def read(self, comm: MPI.Comm) -> dict[str, float]:
+        """Seconds since then, those of the processors summed over the ranks; all must call it."""
+        cpu = comm.allreduce(time.process_time() - self._cpu)
+        return {"wall_seconds": round(time.perf_counter() - self._wall, 3), "cpu_seconds": round(cpu, 3)}
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How the loop ended: all samples are there, or it was stopped on request, or it failed; why, in a sentence."""
+
+    sentence: str
+    complete: bool = False
+    stopped: bool = False
+
+
+class Run:
+    """One simulation: an engine that advances, and observers that watch its samples."""
 
     def __init__(
-        self, case: Case, model: Model, home: RunFolder, native: bool, stop: StopRequest | None, progress: Progress
+        self,
+        case: Case,
+        model: Model,
+        output: RunOutput,
+        native: bool,
+        stop: StopRequest | None,
+        observers: Sequence[Observer],
     ) -> None:
-        self.case, self.model, self.home, self.progress = case, model, home, progress
-        self.comm = home.comm
-        self.layout = Layout.of(model, self.comm)
-        self.operator = LatticeOperator(model, self.layout)
-        kind, self.refused = choose(case.time.engine, model, ENGINES)
-        self.engine = kind.create(model, self.layout, self.operator, native, stop)
-        self.ledger = Ledger(model, self.operator)
-        self.recorder = Recorder(case, model, self.layout)
-        self.parts = 0
+        self.comm, self.observers = output.comm, observers
+        layout = Layout.of(model, self.comm)
+        operator = LatticeOperator(model, layout)
+        kind, self._refusal = select_engine(case.time.engine, model, ENGINES)
+        engine = kind.create(model, layout, operator, native, stop)
+        self.setup = Setup(case, model, layout, EnergyMeter(model, operator), engine, output)
         self.samples = 0
-        self.episodes = 0
         self.last: float | None = None
+        for observer in observers:
+            observer.begin(self.setup)
 
-    def restore(self, number: int) -> None:
-        """Go on after checkpoint ``number``; -1 is the beginning."""
-        if number < 0:
-            return
-        checkpoint = self.home.read_state(number)
-        self.engine.restore(checkpoint)
-        self.samples, self.episodes = (int(n) for n in checkpoint["done"])
-        self.ledger.worst, self.ledger.most_work = checkpoint["ledger"].tolist()
-        self.parts = number + 1
-        self.last = self.engine.time
-        self.progress.start_at(self.engine.time)
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on after a checkpoint."""
+        self.setup.engine.restore(dict(state))
+        self.samples, self.last = int(state["samples"]), self.setup.engine.time
+        for observer in self.observers:
+            prefix = f"{observer.name}/"
+            observer.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
-    def go(self) -> tuple[bool, str]:
-        """Simulate to the end; whether it was reached, and how it ended in words."""
-        engine, model = self.engine, self.model
+    def advance(self) -> Ending:
+        """Simulate to the end, or to where it stops or fails."""
+        engine, model = self.setup.engine, self.setup.model
         while self.samples < model.samples:
             t = self.samples * model.sample_interval
             try:
-                going = engine.advance(t)
+                if not engine.advance(t):
+                    return Ending(f"stopped on request at t = {engine.time:.6g} s", stopped=True)
+                self._observe(Sample(self.samples, t, engine.state, self.setup.meter.measure(engine.state)))
             except StalledError as error:
-                return False, self._failure(f"stalled: {error}")
-            if not going:
-                return False, f"stopped on request at t = {engine.time:.6g} s"
-            energies = self.ledger.measure(engine.state)
-            problem = self.ledger.check(energies)
-            if problem:
-                return False, self._failure(problem)
-            self.recorder.record(self.samples, t, engine.state, energies)
-            self.energies, self.last = energies, t
-            self.samples += 1
-            if self.recorder.full:
-                self._flush()
-            self.progress.update(t)
-        return True, f"complete: {model.samples} samples to t = {self.last:.6g} s"
+                return self._failure(f"stalled: {error}")
+            except RunawayError as error:
+                return self._failure(str(error))
+            self.samples, self.last = self.samples + 1, t
+            if any(observer.due for observer in self.observers):
+                self._checkpoint()
+        return Ending(f"complete: {model.samples} samples to t = {self.last:.6g} s", complete=True)
 
-    def _flush(self) -> None:
-        episodes = self.engine.take_episodes()
-        self.episodes += self.comm.allreduce(len(episodes))
-        self.home.write_part(self.parts, self.recorder.take(episodes))
-        done = {
-            "done": np.array([self.samples, self.episodes]),
-            "ledger": np.array([self.ledger.worst, self.ledger.most_work]),
-        }
-        self.home.write_state(self.parts, self.engine.checkpoint() | done)
-        self.parts += 1
+    def _observe(self, sample: Sample) -> None:
+        for observer in self.observers:
+            observer.observe(sample)
 
-    def _failure(self, reason: str) -> str:
-        """``reason`` with the time, the place where the lattice moves fastest, and the last good sample."""
-        layout = self.layout
-        half = layout.dofs * layout.owned
-        y = self.engine.state.array_r
-        finite = np.isfinite(y[:half]) & np.isfinite(y[half : 2 * half])
-        speed = np.where(finite, np.abs(y[half : 2 * half]), np.inf).reshape(layout.dofs, layout.owned)
-        cell = int(speed.max(axis=0).argmax()) if layout.owned else 0
-        own = (float(speed.max()) if layout.owned else -1.0, layout.start + cell)
-        _, fastest = max(self.comm.allgather(own))
-        sites = self.model.chain.sites
-        near = min(range(len(sites)), key=lambda i: abs(sites[i] - fastest), default=None)
-        place = f"cell {fastest + 1}"
-        if near is not None:
-            place += f", nearest site {near + 1} in cell {sites[near] + 1}"
+    def _failure(self, reason: str) -> Ending:
         good = "none" if self.last is None else f"t = {self.last:.6g} s"
-        return f"{reason}, at t = {self.engine.time:.6g} s ({place}); last good sample: {good}"
+        place = fastest_place(self.setup)
+        return Ending(f"{reason}, at t = {self.setup.engine.time:.6g} s ({place}); last good sample: {good}")
 
-    def finish(self, complete: bool, sentence: str, begin: tuple[float, float]) -> Result:
+    def _checkpoint(self) -> None:
+        for observer in self.observers:
+            observer.flush()
+        state = self.setup.engine.checkpoint() | {"samples": np.array(self.samples)}
+        for observer in self.observers:
+            state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
+        self.setup.output.chunks.save_state(state)
+
+    def finish(self, ending: Ending, clock: Clock) -> Result:
         """Write what is still in memory; unless the run was stopped on request, the final files too."""
-        comm, home = self.comm, self.home
-        self.progress.close()
-        resumable = not complete and sentence.startswith("stopped")
-        if resumable:
-            self._flush()
+        output, sentence = self.setup.output, ending.sentence
+        if ending.stopped:
+            self._checkpoint()
             sentence += "; --resume goes on from there"
-        else:
-            self._write_last_part()
-        statistics = self._statistics(begin)
-        if not resumable:
-            cells = self.recorder.cells if self.recorder.parallel else self._all_cells()
-            about = provenance(comm) | {"status": sentence, "complete": complete, "statistics": statistics}
-            home.assemble(self.case, cells + 1, self.parts, self.recorder.parallel, about)
-            if comm.rank == 0:
-                home.finish(about | {"case": self.case.model_dump(by_alias=True)})
-            comm.Barrier()
-        self.engine.destroy()
-        return Result(complete, resumable, sentence, statistics, home.path)
+        for observer in self.observers:
+            observer.finish(ending.stopped)
+        statistics = self._statistics(clock)
+        if not ending.stopped:
+            attributes = {"status": sentence, "complete": ending.complete, "statistics": statistics}
+            attributes = self.comm.bcast(provenance(self.comm) | attributes)
+            recorder = next(observer for observer in self.observers if isinstance(observer, Recorder))
+            summary = {"case": self.setup.case.model_dump(by_alias=True)}
+            output.finish(attributes, recorder.columns, summary)
+        self.setup.engine.destroy()
+        return Result(ending.complete, ending.stopped, sentence, statistics, output.folder)
 
-    def _all_cells(self) -> np.ndarray:
-        first, last = self.case.output.window or (1, self.layout.cells)
-        return np.arange(first - 1, last, self.case.output.every)
-
-    def _write_last_part(self) -> None:
-        episodes = self.engine.take_episodes() + self.engine.unfinished()
-        self.episodes += self.comm.allreduce(len(episodes))
-        self.home.write_part(self.parts, self.recorder.take(episodes))
-        self.parts += 1
-
-    def _statistics(self, begin: tuple[float, float]) -> dict[str, Any]:
-        comm = self.comm
-        cpu = comm.allreduce(time.process_time() - begin[1])
-        energies = getattr(self, "energies", None)
-        statistics = {"samples": self.samples, "end": self.last or 0.0, "episodes": self.episodes}
-        statistics |= {"engine": self.engine.name} | self.engine.statistics()
-        if self.refused:
-            statistics["engine_note"] = self.refused
-        statistics["ledger_error"] = self.ledger.error
-        if energies is not None:
-            statistics["work"] = energies.work
-            statistics["dissipated"] = energies.dissipated
-        statistics |= {
-            "wall_seconds": round(time.perf_counter() - begin[0], 3),
-            "cpu_seconds": round(cpu, 3),
-        }
-        return statistics
+    def _statistics(self, clock: Clock) -> dict[str, Any]:
+        engine = self.setup.engine
+        statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
+        if self._refusal:
+            statistics["engine_note"] = self._refusal
+        for observer in self.observers:
+            statistics |= observer.statistics()
+        return self.comm.bcast(statistics | clock.read(self.comm))

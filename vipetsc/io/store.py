@@ -1,39 +1,44 @@
-"""Files: parts written while a run goes on, and the HDF5 file they become when it ends.
+"""Where a run goes: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
 
-Every file is written under a temporary name and renamed when complete, so a reader, or a run that goes on after
-a kill, only ever meets whole ones. ``run.h5`` follows netCDF-4's conventions (dimension scales, ``units``,
-``long_name``): xarray opens it.
+While a run goes on, its samples are kept as chunks (``io.chunks``); when it has ended they become one dataset in the
+layout of ``io.netcdf``, by one of the writers of ``io.writers``. Every file is whole or not there, so that a reader,
+or a run that goes on after a kill, never meets a half one.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
-from collections.abc import Collection, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from mpi4py import MPI
 
 import h5py
 import numpy as np
-from numpy.lib import format as npy
+import xarray as xr
 
-from vipetsc.case import Case
-from vipetsc.io.atomic import atomic_write, write_text
-from vipetsc.io.folder import FolderError
+from vipetsc.io import folder as folders
+from vipetsc.io.atomic import write_text
+from vipetsc.io.chunks import ChunkFiles, ChunkList
+from vipetsc.io.folder import RUN, FolderError
+from vipetsc.io.netcdf import variable
+from vipetsc.io.writers import fields_in_file, fields_in_memory
+from vipetsc.parallel import on_every_rank, on_root
 
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
 
-_LEDGER = {
+LEDGER = {
     "kinetic": "kinetic energy",
     "spring": "energy of the springs",
     "contact": "elastic energy of the contacts",
     "work": "work done by the drive",
     "dissipated": "energy dissipated in contacts",
 }
-_IMPACTS = {
+IMPACTS = {
     "site": ("1", "site, counted from 1"),
     "side": ("1", "side of the clearance: +1 or -1"),
     "onset": ("s", "time of onset"),
@@ -43,7 +48,215 @@ _IMPACTS = {
     "force": ("N", "largest contact force"),
     "loss": ("J", "energy dissipated in the episode"),
 }
-_FIELDS = {"displacement": "m", "velocity": "m/s"}
+
+
+@dataclass(frozen=True)
+class RunDescription:
+    """What ``run.h5`` tells of its case.
+
+    Attributes
+    ----------
+    case
+        The resolved case as TOML.
+    cells
+        (cell,) the recorded cells of the whole lattice, from 1.
+    dofs
+        Masses in a cell.
+    sites, clearances
+        (site,) cells of the contact sites, from 1, and their clearances in m.
+    fields
+        Which of ``displacement`` and ``velocity`` are recorded.
+    """
+
+    case: str
+    cells: np.ndarray
+    dofs: int
+    sites: tuple[int, ...]
+    clearances: tuple[float, ...]
+    fields: tuple[str, ...]
+
+
+class RunOutput(ABC):
+    """Takes a run's chunks and checkpoints, and what is told of it when it has ended.
+
+    ``chunks`` are written on all ranks of ``comm`` together; ``shared`` outputs let every rank write its own cells.
+    """
+
+    shared: ClassVar[bool]
+    comm: MPI.Comm
+
+    @property
+    @abstractmethod
+    def chunks(self) -> ChunkFiles | ChunkList:
+        """The chunks and checkpoints of the run."""
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder that holds the run, if one does."""
+        return None
+
+    @abstractmethod
+    def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
+        """Make ready for a run, or for one that goes on; all ranks must call it. Raises FolderError."""
+
+    @abstractmethod
+    def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
+        """Put the chunks together; all ranks must call it. Raises OSError on all ranks if one cannot write.
+
+        Parameters
+        ----------
+        attributes
+            Root attributes besides the case; the same on all ranks.
+        columns
+            The recorded cells whose fields this rank's chunks hold; None: rank 0's hold those of all.
+        summary
+            What ``summary.json`` tells besides ``attributes``.
+        """
+
+
+class RunFolder(RunOutput):
+    """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after."""
+
+    shared = True
+
+    def __init__(self, path: Path, comm: MPI.Comm) -> None:
+        self.path = Path(path)
+        self.comm = comm
+        self._chunks = ChunkFiles(self.path / "parts", comm)
+
+    @property
+    def chunks(self) -> ChunkFiles:
+        """See ``RunOutput``."""
+        return self._chunks
+
+    @property
+    def folder(self) -> Path:
+        """See ``RunOutput``."""
+        return self.path
+
+    @property
+    def run_file(self) -> Path:
+        """The finished run."""
+        return self.path / "run.h5"
+
+    def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
+        """See ``RunOutput``."""
+        self._description = description
+
+        def claim() -> None:
+            folders.claim_folder(self.path, RUN, description.case, force=force, resume=resume)
+            self._chunks.folder.mkdir(exist_ok=True)
+
+        on_root(self.comm, claim)
+
+    def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
+        """See ``RunOutput``: ``run.h5`` takes its name when it is complete, then the chunks go."""
+        aside = self.path / f".{self.run_file.name}.part"
+
+        def write() -> None:
+            if columns is None and self.comm.rank:
+                return
+            data = run_dataset(self._description, self.chunks, attributes)
+            names, sharing = self._description.fields, None if columns is None else self.comm
+            try:
+                with fields_in_file(aside, data, names, sharing) as fields:
+                    put_chunks(fields, self.chunks, self.comm.rank, names, columns or slice(None))
+            except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
+                message = f"{self.run_file} could not be written; make room and go on with --resume: {error}"
+                raise OSError(message) from error
+
+        def conclude() -> None:
+            os.replace(aside, self.run_file)
+            text = json.dumps({**attributes, **summary}, indent=2, allow_nan=False)
+            write_text(self.path / "summary.json", text + "\n")
+            self.chunks.remove()
+
+        try:
+            on_every_rank(self.comm, write)
+            on_root(self.comm, conclude)
+        finally:
+            if self.comm.rank == 0:
+                aside.unlink(missing_ok=True)
+
+
+class RunMemory(RunOutput):
+    """Keeps a run in memory: ``dataset`` on rank 0 of ``comm``, None on the others and before its end.
+
+    Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
+    """
+
+    shared = False
+
+    def __init__(self, comm: MPI.Comm = MPI.COMM_SELF) -> None:
+        self.comm = comm
+        self._chunks = ChunkList()
+        self.dataset: xr.Dataset | None = None
+
+    @property
+    def chunks(self) -> ChunkList:
+        """See ``RunOutput``."""
+        return self._chunks
+
+    def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
+        """See ``RunOutput``; raises ValueError for ``resume``."""
+        if resume:
+            raise ValueError("a run in memory cannot be resumed")
+        self._description = description
+        self.chunks.remove()
+
+    def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
+        """See ``RunOutput``."""
+        if self.comm.rank == 0:
+            names = self._description.fields
+            self.dataset = run_dataset(self._description, self.chunks, attributes)
+            with fields_in_memory(self.dataset, names) as fields:
+                put_chunks(fields, self.chunks, 0, names, slice(None))
+        self.chunks.remove()
+
+
+def put_chunks(
+    fields: Mapping[str, Any], chunks: ChunkFiles | ChunkList, rank: int, names: tuple[str, ...], columns: slice
+) -> None:
+    """Copy the fields ``names`` of all ``chunks`` of ``rank`` to the cells ``columns`` of ``fields``."""
+    first = 0
+    for number in range(chunks.count if names else 0):
+        chunk = chunks.read(number, rank, names)
+        samples = slice(first, first + len(chunk[names[0]]))
+        for name in names:
+            # h5py leaves out empty selections, on which writing together would hang.
+            if chunk[name].size:
+                fields[name][samples, columns] = chunk[name]
+        first = samples.stop
+
+
+def run_dataset(
+    description: RunDescription, chunks: ChunkFiles | ChunkList, attributes: Mapping[str, Any]
+) -> xr.Dataset:
+    """All of a run but its fields, from the chunks of rank 0; episodes in the order of their onsets."""
+    wanted = {"time", "field_time", "dissipated_by_site", *LEDGER, *(f"impact_{name}" for name in IMPACTS)}
+    parts = [chunks.read(number, 0, wanted) for number in range(chunks.count)]
+    table = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+    order = np.lexsort((table["impact_site"], table["impact_onset"]))
+    sites, clearances = np.asarray(description.sites, np.int64), np.asarray(description.clearances, float)
+    variables = {
+        "time": variable("time", table["time"], "s", "time"),
+        "cell": variable("cell", description.cells, "1", "cell, counted from 1"),
+        "dof": variable("dof", np.arange(1, description.dofs + 1), "1", "mass within the cell, from 1"),
+        "site": variable("site", np.arange(1, len(sites) + 1), "1", "contact site, from 1"),
+        "episode": variable("episode", np.arange(1, len(order) + 1), "1", "contact episode, by onset"),
+        "sites/cell": variable("site", sites, "1", "cell of the site"),
+        "sites/clearance": variable("site", clearances, "m", "clearance of the site"),
+    }
+    if len(table["field_time"]) != len(table["time"]):
+        text = "time of the recorded fields"
+        variables["field_time"] = variable("field_time", table["field_time"], "s", text)
+    for name, text in LEDGER.items():
+        variables[f"energy/{name}"] = variable("time", table[name], "J", text)
+    text = "energy dissipated at each site"
+    variables["energy/dissipated_by_site"] = variable(("time", "site"), table["dissipated_by_site"], "J", text)
+    for name, (units, text) in IMPACTS.items():
+        variables[f"impacts/{name}"] = variable("episode", table[f"impact_{name}"][order], units, text)
+    return xr.Dataset(variables, attrs={"case": description.case, **attributes})
 
 
 def claim_folder(path: Path, force: bool, foreign: tuple[str, ...], begun: str = "") -> None:
@@ -73,172 +286,6 @@ def claim_folder(path: Path, force: bool, foreign: tuple[str, ...], begun: str =
         if not force:
             raise FolderError(f"{path}: exists; {begun}--force replaces what is in it, --out chooses another")
     path.mkdir(parents=True, exist_ok=True)
-
-
-class RunFolder:
-    """The folder of one run: ``case.toml``, parts and states while it runs, ``run.h5`` and ``summary.json`` after.
-
-    Parts are numbered from 0; part k holds the samples between checkpoints k and k + 1.
-    """
-
-    def __init__(self, path: Path, comm: MPI.Comm) -> None:
-        self.path = Path(path)
-        self.comm = comm
-        self.parts = self.path / "parts"
-
-    @property
-    def run_file(self) -> Path:
-        """The finished run."""
-        return self.path / "run.h5"
-
-    def prepare(self, case: Case, force: bool, resume: bool) -> None:
-        """Make the folder ready for ``case`` (rank 0 only); raises FolderError if it holds something else."""
-        text = case.to_toml()
-        kept = self.path / "case.toml"
-        if resume:
-            if not kept.exists() or not self.parts.is_dir():
-                raise FolderError(f"{self.path}: holds no unfinished run to resume; leave out --resume")
-            if kept.read_text(encoding="utf-8") != text:
-                lines = _difference(kept.read_text(encoding="utf-8"), text)
-                raise FolderError(f"{self.path}: --resume needs the case it was begun with; differing: {lines}")
-            return
-        begun = "--resume goes on with the unfinished run in it, " if self.parts.is_dir() else ""
-        claim_folder(self.path, force, ("branch-*.h5", "design.h5"), begun)
-        shutil.rmtree(self.parts, ignore_errors=True)
-        self.parts.mkdir()
-        write_text(kept, text)
-
-    def write_part(self, number: int, part: dict[str, np.ndarray] | None) -> None:
-        """Write this rank's share of a part; None writes nothing. All ranks must call it."""
-        if part is not None:
-            _save(self._part(number, self.comm.rank), part)
-        self.comm.Barrier()
-
-    def write_state(self, number: int, state: dict[str, np.ndarray]) -> None:
-        """Write this rank's checkpoint after part ``number``; the part is complete on all ranks by then."""
-        _save(self._state(number, self.comm.rank), state)
-        self._state(number - 2, self.comm.rank).unlink(missing_ok=True)
-
-    def last_state(self) -> int:
-        """Number of the last checkpoint that all ranks wrote, -1 if there is none; raises FolderError.
-
-        Rank 0 only.
-        """
-        found: dict[int, int] = {}
-        sizes = set()
-        for path in self.parts.glob("state-*.npy"):
-            _, number, _, size = path.stem.split("-")
-            found[int(number)] = found.get(int(number), 0) + 1
-            sizes.add(int(size))
-        if sizes - {self.comm.size}:
-            raise FolderError(f"{self.path}: was begun on {max(sizes)} ranks; resume with mpirun -n {max(sizes)}")
-        return max((n for n, count in found.items() if count == self.comm.size), default=-1)
-
-    def read_state(self, number: int) -> dict[str, np.ndarray]:
-        """Checkpoint ``number`` of this rank."""
-        return _load(self._state(number, self.comm.rank))
-
-    def read_part(self, number: int, rank: int, wanted: Collection[str]) -> Mapping[str, np.ndarray]:
-        """The arrays ``wanted`` of part ``number`` as ``rank`` wrote it."""
-        return _load(self._part(number, rank), wanted)
-
-    def _part(self, number: int, rank: int) -> Path:
-        return self.parts / f"part-{number:06d}-{rank}.npy"
-
-    def _state(self, number: int, rank: int) -> Path:
-        return self.parts / f"state-{number:06d}-{rank}-{self.comm.size}.npy"
-
-    def assemble(self, case: Case, cells: np.ndarray, parts: int, parallel: bool, about: dict[str, Any]) -> None:
-        """Turn the first ``parts`` parts into ``run.h5``; all ranks must call it.
-
-        Parameters
-        ----------
-        case
-            The resolved case.
-        cells
-            The recorded cells (1-based) of the whole lattice if this rank writes them all, else this rank's.
-        parts
-            Number of parts.
-        parallel
-            Every rank writes its own cells (one file, collectively) instead of rank 0 all.
-        about
-            Root attributes besides the case.
-        """
-        shares = self.comm.allgather(len(cells)) if parallel else [len(cells)]
-        writers = self.comm if parallel else MPI.COMM_SELF
-        if parallel or self.comm.rank == 0:
-            first = sum(shares[: writers.rank])
-            driver = {"driver": "mpio", "comm": writers} if writers.size > 1 else {}
-            target = self.path / ".run.h5.part"
-            try:
-                with h5py.File(target, "w", **driver) as file:
-                    self._fill(file, case, cells, first, sum(shares), parts, about, writers)
-            except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
-                target.unlink(missing_ok=True)
-                raise OSError(
-                    f"{self.run_file} could not be written; make room and go on with --resume: {error}"
-                ) from error
-            writers.Barrier()
-            if writers.rank == 0:
-                os.replace(target, self.run_file)
-        self.comm.Barrier()
-
-    def _fill(self, file: h5py.File, case: Case, cells, first, total, parts, about, writers) -> None:
-        own = slice(first, first + len(cells))
-        times, field_times, energies, by_site, impacts = self._read_ledger(parts)
-        coordinates = Coordinates(file)
-        coordinates.add("time", times, "s", "time")
-        coordinates.add("cell", np.zeros(total, np.int64), "1", "cell, counted from 1", write=False)
-        coordinates.add("dof", np.arange(1, case.unit_cell().dofs + 1), "1", "mass within the cell, from 1")
-        coordinates.add("site", np.arange(1, len(case.contacts.sites) + 1), "1", "contact site, from 1")
-        coordinates.add("episode", np.arange(1, len(impacts["site"]) + 1), "1", "contact episode, by onset")
-        _write_share(file["cell"], own, cells)
-        at = "time"
-        if len(field_times) != len(times):
-            coordinates.add("field_time", field_times, "s", "time of the recorded fields")
-            at = "field_time"
-        for name in case.output.fields:
-            shape = (len(field_times), total, case.unit_cell().dofs)
-            coordinates.dataset(name, (at, "cell", "dof"), shape, float, _FIELDS[name], f"{name} of each mass")
-        sample = 0
-        rank = writers.rank
-        for number in range(parts):
-            part = self.read_part(number, rank, case.output.fields)
-            count = part[case.output.fields[0]].shape[0] if case.output.fields else 0
-            for name in case.output.fields:
-                _write_share(file[name], (slice(sample, sample + count), own), part[name])
-            sample += count
-        for name, text in _LEDGER.items():
-            coordinates.put(f"energy/{name}", ("time",), energies[name], "J", text)
-        text = "energy dissipated at each site"
-        coordinates.put("energy/dissipated_by_site", ("time", "site"), by_site, "J", text)
-        coordinates.put("sites/cell", ("site",), np.asarray(case.contacts.sites, np.int64), "1", "cell of the site")
-        clearances = np.asarray(case.contacts.clearance or [], float)
-        coordinates.put("sites/clearance", ("site",), clearances, "m", "clearance of the site")
-        for name, (unit, text) in _IMPACTS.items():
-            coordinates.put(f"impacts/{name}", ("episode",), impacts[name], unit, text)
-        file.attrs["case"] = case.to_toml()
-        for key, value in about.items():
-            file.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
-
-    def _read_ledger(self, parts: int) -> tuple:
-        gathered: dict[str, list[np.ndarray]] = {}
-        wanted = {"time", "field_time", "dissipated_by_site", *_LEDGER, *(f"impact_{n}" for n in _IMPACTS)}
-        for number in range(parts):
-            part = self.read_part(number, 0, wanted)
-            for key in wanted:
-                gathered.setdefault(key, []).append(part[key])
-        joined = {key: np.concatenate(arrays) for key, arrays in gathered.items()}
-        impacts = {name: joined[f"impact_{name}"] for name in _IMPACTS}
-        order = np.lexsort((impacts["site"], impacts["onset"]))
-        impacts = {name: values[order] for name, values in impacts.items()}
-        energies = {name: joined[name] for name in _LEDGER}
-        return joined["time"], joined["field_time"], energies, joined["dissipated_by_site"], impacts
-
-    def finish(self, summary: dict[str, Any]) -> None:
-        """Write ``summary.json`` and drop the parts (rank 0 only); ``run.h5`` is in place by then."""
-        write_text(self.path / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
-        shutil.rmtree(self.parts)
 
 
 class Coordinates:
@@ -275,43 +322,3 @@ class Coordinates:
     def _describe(dataset: h5py.Dataset, unit: str, text: str) -> None:
         dataset.attrs["units"] = unit
         dataset.attrs["long_name"] = text
-
-
-def _write_share(dataset: h5py.Dataset, where: Any, values: np.ndarray) -> None:
-    """Write one rank's share. Independently: h5py leaves out empty selections, on which collective writing hangs."""
-    if values.size:
-        dataset[where] = values
-
-
-def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write the names of ``arrays`` and then each of them, one after the other; a zip file costs three times that."""
-    try:
-        with atomic_write(path) as aside, aside.open("wb") as file:
-            np.save(file, np.array(list(arrays)))
-            for values in map(np.ascontiguousarray, arrays.values()):
-                # Through ``write``, which says what is wrong where numpy's own way of writing to disk does not.
-                npy.write_array_header_1_0(file, npy.header_data_from_array_1_0(values))
-                file.write(values.data)
-    except OSError as error:
-        message = f"{path} could not be written; make room and go on with --resume: {error.strerror}"
-        raise OSError(error.errno, message) from error
-
-
-def _load(path: Path, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """What ``_save`` wrote, or the ``wanted`` arrays of it."""
-    found = {}
-    with path.open("rb") as file:
-        for name in np.load(file):
-            npy.read_magic(file)
-            shape, _, kind = npy.read_array_header_1_0(file)
-            count = int(np.prod(shape))
-            if wanted is None or name in wanted:
-                found[str(name)] = np.fromfile(file, kind, count).reshape(shape)
-            else:
-                file.seek(count * kind.itemsize, os.SEEK_CUR)
-    return found
-
-
-def _difference(old: str, new: str) -> str:
-    before, after = set(old.splitlines()), set(new.splitlines())
-    return "; ".join(sorted(line.strip() for line in before ^ after if line.strip()))

@@ -17,6 +17,7 @@ from vipetsc.case import Case, case_id
 from vipetsc.case.sweep import SweepTable
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.memory import RunMemory
+from vipetsc.dynamics.run import describe as describe_run
 from vipetsc.io.atomic import atomic_write, write_text
 from vipetsc.io.folder import provenance
 from vipetsc.io.run_file import ENERGIES, IMPACTS, RunFile
@@ -192,12 +193,11 @@ class Members:
             about = json.loads(linear.file.attrs["statistics"])
             about |= {"episodes": 0, "scaled_from": self.linear_folder(case).name}
             part = _linear_part(linear, len(case.contacts.sites))
-            cells = linear.cells
         # All members with the same first site share these measures, whichever rank needs them first.
         first = _leading_site(case)
         shared = self.linear_folder(case) / f"analysis-{first}-{'-'.join(self._wanted['measures'])}.h5"
         if not shared.exists():
-            home = _filled(part, cells)
+            home = _filled(unit, part, {})
             with home.run(_keeping(unit, ["velocity"])) as run:
                 analyse(run, shared, self.measures, self.arrival(case, wave))
         folder.mkdir(exist_ok=True)
@@ -207,7 +207,7 @@ class Members:
         about |= {"work": float(part["work"][-1]), "dissipated": 0.0}
         summary = provenance(self.team) | {"status": "complete: scaled from the linear run", "complete": True}
         summary["statistics"] = about
-        _filled(part, cells, summary).save(folder / "run.h5", kept)
+        _filled(case, part, summary).save(folder / "run.h5", kept)
         with atomic_write(folder / "analysis.h5") as aside:
             aside.write_bytes(shared.read_bytes())
             with h5py.File(aside, "r+") as file:
@@ -245,10 +245,12 @@ def _linear_part(run: RunFile, sites: int) -> dict[str, np.ndarray]:
     return part | {f"impact_{name}": np.zeros(0, int if name in ("site", "side") else float) for name in IMPACTS}
 
 
-def _filled(part: dict[str, np.ndarray], cells: np.ndarray, about: dict[str, Any] | None = None) -> RunMemory:
+def _filled(case: Case, part: dict[str, np.ndarray], attributes: dict[str, Any]) -> RunMemory:
     home = RunMemory()
-    home.write_part(0, part)
-    home.assemble(None, cells, 1, False, about or {})
+    measured = _keeping(case, ["velocity"])
+    home.begin(describe_run(measured, measured.model()), force=False, resume=False)
+    home.chunks.append(part)
+    home.finish(attributes, None, {})
     return home
 
 
