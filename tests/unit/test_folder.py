@@ -17,7 +17,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FolderError, match="is a file"):
         claim_folder(tmp_path / "file", RUN, "case", force=True)
-    with pytest.raises(FolderError, match="not of this kind"):
+    with pytest.raises(FolderError, match="of this kind"):
         claim_folder(tmp_path, RUN, "case", force=True)
     shown = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
     for kind, file in shown.items():
@@ -26,7 +26,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
         (folder / file).touch()
         for other in KINDS:
             if other is not kind:
-                with pytest.raises(FolderError, match="not of this kind"):
+                with pytest.raises(FolderError, match="of this kind"):
                     claim_folder(folder, other, "case", force=True)
         assert (folder / file).exists()
 

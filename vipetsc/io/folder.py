@@ -102,7 +102,7 @@ def claim_folder(
     foreign = [pattern for other in KINDS if other is not kind for pattern in other.results]
     filled = path.is_dir() and any(path.iterdir())
     if filled and (not marker.exists() or any(any(path.glob(pattern)) for pattern in foreign)):
-        raise FolderError(f"{path}: holds files that are not of this kind ({kind.noun}); choose another --out")
+        raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
     going_on = filled and not force and resume is not False
     if going_on:
         earlier = marker.read_text(encoding="utf-8")
