@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.episodes import Episode, ImpactTracker
+from vipetsc.contact.changes import Extremes
+from vipetsc.contact.episodes import Episode
+from vipetsc.contact.law import create_contacts
+from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.dynamics.engine import StalledError
-from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.operator import LatticeOperator
-from vipetsc.dynamics.propagator import cluster_kernel as words
-from vipetsc.dynamics.propagator import march_kernel
-from vipetsc.dynamics.propagator.collocation import collocation
+from vipetsc.dynamics.propagator.advance import DONE, FAILED, HISTORY, ORDER, ClusterMotion, advance_cluster
+from vipetsc.dynamics.propagator.collocation import NODES, collocation
 from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.substep import SUBSTEP_STATE, ClusterRecord, NodeValues
+from vipetsc.dynamics.records import Burst
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1
@@ -25,10 +27,10 @@ SEARCHED, DRIVEN = 0.4, 1.25
 
 
 @dataclass(frozen=True)
-class Member:
+class ContactDof:
     """One relative displacement of a lattice: of a contact pair, ``site`` (0-based), or of the driven mass, site -1.
 
-    ``form`` (dof,) weighs the displacements of ``cell``.
+    ``form`` (mass,) weighs the displacements of ``cell``.
     """
 
     cell: int
@@ -36,151 +38,160 @@ class Member:
     form: tuple[float, ...]
 
 
-def members_of(model: Model, reach: int) -> list[list[Member]]:
-    """Groups of members of which each is within ``reach`` cells of another, in the lattice's order.
+def group_dofs(model: Model, reach: int) -> list[list[ContactDof]]:
+    """Groups of DoFs of which each is within ``reach`` cells of another, in the lattice's order.
 
     In each group the sites come first, in their own order, then the driven mass.
     """
     cell, cells = model.chain.cell, model.chain.cells
     pair = np.zeros(cell.dofs)
     pair[cell.resonator], pair[cell.host] = 1.0, -1.0
-    found = [Member(c, i, tuple(pair)) for i, c in enumerate(model.chain.sites)]
-    found.append(Member(model.drive_cell, -1, tuple(np.eye(cell.dofs)[model.drive_mass])))
-    found.sort(key=lambda m: m.cell)
-    groups: list[list[Member]] = []
-    for member in found:
-        if groups and member.cell - groups[-1][-1].cell <= reach:
-            groups[-1].append(member)
+    dofs = [ContactDof(c, i, tuple(pair)) for i, c in enumerate(model.chain.sites)]
+    dofs.append(ContactDof(model.drive_cell, -1, tuple(np.eye(cell.dofs)[model.drive_mass])))
+    dofs.sort(key=lambda dof: dof.cell)
+    groups: list[list[ContactDof]] = []
+    for dof in dofs:
+        if groups and dof.cell - groups[-1][-1].cell <= reach:
+            groups[-1].append(dof)
         else:
-            groups.append([member])
-    wrapped = model.chain.ends == "periodic" and len(groups) > 1
-    if wrapped and groups[0][0].cell + cells - groups[-1][-1].cell <= reach:
+            groups.append([dof])
+    joined = model.chain.ends == "periodic" and len(groups) > 1
+    if joined and groups[0][0].cell + cells - groups[-1][-1].cell <= reach:
         groups[0] = groups.pop() + groups[0]
-    return [sorted(group, key=lambda m: (m.site < 0, m.site)) for group in groups]
+    return [sorted(group, key=lambda dof: (dof.site < 0, dof.site)) for group in groups]
 
 
 class Cluster:
-    """The contact state of a group of members on every rank that they reach, marched through one step at a time.
+    """A group of DoFs on every rank that they reach, advanced through one linear step at a time.
 
-    All such ranks do the same sums on the same numbers; the one that owns the first member keeps the log.
+    All such ranks do the same sums on the same numbers; one of them, with ``logs``, keeps the log.
 
     Parameters
     ----------
-    model, layout
-        The lattice and its distribution.
-    members
-        One group of ``members_of``.
+    model
+        The lattice, its contacts and its drive.
+    dofs
+        One group of ``group_dofs``.
     series
         The step's series.
-    responses
-        (member, member, term): series of a member's motion after an impulse on another, times H.
-    jets
-        (member, coefficient): filled with the free motion's series before each step.
+    response
+        (dof, dof, term): series of a DoF's motion after an impulse on another, times H.
+    taylor, moments, energy
+        As in ``ClusterMotion``; ``taylor`` is filled before each step.
     """
 
     def __init__(
-        self, model: Model, layout: Layout, members: list[Member], series: StepSeries, responses: np.ndarray,
-        jets: np.ndarray,
+        self, model: Model, dofs: list[ContactDof], series: StepSeries, response: np.ndarray, logs: bool,
+        taylor: np.ndarray, moments: np.ndarray, energy: np.ndarray,
     ) -> None:  # fmt: skip
-        self.members = members
-        self.sites = [m.site for m in members if m.site >= 0]
-        self.driven = len(self.sites) < len(members)
-        self.logs = layout.start <= members[0].cell < layout.stop
-        self.operator = LatticeOperator(model, replace(layout, sites=tuple(self.sites)))
-        self.tracker = ImpactTracker(self.operator, model.contact)
-        self.energy = np.zeros(len(members))
-        self.moments = np.zeros_like(jets)
-        self.counts = np.zeros(3, np.int64)
+        cell, drive = model.chain.cell, model.drive
+        self.sites = [dof.site for dof in dofs if dof.site >= 0]
+        self.driven = len(self.sites) < len(dofs)
+        self.logs = logs
         self.switches = 0
-        self._burst = model.drive.duration
-        self._first = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / march_kernel.ORDER), 2.0)
-        self._since = np.zeros(len(self.sites))
-        self._durations = np.ones(len(self.sites))
-        self._tops = np.zeros((len(self.sites), 3))
-        nodes = collocation(jets.shape[1])
-        self._clock = np.zeros(9)
-        self._clock[words.INTERVAL] = series.interval
-        self._clock[words.RTOL], self._clock[words.ATOL] = model.rtol, model.atol[1]
-        self._clock[words.TOP] = series.top
-        self._clock[words.SUBSTEP] = 1.0
-        fastest = series.top
+        self._energy = energy
+        self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
+        fastest = series.omega_max_h
         if self.driven:
-            fastest += model.drive.frequency * (1 + 1 / model.drive.cycles) * series.interval
-        self._clock[words.LONGEST] = (SEARCHED if self.sites else DRIVEN) / fastest
-        self._arguments = (jets, responses, nodes.share, nodes.weight, nodes.powers, nodes.tail, self.moments,
-                           self.energy, self.tracker.start, self.tracker.end, self._tops, self.counts)  # fmt: skip
+            fastest += drive.frequency * (1 + 1 / drive.cycles) * series.interval
+        self._record = ClusterRecord(
+            contacts=create_contacts(model.contact, [model.chain.clearances[site] for site in self.sites]),
+            burst=Burst(drive.window_amplitude, drive.frequency, float(drive.cycles), drive.duration),
+            response=response,
+            nodes=collocation(taylor.shape[1]),
+            interval=series.interval,
+            omega_max_h=series.omega_max_h,
+            longest=(SEARCHED if self.sites else DRIVEN) / fastest,
+            rtol=model.rtol,
+            atol=model.atol[1],
+        )
+        reduced_mass = 1 / (1 / cell.masses[cell.host] + 1 / cell.masses[cell.resonator])
+        self.tracker = ImpactTracker(self._record.contacts, self.sites, reduced_mass)
+        self._motion = ClusterMotion(
+            taylor=taylor,
+            trial=np.zeros_like(taylor),
+            start=self.tracker.start,
+            end=self.tracker.end,
+            values=NodeValues(*np.zeros((3, len(dofs), NODES))),
+            moments=moments,
+            energy=energy,
+            history=np.zeros(len(self.sites), HISTORY),
+            state=np.zeros(1, SUBSTEP_STATE),
+        )
+        self._motion.state["begin"], self._motion.state["length"] = np.nan, 1.0
 
-    def busy(self, t: float) -> bool:
-        """Whether a force acts on a member at time t in s."""
-        return bool(self.tracker.open) or (self.driven and t < self._burst)
+    def is_busy(self, t: float) -> bool:
+        """Whether a force acts on a DoF at time t in s."""
+        return bool(self.tracker.open) or (self.driven and t < self._record.burst.duration)
 
-    def march(self, begin: float) -> None:
+    def advance(self, begin: float) -> None:
         """Go through the step that begins at time ``begin`` in s; leaves the forces' moments and energies.
 
         Raises StalledError where the contacts cannot be followed.
         """
-        clock, operator, h = self._clock, self.operator, self._clock[words.INTERVAL]
-        clock[words.BEGIN], clock[words.PLACE] = begin, 0.0
-        clock[words.DRIVE_END] = (self._burst - begin) / h if self.driven else 0.0
-        self.moments[:] = 0.0
         for _ in range(MOST_CHANGES):
-            outcome = march_kernel.march(
-                operator.q, operator.p, clock, self._since, self._durations, *self._arguments
-            )  # fmt: skip
-            if outcome == march_kernel.DONE:
+            outcome = advance_cluster(self._record, self._motion, begin)
+            if outcome == DONE:
                 return
-            if outcome == march_kernel.FAILED:
+            if outcome == FAILED:
                 break
-            self._switch(begin + float(clock[words.PLACE]) * h)
-        now = begin + float(clock[words.PLACE]) * h
-        raise StalledError(f"the contacts of sites {', '.join(str(s + 1) for s in self.sites)} at {now:.9g} s")
+            self._switch(self._time())
+        sites = ", ".join(str(site + 1) for site in self.sites)
+        raise StalledError(f"the contacts of sites {sites} at {self._time():.9g} s")
+
+    def _time(self) -> float:
+        state = self._motion.state[0]
+        return float(state["begin"] + state["position"] * self._record.interval)
 
     def _switch(self, now: float) -> None:
-        tracker = self.tracker
-        self._settle()
+        """Switch the sites that have landed, and set the length of the next substep."""
+        tracker, state = self.tracker, self._motion.state
+        self._update_episodes()
         before = set(tracker.open)
-        self.switches += tracker.switch(now, self.energy)
+        self.switches += tracker.switch(now, self._energy)
         for site in set(tracker.open) - before:
-            self._since[site] = now
-            self._durations[site] = tracker.duration(abs(float(self.operator.approach[site])))
-            first = self._first * self._durations[site] / self._clock[words.INTERVAL]
-            self._clock[words.SUBSTEP] = min(self._clock[words.SUBSTEP], first)
+            duration = tracker.duration(abs(float(self._record.contacts.sites["approach"][site])))
+            self._motion.history[site] = now, duration, 0.0, 0.0, 0.0
+            first = self._first_substep * duration / self._record.interval
+            state["length"] = min(state["length"][0], first)
         if not tracker.open:
-            self._clock[words.SUBSTEP] = 1.0
+            state["length"] = 1.0
 
-    def _settle(self) -> None:
-        """Put the largest indentations and forces so far into the open episodes."""
+    def _update_episodes(self) -> None:
+        """Put the extremes so far into the open episodes."""
         for site, episode in self.tracker.open.items():
-            self.tracker.grow(site, episode, *self._tops[site].tolist())
-        self._tops[:] = 0.0
+            _, _, *extremes = self._motion.history[site].tolist()
+            self.tracker.update_episode(site, episode, Extremes(*extremes))
 
     def take_episodes(self) -> list[Episode]:
         """Episodes closed since the last call; none where another rank logs them."""
-        closed, self.tracker.closed = self.tracker.closed, []
+        closed = self.tracker.take_closed()
         return closed if self.logs else []
 
     def unfinished(self) -> list[Episode]:
         """Copies of the open episodes; none where another rank logs them."""
-        self._settle()
-        return self.tracker.unfinished(self.energy) if self.logs else []
+        self._update_episodes()
+        return self.tracker.unfinished(self._energy) if self.logs else []
+
+    def counts(self) -> dict[str, int]:
+        """Substeps, landings, switches and limits of the contact law."""
+        state = self._motion.state[0]
+        counts = {name: int(state[name]) for name in ("substeps", "rejected", "landings")}
+        return counts | {"switches": self.switches} | asdict(self.tracker.counts)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs."""
-        self._settle()
         return self.tracker.checkpoint() | {
-            "energy": self.energy.copy(),
-            "since": self._since.copy(),
-            "durations": self._durations.copy(),
-            "substep": np.array(self._clock[words.SUBSTEP]),
-            "cluster_counts": np.append(self.counts, self.switches),
+            "energy": self._energy.copy(),
+            "history": self._motion.history.copy(),
+            "state": self._motion.state.copy(),
+            "switches": np.array(self.switches),
         }
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Go back to a checkpoint."""
         self.tracker.restore(checkpoint)
-        self.energy[:] = checkpoint["energy"]
-        self._since[:] = checkpoint["since"]
-        self._durations[:] = checkpoint["durations"]
-        self._clock[words.SUBSTEP] = checkpoint["substep"]
-        *counts, self.switches = checkpoint["cluster_counts"].tolist()
-        self.counts[:] = counts
+        self._energy[:] = checkpoint["energy"]
+        self._motion.history[:] = checkpoint["history"]
+        self._motion.state[:] = checkpoint["state"]
+        self.switches = int(checkpoint["switches"])

@@ -6,8 +6,8 @@ since the onset, or before the separation, see a smooth function: ``ONSET`` and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legval
@@ -23,8 +23,7 @@ _SHARES = {
 }
 
 
-@dataclass(frozen=True)
-class Collocation:
+class Collocation(NamedTuple):
     """Nodes of a substep of unit length; leading axes are the three kinds.
 
     ``share`` (3, node) and ``weight`` (3, node) integrate over it; ``powers`` (3, power, node k, node j): the

@@ -20,11 +20,11 @@ from vipetsc.contact.episodes import Episode
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.operator import LatticeOperator
-from vipetsc.dynamics.propagator.cluster import members_of
+from vipetsc.dynamics.propagator.cluster import group_dofs
 from vipetsc.dynamics.propagator.forces import Forces
-from vipetsc.dynamics.propagator.halo import Patches
-from vipetsc.dynamics.propagator.series import LONGEST, StepSeries
-from vipetsc.dynamics.propagator.stencil import Stencil
+from vipetsc.dynamics.propagator.halo import HaloRegions
+from vipetsc.dynamics.propagator.series import LARGEST_OMEGA_H, StepSeries
+from vipetsc.dynamics.propagator.stencil import apply_propagator, create_stencil
 from vipetsc.parallel import StopRequest
 
 # Steps a sample interval may be cut into.
@@ -49,9 +49,9 @@ def step_series(model: Model) -> StepSeries | None:
         if cost >= least:
             break
         series = StepSeries(model.chain, model.sample_interval / parts, tolerance)
-        if max(series.top, fastest * series.interval) > LONGEST or model.chain.cells <= 2 * series.reach:
+        if max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H or model.chain.cells <= 2 * series.reach:
             continue
-        sizes = np.array([len(group) for group in members_of(model, series.reach)])
+        sizes = np.array([len(group) for group in group_dofs(model, series.reach)])
         cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
         if cost < least:
             best, least = series, cost
@@ -76,14 +76,11 @@ class Propagator(Engine):
         self._states = [layout.create_vector(a) for a in self._arrays]
         self._cells = [a[: 2 * d * n].reshape(2 * d, n) for a in self._arrays]
         self._now = 0
-        self._forces = Forces(model, layout, series)
-        self._stencil = Stencil(series, layout)
-        parts = [self._forces.stretches, self._stencil.stretches, [(cell, 1) for cell in neighbours]]
-        self._patches = Patches(layout, [stretch for part in parts for stretch in part])
-        columns, cuts = self._patches.starts, np.cumsum([len(part) for part in parts])
-        self._forces.place(columns[: cuts[0]])
-        self._stencil.place(columns[cuts[0] : cuts[1]])
-        self._ghosts = columns[cuts[1] :]
+        self._halo = HaloRegions(layout)
+        self._forces = Forces(model, layout, series, self._halo)
+        self._stencil = create_stencil(series, layout, self._halo)
+        self._ghosts = [self._halo.add(cell, 1) for cell in neighbours]
+        self._halo.bind_columns()
         self._status = np.zeros(2)
 
     @classmethod
@@ -102,7 +99,7 @@ class Propagator(Engine):
             if model.chain.cells > 2 * shortest.reach:
                 return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
             return f"{model.chain.cells} cells are fewer than the propagator's band"
-        groups = ([m.cell + 1 for m in group if m.site >= 0] for group in members_of(model, series.reach))
+        groups = ([dof.cell + 1 for dof in group if dof.site >= 0] for group in group_dofs(model, series.reach))
         cells = sorted(max(groups, key=len))
         if len(cells) > MOST_SITES:
             return (
@@ -140,21 +137,20 @@ class Propagator(Engine):
 
     def _step(self) -> None:
         old, new = self._now, 1 - self._now
-        columns = self._patches.columns
-        self._stencil.apply(self._cells[old], columns, self._cells[new])
-        self._forces.act(self.time, columns, self._cells[new])
+        apply_propagator(self._stencil, self._cells[old], self._halo.columns, self._cells[new])
+        self._forces.act(self.time, self._cells[new])
         self._now = new
         self.steps += 1
         self._refresh()
 
     def _refresh(self) -> None:
-        """Bring the patches, the ledger's components and the ghosts of the state up to date."""
+        """Bring the halo, the ledger's components and the ghosts of the state up to date."""
         layout, array = self._layout, self._arrays[self._now]
-        self._patches.fetch(self.state, self._cells[self._now])
+        self._halo.fetch(self.state, self._cells[self._now])
         array[2 * layout.dofs * layout.owned : layout.size] = self._forces.ledger
         d, at = layout.dofs, layout.size
         for column in self._ghosts:
-            array[at : at + d] = self._patches.columns[:d, column]
+            array[at : at + d] = self._halo.columns[:d, column]
             at += d
 
     def take_episodes(self) -> list[Episode]:
@@ -173,7 +169,7 @@ class Propagator(Engine):
             "interval": self.series.interval,
             "bandwidth": self.series.reach,
             "terms": self.series.terms,
-            "nonzeros": self._stencil.nonzeros,
+            "nonzeros": int(np.count_nonzero(self._stencil.values)),
             "truncation": self.series.truncation,
         }  # fmt: skip
 
@@ -191,6 +187,6 @@ class Propagator(Engine):
 
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
-        self._patches.destroy()
+        self._halo.destroy()
         for state in self._states:
             state.destroy()

@@ -1,82 +1,125 @@
-"""The propagator P(H) on a rank's cells: one stencil, and rows of their own for the cells near the ends."""
+"""P(H) on a rank's cells: one stencil for the interior, rows of their own for the cells near the lattice's ends.
+
+States are arrays (2 dof, cell), displacements before velocities. Every sum runs in an order that depends on the cell
+alone, so that results have the same bits on any partition.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numba import njit
 
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator import linear_kernel
+from vipetsc.dynamics.propagator.halo import HaloRegions
 from vipetsc.dynamics.propagator.series import StepSeries
 
+# Cells in one pass: what a pass reads stays in the first-level cache.
+CHUNK = 512
+# Terms that one pass over a chunk adds.
+GROUP = 8
 
-class Stencil:
-    """P(H) as compiled passes over a rank's cells.
 
-    ``stretches`` are the cells (first, number) that it reads through patches: around the rank's borders and at the
-    lattice's ends. ``place`` must be told where they lie before ``apply``.
+class Stencil(NamedTuple):
+    """P(H) on the cells of one rank, as ``apply_propagator`` reads it.
+
+    The terms of output row o are ``starts[o]`` to ``starts[o + 1]``, a multiple of ``GROUP`` padded with zeros:
+    ``values`` times the row ``rows`` at the cell ``offsets`` away. ``pieces`` (piece, 4) are the interior cells:
+    whether they are read from the halo's columns, their first column there, the first owned cell, their number.
+    ``ends`` (end, 2 dof, 2 reach, 2 dof reach) are dense rows of cells near an end of the lattice; of these cells
+    ``end_cells`` (end, 4) has the halo's first column, the first one owned, the owned cell it is, their number.
     """
 
-    def __init__(self, series: StepSeries, layout: Layout) -> None:
-        r, n, start, stop = series.reach, layout.cells, layout.start, layout.stop
-        self._start = start
-        self._terms = _terms(series)
-        self.stretches: list[tuple[int, int]] = []
-        self._ends = []
-        first, last = start, stop
-        if not layout.periodic:
-            first, last = max(start, r), min(stop, n - r)
-            for right, a, b in ((False, start, min(stop, r)), (True, max(start, n - r), stop)):
-                if a < b:
-                    rows = series.end(right)  # (cell, 2 dof, 2 dof, cell)
-                    block = rows.transpose(2, 3, 1, 0).reshape(rows.shape[2], 2 * r, -1)
-                    wanted = np.array([a - (n - r if right else 0), b - a])
-                    total = np.empty(block.shape[2])
-                    self._ends.append((np.ascontiguousarray(block), a - start, total, wanted))
-                    self.stretches.append((n - 2 * r if right else 0, 2 * r))
-        # Cells that see only this rank's read the state itself.
-        inner = max(first, start + r), min(last, stop - r)
-        self._inner = None
-        pieces = [(first, last)]
-        if inner[0] < inner[1]:
-            self._inner = (inner[0] - start, inner[1] - inner[0])
-            pieces = [(first, inner[0]), (inner[1], last)]
-        self._pieces = [(a - start, b - a) for a, b in pieces if a < b]
-        self.stretches += [(a - r, b - a + 2 * r) for a, b in pieces if a < b]
-        self._reach = r
-        self._columns: list[int] = []
-
-    @property
-    def nonzeros(self) -> int:
-        """Entries of P in one cell's rows."""
-        return int(np.count_nonzero(self._terms[3]))
-
-    def place(self, columns: list[int]) -> None:
-        """Say at which columns of the patches the stretches begin."""
-        self._columns = columns
-
-    def apply(self, state: np.ndarray, patches: np.ndarray, out: np.ndarray) -> None:
-        """``out`` = P times the lattice, for the owned cells (2 dof, cell)."""
-        columns = self._columns
-        for (block, at, total, wanted), first in zip(self._ends, columns, strict=False):
-            linear_kernel.end_cells(patches, first, block, out, at, total, wanted)
-        if self._inner:
-            at, count = self._inner
-            linear_kernel.stencil(state, at, out, at, count, *self._terms)
-        for (at, count), first in zip(self._pieces, columns[len(self._ends) :], strict=True):
-            linear_kernel.stencil(patches, first + self._reach, out, at, count, *self._terms)
+    starts: np.ndarray
+    rows: np.ndarray
+    offsets: np.ndarray
+    values: np.ndarray
+    pieces: np.ndarray
+    ends: np.ndarray
+    end_cells: np.ndarray
 
 
-def _terms(series: StepSeries) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """P's interior rows as ``linear_kernel.stencil`` takes them: starts, rows, offsets, values."""
+def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Stencil:
+    """P(H) on the cells of ``layout``; adds to ``halo`` the cells around the rank's borders and at the ends."""
+    r, n, start, stop = series.reach, layout.cells, layout.start, layout.stop
+    first, last = (start, stop) if layout.periodic else (max(start, r), min(stop, n - r))
+    ends, end_cells = [], []
+    if not layout.periodic:
+        for right, a, b in ((False, start, min(stop, r)), (True, max(start, n - r), stop)):
+            if a < b:
+                rows = series.end(right)  # (cell, 2 dof, 2 dof, cell)
+                ends.append(rows.transpose(2, 3, 1, 0).reshape(rows.shape[2], 2 * r, -1))
+                column = halo.add(n - 2 * r if right else 0, 2 * r)
+                end_cells.append((column, a - (n - r if right else 0), a - start, b - a))
+    # Cells that see only this rank's read the state itself.
+    a, b = max(first, start + r), min(last, stop - r)
+    pieces = [(0, a - start, a - start, b - a)] if a < b else []
+    for a, b in ((first, a), (b, last)) if a < b else ((first, last),):
+        if a < b:
+            pieces.append((1, halo.add(a - r, b - a + 2 * r) + r, a - start, b - a))
+    return Stencil(
+        *_interior_terms(series),
+        pieces=np.array(pieces, np.int64).reshape(-1, 4),
+        ends=np.array(ends).reshape(len(ends), 2 * layout.dofs, 2 * r, 2 * layout.dofs * r),
+        end_cells=np.array(end_cells, np.int64).reshape(-1, 4),
+    )
+
+
+def _interior_terms(series: StepSeries) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The starts, rows, offsets and values of ``Stencil``."""
     entries = series.interior()
-    kept = series.significant(entries)
+    significant = series.significant(entries)
     starts, rows, offsets, values = [0], [], [], []
-    group = linear_kernel.GROUP
-    for o in range(len(entries)):
-        at = np.argwhere(kept[o])
-        missing = -len(at) % group
-        rows += at[:, 0].tolist() + [0] * missing
-        offsets += (at[:, 1] - series.reach).tolist() + [0] * missing
-        values += entries[o][kept[o]].tolist() + [0.0] * missing
+    for entry, is_term in zip(entries, significant, strict=True):
+        row, column = np.nonzero(is_term)
+        padding = [0] * (-len(row) % GROUP)
+        rows += row.tolist() + padding
+        offsets += (column - series.reach).tolist() + padding
+        values += entry[is_term].tolist() + padding
         starts.append(len(rows))
-    return np.array(starts), np.array(rows), np.array(offsets), np.array(values)
+    return np.array(starts), np.array(rows), np.array(offsets), np.array(values, float)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_group(out: np.ndarray, x: np.ndarray, column: int, places: np.ndarray, values: np.ndarray) -> None:
+    """Add to the cells ``out`` eight ``values`` times ``x`` from ``column`` + ``places`` (modulo 2^64) on."""
+    # Unsigned: numba makes no provision for negative places then, and the loop is vectorised.
+    a, b, c = places, np.uint64(column), values
+    a0, a1, a2, a3, a4, a5, a6, a7 = b + a[0], b + a[1], b + a[2], b + a[3], b + a[4], b + a[5], b + a[6], b + a[7]
+    c0, c1, c2, c3, c4, c5, c6, c7 = c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7]
+    for i in range(np.uint64(out.size)):
+        out[i] = (
+            out[i] + c0 * x[a0 + i] + c1 * x[a1 + i] + c2 * x[a2 + i] + c3 * x[a3 + i] + c4 * x[a4 + i]
+            + c5 * x[a5 + i] + c6 * x[a6 + i] + c7 * x[a7 + i]
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
+    """``out`` (2 dof, owned cell) = P(H) times the lattice's ``state``, whose halo is ``columns``."""
+    for piece in range(stencil.pieces.shape[0]):
+        from_halo, first, at, count = stencil.pieces[piece]
+        x = columns if from_halo == 1 else state
+        flat, places = x.reshape(-1), (stencil.rows * x.shape[1] + stencil.offsets).astype(np.uint64)
+        for a in range(0, count, CHUNK):
+            n = min(CHUNK, count - a)
+            for o in range(out.shape[0]):
+                y = out[o, at + a : at + a + n]
+                y[:] = 0.0
+                for g in range(stencil.starts[o], stencil.starts[o + 1], GROUP):
+                    _add_group(y, flat, first + a, places[g : g + GROUP], stencil.values[g : g + GROUP])
+    total = np.empty(stencil.ends.shape[3])
+    for end in range(stencil.ends.shape[0]):
+        rows = stencil.ends[end]
+        column, first, at, count = stencil.end_cells[end]
+        total[:] = 0.0
+        for i in range(rows.shape[0]):
+            for k in range(rows.shape[1]):
+                value = columns[i, column + k]
+                for o in range(total.size):
+                    total[o] += value * rows[i, k, o]
+        reach = rows.shape[1] // 2
+        for i in range(out.shape[0]):
+            for k in range(count):
+                out[i, at + k] = total[i * reach + first + k]

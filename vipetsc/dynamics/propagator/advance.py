@@ -1,0 +1,287 @@
+"""Compiled advance of a cluster of contact sites through one linear step, from change to change.
+
+Sec. 2 to 4 of the derivation in the package's docstring.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from vipetsc.contact.changes import Change, extremes, first_change, switching
+from vipetsc.contact.landing import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
+from vipetsc.contact.law import CLOSED, FREE, contact_force
+from vipetsc.dynamics.propagator.collocation import EXIT, ONSET, PLAIN
+from vipetsc.dynamics.propagator.substep import (
+    ClusterRecord,
+    NodeValues,
+    Substep,
+    accumulate_moments,
+    collocate,
+    error_ratio,
+    site_motion,
+    update_taylor,
+)
+from vipetsc.dynamics.propagator.taylor import ROUNDING, first_onset, shift
+
+# How an advance ended: at the end of the step, on a change of modes, or without progress.
+DONE, CHANGED, FAILED = range(3)
+
+MOST_SUBSTEPS = 20_000
+# Longest substep of a contact in ages of the contact.
+MOST_AGES = 1.5
+# Share of a step that is too short for anything to happen.
+BLIND = 1e-7
+# Shortest substep, as a share of the step, that is rejected for its error or cut for an onset.
+SHORTEST = 1e-9
+# Order by which the substep follows its error, and bounds of its growth.
+ORDER = 8.0
+LEAST_GROWTH, MOST_GROWTH = 0.2, 2.0
+# A substep that could not be collocated is repeated at this share of its length.
+CUT = 0.4
+
+HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
+"""A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
+
+
+class ClusterMotion(NamedTuple):
+    """What changes while a cluster is advanced.
+
+    ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``trial`` those after the
+    substep at hand; ``start`` and ``end`` (site, 3) w, w', w'' at both ends of it; ``values`` its nodes. ``moments``
+    (dof, 2 term) in N s are those of the step's forces about its end, ``energy`` (dof,) in J what sites dissipated and
+    the work of the drive; ``history`` (site,) is of dtype ``HISTORY``, ``state`` (1,) of dtype ``SUBSTEP_STATE``.
+    """
+
+    taylor: np.ndarray
+    trial: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    values: NodeValues
+    moments: np.ndarray
+    energy: np.ndarray
+    history: np.ndarray
+    state: np.ndarray
+
+
+@njit(cache=True, error_model="numpy")
+def _advance_freely(cluster: ClusterRecord, motion: ClusterMotion) -> int:
+    """Go to the first onset, or to the end of the step, while no force acts."""
+    state = motion.state[0]
+    rest, first = 1.0 - state.position, 2.0
+    for i in range(cluster.contacts.sites.size):
+        first = min(first, first_onset(motion.taylor[i], cluster.contacts.sites[i].clearance, rest))
+    if first > rest:
+        state.position = 1.0
+        return DONE
+    shift(motion.taylor, first, motion.taylor)
+    state.position += first
+    site_motion(cluster, state, motion.taylor, motion.start)
+    state.landings += 1
+    return CHANGED
+
+
+@njit(cache=True, error_model="numpy")
+def _active_dofs(cluster: ClusterRecord, motion: ClusterMotion) -> np.ndarray:
+    """The DoFs on which a force acts: sites in contact, then the driven mass."""
+    state, sites, dofs = motion.state[0], cluster.contacts.sites, motion.taylor.shape[0]
+    active, count = np.empty(dofs, np.int64), 0
+    for i in range(dofs):
+        if (sites[i].mode != FREE) if i < sites.size else (state.position < state.drive_end):
+            active[count] = i
+            count += 1
+    return active[:count]
+
+
+@njit(cache=True, error_model="numpy")
+def _choose_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray) -> Substep:
+    """The next substep: as long as its error allows, not beyond the drive's end, short while a contact is young."""
+    state, sites = motion.state[0], cluster.contacts.sites
+    length = min(1.0 - state.position, cluster.longest)
+    if active[-1] == sites.size:
+        length = min(length, state.drive_end - state.position)
+    if active[0] < sites.size:
+        length = min(length, state.length)
+    longest = length
+    for i in range(sites.size):
+        # A young contact's force goes as the root of its age.
+        if cluster.contacts.law.exponent != 1.0 and abs(sites[i].mode) == CLOSED:
+            age = (state.begin - motion.history[i].onset) / cluster.interval + state.position
+            if age * cluster.interval <= 1e-7 * motion.history[i].duration:
+                return Substep(ONSET, longest)
+            length = min(length, MOST_AGES * age)
+    return Substep(PLAIN, length)
+
+
+@njit(cache=True, error_model="numpy")
+def _try_substep(
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep
+) -> bool:
+    """Leave the end of a substep in ``motion.trial`` and ``motion.end``; whether it could be collocated."""
+    state = motion.state[0]
+    if not collocate(cluster, state, motion.taylor, active, substep, motion.values):
+        return False
+    update_taylor(cluster, motion.taylor, active, substep, motion.values.force, motion.trial)
+    state.position += substep.length
+    site_motion(cluster, state, motion.trial, motion.end)
+    state.position -= substep.length
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _land(
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep, change: Change
+) -> tuple[float, bool]:
+    """Repeat a substep so that it ends on a ``change``; the length taken, and whether the change was met.
+
+    A near miss may turn out to be none. A negative length could not be taken.
+    """
+    contacts, site, h = cluster.contacts, change.site, cluster.interval
+    landing = begin_landing(change.share, substep.length)
+    while True:
+        if landing.length <= ROUNDING:
+            begin = switching(contacts, site, change.function, motion.start[site])
+            return 0.0, begin.value > begin.tolerance or (begin.value >= -begin.tolerance and begin.rate > 0.0)
+        if not _try_substep(cluster, motion, active, Substep(substep.kind, landing.length)):
+            return -landing.length, False
+        end = switching(contacts, site, change.function, motion.end[site])
+        # Landings come to the rounding of w where Newton's steps still help.
+        landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, 1e-4 * end.tolerance)
+        if outcome == SEARCH:
+            share = first_change(contacts, motion.start, motion.end, h * landing.length).share
+            if share > 1.0:
+                return landing.length, False
+            landing = shorten(landing, share)
+        elif outcome != RETRY:
+            return landing.length, outcome == LANDED
+
+
+@njit(cache=True, error_model="numpy")
+def _search_and_land(
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep
+) -> tuple[Substep, bool]:
+    """Search a substep just tried for a change and land on the first one: the substep taken, whether it was met.
+
+    A substep of negative length was rejected; ``state.length`` has the next one to try.
+    """
+    state = motion.state[0]
+    change = first_change(cluster.contacts, motion.start, motion.end, cluster.interval * substep.length)
+    if change.share > 1.0:
+        return substep, False
+    separates = (
+        cluster.contacts.law.exponent != 1.0
+        and abs(cluster.contacts.sites[change.site].mode) == CLOSED
+        and change.function == 0
+    )
+    if separates and substep.kind == ONSET and substep.length > SHORTEST:
+        # The force begins and ends as a root: one substep for each.
+        state.length = 0.5 * change.share * substep.length
+        return Substep(ONSET, -1.0), False
+    kind = EXIT if separates else substep.kind
+    state.landings += 1
+    taken, landed = _land(cluster, motion, active, Substep(kind, substep.length), change)
+    if taken < 0.0:
+        state.rejected += 1
+        state.length = -CUT * taken
+    return Substep(kind, taken), landed
+
+
+@njit(cache=True, error_model="numpy")
+def _control_length(
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, taken: float, landed: bool
+) -> bool:
+    """Set the next substep's length by the error of the one ``taken``; whether that is small enough."""
+    state = motion.state[0]
+    ratio = error_ratio(cluster, active, taken, motion.values.force)
+    factor = min(max(0.9 * (1.0 / max(ratio, 1e-30)) ** (1.0 / ORDER), LEAST_GROWTH), MOST_GROWTH)
+    if ratio > 1.0 and taken > SHORTEST:
+        state.rejected += 1
+        state.length = factor * taken
+        return False
+    if not landed and active[0] < cluster.contacts.sites.size:
+        state.length = max(factor * taken, state.length if taken < state.length else 0.0)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _accept(
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep
+) -> None:
+    """Take the substep tried last as done."""
+    state = motion.state[0]
+    accumulate_moments(cluster, state, active, substep, motion.values, motion.moments, motion.energy)
+    for i in active:
+        if i < cluster.contacts.sites.size:
+            _update_extremes(cluster, motion, i, cluster.interval * substep.length)
+    state.position += substep.length
+    motion.taylor[:] = motion.trial
+    motion.start[:] = motion.end
+
+
+@njit(cache=True, error_model="numpy")
+def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, i: int, seconds: float) -> None:
+    """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
+    start, end, history = motion.start[i], motion.end[i], motion.history[i]
+    side = 1.0 if cluster.contacts.sites[i].mode > 0 else -1.0
+    depth = max(side * start[0], side * end[0]) - cluster.contacts.sites[i].clearance
+    first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
+    last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]
+    force, smallest = max(first, last), min(first, last)
+    inside = -side * motion.values.force[i]
+    smallest = min(smallest, inside.min())
+    if inside.max() > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
+        # A turn lies inside.
+        depth, force, smallest = extremes(cluster.contacts, i, motion.start, motion.end, seconds)
+    history.indentation = max(history.indentation, depth)
+    history.force = max(history.force, force)
+    history.smallest_force = min(history.smallest_force, smallest)
+
+
+@njit(cache=True, error_model="numpy")
+def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float) -> int:
+    """Advance a cluster in the step that begins at ``begin`` in s, to the first change of modes or to the step's end.
+
+    Returns ``DONE``, ``CHANGED`` (``motion.start`` holds the motion there) or ``FAILED``.
+    """
+    state, blind = motion.state[0], False
+    if begin != state.begin:
+        state.begin, state.position = begin, 0.0
+        state.drive_end = (cluster.burst.duration - begin) / cluster.interval
+        motion.moments[:] = 0.0
+    for values in motion.values:
+        values[:] = 0.0
+    for _ in range(MOST_SUBSTEPS):
+        if 1.0 - state.position <= ROUNDING:
+            state.position = 1.0
+            return DONE
+        active = _active_dofs(cluster, motion)
+        if active.size == 0:
+            return _advance_freely(cluster, motion)
+        site_motion(cluster, state, motion.taylor, motion.start)
+        substep = _choose_substep(cluster, motion, active)
+        if blind:
+            substep = Substep(substep.kind, min(substep.length, BLIND))
+        state.substeps += 1
+        if not _try_substep(cluster, motion, active, substep):
+            state.rejected += 1
+            state.length = CUT * substep.length
+            if substep.length < ROUNDING:
+                return FAILED
+            continue
+        landed = False
+        if not blind:
+            substep, landed = _search_and_land(cluster, motion, active, substep)
+            if substep.length < 0.0:
+                continue
+        # A change at the very start that is none: past it.
+        blind = substep.length == 0.0 and not landed
+        if substep.length > 0.0:
+            # Judged only now: a force continued beyond its end is no smooth function.
+            if not _control_length(cluster, motion, active, substep.length, landed):
+                continue
+            _accept(cluster, motion, active, substep)
+        if landed:
+            return CHANGED
+    return FAILED

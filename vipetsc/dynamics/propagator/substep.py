@@ -1,0 +1,245 @@
+"""Compiled parts of one substep of a cluster: collocation of the forces, the motion after them, error, moments.
+
+Sec. 3 to 5 of the derivation in the package's docstring.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.special import binom
+
+from vipetsc.contact.law import Contacts, contact_force
+from vipetsc.dynamics.propagator.collocation import NODES, Collocation
+from vipetsc.dynamics.propagator.series import MOST_TERMS
+from vipetsc.dynamics.propagator.taylor import evaluate, shift
+from vipetsc.dynamics.records import Burst, drive_force
+
+MOST_SWEEPS = 60
+# Responses smaller than this, beside the first one, are left out.
+SMALLEST_RESPONSE = 1e-18
+# Share of the estimated error (interpolation of the force) that the end of a substep is left with.
+SUPERCONVERGENCE = 0.02
+BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
+
+SUBSTEP_STATE = np.dtype(
+    [("begin", float), ("position", float), ("length", float), ("drive_end", float)]
+    + [(name, np.int64) for name in ("substeps", "rejected", "landings")]
+)
+"""Where a cluster stands: the step's begin in s; in shares of the step the position, the next substep's length and the
+end of the drive; counts of substeps, of rejected ones and of landings."""
+
+
+class ClusterRecord(NamedTuple):
+    """A cluster's constants.
+
+    Its DoFs are the sites of ``contacts`` and, where it is in reach, the driven mass with the ``burst``. ``response``
+    (dof, dof, term) is the motion of one after an impulse on another, times H; ``interval`` is H in s,
+    ``longest`` the longest substep as a share of H, ``atol`` in m/s.
+    """
+
+    contacts: Contacts
+    burst: Burst
+    response: np.ndarray
+    nodes: Collocation
+    interval: float
+    omega_max_h: float
+    longest: float
+    rtol: float
+    atol: float
+
+
+class Substep(NamedTuple):
+    """A substep: how its nodes lie (``collocation``), its length as a share of the step."""
+
+    kind: int
+    length: float
+
+
+class NodeValues(NamedTuple):
+    """Force in N, displacement in m and velocity in m/s (dof, node) of the DoFs in a substep."""
+
+    force: np.ndarray
+    w: np.ndarray
+    v: np.ndarray
+
+
+@njit(cache=True, error_model="numpy")
+def site_motion(cluster: ClusterRecord, state: np.void, taylor: np.ndarray, motion: np.ndarray) -> None:
+    """``motion`` (site, 3): w, w', w'' of every site at the present position, where the series is ``taylor``."""
+    sites, h = cluster.contacts.sites.size, cluster.interval
+    forces = np.zeros(taylor.shape[0])
+    for i in range(sites):
+        motion[i, 0], motion[i, 1] = taylor[i, 0], taylor[i, 1] / h
+        forces[i] = -contact_force(cluster.contacts, i, motion[i, 0], motion[i, 1])[0]
+    if forces.size > sites:
+        forces[sites] = drive_force(cluster.burst, state.begin + state.position * h)
+    for i in range(sites):
+        acceleration = 2.0 * taylor[i, 2]
+        for j in range(forces.size):
+            acceleration += cluster.response[i, j, 0] * forces[j]
+        motion[i, 2] = acceleration / (h * h)
+
+
+@njit(cache=True, error_model="numpy")
+def _node_responses(
+    cluster: ClusterRecord, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray
+) -> bool:
+    """What the force on DoF ``j`` at node k adds to w and w' of DoF ``i`` at each node; whether it reaches that far.
+
+    ``to_w`` and ``to_v`` are (node k, node).
+    """
+    reaches = False
+    power, size = substep.length, 1.0
+    for m in range(cluster.response.shape[2]):
+        g = cluster.response[i, j, m]
+        if g != 0.0:
+            reaches = True
+            by_w, by_v = g * power * substep.length, g * power * (2 * m + 1) / cluster.interval
+            for k in range(NODES):
+                for node in range(NODES):
+                    to_w[k, node] += by_w * cluster.nodes.powers[substep.kind, 2 * m + 1, k, node]
+                    to_v[k, node] += by_v * cluster.nodes.powers[substep.kind, 2 * m, k, node]
+        power *= substep.length * substep.length
+        size *= (cluster.omega_max_h * substep.length) ** 2 / ((2 * m + 2) * (2 * m + 3))
+        if size < SMALLEST_RESPONSE:
+            break
+    return reaches
+
+
+@njit(cache=True, error_model="numpy")
+def collocate(
+    cluster: ClusterRecord, state: np.void, taylor: np.ndarray, active: np.ndarray, substep: Substep, values: NodeValues
+) -> bool:
+    """Solve for the ``values`` of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
+
+    Picard's iteration, which begins with the forces that ``values`` hold.
+    """
+    contacts, h, n = cluster.contacts, cluster.interval, active.size
+    free_w, free_v = np.empty((n, NODES)), np.empty((n, NODES))
+    for a in range(n):
+        for node in range(NODES):
+            at = substep.length * cluster.nodes.share[substep.kind, node]
+            free_w[a, node], slope = evaluate(taylor[active[a]], at)
+            free_v[a, node] = slope / h
+            if active[a] == contacts.sites.size:
+                values.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
+    to_w, to_v = np.zeros((n, n, NODES, NODES)), np.zeros((n, n, NODES, NODES))
+    reaches = np.zeros((n, n), np.bool_)
+    for a in range(n):
+        for b in range(n):
+            reaches[a, b] = _node_responses(cluster, substep, active[a], active[b], to_w[a, b], to_v[a, b])
+    w, v, last = np.empty(NODES), np.empty(NODES), np.inf
+    for _ in range(MOST_SWEEPS):
+        change = 0.0
+        for a in range(n):
+            w[:] = free_w[a]
+            v[:] = free_v[a]
+            for b in range(n):
+                if reaches[a, b]:
+                    for k in range(NODES):
+                        force = values.force[active[b], k]
+                        for node in range(NODES):
+                            w[node] += to_w[a, b, k, node] * force
+                            v[node] += to_v[a, b, k, node] * force
+            change = max(change, _replace(contacts, active[a], w, v, values))
+        if change < 1e-15 or (change < 1e-13 and change >= last):
+            return True
+        if change == np.inf:
+            break
+        last = change
+        for i in active:
+            if i < contacts.sites.size:
+                for node in range(NODES):
+                    values.force[i, node] = -contact_force(contacts, i, values.w[i, node], values.v[i, node])[0]
+    values.force[: contacts.sites.size] = 0.0
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, values: NodeValues) -> float:
+    """Put the motion ``w``, ``v`` (node,) of DoF ``i`` into ``values``; returns its largest change.
+
+    Changes of a site count against its clearance and against its velocity; inf where the motion is not finite.
+    """
+    change = 0.0
+    for node in range(NODES):
+        if not abs(w[node]) + abs(v[node]) < np.inf:
+            return np.inf
+        if i < contacts.sites.size:
+            site = contacts.sites[i]
+            change = max(change, abs(w[node] - values.w[i, node]) / site.clearance)
+            change = max(change, abs(v[node] - values.v[i, node]) / (abs(v[node]) + abs(site.approach)))
+        values.w[i, node], values.v[i, node] = w[node], v[node]
+    return change
+
+
+@njit(cache=True, error_model="numpy")
+def update_taylor(
+    cluster: ClusterRecord, taylor: np.ndarray, active: np.ndarray, substep: Substep, force: np.ndarray, out: np.ndarray
+) -> None:
+    """Series ``out`` of all DoFs' free motion after a substep in which the ``force`` (dof, node) acted."""
+    shift(taylor, substep.length, out)
+    dofs, terms = taylor.shape[0], cluster.response.shape[2]
+    moments, series = np.empty(2 * terms), np.empty((terms, 2 * terms))
+    for source in active:
+        moments[:] = 0.0
+        for node in range(NODES):
+            amount = substep.length * cluster.nodes.weight[substep.kind, node] * force[source, node]
+            lag = substep.length * (1.0 - cluster.nodes.share[substep.kind, node])
+            for k in range(2 * terms):
+                moments[k] += amount
+                amount *= lag
+        for m in range(terms):
+            for k in range(2 * m + 2):
+                series[m, k] = BINOMIALS[2 * m + 1, k] * moments[2 * m + 1 - k]
+        for i in range(dofs):
+            for m in range(terms):
+                g = cluster.response[i, source, m]
+                if g != 0.0:
+                    for k in range(2 * m + 2):
+                        out[i, k] += g * series[m, k]
+
+
+@njit(cache=True, error_model="numpy")
+def error_ratio(cluster: ClusterRecord, active: np.ndarray, length: float, force: np.ndarray) -> float:
+    """Estimated error of a substep over the allowed one, by the forces' last two Legendre coefficients."""
+    worst = 0.0
+    for i in active:
+        if i < cluster.contacts.sites.size:
+            last = 0.0
+            for row in range(2):
+                coefficient = 0.0
+                for node in range(NODES):
+                    coefficient += cluster.nodes.tail[row, node] * force[i, node]
+                last += abs(coefficient)
+            allowed = cluster.rtol * abs(cluster.contacts.sites[i].approach) + cluster.atol
+            error = SUPERCONVERGENCE * last * length * cluster.response[i, i, 0] / cluster.interval
+            worst = max(worst, error / allowed)
+    return worst
+
+
+@njit(cache=True, error_model="numpy")
+def accumulate_moments(
+    cluster: ClusterRecord, state: np.void, active: np.ndarray, substep: Substep, values: NodeValues,
+    moments: np.ndarray, energy: np.ndarray,
+) -> None:  # fmt: skip
+    """Add a substep's forces to the ``moments`` (dof, 2 term) about the step's end, their work to ``energy`` (dof,).
+
+    Of a site, ``energy`` is what it dissipates; of the driven mass, the work of the drive.
+    """
+    h = cluster.interval
+    for i in active:
+        for node in range(NODES):
+            duration = h * substep.length * cluster.nodes.weight[substep.kind, node]
+            power = values.force[i, node] * values.v[i, node]
+            if i < cluster.contacts.sites.size:
+                power = contact_force(cluster.contacts, i, values.w[i, node], values.v[i, node])[1]
+            energy[i] += duration * power
+            rest = 1.0 - state.position - substep.length * cluster.nodes.share[substep.kind, node]
+            amount = duration * values.force[i, node]
+            for k in range(moments.shape[1]):
+                moments[i, k] += amount
+                amount *= rest
