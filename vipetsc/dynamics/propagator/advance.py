@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.landing import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
 from vipetsc.contact.law import CLOSED, FREE, contact_force
@@ -66,7 +66,7 @@ class ClusterMotion(NamedTuple):
     state: np.ndarray
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _advance_freely(cluster: ClusterRecord, motion: ClusterMotion) -> int:
     """Go to the first onset, or to the end of the step, while no force acts."""
     state = motion.state[0]
@@ -83,7 +83,7 @@ def _advance_freely(cluster: ClusterRecord, motion: ClusterMotion) -> int:
     return CHANGED
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _active_dofs(cluster: ClusterRecord, motion: ClusterMotion) -> np.ndarray:
     """The DoFs on which a force acts: sites in contact, then the driven mass."""
     state, sites, dofs = motion.state[0], cluster.contacts.sites, motion.taylor.shape[0]
@@ -95,7 +95,7 @@ def _active_dofs(cluster: ClusterRecord, motion: ClusterMotion) -> np.ndarray:
     return active[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _choose_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray) -> Substep:
     """The next substep: as long as its error allows, not beyond the drive's end, short while a contact is young."""
     state, sites = motion.state[0], cluster.contacts.sites
@@ -115,10 +115,8 @@ def _choose_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.nd
     return Substep(PLAIN, length)
 
 
-@njit(cache=True, error_model="numpy")
-def _try_substep(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep
-) -> bool:
+@njit(error_model="numpy")
+def _try_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep) -> bool:
     """Leave the end of a substep in ``motion.trial`` and ``motion.end``; whether it could be collocated."""
     state = motion.state[0]
     if not collocate(cluster, state, motion.taylor, active, substep, motion.values):
@@ -130,7 +128,7 @@ def _try_substep(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _land(
     cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep, change: Change
 ) -> tuple[float, bool]:
@@ -158,7 +156,7 @@ def _land(
             return landing.length, outcome == LANDED
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _search_and_land(
     cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep
 ) -> tuple[Substep, bool]:
@@ -188,7 +186,7 @@ def _search_and_land(
     return Substep(kind, taken), landed
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _control_length(
     cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, taken: float, landed: bool
 ) -> bool:
@@ -205,10 +203,8 @@ def _control_length(
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def _accept(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep
-) -> None:
+@njit(error_model="numpy")
+def _accept(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep) -> None:
     """Take the substep tried last as done."""
     state = motion.state[0]
     accumulate_moments(cluster, state, active, substep, motion.values, motion.moments, motion.energy)
@@ -220,7 +216,7 @@ def _accept(
     motion.start[:] = motion.end
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, i: int, seconds: float) -> None:
     """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
     start, end, history = motion.start[i], motion.end[i], motion.history[i]
@@ -239,7 +235,7 @@ def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, i: int, seco
     history.smallest_force = min(history.smallest_force, smallest)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float) -> int:
     """Advance a cluster in the step that begins at ``begin`` in s, to the first change of modes or to the step's end.
 

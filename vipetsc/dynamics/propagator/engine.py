@@ -49,7 +49,10 @@ def step_series(model: Model) -> StepSeries | None:
         if cost >= least:
             break
         series = StepSeries(model.chain, model.sample_interval / parts, tolerance)
-        if max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H or model.chain.cells <= 2 * series.reach:
+        if (
+            max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
+            or model.chain.cells <= 2 * series.reach
+        ):
             continue
         sizes = np.array([len(group) for group in group_dofs(model, series.reach)])
         cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
@@ -64,11 +67,13 @@ class Propagator(Engine):
     name = "propagator"
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None) -> None:
-        self.series = series = step_series(model)
+        series = step_series(model)
+        assert series is not None, "refused"
+        self.series = series
         self._layout, self._stop = layout, stop or StopRequest()
         self._interval = model.sample_interval
         self._parts = round(model.sample_interval / series.interval)
-        self.steps = 0
+        self.steps, self.time = 0, 0.0
         neighbours = [cell for cell in layout.neighbours() if cell is not None]
         d, n = layout.dofs, layout.owned
         # Two states in turn: each step reads one and writes the other.
@@ -100,7 +105,7 @@ class Propagator(Engine):
                 return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
             return f"{model.chain.cells} cells are fewer than the propagator's band"
         groups = ([dof.cell + 1 for dof in group if dof.site >= 0] for group in group_dofs(model, series.reach))
-        cells = sorted(max(groups, key=len))
+        _, cells = max((len(cells), sorted(cells)) for cells in groups)
         if len(cells) > MOST_SITES:
             return (
                 f"{len(cells)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
@@ -112,12 +117,6 @@ class Propagator(Engine):
     def state(self) -> PETSc.Vec:
         """The state at ``time``, as ``Layout`` orders it."""
         return self._states[self._now]
-
-    @property
-    def time(self) -> float:
-        """Time in s."""
-        whole, rest = divmod(self.steps, self._parts)
-        return whole * self._interval + rest * self.series.interval
 
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s, a multiple of the sample interval; see ``Engine``."""
@@ -140,11 +139,12 @@ class Propagator(Engine):
         apply_propagator(self._stencil, self._cells[old], self._halo.columns, self._cells[new])
         self._forces.act(self.time, self._cells[new])
         self._now = new
-        self.steps += 1
-        self._refresh()
+        self._refresh(self.steps + 1)
 
-    def _refresh(self) -> None:
-        """Bring the halo, the ledger's components and the ghosts of the state up to date."""
+    def _refresh(self, steps: int) -> None:
+        """Bring the time, the halo, the ledger's components and the ghosts up to date with a state after ``steps``."""
+        whole, rest = divmod(steps, self._parts)
+        self.steps, self.time = steps, whole * self._interval + rest * self.series.interval
         layout, array = self._layout, self._arrays[self._now]
         self._halo.fetch(self.state, self._cells[self._now])
         array[2 * layout.dofs * layout.owned : layout.size] = self._forces.ledger
@@ -181,9 +181,8 @@ class Propagator(Engine):
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Go back to a checkpoint."""
         self._arrays[self._now][: self._layout.size] = checkpoint["state"]
-        self.steps = int(checkpoint["steps"])
-        self._forces.restore(checkpoint, self.time)
-        self._refresh()
+        self._forces.restore(checkpoint)
+        self._refresh(int(checkpoint["steps"]))
 
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""

@@ -100,14 +100,15 @@ class Forces:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs."""
-        return {f"cluster-{i}-{k}": v for i, c in enumerate(self.clusters) for k, v in c.checkpoint().items()}
+        clusters = {f"cluster-{i}-{k}": v for i, c in enumerate(self.clusters) for k, v in c.checkpoint().items()}
+        return clusters | {"busy": self._index.busy.copy()}
 
-    def restore(self, checkpoint: dict[str, np.ndarray], now: float) -> None:
-        """Go back to a checkpoint taken at time ``now`` in s."""
+    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
+        """Go back to a checkpoint."""
+        self._index.busy[:] = checkpoint["busy"]
         for i, cluster in enumerate(self.clusters):
             prefix = f"cluster-{i}-"
             cluster.restore({k.removeprefix(prefix): v for k, v in checkpoint.items() if k.startswith(prefix)})
-            self._index.busy[i] = cluster.is_busy(now)
 
 
 def _unwrapped(cell: int, near: int, layout: Layout) -> int:
@@ -122,12 +123,12 @@ def _owned_cells(cell: int, reach: int, layout: Layout) -> np.ndarray:
     return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
 
 
-def _lattice_rows(
-    groups: list[list[ContactDof]], layout: Layout, series: StepSeries, halo: HaloRegions
-) -> LatticeRows:
+def _lattice_rows(groups: list[list[ContactDof]], layout: Layout, series: StepSeries, halo: HaloRegions) -> LatticeRows:
     """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
     r, cell = series.reach, series.chain.cell
-    columns, owned, tables, rows = [], [], [], []
+    columns: list[int] = []
+    owned, tables = [], []
+    rows: list[np.ndarray] = []
     numbers: dict[tuple, int] = {}  # DoFs away from the ends share their rows
     for group in groups:
         cells = [_unwrapped(dof.cell, group[0].cell, layout) for dof in group]

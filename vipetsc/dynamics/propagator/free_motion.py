@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from vipetsc.compiled import njit
 
 
 class LatticeRows(NamedTuple):
@@ -41,7 +42,7 @@ class ClusterIndex(NamedTuple):
     active: np.ndarray
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def taylor_coefficients(lattice: LatticeRows, dof: int, columns: np.ndarray, taylor: np.ndarray) -> float:
     """Coefficients ``taylor`` (2 term,) in m of a DoF's free motion in powers of t/H; returns a bound on |motion|.
 
@@ -65,7 +66,7 @@ def taylor_coefficients(lattice: LatticeRows, dof: int, columns: np.ndarray, tay
     return bound
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def active_clusters(lattice: LatticeRows, clusters: ClusterIndex, columns: np.ndarray, taylor: np.ndarray) -> int:
     """Find the clusters that are busy or have a site whose free motion may reach its clearance; returns how many.
 
@@ -82,7 +83,7 @@ def active_clusters(lattice: LatticeRows, clusters: ClusterIndex, columns: np.nd
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def apply_impulses(lattice: LatticeRows, first: int, moments: np.ndarray, out: np.ndarray) -> None:
     """Add to the owned cells ``out`` (2 mass, cell) what forces within the step leave there at its end.
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from petsc4py import PETSc
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.dynamics.layout import Layout
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _gather(owned: np.ndarray, fetched: np.ndarray, sources: np.ndarray, out: np.ndarray) -> None:
     """Columns ``sources`` of ``owned`` and, numbered on behind them, of ``fetched`` into ``out``."""
     count = owned.shape[1]

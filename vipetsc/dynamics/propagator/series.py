@@ -170,7 +170,7 @@ class StepSeries:
         return self.stencil(self._interior)[:, :, middle]
 
     def end(self, right: bool) -> np.ndarray:
-        """P's rows (reach, 2 dof, 2 dof, 2 reach) of the first or last ``reach`` cells over the first or last 2 reach."""
+        """P's rows (cell, 2 dof, 2 dof, 2 reach) of the first or last ``reach`` cells, over twice as many cells."""
         n, r = self.chain.cells, self.reach
         first, cells = (n - 2 * r, range(n - r, n)) if right else (0, range(r))
         return np.stack([self.stencil(self.rows(cell, first, 2 * r)) for cell in cells])

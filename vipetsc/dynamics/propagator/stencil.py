@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.halo import HaloRegions
 from vipetsc.dynamics.propagator.series import StepSeries
@@ -46,16 +46,16 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     first, last = (start, stop) if layout.periodic else (max(start, r), min(stop, n - r))
     ends, end_cells = [], []
     if not layout.periodic:
-        for right, a, b in ((False, start, min(stop, r)), (True, max(start, n - r), stop)):
+        for is_right, a, b in ((False, start, min(stop, r)), (True, max(start, n - r), stop)):
             if a < b:
-                rows = series.end(right)  # (cell, 2 dof, 2 dof, cell)
+                rows = series.end(is_right)  # (cell, 2 dof, 2 dof, cell)
                 ends.append(rows.transpose(2, 3, 1, 0).reshape(rows.shape[2], 2 * r, -1))
-                column = halo.add(n - 2 * r if right else 0, 2 * r)
-                end_cells.append((column, a - (n - r if right else 0), a - start, b - a))
+                column = halo.add(n - 2 * r if is_right else 0, 2 * r)
+                end_cells.append((column, a - (n - r if is_right else 0), a - start, b - a))
     # Cells that see only this rank's read the state itself.
-    a, b = max(first, start + r), min(last, stop - r)
-    pieces = [(0, a - start, a - start, b - a)] if a < b else []
-    for a, b in ((first, a), (b, last)) if a < b else ((first, last),):
+    left, right = max(first, start + r), min(last, stop - r)
+    pieces = [(0, left - start, left - start, right - left)] if left < right else []
+    for a, b in ((first, left), (right, last)) if left < right else ((first, last),):
         if a < b:
             pieces.append((1, halo.add(a - r, b - a + 2 * r) + r, a - start, b - a))
     return Stencil(
@@ -81,7 +81,7 @@ def _interior_terms(series: StepSeries) -> tuple[np.ndarray, np.ndarray, np.ndar
     return np.array(starts), np.array(rows), np.array(offsets), np.array(values, float)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_group(out: np.ndarray, x: np.ndarray, column: int, places: np.ndarray, values: np.ndarray) -> None:
     """Add to the cells ``out`` eight ``values`` times ``x`` from ``column`` + ``places`` (modulo 2^64) on."""
     # Unsigned: numba makes no provision for negative places then, and the loop is vectorised.
@@ -95,7 +95,7 @@ def _add_group(out: np.ndarray, x: np.ndarray, column: int, places: np.ndarray, 
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
     """``out`` (2 dof, owned cell) = P(H) times the lattice's ``state``, whose halo is ``columns``."""
     for piece in range(stencil.pieces.shape[0]):

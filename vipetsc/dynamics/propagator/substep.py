@@ -5,12 +5,12 @@ Sec. 3 to 5 of the derivation in the package's docstring.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.special import binom
 
+from vipetsc.compiled import njit
 from vipetsc.contact.law import Contacts, contact_force
 from vipetsc.dynamics.propagator.collocation import NODES, Collocation
 from vipetsc.dynamics.propagator.series import MOST_TERMS
@@ -66,8 +66,8 @@ class NodeValues(NamedTuple):
     v: np.ndarray
 
 
-@njit(cache=True, error_model="numpy")
-def site_motion(cluster: ClusterRecord, state: np.void, taylor: np.ndarray, motion: np.ndarray) -> None:
+@njit(error_model="numpy")
+def site_motion(cluster: ClusterRecord, state: Any, taylor: np.ndarray, motion: np.ndarray) -> None:
     """``motion`` (site, 3): w, w', w'' of every site at the present position, where the series is ``taylor``."""
     sites, h = cluster.contacts.sites.size, cluster.interval
     forces = np.zeros(taylor.shape[0])
@@ -83,7 +83,7 @@ def site_motion(cluster: ClusterRecord, state: np.void, taylor: np.ndarray, moti
         motion[i, 2] = acceleration / (h * h)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _node_responses(
     cluster: ClusterRecord, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray
 ) -> bool:
@@ -109,9 +109,9 @@ def _node_responses(
     return reaches
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def collocate(
-    cluster: ClusterRecord, state: np.void, taylor: np.ndarray, active: np.ndarray, substep: Substep, values: NodeValues
+    cluster: ClusterRecord, state: Any, taylor: np.ndarray, active: np.ndarray, substep: Substep, values: NodeValues
 ) -> bool:
     """Solve for the ``values`` of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
 
@@ -158,7 +158,7 @@ def collocate(
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, values: NodeValues) -> float:
     """Put the motion ``w``, ``v`` (node,) of DoF ``i`` into ``values``; returns its largest change.
 
@@ -176,7 +176,7 @@ def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, values: N
     return change
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def update_taylor(
     cluster: ClusterRecord, taylor: np.ndarray, active: np.ndarray, substep: Substep, force: np.ndarray, out: np.ndarray
 ) -> None:
@@ -203,7 +203,7 @@ def update_taylor(
                         out[i, k] += g * series[m, k]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def error_ratio(cluster: ClusterRecord, active: np.ndarray, length: float, force: np.ndarray) -> float:
     """Estimated error of a substep over the allowed one, by the forces' last two Legendre coefficients."""
     worst = 0.0
@@ -221,9 +221,9 @@ def error_ratio(cluster: ClusterRecord, active: np.ndarray, length: float, force
     return worst
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def accumulate_moments(
-    cluster: ClusterRecord, state: np.void, active: np.ndarray, substep: Substep, values: NodeValues,
+    cluster: ClusterRecord, state: Any, active: np.ndarray, substep: Substep, values: NodeValues,
     moments: np.ndarray, energy: np.ndarray,
 ) -> None:  # fmt: skip
     """Add a substep's forces to the ``moments`` (dof, 2 term) about the step's end, their work to ``energy`` (dof,).

@@ -6,15 +6,15 @@ Sec. 2 of the derivation in the package's docstring.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vipetsc.compiled import njit
 from vipetsc.contact.changes import LANDED_W
 
 # Shares of a step below this are rounding.
 ROUNDING = 1e-15
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
     """Series ``taylor`` (dof, coefficient) expanded about ``s`` instead of 0 into ``out``, which may be ``taylor``."""
     # Coefficient by coefficient, so that the innermost loop runs over contiguous DoFs.
@@ -27,7 +27,7 @@ def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
     out[:] = series.T
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
     """Value and slope of a ``series`` at ``s``, by Horner's scheme."""
     value = slope = 0.0
@@ -37,7 +37,7 @@ def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
     return value, slope
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def first_onset(series: np.ndarray, clearance: float, length: float) -> float:
     """First s in [0, length] at which |w| comes within rounding of the clearance and grows; 2 if none does.
 
