@@ -1,7 +1,7 @@
 """Compiled search of a step for the first change of a site's mode, and the extremes of a contact within the step.
 
-A site's motion is (w, w', w''), w = u_resonator - u_host, in rows of arrays (sites, 3). Every change is an
-upcrossing of one of two switching functions of the site's mode:
+A site's motion is (w, w', w''), w = u_resonator - u_host, in rows of arrays (sites, 3). Every change is an upcrossing
+of one of two switching functions of the site's mode, each affine in w or in w':
 
 - free: w - D and -w - D, an onset on either side;
 - closed: D - side w, the separation, and with clipping -g (the force would turn into a pull);
@@ -16,7 +16,7 @@ import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.contact.law import CLIPPED, CLOSED, FREE, Contacts, contact_force
-from vipetsc.contact.search import bernstein, derivative, evaluate, first_upcrossing, first_upcrossing_after_start
+from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
 # A site has landed on its clearance when |side w - D| is within this share of D.
 LANDED_W = 1e-10
@@ -53,51 +53,55 @@ class Extremes(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def switching(contacts: Contacts, i: int, function: int, motion: np.ndarray) -> Switching:
-    """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
+def _affine_form(contacts: Contacts, i: int, function: int) -> tuple[int, float, float, float, int]:
+    """Order k, factor, offset of a switching function ``factor`` d^k w/dt^k + ``offset``; its tolerance and mode.
+
+    The offset is -inf where the site's mode has no such function.
+    """
     site = contacts.sites[i]
-    w, rate, acceleration = motion[0], motion[1], motion[2]
+    tolerance = LANDED_W * site.clearance
     if site.mode == FREE:
         side = 1 - 2 * function
-        return Switching(side * w - site.clearance, side * rate, LANDED_W * site.clearance, side * CLOSED)
+        return 0, float(side), -site.clearance, tolerance, side * CLOSED
     side = 1 if site.mode > 0 else -1
     if function == 0:
-        return Switching(site.clearance - side * w, -side * rate, LANDED_W * site.clearance, FREE)
+        return 0, float(-side), site.clearance, tolerance, FREE
     if not contacts.law.clip:
-        return Switching(-np.inf, 0.0, 0.0, site.mode)
+        return 1, 0.0, -np.inf, 0.0, site.mode
     clipped = abs(site.mode) == CLIPPED
-    slope = contacts.law.damping / site.approach
     sign = 1.0 if clipped else -1.0
-    mode = side * (CLOSED if clipped else CLIPPED)
-    return Switching(sign * (1.0 + slope * rate), sign * slope * acceleration, LANDED_G, mode)
+    factor = sign * (contacts.law.damping / site.approach)
+    return 1, factor, sign, LANDED_G, side * (CLOSED if clipped else CLIPPED)
+
+
+@njit(cache=True, error_model="numpy")
+def switching(contacts: Contacts, i: int, function: int, motion: np.ndarray) -> Switching:
+    """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
+    order, factor, offset, tolerance, mode = _affine_form(contacts, i, function)
+    return Switching(factor * motion[order] + offset, factor * motion[order + 1], tolerance, mode)
 
 
 @njit(cache=True, error_model="numpy")
 def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: float) -> Change:
     """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3)."""
     first = Change(2.0, -1, 0)
-    b, c, d = np.empty(6), np.empty(6), np.empty(5)
+    b, c = np.empty(6), np.empty(6)
     for i in range(contacts.sites.size):
         bernstein(start[i], end[i], h, b)
         site = contacts.sites[i]
-        tolerance = LANDED_W * site.clearance
-        if site.mode == FREE and b.max() < site.clearance - tolerance and b.min() > tolerance - site.clearance:
+        reach = site.clearance - LANDED_W * site.clearance
+        if site.mode == FREE and b.max() < reach and b.min() > -reach:
             continue
         for function in range(2):
-            if site.mode == FREE:
-                c[:] = (1 - 2 * function) * b - site.clearance
-                share = first_upcrossing_after_start(c, tolerance)
-            elif function == 0:
-                c[:] = site.clearance - (1.0 if site.mode > 0 else -1.0) * b
-                share = first_upcrossing_after_start(c, tolerance)
-            elif contacts.law.clip:
-                slope = contacts.law.damping / site.approach
-                sign = 1.0 if abs(site.mode) == CLIPPED else -1.0
-                for k in range(5):
-                    d[k] = sign * (1.0 + slope * 5.0 * (b[k + 1] - b[k]) / h)
-                share = first_upcrossing_after_start(d, LANDED_G)
-            else:
+            order, factor, offset, tolerance, _ = _affine_form(contacts, i, function)
+            if offset == -np.inf:
                 continue
+            if order == 0:
+                c[:] = factor * b + offset
+            else:
+                for k in range(5):
+                    c[k] = factor * 5.0 * (b[k + 1] - b[k]) / h + offset
+            share = first_upcrossing_after_start(c[: 6 - order], tolerance)
             if share < first.share:
                 first = Change(share, i, function)
     return first
@@ -115,7 +119,8 @@ def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: 
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     b, d = np.empty(6), np.empty(5)
     bernstein(start[i], end[i], h, b)
-    derivative(b, h, d)
+    for k in range(5):
+        d[k] = 5.0 * (b[k + 1] - b[k]) / h
     site = contacts.sites[i]
     side = 1.0 if site.mode > 0 else -1.0
     deepest = max(side * b[0], side * b[5])

@@ -28,14 +28,6 @@ def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> No
 
 
 @njit(cache=True, error_model="numpy")
-def derivative(b: np.ndarray, h: float, d: np.ndarray) -> None:
-    """Coefficients ``d`` (n,) of the time derivative of ``b`` (n + 1,) over a step h."""
-    n = b.size - 1
-    for i in range(n):
-        d[i] = n * (b[i + 1] - b[i]) / h
-
-
-@njit(cache=True, error_model="numpy")
 def evaluate(b: np.ndarray, s: float) -> float:
     """Value at s in [0, 1] by de Casteljau's scheme, for up to six coefficients."""
     c = np.empty(6)

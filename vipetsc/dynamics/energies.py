@@ -20,48 +20,23 @@ PARTS = 4
 FINE = 2.0**40
 """Multiples of the finer rest in one unit."""
 
-# Energies count in whole numbers up to the largest; added to floats of at most 2^51, _WHOLE rounds to whole numbers.
 _LARGEST = 2.0**50
-_WHOLE = 2.0**52 + 2.0**51
-_WHOLE_BITS = int(np.float64(_WHOLE).view(np.int64))
 
 
 @njit(cache=True, error_model="numpy")
-def _add_one(sums: np.ndarray, part: int, value: float, unit: float) -> None:
-    coarse = np.rint(value / unit)
-    if not abs(coarse) < _LARGEST:
-        coarse = _LARGEST  # not finite or far beyond the scale: the guard sees a runaway energy
-        value = coarse * unit
-    sums[part] += np.int64(coarse)
-    sums[part + 1] += np.int64(np.rint((value - coarse * unit) / unit * FINE))
-
-
-@njit(cache=True, error_model="numpy")
-def _as_multiples(values: np.ndarray, coarse: np.ndarray, fine: np.ndarray, unit: float) -> None:
-    """Whole numbers of ``unit`` in ``values``, at most 2^50, and of unit/2^40 in the rest, both plus ``_WHOLE``.
-
-    A float near 2^52 + 2^51 has units of one: adding it leaves whole numbers in the lowest bits.
-    """
+def _add_exactly(sums: np.ndarray, part: int, values: np.ndarray, unit: float) -> None:
+    """Add energies in J to ``sums[part]`` in units and to the next entry in units of unit/2^40."""
+    coarse = fine = 0
     for i in range(values.size):
-        value = values[i]
-        whole = np.rint(value * (1.0 / unit))
-        fits = abs(whole) < _LARGEST  # as in _add_one
-        whole = whole if fits else _LARGEST
-        coarse[i] = whole + _WHOLE
-        fine[i] = (np.rint((value * (1.0 / unit) - whole) * FINE) if fits else 0.0) + _WHOLE
-
-
-@njit(cache=True, error_model="numpy")
-def _add_all(sums: np.ndarray, part: int, values: np.ndarray, unit: float) -> None:
-    multiples = np.empty((2, CHUNK))
-    coarse, fine = multiples[0, : values.size], multiples[1, : values.size]
-    _as_multiples(values, coarse, fine, unit)
-    for rest in range(2):
-        bits = (coarse if rest == 0 else fine).view(np.int64)
-        total = 0
-        for i in range(values.size):
-            total += bits[i] - _WHOLE_BITS
-        sums[part + rest] += total
+        multiple = values[i] * (1.0 / unit)
+        whole = np.rint(multiple)
+        if abs(whole) < _LARGEST:
+            coarse += np.int64(whole)
+            fine += np.int64(np.rint((multiple - whole) * FINE))
+        else:  # not finite or far beyond the scale: the guard sees a runaway energy
+            coarse += np.int64(_LARGEST)
+    sums[part] += coarse
+    sums[part + 1] += fine
 
 
 @njit(cache=True, error_model="numpy")
@@ -117,8 +92,8 @@ def _add_cells(sums: np.ndarray, y: np.ndarray, lattice: LatticeRecord, unit: fl
         for cell in (0, n - 1):
             if a <= cell < b:
                 held[cell - a], springs[cell - a] = _cell_energies(y, lattice, cell)
-        _add_all(sums, KINETIC, held, unit)
-        _add_all(sums, SPRING_ENERGY, springs, unit)
+        _add_exactly(sums, KINETIC, held, unit)
+        _add_exactly(sums, SPRING_ENERGY, springs, unit)
 
 
 @njit(cache=True, error_model="numpy")
@@ -130,13 +105,13 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, total: np.ndarra
     shape, contacts = lattice.shape, lattice.contacts
     sums = np.zeros(2 * PARTS, np.int64)
     _add_cells(sums, y, lattice, unit)
-    for i in range(lattice.site_cells.size):
+    stored = np.zeros(lattice.site_cells.size)
+    for i in range(stored.size):
         cell = lattice.site_cells[i]
         w = y[shape.resonator * shape.cells + cell] - y[shape.host * shape.cells + cell]
-        x = abs(w) - contacts.sites[i].clearance
-        if x > 0.0:
-            _add_one(sums, CONTACT_ENERGY, elastic_energy(contacts.law, x), unit)
-        _add_one(sums, DISSIPATED, y[shape.dissipated + i], unit)
+        stored[i] = elastic_energy(contacts.law, abs(w) - contacts.sites[i].clearance)
+    _add_exactly(sums, CONTACT_ENERGY, stored, unit)
+    _add_exactly(sums, DISSIPATED, y[shape.dissipated : shape.dissipated + stored.size], unit)
     for part in range(PARTS):
         carried = sums[2 * part + 1] >> 40
         total[2 * part] = sums[2 * part] + carried
