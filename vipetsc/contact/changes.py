@@ -52,7 +52,7 @@ class Extremes(NamedTuple):
     smallest_force: float
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _affine_form(contacts: Contacts, i: int, function: int) -> tuple[int, float, float, float, int]:
     """Order k, factor, offset of a switching function ``factor`` d^k w/dt^k + ``offset``; its tolerance and mode.
 
@@ -74,14 +74,14 @@ def _affine_form(contacts: Contacts, i: int, function: int) -> tuple[int, float,
     return 1, factor, sign, LANDED_G, side * (CLOSED if clipped else CLIPPED)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def switching(contacts: Contacts, i: int, function: int, motion: np.ndarray) -> Switching:
     """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
     order, factor, offset, tolerance, mode = _affine_form(contacts, i, function)
     return Switching(factor * motion[order] + offset, factor * motion[order + 1], tolerance, mode)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: float) -> Change:
     """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3)."""
     first = Change(2.0, -1, 0)
@@ -107,14 +107,14 @@ def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: floa
     return first
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _push(contacts: Contacts, i: int, b: np.ndarray, d: np.ndarray, s: float) -> float:
     """Contact force in N at share ``s`` of a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
     force, _ = contact_force(contacts, i, evaluate(b, s), evaluate(d, s))
     return force if contacts.sites[i].mode > 0 else -force
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     b, d = np.empty(6), np.empty(5)

@@ -29,13 +29,13 @@ class Landing(NamedTuple):
     attempts: int
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def begin_landing(share: float, longest: float) -> Landing:
     """The first attempt at a change that a search found at a ``share`` of the step ``longest``."""
     return Landing(share * longest, longest, np.inf, 0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def correct(landing: Landing, value: float, rate: float, tolerance: float, goal: float) -> tuple[Landing, int]:
     """Judge an attempt that ended at the ``value`` and ``rate`` (per unit of length) of the switching function.
 
@@ -58,7 +58,7 @@ def correct(landing: Landing, value: float, rate: float, tolerance: float, goal:
     return Landing(landing.length, landing.longest, landing.residual, attempts), SEARCH
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def shorten(landing: Landing, share: float) -> Landing:
     """The attempt at a ``share`` of the last one's length."""
     return Landing(landing.length * share, landing.longest, landing.residual, landing.attempts)

@@ -13,7 +13,7 @@ from vipetsc.compiled import njit
 _DEPTH = 64
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> None:
     """Coefficients ``b`` (6,) on [0, 1] of the quintic with (w, w', w'') given at both ends of a step h.
 
@@ -27,7 +27,7 @@ def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> No
     b[5] = end[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def evaluate(b: np.ndarray, s: float) -> float:
     """Value at s in [0, 1] by de Casteljau's scheme, for up to six coefficients."""
     c = np.empty(6)
@@ -39,7 +39,7 @@ def evaluate(b: np.ndarray, s: float) -> float:
     return c[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _bisect(c: np.ndarray) -> float:
     """Root in [0, 1] of a polynomial that turns from negative to positive once."""
     a, b = 0.0, 1.0
@@ -52,7 +52,7 @@ def _bisect(c: np.ndarray) -> float:
     return b
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def first_upcrossing(b: np.ndarray) -> float:
     """Smallest s in [0, 1] at which the polynomial ``b`` (n <= 6,) turns positive; 2 if it never does."""
     n = b.size
@@ -93,7 +93,7 @@ def first_upcrossing(b: np.ndarray) -> float:
     return 2.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
     """``first_upcrossing``, where a start within ``tolerance`` of zero has just landed and is itself no crossing."""
     if abs(b[0]) > tolerance:

@@ -23,10 +23,10 @@ FINE = 2.0**40
 _LARGEST = 2.0**50
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_exactly(sums: np.ndarray, part: int, values: np.ndarray, unit: float) -> None:
     """Add energies in J to ``sums[part]`` in units and to the next entry in units of unit/2^40."""
-    coarse = fine = 0
+    coarse, fine = np.int64(0), np.int64(0)
     for i in range(values.size):
         multiple = values[i] * (1.0 / unit)
         whole = np.rint(multiple)
@@ -39,20 +39,20 @@ def _add_exactly(sums: np.ndarray, part: int, values: np.ndarray, unit: float) -
     sums[part + 1] += fine
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_kinetic(out: np.ndarray, v: np.ndarray, inverse_mass: float) -> None:
     for i in range(out.size):
         out[i] += 0.5 * v[i] * v[i] / inverse_mass
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_spring(out: np.ndarray, end: np.ndarray, start: np.ndarray, stiffness: float) -> None:
     for i in range(out.size):
         stretch = end[i] - start[i]
         out[i] += 0.5 * stiffness * stretch * stretch
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _cell_energies(y: np.ndarray, lattice: LatticeRecord, cell: int) -> tuple[float, float]:
     """Kinetic and spring energy of one cell, its springs to the next cell and a wall on its left included."""
     shape = lattice.shape
@@ -71,7 +71,7 @@ def _cell_energies(y: np.ndarray, lattice: LatticeRecord, cell: int) -> tuple[fl
     return kinetic, energy
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_cells(sums: np.ndarray, y: np.ndarray, lattice: LatticeRecord, unit: float) -> None:
     """Add the kinetic and spring energies of all owned cells."""
     n, d = lattice.shape.cells, lattice.shape.dofs
@@ -96,7 +96,7 @@ def _add_cells(sums: np.ndarray, y: np.ndarray, lattice: LatticeRecord, unit: fl
         _add_exactly(sums, SPRING_ENERGY, springs, unit)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, total: np.ndarray) -> None:
     """Kinetic, spring, contact and dissipated energy (2 whole numbers each) and the work (J) into ``total`` (9,).
 

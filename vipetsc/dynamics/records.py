@@ -150,7 +150,7 @@ def create_context(lattice: LatticeRecord) -> np.ndarray:
     return context
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def drive_force(burst: Burst, t: float) -> float:
     """Force in N of the tone burst at time t in s, Eq. (3)."""
     if t <= 0.0 or t >= burst.duration:

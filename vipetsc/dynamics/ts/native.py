@@ -19,12 +19,18 @@ from vipetsc.contact.law import SITE, Contacts, ForceLaw
 from vipetsc.dynamics.records import CONTEXT, COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
 from vipetsc.dynamics.ts.right_hand_side import right_hand_side
 
-_BEGIN = types.ExternalFunction("VecGhostUpdateBegin", types.int32(types.int64, types.int32, types.int32))
-_END = types.ExternalFunction("VecGhostUpdateEnd", types.int32(types.int64, types.int32, types.int32))
-_GET = types.ExternalFunction("VecGetArrayRead", types.int32(types.int64, types.int64))
-_RESTORE = types.ExternalFunction("VecRestoreArrayRead", types.int32(types.int64, types.int64))
-_GET_WRITE = types.ExternalFunction("VecGetArrayWrite", types.int32(types.int64, types.int64))
-_RESTORE_WRITE = types.ExternalFunction("VecRestoreArrayWrite", types.int32(types.int64, types.int64))
+
+def _petsc_function(name: str, *arguments: types.Type) -> Any:
+    """A function of PETSc for compiled code; handles and pointers are int64."""
+    return types.ExternalFunction(name, types.int32(*arguments))
+
+
+_ghosts_begin = _petsc_function("VecGhostUpdateBegin", types.int64, types.int32, types.int32)
+_ghosts_end = _petsc_function("VecGhostUpdateEnd", types.int64, types.int32, types.int32)
+_get_read = _petsc_function("VecGetArrayRead", types.int64, types.int64)
+_restore_read = _petsc_function("VecRestoreArrayRead", types.int64, types.int64)
+_get_write = _petsc_function("VecGetArrayWrite", types.int64, types.int64)
+_restore_write = _petsc_function("VecRestoreArrayWrite", types.int64, types.int64)
 
 
 def petsc_library() -> ctypes.CDLL:
@@ -44,7 +50,7 @@ def _pointer_of(typing_context: Any, address: Any) -> tuple[Any, Callable]:
 _pointer: Any = intrinsic(_pointer_of)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _lattice(context: Any) -> LatticeRecord:
     """The record whose tables stand at the context's addresses."""
     shape, law, burst, at, size = context.shape, context.law, context.burst, context.address, context.length
@@ -67,29 +73,23 @@ def _lattice(context: Any) -> LatticeRecord:
 
 
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
-    """The right-hand side between PETSc's vectors; not a closure, whose cache numba would not find again."""
     context: Any = carray(_pointer(address), (1,), CONTEXT)[0]
     shape = context.shape
-    if shape.exchange:
-        error = _BEGIN(u, 1, 0)
-        if error == 0:
-            error = _END(u, 1, 0)
-        if error != 0:
-            return error
-    error = _GET(u, address)
+    error = (_ghosts_begin(u, 1, 0) or _ghosts_end(u, 1, 0)) if shape.exchange else 0
+    error = error or _get_read(u, address)
     if error != 0:
         return error
     state = context.array
-    error = _GET_WRITE(f, address)
+    error = _get_write(f, address)
     if error != 0:
         return error
     rate = carray(_pointer(context.array), (shape.owned,), np.float64)
     right_hand_side(t, carray(_pointer(state), (shape.ghosted,), np.float64), rate, _lattice(context))
-    error = _RESTORE_WRITE(f, address)
+    error = _restore_write(f, address)
     if error != 0:
         return error
     context.array = state
-    return _RESTORE(u, address)
+    return _restore_read(u, address)
 
 
 def compile_callback() -> CFunc:
@@ -98,7 +98,7 @@ def compile_callback() -> CFunc:
     ``context`` is the address of a ``CONTEXT`` record. Raises AttributeError where PETSc hides its symbols.
     """
     library = petsc_library()
-    for function in (_BEGIN, _END, _GET, _RESTORE, _GET_WRITE, _RESTORE_WRITE):
+    for function in (_ghosts_begin, _ghosts_end, _get_read, _restore_read, _get_write, _restore_write):
         address = ctypes.cast(getattr(library, function.symbol), ctypes.c_void_p).value
         binding.add_symbol(function.symbol, address)
     return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)

@@ -16,7 +16,7 @@ from vipetsc.dynamics.records import LatticeRecord, drive_force
 CHUNK = 512
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(error_model="numpy", forceinline=True)
 def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall."""
     shape = lattice.shape
@@ -27,7 +27,7 @@ def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) ->
     return y[mass * shape.cells + cell]
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(error_model="numpy", forceinline=True)
 def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Acceleration in m/s^2 of one mass by its springs; the same sums as the chunked loop, bit for bit."""
     shape = lattice.shape
@@ -42,7 +42,7 @@ def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: 
     return total * lattice.masses[mass].inverse_mass
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def relative_motion(t: float, y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[float, float, float]:
     """w, w', w'' of site ``i`` at time ``t``, w = u_resonator - u_host."""
     shape, masses = lattice.shape, lattice.masses
@@ -60,20 +60,20 @@ def relative_motion(t: float, y: np.ndarray, lattice: LatticeRecord, i: int) -> 
     return w, rate, at_resonator - at_host
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
     """Fill ``motion`` (sites, 3) with w, w', w'' of every owned site."""
     for i in range(motion.shape[0]):
         motion[i, 0], motion[i, 1], motion[i, 2] = relative_motion(t, y, lattice, i)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_spring(out: np.ndarray, other: np.ndarray, here: np.ndarray, stiffness: float) -> None:
     for i in range(out.size):
         out[i] += stiffness * (other[i] - here[i])
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(error_model="numpy", forceinline=True)
 def _spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acceleration: np.ndarray) -> None:
     """Accelerations (cells,) of a mass by its springs, in chunks of cells whose neighbours are all owned."""
     n = acceleration.size
@@ -95,7 +95,7 @@ def _spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acce
         acceleration[n - 1] = spring_acceleration(y, lattice, n - 1, mass)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
     """Time derivative ``f`` (owned,) of the state ``y`` (ghosted,): velocities, accelerations, powers."""
     shape, masses = lattice.shape, lattice.masses
