@@ -11,7 +11,7 @@ import pytest
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Sweep
 from vipetsc.parallel import SharedCounter
-from vipetsc.studies.sweep import sweep
+from vipetsc.studies.sweep import run_sweep
 
 TABLE = """
 name = "small"
@@ -39,12 +39,12 @@ amplitude = [0.1, 20.0, 40.0]
 def test_the_ensemble_does_not_depend_on_the_ranks(folder, team):
     comm = MPI.COMM_WORLD
     plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
-    result = sweep(plan, folder / "all", comm)
+    result = run_sweep(plan, folder / "all", comm)
     assert result.complete
     assert len(result.outcomes) == 6
     assert len(result.busy) == comm.size
     if comm.rank == 0:
-        alone = sweep(Sweep.from_table(tomllib.loads(TABLE)), folder / "alone", MPI.COMM_SELF)
+        alone = run_sweep(Sweep.from_table(tomllib.loads(TABLE)), folder / "alone", MPI.COMM_SELF)
         assert alone.complete
         assert_same_bits(datasets(folder / "all" / "ensemble.h5"), datasets(folder / "alone" / "ensemble.h5"))
     comm.Barrier()

@@ -13,7 +13,7 @@ from vipetsc.figures.style import new_figure, rc_style
 from vipetsc.io.run_file import ENERGIES, IMPACTS
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.spectra import kinetic_energy
-from vipetsc.studies.analysis import analyse
+from vipetsc.studies.reanalyse import measure_run
 
 NT, CELLS, INTERVAL = 240, 24, 2e-4
 
@@ -81,7 +81,7 @@ SHAPES = {
 def folder(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
     write_run(path / "run.h5", **SHAPES[request.param])
-    analyse(path / "run.h5", path / "analysis.h5")
+    measure_run(path)
     return path, request.param
 
 
@@ -116,7 +116,7 @@ def test_analysis_says_what_it_left_out(folder):
 def test_analysis_opens_in_xarray_and_agrees_with_the_run(tmp_path):
     xarray = pytest.importorskip("xarray")
     write_run(tmp_path / "run.h5")
-    analyse(tmp_path / "run.h5", tmp_path / "analysis.h5")
+    measure_run(tmp_path)
     with h5py.File(tmp_path / "run.h5") as run:
         kinetic = kinetic_energy(run["velocity"][...], four_band().masses)
     with xarray.open_dataset(tmp_path / "analysis.h5", engine="h5netcdf") as data:
@@ -141,10 +141,10 @@ def test_a_wrong_name_and_a_foreign_file_are_refused(tmp_path):
     write_run(tmp_path / "run.h5")
     with pytest.raises(KeyError, match="ledger"):
         draw("run", [tmp_path], ["leger"])
-    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+    with h5py.File(tmp_path / "run.h5", "w") as file:
         file["x"] = 1
     with pytest.raises(ValueError, match="not a run"):
-        analyse(tmp_path / "foreign.h5", tmp_path / "analysis.h5")
+        measure_run(tmp_path)
     assert not (tmp_path / "analysis.h5").exists()
 
 

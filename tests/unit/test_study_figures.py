@@ -23,7 +23,7 @@ from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.io.run_file import RunFile
 from vipetsc.lattice import bloch
 from vipetsc.spectra import filter_bank, normalised, transform
-from vipetsc.studies.sweep import sweep
+from vipetsc.studies.sweep import run_sweep
 
 CELLS = 40
 BASE = {
@@ -52,7 +52,7 @@ OF_CURVES = ("entropy", "entropy_all", "entropy_history")
 
 def made(table, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp(table["name"])
-    assert sweep(Sweep.from_table(BASE | table), folder).complete
+    assert run_sweep(Sweep.from_table(BASE | table), folder).complete
     return folder
 
 

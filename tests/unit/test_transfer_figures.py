@@ -19,7 +19,7 @@ from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.io.run_file import RunFile
 from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
-from vipetsc.studies.sweep import sweep
+from vipetsc.studies.sweep import run_sweep
 
 NAMES = ("transfer", "transfer_dispersions", "band_energies", "ibtet", "ibtet_backbone", "phase_regimes")
 AMPLITUDES = [1.0, 2.0, 30.0, 60.0, 120.0, 240.0, 500.0]
@@ -40,7 +40,7 @@ TABLE = {
 def made(folder, **options):
     """A sweep of 20 cells with one site in ``folder``; ``options`` go into ``[sweep]``."""
     table = TABLE | {"sweep": TABLE["sweep"] | options}
-    result = sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
+    result = run_sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
     assert result.complete
     return folder
 
@@ -140,7 +140,7 @@ def test_backbone_is_aligned_exactly(reduced):
         (group,) = file.values()
         about = dict(group.attrs)
         case, _ = next(ensemble.curves())
-        start = initiation_of(ensemble, case)
+        start = initiation_of(ensemble.folder, case)
         work = ensemble.curve("work", "amplitude", law="hertz")
         touched = ensemble.curve("contact_episodes", "amplitude", law="hertz") > 0
     np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)

@@ -11,12 +11,12 @@ import xarray
 from tests.conftest import datasets, small_case
 from vipetsc import Case, simulate
 from vipetsc.dynamics.ts import integrator
-from vipetsc.studies.analysis import analyse
+from vipetsc.studies.reanalyse import measure_run
 
 
 def test_every_file_opens_in_xarray_with_units(folder):
     simulate(small_case(), folder / "run")
-    analyse(folder / "run" / "run.h5", folder / "run" / "analysis.h5")
+    measure_run(folder / "run")
     groups = {"run.h5": [None, "energy", "sites", "impacts"], "analysis.h5": [None, "bands"]}
     for name, members in groups.items():
         for group in members:

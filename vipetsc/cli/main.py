@@ -151,9 +151,9 @@ def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
     from vipetsc.cli.plot import draw_source
-    from vipetsc.studies.analysis import analyse
+    from vipetsc.studies.reanalyse import measure_run
 
-    on_root(comm, lambda: analyse(folder / "run.h5", folder / "analysis.h5"))
+    on_root(comm, lambda: measure_run(folder))
     if case.output.figures:
         _name(draw_source("run", [folder], None, ("png",), comm), comm)
 
@@ -161,11 +161,11 @@ def _analyse_and_draw(case: Case, folder: Path, comm: MPI.Comm) -> None:
 def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Every combination in the section [sweep] of a case; goes on where it was stopped."""
     from vipetsc.cli.plot import draw_source
-    from vipetsc.studies.sweep import sweep as make
+    from vipetsc.studies.sweep import run_sweep
 
     plan = on_root(comm, lambda: _read(options.case, lambda path: Sweep.load(path, options.set)))
     folder = options.out or Path("runs") / plan.name
-    result = make(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
+    result = run_sweep(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
     _say(comm, sweep_table(result))
     if plan.figures and (folder / "ensemble.h5").exists():
         _name(draw_source("sweep", [folder], None, ("png",), comm), comm)
@@ -242,14 +242,14 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
     def seek() -> str:
         from vipetsc.figures import draw
-        from vipetsc.studies.design import design
+        from vipetsc.studies.design import search_design
 
         try:
             case = DesignCase.load(options.case, options.set)
         except OSError as error:
             raise FolderError(f"{options.case}: {error.strerror}; a case file (TOML) is needed") from None
         folder = options.out or Path("runs") / case.name
-        table = design(case, folder, options.force)
+        table = search_design(case, folder, options.force)
         return "\n".join([table, *(f"  {path}" for path in draw("design", [folder]))])
 
     _say(comm, on_root(comm, seek))
@@ -258,9 +258,9 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
-    from vipetsc.studies.reanalyse import analyse_again
+    from vipetsc.studies.reanalyse import reanalyse_folders
 
-    for path in analyse_again(options.path, comm):
+    for path in reanalyse_folders(options.path, comm):
         _say(comm, f"  {path}")
     return DONE
 

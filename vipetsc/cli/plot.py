@@ -72,19 +72,17 @@ def draw_source(
 
 
 def _prepare_run(folder: Path) -> None:
-    from vipetsc.io.run_file import RunFile
-    from vipetsc.studies.analysis import analyse
+    from vipetsc.studies.reanalyse import is_measured, measure_run
 
-    run, analysis = folder / "run.h5", folder / "analysis.h5"
+    run = folder / "run.h5"
     if not run.exists():
         raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
     try:
-        with RunFile(run):
-            pass
+        measured = is_measured(folder)
     except (OSError, ValueError, KeyError) as error:
         raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
-    if not analysis.exists() or analysis.stat().st_mtime < run.stat().st_mtime:
-        analyse(run, analysis)
+    if not measured:
+        measure_run(folder)
 
 
 def _prepare_sweeps(folders: Sequence[Path]) -> None:

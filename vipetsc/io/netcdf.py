@@ -21,6 +21,9 @@ import xarray as xr
 
 from vipetsc.io.atomic import atomic_write
 
+Variables = dict[str, xr.Variable]
+"""Variables by name, of which a dataset is made."""
+
 
 def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
     """``values`` over the named dimensions, with ``units``, ``long_name`` and further attributes."""

@@ -24,8 +24,8 @@ from vipetsc.modes.follow import follow_all, prepare_folder
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.backbone import relate_folders
-from vipetsc.studies.design import design
-from vipetsc.studies.sweep import sweep
+from vipetsc.studies.design import search_design
+from vipetsc.studies.sweep import run_sweep
 
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
 
@@ -125,7 +125,7 @@ class SweepStep(Step):
 
     def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
         """See ``Step``."""
-        sweep(self.plan, folder, comm, force=afresh, stop=stop, progress=True)
+        run_sweep(self.plan, folder, comm, force=afresh, stop=stop, progress=True)
 
     def left(self, root: Path) -> float:
         """CPU time of the members not made, at the mean of those that were, or at ``cost`` if that is more."""
@@ -219,7 +219,7 @@ class DesignStep(Step):
     def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
         """See ``Step``."""
         begun = on_root(comm, (folder / "case.toml").exists)
-        on_root(comm, lambda: design(self.case, folder, afresh or begun))
+        on_root(comm, lambda: search_design(self.case, folder, afresh or begun))
 
 
 @dataclass(frozen=True)

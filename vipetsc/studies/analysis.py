@@ -1,19 +1,25 @@
-"""The measures of one run: ``run.h5`` in, ``analysis.h5`` out."""
+"""The measures of one run: ``run.h5`` in, ``analysis.h5`` out.
+
+Kinetic energy in space and time, wavenumber content, dispersion (of the whole record, and of the cells before and
+after the first site), wavenumber partition and entropy (wavelets over the cells), energies of the pass bands and
+gaps, and the inter-band targeted energy transfer. The measures themselves stand in ``vipetsc.spectra``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
-import h5py
 import numpy as np
+import xarray as xr
 from scipy import fft
 
-from vipetsc.case import Case
-from vipetsc.io.atomic import atomic_write
-from vipetsc.io.run_file import RunFile
+import vipetsc
+from vipetsc.case import Case, Model
+from vipetsc.io.netcdf import Variables, variable
+from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import (
     TAPER,
@@ -25,169 +31,214 @@ from vipetsc.spectra import (
     part_energies,
     wavenumber_content,
 )
-from vipetsc.studies.datasets import put
-from vipetsc.studies.wavelets import SNAPSHOTS, put_wavelets
+from vipetsc.studies.wavelets import entropy_variables, partition_variables
 
 FORMAT_VERSION = 2
 IN_MEMORY = 2**30  # bytes of velocity that are read at once; larger fields are read mass by mass
-MAP_SIZE = 20_000_000  # values of a (t, cell) map that are written; longer records are thinned out in time
+MAP_SIZE = 20_000_000  # values of a (t, cell) map that are kept; longer records are thinned out in time
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
-
+SNAPSHOTS = 500  # at most this many samples are transformed by wavelets; averages over time need no more
+MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those who window the record
 
 # What is measured of one run, and of every run of a sweep; "maps" are the space-time maps of the other measures.
 FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "maps")
 REDUCED = ("entropy", "bands")
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """When the wave reached the first site: ``sample`` of the fields, and by what it is told."""
-
-    sample: int
-    reason: str
-
-
-def analyse(
-    run: RunFile | str | Path, out_path: str | Path, measures: Sequence[str] = FULL, arrival: float | None = None
-) -> None:
-    """Measure ``run`` and write ``out_path``, complete or not at all.
-
-    Kinetic energy in space-time, wavenumber content, dispersion of the whole record and of the cells before
-    and after the first site, wavenumber partition, entropy, energies of the pass bands and gaps, and the
-    inter-band transfer. What a run cannot give (no sites, a single cell) is left out and named in the
-    attribute ``left_out``.
+def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | None = None) -> xr.Dataset:
+    """Measure a run.
 
     Parameters
     ----------
     run
-        An open run, or the path of ``run.h5``.
+        A run, open or in memory, with its case in the attribute ``case``.
     measures
         Which of ``FULL``; "maps" are the space-time maps of what else is named.
     arrival
         The paper's t_hat in s, the time of the largest host velocity at the first site in the linear run. By
         default it is estimated from the group velocity: half the burst and the way to the site.
 
-    Raises
-    ------
-    OSError, ValueError
-        If the run cannot be read or is not one of ours.
+    Returns
+    -------
+    xarray.Dataset
+        The content of ``analysis.h5``. What the run cannot give (no sites, a single cell) is left out and named in
+        the attribute ``left_out``.
     """
-    with ExitStack() as stack:
-        aside = stack.enter_context(atomic_write(Path(out_path)))
-        if not isinstance(run, RunFile):
-            run = stack.enter_context(RunFile(run))
-        out = stack.enter_context(h5py.File(aside, "w"))
-        _measure(run, out, frozenset(measures), arrival)
-
-
-def describe(out: h5py.File, case: Case, status: str) -> None:
-    """Root attributes of an analysis: the resolved case and how its run ended."""
-    out.attrs["format_version"] = FORMAT_VERSION
-    out.attrs["case"] = case.to_toml()
-    out.attrs["status"] = status
-
-
-def _measure(run: RunFile, out: h5py.File, measures: frozenset[str], arrival: float | None) -> None:
-    describe(out, run.case, run.file.attrs.get("status", ""))
-    if "velocity" not in run.file:
-        out.attrs["left_out"] = "everything: the velocity was not recorded"
-        return
-    velocity = run.velocity if run.velocity.nbytes > IN_MEMORY else run.velocity[...]
-    nt, cells = velocity.shape[:2]
-    thinning = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
-    thin = slice(None, None, thinning)
-    out.attrs["thinning"] = thinning
-    left_out = []
-
-    put(out, "time", run.field_time[thin], "s", "time")
-    put(out, "cell", run.cells, "1", "cell")
-    kinetic = kinetic_energy(velocity, run.masses) if {"kinetic", "bands"} & measures else None
-    if "kinetic" in measures:
-        put(out, "kinetic_energy", kinetic[thin], "J", "kinetic energy of a cell", "time", "cell")
-    if cells > 1 and "wavenumber" in measures:
-        wavenumber, content = wavenumber_content(velocity, run.masses)
-        put(out, "wavenumber", wavenumber / run.spacing, "rad/cell", "wavenumber")
-        long_name = "kinetic energy per wavenumber bin"
-        put(out, "wavenumber_content", content[thin], "J", long_name, "time", "wavenumber")
+    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
+    about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}
+    if "velocity" not in run:
+        return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
+    analysis = _Analysis.of(run, frozenset(measures), arrival)
+    analysis.add_space_time()
+    nt, cells = analysis.velocity.shape[:2]
     if nt < 2:
-        left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
+        analysis.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
-        if "dispersion" in measures:
-            left_out += _put_dispersions(run, velocity, out)
-        if "bands" in measures:
-            _put_bands(run, velocity, kinetic, out, thin)
-        if cells > 1 and {"partition", "entropy"} & measures:
-            left_out += put_wavelets(run, velocity, out, measures, arrival)
+        analysis.add_dispersions()
+        analysis.add_bands()
+        analysis.add_wavelets()
     if cells == 1:
-        left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
-    out.attrs["left_out"] = "; ".join(left_out)
+        analysis.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
+    about |= {"thinning": analysis.thin.step, "left_out": "; ".join(analysis.left_out)} | analysis.attributes
+    return xr.Dataset(analysis.variables, attrs=about)
 
 
-def _put_dispersions(run: RunFile, velocity: np.ndarray, out: h5py.File) -> list[str]:
-    """Write the dispersion of all cells, of those before and of those after the first site."""
-    nt, cells = velocity.shape[:2]
-    if cells < 2:
-        return ["dispersion: a single cell was recorded"]
-    windows, left_out = {"dispersion": slice(None)}, []
-    if run.leading_site is None:
-        left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
-    else:
-        site = run.site_cells[run.leading_site]
-        low, high = np.searchsorted(run.cells, [site, site + 1])
-        sides = slice(0, int(low)), slice(int(high), cells)
-        before, after = sides if run.model.drive_cell < site else sides[::-1]
-        windows |= {"dispersion_before": before, "dispersion_after": after}
-    lengths = fft.next_fast_len(nt, real=True), cells
-    highest = HEADROOM * pass_bands(run.model.chain.cell)[-1].high
-    for name, window in windows.items():
-        if len(range(cells)[window]) < 2:
-            left_out.append(f"{name}: fewer than two of its cells were recorded")
-            continue
-        spectrum = dispersion(
-            velocity,
-            run.masses,
-            run.field_interval,
-            cells=window,
+class _StoredField:
+    """A field (t, cell, dof) that stays in its file; what is sliced is read."""
+
+    def __init__(self, field: xr.DataArray) -> None:
+        self._field = field
+        self.shape = field.shape
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return np.asarray(self._field[index].values)
+
+
+@dataclass
+class _Analysis:
+    """A run on its way to an analysis: what the measures need of it, and what they have given so far.
+
+    ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) as numbers from 1, ``site``
+    the cell of the leading site, None without sites; ``thin`` picks the samples of the space-time maps.
+    """
+
+    model: Model
+    velocity: Any
+    time: np.ndarray
+    interval: float
+    cells: np.ndarray
+    site: int | None
+    measures: frozenset[str]
+    arrival: float | None
+    thin: slice
+    variables: Variables = field(default_factory=dict)
+    attributes: dict[str, Any] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, run: xr.Dataset, measures: frozenset[str], arrival: float | None) -> _Analysis:
+        recorded, leading = run["velocity"], leading_site(run)
+        velocity = _StoredField(recorded) if recorded.nbytes > IN_MEMORY else recorded.values
+        site = None if leading is None else int(run["sites/cell"].values[leading])
+        nt, cells = velocity.shape[:2]
+        thin = slice(None, None, -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS))
+        model, interval = Case.of(run).model(), field_interval(run)
+        return cls(model, velocity, field_time(run), interval, run["cell"].values, site, measures, arrival, thin)
+
+    @property
+    def masses(self) -> np.ndarray:
+        """Masses (dof) of a cell in kg."""
+        return np.asarray(self.model.chain.cell.masses)
+
+    @cached_property
+    def kinetic(self) -> np.ndarray:
+        """Kinetic energy (t, cell) in J."""
+        return kinetic_energy(self.velocity, self.masses)
+
+    def add_space_time(self) -> None:
+        """Kinetic energy of the cells, and by wavenumber, over time."""
+        self.variables["time"] = variable("time", self.time[self.thin], "s", "time")
+        self.variables["cell"] = variable("cell", self.cells, "1", "cell")
+        if "kinetic" in self.measures:
+            dims, long_name = ("time", "cell"), "kinetic energy of a cell"
+            self.variables["kinetic_energy"] = variable(dims, self.kinetic[self.thin], "J", long_name)
+        if "wavenumber" in self.measures and len(self.cells) > 1:
+            wavenumber, content = wavenumber_content(self.velocity, self.masses)
+            wavenumber = wavenumber / int(self.cells[1] - self.cells[0])
+            dims, long_name = ("time", "wavenumber"), "kinetic energy per wavenumber bin"
+            self.variables["wavenumber"] = variable("wavenumber", wavenumber, "rad/cell", "wavenumber")
+            self.variables["wavenumber_content"] = variable(dims, content[self.thin], "J", long_name)
+
+    def add_dispersions(self) -> None:
+        """Dispersion of all cells, of those before and of those after the first site."""
+        if "dispersion" not in self.measures:
+            return
+        nt, cells = self.velocity.shape[:2]
+        if cells < 2:
+            self.left_out.append("dispersion: a single cell was recorded")
+            return
+        windows = {"dispersion": slice(None)}
+        if self.site is None:
+            self.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
+        else:
+            low, high = map(int, np.searchsorted(self.cells, [self.site, self.site + 1]))
+            sides = slice(0, low), slice(high, cells)
+            before, after = sides if self.model.drive_cell < self.site else sides[::-1]
+            windows |= {"dispersion_before": before, "dispersion_after": after}
+        lengths = fft.next_fast_len(nt, real=True), cells
+        highest = HEADROOM * pass_bands(self.model.chain.cell)[-1].high
+        for name, window in windows.items():
+            if len(range(cells)[window]) < 2:
+                self.left_out.append(f"{name}: fewer than two of its cells were recorded")
+                continue
+            side = name.removeprefix("dispersion").strip("_")
             # A wave that crosses the border of a window would smear over all wavenumbers.
-            tapers=(TAPER, TAPER if name == "dispersion" else 0.5),
-            lengths=lengths,
-            highest=highest,
-        ).folded()
-        if "frequency" not in out:
-            put(out, "frequency", spectrum.frequency, "rad/s", "angular frequency")
-        where = name.removeprefix("dispersion").strip("_")
-        long_name = "mean kinetic energy per bin" + (f", cells {where} the first site" if where else "")
-        put(out, name, spectrum.energy, "J", long_name, "wavenumber", "frequency")
-    return left_out
+            tapers = TAPER, 0.5 if side else TAPER
+            field = self.velocity, self.masses, self.interval
+            spectrum = dispersion(*field, cells=window, tapers=tapers, lengths=lengths, highest=highest).folded()
+            long_name = "mean kinetic energy per bin" + (f", cells {side} the first site" if side else "")
+            self.variables["frequency"] = variable("frequency", spectrum.frequency, "rad/s", "angular frequency")
+            self.variables[name] = variable(("wavenumber", "frequency"), spectrum.energy, "J", long_name)
 
+    def add_bands(self) -> None:
+        """Energies of the pass bands and gaps, and the inter-band transfer."""
+        if "bands" not in self.measures:
+            return
+        parts = Parts.of(pass_bands(self.model.chain.cell))
+        energy = part_energies(self.velocity, self.masses, self.interval, parts.edges)
+        above = parts.above(self.model.drive.frequency)
+        first, reason = self._front()
+        total = energy[:, first:].sum(axis=0)
+        moving = total > 0
+        shares = (energy[:, first:][:, moving] / total[moving]).mean(axis=1)
+        edge, part = "bands/edge", "bands/part"
+        numbers, names = np.arange(1, len(parts.names) + 1), list(parts.names)
+        long_name = "kinetic energy of a part"
+        self.variables |= {
+            edge: variable(edge, np.arange(len(parts.edges)), "1", "edge of a part"),
+            part: variable(part, numbers, "1", "part of the frequency axis"),
+            "bands/edges": variable(edge, parts.edges, "rad/s", "edges of the pass bands and gaps"),
+            "bands/energy": variable((part, "time"), energy[:, self.thin], "J", long_name, parts=names),
+            "bands/above": variable(part, above.astype(np.int8), "1", "1 for a pass band above the driven one"),
+            "bands/total": variable("time", self.kinetic.sum(axis=1)[self.thin], "J", "kinetic energy"),
+            "bands/share": variable(part, shares, "1", "mean share of a part after the wave's arrival"),
+        }
+        transfer, told = ibtet(energy, above, first), {"start": self.time[first], "starts_when": reason}
+        self.variables["ibtet"] = variable((), transfer, "1", "inter-band energy transfer", **told)
 
-def _put_bands(run: RunFile, velocity: np.ndarray, kinetic: np.ndarray, out: h5py.File, thin: slice) -> None:
-    """Write the energies of the parts and the inter-band transfer."""
-    parts = Parts.of(pass_bands(run.model.chain.cell))
-    energy = part_energies(velocity, run.masses, run.field_interval, parts.edges)
-    above = parts.above(run.model.drive.frequency)
-    arrival = _arrival(run, kinetic)
-    bands = out.create_group("bands")
-    put(bands, "edge", np.arange(len(parts.edges)), "1", "edge of a part")
-    put(bands, "part", np.arange(1, len(parts.names) + 1), "1", "part of the frequency axis")
-    put(bands, "edges", parts.edges, "rad/s", "edges of the pass bands and gaps", "edge")
-    put(bands, "energy", energy[:, thin], "J", "kinetic energy of a part", "part", "time")
-    put(bands, "above", above.astype(np.int8), "1", "1 for a pass band above the driven one", "part")
-    bands["energy"].attrs["parts"] = list(parts.names)
-    put(bands, "total", kinetic.sum(axis=1)[thin], "J", "kinetic energy", "time")
-    whole = energy[:, arrival.sample :].sum(axis=0)
-    moving = whole > 0
-    shares = (energy[:, arrival.sample :][:, moving] / whole[moving]).mean(axis=1)
-    put(bands, "share", shares, "1", "mean share of a part after the wave's arrival", "part")
-    share = put(out, "ibtet", ibtet(energy, above, arrival.sample), "1", "inter-band energy transfer")
-    share.attrs["start"] = run.field_time[arrival.sample]
-    share.attrs["starts_when"] = arrival.reason
+    def _front(self) -> tuple[int, str]:
+        """The sample at which the wave reaches the first site, and by what it is told."""
+        if self.site is None:
+            after = int(np.searchsorted(self.time, self.model.drive.duration))
+            return min(after, len(self.time) - 1), "the drive ends (the lattice has no sites)"
+        at = int(np.argmin(np.abs(self.cells - self.site)))
+        reason = f"the kinetic energy of cell {self.cells[at]} first exceeds 1 % of its largest value"
+        return front_arrival(self.kinetic[:, at]), reason
 
+    def add_wavelets(self) -> None:
+        """Wavenumber entropy of the host velocity, and partition of the velocity."""
+        nt, cells = self.velocity.shape[:2]
+        if cells < 2 or not {"partition", "entropy"} & self.measures:
+            return
+        if cells > MOST_CELLS:
+            self.left_out.append(f"partition, entropy: more than {MOST_CELLS} cells were recorded")
+            return
+        stride = -(-nt // (SNAPSHOTS + 1))
+        time, maps = self.time[::stride], "maps" in self.measures
+        if "entropy" in self.measures:
+            arrival, reason = self._arrival()
+            # A record that ends before keeps its last snapshot.
+            start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
+            host = np.ascontiguousarray(self.velocity[::stride, :, self.model.chain.cell.host])
+            self.variables |= entropy_variables(host, time, start, maps)
+            self.attributes |= {"entropy/start": time[start], "entropy/starts_when": reason}
+        if "partition" in self.measures:
+            self.variables |= partition_variables(self.velocity[::stride], self.masses, time, maps)
 
-def _arrival(run: RunFile, kinetic: np.ndarray) -> Arrival:
-    if run.leading_site is None:
-        after = int(np.searchsorted(run.field_time, run.model.drive.duration))
-        return Arrival(min(after, len(run.field_time) - 1), "the drive ends (the lattice has no sites)")
-    site = run.nearest(run.site_cells[run.leading_site])
-    reason = f"the kinetic energy of cell {run.cells[site]} first exceeds 1 % of its largest value"
-    return Arrival(front_arrival(kinetic[:, site]), reason)
+    def _arrival(self) -> tuple[float, str]:
+        """The paper's t_hat in s, and by what it is told."""
+        if self.arrival is not None:
+            return self.arrival, "the largest host velocity at the first site in the linear run"
+        distance = 0 if self.site is None else abs(self.site - 1 - self.model.drive_cell)
+        estimate = 0.5 * self.model.drive.duration + distance / self.model.speed
+        return estimate, "half the burst and the way to the first site at the group velocity"

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import h5py
 import numpy as np
+import xarray as xr
 from scipy.optimize import minimize_scalar
 
+import vipetsc
 from vipetsc.case import Case, case_id
-from vipetsc.io.atomic import atomic_write
-from vipetsc.io.ensemble_file import EnsembleFile
 from vipetsc.io.folder import FolderError
-from vipetsc.io.run_file import RunFile
+from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
+from vipetsc.io.read import curves, open_ensemble, open_run
 from vipetsc.spectra import Fit, power_law
-from vipetsc.studies.datasets import put
-from vipetsc.studies.members import LinearWave, linear_case
+from vipetsc.studies.linear import LinearWave, leading_cell, linear_case
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
@@ -46,14 +48,14 @@ class Slope:
 
         Raises
         ------
-        OSError, KeyError
-            If the file holds no branch of ours.
+        OSError
+            If the file cannot be opened.
         ValueError
-            If the branch does not reach a contact.
+            If it holds no branch of ours, or one that does not reach a contact.
         """
-        with h5py.File(path) as file:
-            energy, slope, region, contacts = (file[n][...] for n in ("energy", "slope", "region", "contacts"))
-            kind = file["kind"][...]
+        with open_netcdf(path, "branch", ("energy", "slope", "region", "contacts", "kind", "case")) as file:
+            names = "energy", "slope", "region", "contacts", "kind"
+            energy, slope, region, contacts, kind = (file[name].values for name in names)
             table = tomllib.loads(file.attrs["case"])
         touched = np.nonzero(contacts > 0)[0]
         if not touched.size or touched[0] == 0:
@@ -123,9 +125,9 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     ValueError
         If the branch has no region III.
     """
-    there = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
-    order = np.argsort(work[there], kind="stable")
-    energy, ibtet = work[there][order] * (slope.grazing / initiation), ibtet[there][order]
+    valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
+    order = np.argsort(work[valid], kind="stable")
+    energy, ibtet = work[valid][order] * (slope.grazing / initiation), ibtet[valid][order]
     region = slope.inside(VIBRO_IMPACT)
     if not region.any():
         raise ValueError("the branch has no region III; follow it to higher energy")
@@ -133,32 +135,38 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     fitted = (energy >= known.min()) & (energy <= known.max()) & (np.arange(len(energy)) >= np.argmax(ibtet))
     if fitted.sum() < FEWEST:
         return Alignment(energy, ibtet, fitted, np.nan, None, None)
-    rising = np.argsort(known)
-    at = np.interp(np.log(energy[fitted]), np.log(known[rising]), np.log(steep[rising]))
-    seen = np.log(ibtet[fitted])
+    order = np.argsort(known)
+    at = np.interp(np.log(energy[fitted]), np.log(known[order]), np.log(steep[order]))
+    measured = np.log(ibtet[fitted])
 
     def misfit(logarithm: float) -> float:
-        return float(np.sum((np.log(np.exp(at - logarithm) + floor) - seen) ** 2))
+        return float(np.sum((np.log(np.exp(at - logarithm) + floor) - measured) ** 2))
 
     # Without a floor the mean of the differences is the answer; the floor only asks for a larger divisor.
-    start = float(np.mean(at - seen))
+    start = float(np.mean(at - measured))
     best = minimize_scalar(misfit, bracket=(start, start + 0.5), options={"xtol": 1e-10})
     law, steepness = (power_law(energy[fitted], y).log_log for y in (ibtet[fitted], np.exp(at)))
     return Alignment(energy, ibtet, fitted, float(np.exp(best.x)), law, steepness)
 
 
-def initiation_of(ensemble: EnsembleFile, case: Case) -> Initiation:
-    """The initiation of the members like ``case``, from their linear run; raises OSError if that is gone."""
-    folder = ensemble.folder / "linear" / case_id(linear_case(case))
-    wave = LinearWave.read(folder / "wave.h5")
-    with RunFile(folder / "run.h5") as run:
-        work = float(run.energies["work"][-1])
+def initiation_of(folder: Path, case: Case) -> Initiation:
+    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run.
+
+    Raises
+    ------
+    OSError, ValueError
+        If the linear run is gone or cannot be read.
+    """
+    linear = folder / "linear" / case_id(linear_case(case))
+    wave = LinearWave.read(linear / "wave.h5")
+    with open_run(linear / "run.h5") as run:
+        work = float(run["energy/work"][-1])
     sites = np.asarray(case.contacts.sites)
-    first = int(np.argmin(np.abs(sites - case.drive.cell)))
+    first = int(np.argmax(sites == leading_cell(case)))
     return Initiation.of(wave.envelope[sites - 1], np.asarray(case.contacts.clearance), first, work)
 
 
-def relate(ensemble: EnsembleFile, branches: Sequence[Path]) -> Path | None:
+def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
     """Write ``backbone.h5`` beside the ensemble: a group a curve; returns its path, None if there is no such curve.
 
     A curve over the amplitude is laid over the branch of its law and reading, or of its law alone if there is
@@ -167,43 +175,104 @@ def relate(ensemble: EnsembleFile, branches: Sequence[Path]) -> Path | None:
 
     Raises
     ------
-    OSError, KeyError, ValueError
+    OSError, ValueError
         If a branch or a linear run cannot be read, or a branch has no region III.
     """
-    if "ibtet" not in ensemble or np.all(np.isnan(ensemble.values("ibtet"))):
+    if "ibtet" not in ensemble or bool(ensemble["ibtet"].isnull().all()):
         return None
     slopes = [Slope.read(folder / BRANCH) for folder in branches]
-    path = ensemble.folder / "backbone.h5"
-    left_out, made = [], 0
-    with atomic_write(path) as aside, h5py.File(aside, "w") as file:
-        file.attrs["format_version"] = FORMAT_VERSION
-        file.attrs["case"] = ensemble.file.attrs["case"]
-        for case, index in ensemble.curves("amplitude"):
-            if not case.contacts.sites:
-                continue
-            reading, law = case.lattice.reading, case.contacts.law
-            name = f"{reading}-{law}-{len(case.contacts.sites)}-sites-{case.drive.cycles:g}-cycles"
-            own = [s for s in slopes if s.law == law]
-            own = [s for s in own if s.reading == reading] or own
-            episodes, ibtet = ensemble.values("contact_episodes")[index], ensemble.values("ibtet")[index]
-            untouched = ibtet[episodes == 0]
-            if name in file:
-                left_out.append(f"{name}: another curve has the same law, reading, sites and cycles")
-                continue
-            if not own or not untouched.size:
-                left_out.append(f"{name}: " + ("no member without contact" if own else f"no branch of the law {law}"))
-                continue
-            initiation, floor = initiation_of(ensemble, case), float(untouched.mean())
-            found = align(ensemble.values("work")[index], ibtet, initiation.energy, floor, own[0])
-            if found.law is None:
-                left_out.append(f"{name}: {found.fitted.sum()} points in region III behind the peak")
-                continue
-            group = file.create_group(name)
-            group.attrs["case"] = case.to_toml()
-            _fill(group, found, initiation, floor, own[0])
-            made += 1
-        file.attrs["left_out"] = left_out
-    return path if made else None
+    folder, left_out = Path(ensemble.attrs["folder"]), []
+    variables: Variables = {}
+    attributes: dict[str, Any] = {}
+    for curve, member in curves(ensemble):
+        case = Case.load(member / "case.toml")
+        if not case.contacts.sites:
+            continue
+        name = _name(case)
+        if f"{name}/case" in attributes:
+            left_out.append(f"{name}: another curve has the same law, reading, sites and cycles")
+            continue
+        result = _relate_curve(curve, case, slopes, folder)
+        if isinstance(result, str):
+            left_out.append(f"{name}: {result}")
+            continue
+        variables |= {f"{name}/{key}": _inside(name, item) for key, item in result[0].items()}
+        attributes |= {f"{name}/{key}": value for key, value in (result[1] | {"case": case.to_toml()}).items()}
+    about = {"format_version": FORMAT_VERSION, "case": ensemble.attrs["case"], "left_out": left_out}
+    about |= {"vipetsc_version": vipetsc.__version__, "sources": _sources(folder, branches)}
+    write_netcdf(folder / "backbone.h5", xr.Dataset(variables, attrs=about | attributes))
+    return folder / "backbone.h5" if variables else None
+
+
+def _name(case: Case) -> str:
+    """The group of a curve: reading, law, number of sites and cycles."""
+    sites = len(np.asarray(case.contacts.sites))
+    return f"{case.lattice.reading}-{case.contacts.law}-{sites}-sites-{case.drive.cycles:g}-cycles"
+
+
+def _relate_curve(
+    curve: xr.Dataset, case: Case, slopes: Sequence[Slope], folder: Path
+) -> tuple[Variables, dict[str, Any]] | str:
+    """Variables and attributes of one curve's group, or why there is none."""
+    reading, law = case.lattice.reading, case.contacts.law
+    of_law = [slope for slope in slopes if slope.law == law]
+    candidates = [slope for slope in of_law if slope.reading == reading] or of_law
+    work, ibtet = curve["work"].values, curve["ibtet"].values
+    untouched = ibtet[curve["contact_episodes"].values == 0]
+    if not candidates:
+        return f"no branch of the law {law}"
+    if not untouched.size:
+        return "no member without contact"
+    slope, initiation, floor = candidates[0], initiation_of(folder, case), float(untouched.mean())
+    aligned = align(work, ibtet, initiation.energy, floor, slope)
+    if aligned.law is None or aligned.steepness is None:
+        return f"{aligned.fitted.sum()} points in region III behind the peak"
+    fitted = aligned.fitted.astype(np.int8)
+    variables = {
+        "energy": variable("energy", aligned.energy, "J", "work of the drive, normalised to the branch"),
+        "ibtet": variable("energy", aligned.ibtet, "1", "inter-band energy transfer"),
+        "fitted": variable("energy", fitted, "1", "1 in region III at or behind the peak"),
+        "point": variable("point", np.arange(len(slope.energy)), "1", "regular point of the branch"),
+        "branch/energy": variable("point", slope.energy, "J", "energy of the branch"),
+        "branch/slope": variable("point", slope.slope, "Hz/J", "slope df/dE"),
+        "branch/region": variable("point", slope.region, "1", "region of the branch"),
+    }
+    low, high = aligned.law.exponent_interval
+    return variables, {
+        "branch_reading": slope.reading,
+        "grazing_energy": slope.grazing,
+        "initiation_amplitude": initiation.amplitude,
+        "initiation_energy": initiation.energy,
+        "onset_amplitude": initiation.onset,
+        "floor": floor,
+        "divisor": aligned.divisor,
+        "exponent": aligned.law.exponent,
+        "exponent_low": low,
+        "exponent_high": high,
+        "factor": aligned.law.factor,
+        "r2_adjusted": aligned.law.r2_adjusted,
+        "slope_exponent": aligned.steepness.exponent,
+    }
+
+
+def _inside(group: str, item: xr.Variable) -> xr.Variable:
+    """``item`` over the dimensions of ``group``."""
+    return xr.Variable([f"{group}/{dim}" for dim in item.dims], item.values, item.attrs)
+
+
+def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
+    """SHA-256 of the files that ``backbone.h5`` is made from, by folder."""
+    files = {folder.name: folder / "ensemble.h5"} | {branch.name: branch / BRANCH for branch in branches}
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+
+
+def is_related(folder: Path, branches: Sequence[Path]) -> bool:
+    """Whether ``folder/backbone.h5`` is what this version makes of the sweep and the ``branches`` as they are now."""
+    if not (folder / "backbone.h5").exists():
+        return False
+    with open_netcdf(folder / "backbone.h5", "relation") as file:
+        made, version = file.attrs.get("sources", "{}"), file.attrs.get("vipetsc_version")
+    return version == vipetsc.__version__ and json.loads(made) == _sources(folder, branches)
 
 
 def relate_folders(folders: Sequence[Path]) -> list[Path]:
@@ -222,36 +291,7 @@ def relate_folders(folders: Sequence[Path]) -> list[Path]:
     written = []
     for folder in sweeps if branches else ():
         try:
-            with EnsembleFile(folder) as ensemble:
-                written.append(relate(ensemble, branches))
+            written.append(relate(open_ensemble(folder), branches))
         except (KeyError, OSError, ValueError) as error:
             raise FolderError(f"{folder} beside {', '.join(map(str, branches))}: {error}") from None
     return [path for path in written if path]
-
-
-def _fill(group: h5py.Group, found: Alignment, initiation: Initiation, floor: float, slope: Slope) -> None:
-    put(group, "energy", found.energy, "J", "work of the drive, normalised to the branch")
-    put(group, "ibtet", found.ibtet, "1", "inter-band energy transfer", "energy")
-    put(group, "fitted", found.fitted.astype(np.int8), "1", "1 in region III at or behind the peak", "energy")
-    put(group, "point", np.arange(len(slope.energy)), "1", "regular point of the branch")
-    put(group, "branch/energy", slope.energy, "J", "energy of the branch", "point")
-    put(group, "branch/slope", slope.slope, "Hz/J", "slope df/dE", "point")
-    put(group, "branch/region", slope.region, "1", "region of the branch", "point")
-    low, high = found.law.exponent_interval
-    numbers = {
-        "branch_reading": slope.reading,
-        "grazing_energy": slope.grazing,
-        "initiation_amplitude": initiation.amplitude,
-        "initiation_energy": initiation.energy,
-        "onset_amplitude": initiation.onset,
-        "floor": floor,
-        "divisor": found.divisor,
-        "exponent": found.law.exponent,
-        "exponent_low": low,
-        "exponent_high": high,
-        "factor": found.law.factor,
-        "r2_adjusted": found.law.r2_adjusted,
-        "slope_exponent": found.steepness.exponent,
-    }
-    for key, value in numbers.items():
-        group.attrs[key] = value

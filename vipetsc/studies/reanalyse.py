@@ -6,16 +6,18 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from vipetsc.case import Sweep
+import vipetsc
+from vipetsc.case import Case, Sweep
 from vipetsc.io.folder import FolderError
-from vipetsc.io.run_file import RunFile
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.io.netcdf import open_netcdf, write_netcdf
+from vipetsc.io.read import open_run
+from vipetsc.parallel import on_root
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.members import LinearWave, Members
+from vipetsc.studies.members import MemberStore
 from vipetsc.studies.sweep import conclude
 
 
-def analyse_again(paths: list[Path], comm: MPI.Comm) -> list[Path]:
+def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     """Measure the runs in ``paths`` (folders of runs or sweeps, or ``run.h5``); returns the files written.
 
     The runs are shared over the ranks of ``comm``. Members of a sweep that kept no fields stay as they are; the
@@ -26,46 +28,62 @@ def analyse_again(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     FolderError
         If a path holds neither runs nor a sweep; nothing is written then.
     """
-    runs = on_root(comm, lambda: [folder for path in paths for folder in _runs(path)])
-    measured: list[Path] = []
+    runs = on_root(comm, lambda: [folder for path in paths for folder in _run_folders(path)])
+    measured = []
     for folder in runs[comm.rank :: comm.size]:
-        with RunFile(folder / "run.h5") as run:
-            if "velocity" in run.file or not (folder.parent / "index.json").exists():
-                analyse(run, folder / "analysis.h5", arrival=_arrival(folder, run))
-                measured.append(folder / "analysis.h5")
+        with open_run(folder / "run.h5") as run:
+            has_fields = "velocity" in run
+        if has_fields or not (folder.parent / "index.json").exists():
+            measured.append(measure_run(folder))
     written = sorted(path for share in comm.allgather(measured) for path in share)
-    for folder in paths:
-        if on_root(comm, (folder / "index.json").exists):
-            written.append(on_root(comm, lambda folder=folder: _reassemble(folder)))
-    return written
+    return written + on_root(comm, lambda: [_reassemble(path) for path in paths if (path / "index.json").exists()])
 
 
-def _runs(path: Path) -> list[Path]:
+def measure_run(folder: Path) -> Path:
+    """Write ``folder/analysis.h5``; a run of a sweep has its wave's arrival from the sweep. Returns the path.
+
+    Raises
+    ------
+    OSError, ValueError
+        If ``run.h5`` cannot be read or is not one of ours.
+    """
+    with open_run(folder / "run.h5") as run:
+        case = Case.of(run)
+        wave = MemberStore(folder.parent).wave(case)
+        write_netcdf(folder / "analysis.h5", analyse(run, arrival=wave.arrival_at(case) if wave else None))
+    return folder / "analysis.h5"
+
+
+def is_measured(folder: Path) -> bool:
+    """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
+    with open_run(folder / "run.h5") as run:
+        if not (folder / "analysis.h5").exists():
+            return False
+        with open_netcdf(folder / "analysis.h5", "analysis") as analysis:
+            expected = {key: run.attrs.get(key) for key in ("case", "status")}
+            expected["vipetsc_version"] = vipetsc.__version__
+            return all(analysis.attrs.get(key) == value for key, value in expected.items())
+
+
+def _run_folders(path: Path) -> list[Path]:
+    """The folders of the runs in ``path``, every one checked; raises FolderError."""
     folder = path.parent if path.name == "run.h5" else path
     sweep = (folder / "index.json").exists()
-    found = [run.parent for run in sorted(folder.glob("*/run.h5"))] if sweep else [folder]
+    folders = [run.parent for run in sorted(folder.glob("*/run.h5"))] if sweep else [folder]
     if not sweep and not (folder / "run.h5").exists():
         raise FolderError(f"{path}: holds no run.h5; the folder of a finished run or sweep is needed")
-    for one in found:
+    for one in folders:
         try:
-            with RunFile(one / "run.h5"):
-                pass
+            open_run(one / "run.h5").close()
         except (OSError, ValueError, KeyError) as error:
             raise FolderError(f"{one / 'run.h5'}: is not a run of vipetsc ({error})") from None
-    return found
-
-
-def _arrival(folder: Path, run: RunFile) -> float | None:
-    """The wave's arrival at the first site as the run's sweep knows it, None outside a sweep."""
-    shop = Members(folder.parent, None, MPI.COMM_SELF, StopRequest())
-    wave = shop.linear_folder(run.case) / "wave.h5"
-    return shop.arrival(run.case, LinearWave.read(wave)) if wave.exists() else None
+    return folders
 
 
 def _reassemble(folder: Path) -> Path:
+    """Put the ensemble of the sweep in ``folder`` together anew."""
     plan = Sweep.load(folder / "case.toml")
-    shop = Members(folder, plan.options, MPI.COMM_SELF, StopRequest())
-    outcomes = conclude(plan, plan.members(), shop, {})
+    outcomes = conclude(plan, plan.members(), MemberStore(folder, plan.options), {})
     if not all(outcomes):
         raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
     return folder / "ensemble.h5"

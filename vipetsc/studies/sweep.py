@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from mpi4py import MPI
 
@@ -15,15 +15,17 @@ import numpy as np
 
 from vipetsc.case import Case, Sweep, SweepMember
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import FolderError
-from vipetsc.io.store import claim_folder
+from vipetsc.io.folder import SWEEP, claim_folder
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_root
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Outcome, assemble
-from vipetsc.studies.members import LinearWave, Members, StoppedError
+from vipetsc.studies.linear import LinearWave
+from vipetsc.studies.members import MemberStore, StoppedError
 
 FORMAT_VERSION = 1
 # What a member may raise and leave the others to go on: the machine's limits, a solver's or a file's refusal.
 FAILURES = (ArithmeticError, MemoryError, OSError, RuntimeError, ValueError)
+
+Job = TypeVar("Job", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class SweepResult:
         return sum(o is not None and o.status == status for o in self.outcomes)
 
 
-def sweep(
+def run_sweep(
     plan: Sweep,
     folder: str | Path,
     comm: MPI.Comm = MPI.COMM_WORLD,
@@ -61,14 +63,14 @@ def sweep(
 ) -> SweepResult:
     """Make every member of ``plan`` in ``folder``, then ``index.json`` and ``ensemble.h5``.
 
-    Members that are complete are not made again, so a sweep that was killed goes on where it was; ``force``
-    begins anew. A member that fails is recorded with its reason and the others go on. All ranks of ``comm`` make
-    members; ``[sweep] ranks`` of them share each.
+    Members that are complete and made by this version are not made again, so a sweep that was killed goes on where
+    it was; ``force`` begins anew. A member that fails is recorded with its reason and the others go on. All ranks of
+    ``comm`` make members; ``[sweep] ranks`` of them share each.
 
     Raises
     ------
     CaseError
-        If no member is a sound case.
+        If no member is a valid case.
     FolderError
         If the folder holds anything but this sweep.
     """
@@ -77,53 +79,56 @@ def sweep(
     members = plan.members()
     on_root(comm, lambda: _prepare(plan, folder, force))
     team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
-    crew = TaskPool(comm, team, stop)
-    shop = Members(folder, plan.options, team, stop)
+    pool = TaskPool(comm, team, stop)
+    store = MemberStore(folder, plan.options, team, stop)
 
     cases = {m.id: m.case for m in members if m.case}
-    missing = on_root(comm, lambda: [key for key, case in cases.items() if not shop.is_complete(case)])
-    linear = {shop.linear_folder(cases[key]): cases[key] for key in missing}
+    missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_current(case)])
+    source = {key: store.linear_folder(cases[key]) for key in missing}
+    linear = {source[key]: cases[key] for key in missing}
     absent = on_root(comm, lambda: [path for path in linear if not (path / "wave.h5").exists()])
-    reasons = crew.share(absent, lambda path: shop.make_linear(linear[path]), None)
-    broken = {path: reason for path, reason in reasons.items() if reason}
-    waves = {path: shop.wave(case) for path, case in linear.items() if (path / "wave.h5").exists()}
-    feasible = [key for key in missing if shop.linear_folder(cases[key]) in waves]
-    order = sorted(feasible, key=lambda key: -_cost(cases[key], waves[shop.linear_folder(cases[key])]))
+    failures = pool.share(absent, lambda path: store.make_linear(linear[path]), None)
+    ready = on_root(comm, lambda: [path for path in linear if (path / "wave.h5").exists()])
+    waves = {path: LinearWave.read(path / "wave.h5") for path in ready}
+    feasible = [key for key in missing if source[key] in waves]
+    order = sorted(feasible, key=lambda key: -_cost(cases[key], waves[source[key]]))
     bar = Progress(comm, len(order), "runs", show=progress)
-    made = crew.share(order, lambda key: shop.make(cases[key], waves[shop.linear_folder(cases[key])]), bar)
-    reasons = {key: broken.get(shop.linear_folder(cases[key])) for key in missing if key not in feasible} | made
+    made = pool.share(order, lambda key: store.make(cases[key], waves[source[key]]), bar)
+    reasons = {key: failures.get(source[key], "") for key in missing} | made
 
     seconds = time.perf_counter() - begin
-    busy = tuple(comm.allgather(crew.busy / seconds))
-    outcomes = on_root(comm, lambda: conclude(plan, members, shop, reasons))
+    busy = tuple(comm.allgather(pool.busy / seconds))
+    outcomes = on_root(comm, lambda: conclude(plan, members, store, reasons))
     team.Free()
-    return SweepResult(outcomes, sum(r == "" for r in made.values()), seconds, busy, folder)
+    return SweepResult(outcomes, sum(reason == "" for reason in made.values()), seconds, busy, folder)
 
 
 def conclude(
-    plan: Sweep, members: list[SweepMember], shop: Members, reasons: dict[str, str | None]
+    plan: Sweep, members: list[SweepMember], store: MemberStore, reasons: dict[str, str]
 ) -> tuple[Outcome | None, ...]:
     """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns how the members ended.
 
     ``reasons`` names the members (by id) that failed just now, and why.
     """
-    outcomes = tuple(_outcome(member, shop, reasons) for member in members)
-    _write_index(plan, members, outcomes, shop.folder)
-    if all(outcomes):
-        assemble(plan, members, outcomes, shop.folder)
+    outcomes = tuple(_outcome(member, store, reasons) for member in members)
+    _write_index(plan, members, outcomes, store.folder)
+    ended = [outcome for outcome in outcomes if outcome]
+    if len(ended) == len(outcomes):
+        assemble(plan, members, ended, store.folder)
     return outcomes
 
 
 class TaskPool:
-    """Teams of ranks that draw jobs until none are left."""
+    """Teams of ranks that draw jobs until none are left; ``busy`` is the time in s that this rank worked on them."""
 
     def __init__(self, comm: MPI.Comm, team: MPI.Comm, stop: StopRequest) -> None:
         self.comm, self.team, self.stop = comm, team, stop
         self.busy = 0.0
 
-    def share(self, jobs: list, work: Callable, progress: Progress | None) -> dict:
+    def share(self, jobs: Sequence[Job], work: Callable[[Job], None], progress: Progress | None) -> dict[Job, str]:
         """Do all ``jobs``; returns for each one done the reason why it failed, "" if it did not. Collective."""
-        drawn, ended, reasons = SharedCounter(self.comm), SharedCounter(self.comm), {}
+        drawn, ended = SharedCounter(self.comm), SharedCounter(self.comm)
+        reasons: dict[Job, str] = {}
         leader = self.team.rank == 0
         while not self.stop.requested:
             number = self.team.bcast(drawn.draw() if leader else None)
@@ -144,9 +149,10 @@ class TaskPool:
             progress.close()
         drawn.free()
         ended.free()
-        return {job: reason for found in everything for job, reason in found.items()}
+        return {job: reason for share in everything for job, reason in share.items()}
 
-    def _reason(self, work: Callable, job: object) -> str:
+    def _reason(self, work: Callable[[Job], None], job: Job) -> str:
+        """Do ``job``; returns why it failed, "" if it did not."""
         if self.team.size > 1:  # ranks that meet in a member cannot go on without one of theirs: all end
             work(job)
             return ""
@@ -158,43 +164,31 @@ class TaskPool:
 
 
 def _prepare(plan: Sweep, folder: Path, force: bool) -> None:
-    kept, text = folder / "case.toml", plan.to_toml()
-    sweeps = (folder / "index.json").exists() or (folder / "linear").is_dir()
-    if kept.exists() and kept.read_text(encoding="utf-8") == text and not force:
-        return
-    if kept.exists() and not sweeps and any(folder.glob("*.h5")):
-        raise FolderError(f"{folder}: holds results of another kind; choose another --out")
-    if kept.exists() and not force:
-        raise FolderError(f"{folder}: holds another sweep; --force replaces it, --out chooses another folder")
-    claim_folder(folder, force, ("branch-*.h5", "run.h5"))
-    for path in folder.iterdir() if force else ():
-        if path.is_dir():
-            shutil.rmtree(path)
-        elif path.name in ("index.json", "ensemble.h5", "backbone.h5"):
-            path.unlink()
-    write_text(kept, text)
+    """Claim ``folder``: a sweep of the same case goes on; raises FolderError."""
+    claim_folder(folder, SWEEP, plan.to_toml(), force=force, resume=None)
     (folder / "linear").mkdir(exist_ok=True)
 
 
 def _cost(case: Case, wave: LinearWave) -> float:
     """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
-    return float(np.minimum(wave.reached(case), 10.0).sum()) + 1e-3 * case.time.end
+    return float(np.minimum(wave.reached(case), 10.0).sum()) + 1e-3 * float(case.time.end)
 
 
-def _outcome(member: SweepMember, shop: Members, reasons: dict[str, str | None]) -> Outcome | None:
+def _outcome(member: SweepMember, store: MemberStore, reasons: dict[str, str]) -> Outcome | None:
+    """How ``member`` ended; None if it is still to be made."""
     if member.case is None:
         return Outcome(FAILED, member.problem)
-    summary = shop.summary(member.case)
     if reasons.get(member.id):
         return Outcome(FAILED, reasons[member.id])
-    if not shop.is_complete(member.case):
+    if not store.is_complete(member.case):
         return None
-    return Outcome(
-        SCALED if "scaled_from" in summary["statistics"] else COMPLETE, summary["status"], summary["statistics"]
-    )
+    summary = store.summary(member.case)
+    status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
+    return Outcome(status, summary["status"], summary["statistics"])
 
 
 def _write_index(plan: Sweep, members: list[SweepMember], outcomes: tuple[Outcome | None, ...], folder: Path) -> None:
+    """Write ``index.json``: the axes, and every member's place, folder and how it ended."""
     names = plan.names()
     axes = [{"keys": axis.keys, "names": [names[k] for k in axis.keys], "values": axis.values} for axis in plan.axes]
     rows = []

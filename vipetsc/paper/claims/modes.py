@@ -179,7 +179,7 @@ def portraits(evidence: Evidence, reading: str, finding: Measurement) -> None:
         grazing = finding.value[f"II: correlation with the motion without contact, {law}"]
         if grazing < SAME:
             try:
-                over = first.case.drive.amplitude / initiation_of(ensemble, first.case).onset - 1
+                over = first.case.drive.amplitude / initiation_of(ensemble.folder, first.case).onset - 1
             except OSError:
                 over = np.nan
             beyond = f", {100 * over:.2g} % above first contact," if np.isfinite(over) else ""

@@ -67,7 +67,7 @@ class AmplitudeTriple:
             return
         text = f"{member.amplitude:g} N makes no contact"
         try:
-            onset = initiation_of(evidence.ensemble(STEP), member.case).onset
+            onset = initiation_of(evidence.ensemble(STEP).folder, member.case).onset
         except OSError:
             onset = np.nan
         if np.isfinite(onset):
