@@ -477,7 +477,7 @@ def test_transfer_beside_the_slope(tmp_path, exponent, scatter, expected):
         for name in ("hertz", "bilinear"):
             group = file.create_group(f"calibrated-{name}-5-sites-30-cycles")
             transfer = 0.1 * (energy / energy[0]) ** exponent * rough
-            fit = power_law(energy, transfer).log_log
+            fit = power_law(energy, transfer)
             group["energy"], group["ibtet"], group["fitted"] = energy, transfer, np.ones(12, np.int8)
             group["branch/energy"], group["branch/slope"] = known, 10.0 / known
             group["branch/region"] = np.full(60, 3)

@@ -21,7 +21,7 @@ from vipetsc.modes.continuation import Continuation, StepControl
 from vipetsc.modes.orbit import Dop853Flow
 from vipetsc.modes.point import linear_start
 from vipetsc.modes.portrait import portrait
-from vipetsc.modes.regions import power_law, regions
+from vipetsc.modes.regions import regions, slope_law
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.stability import stability
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
@@ -172,9 +172,9 @@ def test_regions_and_power_law_of_a_made_up_branch():
     assert set(region) == {1, 2, 3, 4}
     assert np.all((region == 1) == ~touched)
     assert closed[region == 4].min() >= 0.95 > closed[region == 3].max()
-    law = power_law(energy[region == 4], slope[region == 4])
+    law = slope_law(energy[region == 4], slope[region == 4])
     assert law.exponent == pytest.approx(-1, abs=1e-3)
-    assert law.adjusted_r2 > 0.9999
+    assert law.r2_adjusted > 0.9999
 
 
 def test_regions_without_contacts():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from vipetsc.io.store import Coordinates
 from vipetsc.modes.compare import Comparison
 from vipetsc.modes.point import Point
 from vipetsc.modes.portrait import Portrait
-from vipetsc.modes.regions import power_law, regions
+from vipetsc.modes.regions import regions, slope_law
 
 KINDS = (
     "regular",
@@ -93,9 +93,10 @@ class Branch:
                 backwards = np.nonzero(~(slope[inside] > 0))[0]
                 inside = inside[backwards[-1] + 1 if backwards.size else 0 :]
                 inside = inside[int(np.argmax(slope[inside])) if inside.size else 0 :]
-            law = power_law(energy[inside], slope[inside])
+            law = slope_law(energy[inside], slope[inside])
             if law is not None:
-                found[label] = asdict(law)
+                found[label] = {"exponent": law.exponent, "factor": law.factor, "adjusted_r2": law.r2_adjusted}
+                found[label]["points"] = law.points
         return found
 
     def write(self, folder: Path, about: dict[str, Any]) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+
+from vipetsc.spectra import PowerLaw, power_law
 
 SMOOTH_LIMIT = 0.95
 """Fraction of the time in contact from which the clearance counts as negligible (region IV)."""
@@ -13,18 +13,11 @@ SMOOTH_LIMIT = 0.95
 SETTLED = 0.5
 """Change of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III)."""
 
+STEEPEST = 500.0
+"""|ln factor| of a power law above which it stands for a vertical piece of the branch."""
+
 STEEP = -2.0
 """Local exponents below this still belong to the fall from the grazing peak; no limit law is so steep."""
-
-
-@dataclass(frozen=True)
-class PowerLaw:
-    """df/dE = factor E^exponent over ``points`` points; ``adjusted_r2`` of the line in log-log."""
-
-    exponent: float
-    factor: float
-    adjusted_r2: float
-    points: int
 
 
 def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:
@@ -70,17 +63,12 @@ def regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed:
     return region
 
 
-def power_law(energy: np.ndarray, slope: np.ndarray) -> PowerLaw | None:
-    """The straight line through ln(slope) over ln(energy), None for fewer than 4 usable points."""
+def slope_law(energy: np.ndarray, slope: np.ndarray) -> PowerLaw | None:
+    """df/dE as a power law of E over the usable points, None where it is not one: fewer than 4, or a vertical piece."""
     usable = np.isfinite(slope) & (slope > 0) & (energy > 0)
-    count = int(usable.sum())
-    if count < 4:
+    if usable.sum() < 4 or np.ptp(energy[usable]) == 0:
         return None
-    x, y = np.log(energy[usable]), np.log(slope[usable])
-    exponent, constant = np.polyfit(x, y, 1)
-    unexplained = float(np.sum((y - exponent * x - constant) ** 2))
-    total = float(np.sum((y - y.mean()) ** 2))
-    if total == 0 or abs(constant) > 500:  # no power law in range: a vertical piece of the branch
-        return None
-    r2 = 1 - (unexplained / (count - 2)) / (total / (count - 1))
-    return PowerLaw(float(exponent), float(np.exp(constant)), float(r2), count)
+    law = power_law(energy[usable], slope[usable])
+    with np.errstate(divide="ignore"):
+        vertical = abs(np.log(law.factor)) > STEEPEST
+    return None if vertical or np.isnan(law.r2_adjusted) else law

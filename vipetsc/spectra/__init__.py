@@ -4,7 +4,7 @@ from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, pa
 from vipetsc.spectra.entropy import Entropy, entropy, local_entropy
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
 from vipetsc.spectra.partition import Partition, partition
-from vipetsc.spectra.power_law import Fit, PowerLaw, from_peak, normalised, power_law
+from vipetsc.spectra.power_law import PowerLaw, from_peak, normalised, power_law
 from vipetsc.spectra.wavelet import BINS, Bank, Nodes, filter_bank, inverse, padded_length, transform
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "Bank",
     "Dispersion",
     "Entropy",
-    "Fit",
     "Nodes",
     "Partition",
     "Parts",

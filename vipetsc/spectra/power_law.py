@@ -1,22 +1,29 @@
-"""Power laws y = a x^b by a straight line through the logarithms and by nonlinear least squares."""
+"""Power laws y = a x^b by a straight line through the logarithms or by nonlinear least squares.
+
+Both as in any textbook on regression; intervals are Student's with n - 2 degrees of freedom, and R^2 is adjusted for
+the two parameters.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
 LEVEL = 0.95
 
+Method = Literal["log-log", "nonlinear"]
+
 
 @dataclass(frozen=True)
-class Fit:
-    """y = ``factor`` x^``exponent``, the adjusted R^2 and the 95 % confidence intervals (low, high) of both.
+class PowerLaw:
+    """y = ``factor`` x^``exponent`` through ``points`` points, with 95 % confidence intervals (low, high) of both.
 
-    R^2 is that of the logarithms for the log-log line, and of the values themselves for the nonlinear fit.
+    ``r2_adjusted`` is that of the logarithms for the log-log line, and of the values for the nonlinear fit.
     """
 
     factor: float
@@ -24,19 +31,11 @@ class Fit:
     r2_adjusted: float
     factor_interval: tuple[float, float]
     exponent_interval: tuple[float, float]
-
-    def __call__(self, x: ArrayLike) -> np.ndarray:
-        """The law at ``x``."""
-        return self.factor * np.asarray(x, dtype=float) ** self.exponent
-
-
-@dataclass(frozen=True)
-class PowerLaw:
-    """Both fits through the same ``points``."""
-
-    log_log: Fit
-    nonlinear: Fit
     points: int
+
+    def __call__(self, x: ArrayLike) -> NDArray[np.float64]:
+        """The law at ``x``."""
+        return np.asarray(self.factor * np.asarray(x, dtype=float) ** self.exponent)
 
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike, parameters: int = 2) -> float:
@@ -54,12 +53,11 @@ def _interval(value: float, deviation: float, freedom: int) -> tuple[float, floa
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def power_law(x: ArrayLike, y: ArrayLike) -> PowerLaw:
-    """Fit y = a x^b to points (n), both ways.
+def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
+    """Fit y = a x^b to points (n).
 
-    The log-log line weighs relative errors alike; the nonlinear fit weighs errors alike and starts from it.
-    Student's t with n - 2 degrees of freedom gives the intervals. A nonlinear fit without a minimum, whose
-    exponent runs away to leave a single point standing, is all NaN.
+    The log-log line has least relative errors, the nonlinear fit least errors, from the line as its start. A
+    nonlinear fit without a minimum, whose exponent runs away to leave a single point standing, is all NaN.
 
     Raises
     ------
@@ -79,49 +77,52 @@ def power_law(x: ArrayLike, y: ArrayLike) -> PowerLaw:
     cx, cy = lx.mean(), ly.mean()
     u, v = lx - cx, ly - cy
     slope = float(u @ v / (u @ u))
+    if method == "nonlinear":
+        return _nonlinear(u, y / np.exp(cy), slope, cx, cy)
     variance = float(np.sum((v - slope * u) ** 2)) / freedom
-    deviation = np.sqrt(variance / (u @ u))
+    deviation = float(np.sqrt(variance / (u @ u)))
     at_one = cy - slope * cx
-    low, high = _interval(at_one, np.sqrt(variance / len(x) + (cx * deviation) ** 2), freedom)
-    line = Fit(
+    low, high = _interval(at_one, float(np.sqrt(variance / len(x) + (cx * deviation) ** 2)), freedom)
+    return PowerLaw(
         float(np.exp(at_one)),
         slope,
         r2_adjusted(v, slope * u),
         (float(np.exp(low)), float(np.exp(high))),
         _interval(slope, deviation, freedom),
+        len(x),
     )
-    return PowerLaw(line, _nonlinear(u, y / np.exp(cy), slope, cx, cy), len(x))
 
 
-def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float) -> Fit:
+def _nonlinear(u: NDArray[np.float64], w: NDArray[np.float64], slope: float, cx: float, cy: float) -> PowerLaw:
     """Fit w = c exp(b u), c of order 1, and return it as y = a x^b with ln a = cy + ln c - b cx."""
 
-    def law(u: np.ndarray, c: float, b: float) -> np.ndarray:
-        return c * np.exp(b * u)
+    def law(u: NDArray[np.float64], c: float, b: float) -> NDArray[np.float64]:
+        return np.asarray(c * np.exp(b * u))
 
-    def slopes(u: np.ndarray, c: float, b: float) -> np.ndarray:
+    def gradient(u: NDArray[np.float64], c: float, b: float) -> NDArray[np.float64]:
         return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
     tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
     try:
-        (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=slopes, **tolerances)
+        (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=gradient, **tolerances)
     except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
         nan = float("nan")
-        return Fit(nan, nan, nan, (nan, nan), (nan, nan))
+        return PowerLaw(nan, nan, nan, (nan, nan), (nan, nan), len(u))
     freedom = len(u) - 2
     # The factor's deviation by linear propagation from (c, b) to a.
     factor = c * np.exp(cy - b * cx)
-    gradient = np.array([factor / c, -cx * factor])
-    return Fit(
+    of_factor = np.array([factor / c, -cx * factor])
+    return PowerLaw(
         float(factor),
         float(b),
         r2_adjusted(w, law(u, c, b)),
-        _interval(float(factor), float(np.sqrt(gradient @ covariance @ gradient)), freedom),
+        _interval(float(factor), float(np.sqrt(of_factor @ covariance @ of_factor)), freedom),
         _interval(float(b), float(np.sqrt(covariance[1, 1])), freedom),
+        len(u),
     )
 
 
-def from_peak(x: ArrayLike, y: ArrayLike) -> PowerLaw:
+def from_peak(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
     """The power law of the points from the largest ``y`` on, in the order of x; raises as ``power_law``."""
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     order = np.argsort(x, kind="stable")
@@ -129,14 +130,14 @@ def from_peak(x: ArrayLike, y: ArrayLike) -> PowerLaw:
     if not y.size or np.isnan(y).any():
         raise ValueError(f"power law: {y.size} points, {np.isnan(y).sum()} of them NaN; drop those first")
     peak = int(np.argmax(y))
-    return power_law(x[peak:], y[peak:])
+    return power_law(x[peak:], y[peak:], method)
 
 
-def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
+def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> NDArray[np.float64]:
     """A curve (n) scaled linearly so that it runs from ``low`` to ``high``; NaN stays, and a constant raises."""
     y = np.asarray(y, dtype=float)
     least, most = np.nanmin(y), np.nanmax(y)
     if not most > least:
         raise ValueError(f"normalised: the curve is constant, {least:g}")
     share = (y - least) / (most - least)
-    return low * (1 - share) + high * share
+    return np.asarray(low * (1 - share) + high * share)

@@ -19,7 +19,7 @@ from vipetsc.case import Case, case_id
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, open_run
-from vipetsc.spectra import Fit, power_law
+from vipetsc.spectra import PowerLaw, power_law
 from vipetsc.studies.linear import LinearWave, leading_cell, linear_case
 
 FORMAT_VERSION = 1
@@ -108,8 +108,8 @@ class Alignment:
     ibtet: np.ndarray
     fitted: np.ndarray
     divisor: float
-    law: Fit | None
-    steepness: Fit | None
+    law: PowerLaw | None
+    steepness: PowerLaw | None
 
 
 def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, slope: Slope) -> Alignment:
@@ -145,7 +145,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     # Without a floor the mean of the differences is the answer; the floor only asks for a larger divisor.
     start = float(np.mean(at - measured))
     best = minimize_scalar(misfit, bracket=(start, start + 0.5), options={"xtol": 1e-10})
-    law, steepness = (power_law(energy[fitted], y).log_log for y in (ibtet[fitted], np.exp(at)))
+    law, steepness = (power_law(energy[fitted], y) for y in (ibtet[fitted], np.exp(at)))
     return Alignment(energy, ibtet, fitted, float(np.exp(best.x)), law, steepness)
 
 

@@ -185,8 +185,8 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     row["points"] = len(y) - int(np.argmax(y[order]))
     if row["points"] < 3:
         return row
-    law = from_peak(x, normalised(y) if normalise else y)
-    line, curved = law.log_log, law.nonlinear
+    y = normalised(y) if normalise else y
+    line, curved = from_peak(x, y), from_peak(x, y, "nonlinear")
     low, high = line.exponent_interval
     row |= {"exponent": line.exponent, "exponent_low": low, "exponent_high": high, "factor": line.factor}
     row |= {"r2_log_log": line.r2_adjusted, "r2_nonlinear": curved.r2_adjusted}
