@@ -128,11 +128,6 @@ class Integrator(Engine):
         ts.setFromOptions()
         return ts
 
-    @property
-    def method(self) -> str:
-        """The Runge-Kutta type in use, PETSc options included."""
-        return self.ts.getRKType()
-
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s; returns False if a stop was requested.
 
@@ -265,7 +260,7 @@ class Integrator(Engine):
         limits = {name: self.comm.allreduce(count) for name, count in asdict(self.tracker.counts).items()}
         statistics = asdict(self.counts) | limits
         statistics["switches"] = self.comm.allreduce(self.counts.switches)
-        return statistics | {"method": self.method, "right_hand_side": self.right_hand_side}
+        return statistics | {"method": self.ts.getRKType(), "right_hand_side": self.right_hand_side}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs to go on with the same bits, this rank's share."""

@@ -42,29 +42,35 @@ def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: 
     return total * lattice.masses[mass].inverse_mass
 
 
+@njit(error_model="numpy", forceinline=True)
+def relative_motion(y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[float, float]:
+    """w = u_resonator - u_host of site ``i`` and w'."""
+    n, cell = lattice.shape.cells, lattice.site_cells[i]
+    host, resonator = lattice.shape.host * n + cell, lattice.shape.resonator * n + cell
+    velocities = lattice.shape.dofs * n
+    return y[resonator] - y[host], y[velocities + resonator] - y[velocities + host]
+
+
 @njit(error_model="numpy")
-def relative_motion(t: float, y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[float, float, float]:
-    """w, w', w'' of site ``i`` at time ``t``, w = u_resonator - u_host."""
-    shape, masses = lattice.shape, lattice.masses
-    n, d, host, resonator = shape.cells, shape.dofs, shape.host, shape.resonator
-    cell = lattice.site_cells[i]
-    w = y[resonator * n + cell] - y[host * n + cell]
-    rate = y[(d + resonator) * n + cell] - y[(d + host) * n + cell]
-    force, _ = contact_force(lattice.contacts, i, w, rate)
-    at_host = spring_acceleration(y, lattice, cell, host) + force * masses[host].inverse_mass
-    at_resonator = spring_acceleration(y, lattice, cell, resonator) - force * masses[resonator].inverse_mass
-    if shape.driven == (d + host) * n + cell:
-        at_host += drive_force(lattice.burst, t) * masses[host].inverse_mass
-    if shape.driven == (d + resonator) * n + cell:
-        at_resonator += drive_force(lattice.burst, t) * masses[resonator].inverse_mass
-    return w, rate, at_resonator - at_host
+def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int, force: float) -> float:
+    """Acceleration of one mass by its springs, a contact ``force`` and the drive."""
+    inverse_mass = lattice.masses[mass].inverse_mass
+    acceleration = spring_acceleration(y, lattice, cell, mass) + force * inverse_mass
+    if lattice.shape.driven == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:
+        acceleration += drive_force(lattice.burst, t) * inverse_mass
+    return acceleration
 
 
 @njit(error_model="numpy")
 def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
     """Fill ``motion`` (sites, 3) with w, w', w'' of every owned site."""
     for i in range(motion.shape[0]):
-        motion[i, 0], motion[i, 1], motion[i, 2] = relative_motion(t, y, lattice, i)
+        w, rate = relative_motion(y, lattice, i)
+        force, _ = contact_force(lattice.contacts, i, w, rate)
+        cell = lattice.site_cells[i]
+        at_host = _acceleration(t, y, lattice, cell, lattice.shape.host, force)
+        at_resonator = _acceleration(t, y, lattice, cell, lattice.shape.resonator, -force)
+        motion[i, 0], motion[i, 1], motion[i, 2] = w, rate, at_resonator - at_host
 
 
 @njit(error_model="numpy")
@@ -107,8 +113,7 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         power = 0.0
         if lattice.contacts.sites[i].mode != FREE:
             cell = lattice.site_cells[i]
-            w = y[resonator * n + cell] - y[host * n + cell]
-            rate = y[(d + resonator) * n + cell] - y[(d + host) * n + cell]
+            w, rate = relative_motion(y, lattice, i)
             force, power = contact_force(lattice.contacts, i, w, rate)
             f[(d + host) * n + cell] += force * masses[host].inverse_mass
             f[(d + resonator) * n + cell] -= force * masses[resonator].inverse_mass
