@@ -1,0 +1,103 @@
+"""An ensemble holds every member at the values of its keys, and the fits of its curves from the peak on."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from vipetsc.case import Case, Sweep, case_id
+from vipetsc.io.read import curves, open_ensemble, select
+from vipetsc.lattice import four_band
+from vipetsc.studies.ensemble import fit_curve
+from vipetsc.studies.linear import LinearWave, leading_cell
+from vipetsc.studies.members import MemberStore
+from vipetsc.studies.sweep import conclude
+
+SWEEP = {
+    "name": "small",
+    "lattice": {"preset": "four-band", "cells": 40},
+    "sweep": {
+        "measures": ["transfer"],
+        "zip": [["contacts.sites", "drive.cycles"]],
+        "contacts": {"law": ["hertz", "bilinear"], "sites": [[9], [9, 20], [9]]},
+        "drive": {"cycles": [4, 4, 6], "amplitude": [8.0, 2.0, 4.0, 16.0]},
+    },
+}
+
+
+def measure(case):
+    """A number that tells the members apart."""
+    sites = len(case.contacts.sites)
+    return case.drive.amplitude + 100 * sites + 1000 * case.drive.cycles + 1e5 * (case.contacts.law == "hertz")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A finished sweep whose members were not simulated, but have what an ensemble is made of."""
+    plan = Sweep.from_table(SWEEP)
+    store, members = MemberStore(tmp_path, plan.options), plan.members()
+    for number, member in enumerate(members):
+        path = tmp_path / member.id
+        path.mkdir()
+        (path / "case.toml").write_text(member.case.to_toml())
+        statistics = {"episodes": number, "work": 2.0, "dissipated": 0.5, "ledger_error": 0.0}
+        summary = {"complete": True, "status": "complete", "statistics": statistics}
+        (path / "summary.json").write_text(json.dumps(summary | {"measures": ["transfer"], "fields": False}))
+        with h5py.File(path / "analysis.h5", "w") as file:
+            file["ibtet"] = measure(member.case)
+    assert all(conclude(plan, members, store, {members[5].id: "ArithmeticError: overflow"}))
+    return tmp_path
+
+
+def test_every_member_stands_at_the_values_of_its_keys(folder):
+    ensemble = open_ensemble(folder)
+    assert ensemble["ibtet"].dims == ("law", "sites", "amplitude")
+    assert dict(ensemble["cycles"].sizes) == {"sites": 3}
+    for member in Sweep.from_table(SWEEP).members():
+        case, number = member.case, int(np.ravel_multi_index(member.index, ensemble["ibtet"].shape))
+        keys = {"law": case.contacts.law, "sites": json.dumps(case.contacts.sites), "cycles": case.drive.cycles}
+        one = select(ensemble, **keys, amplitude=case.drive.amplitude)
+        assert str(one["member"].item()) == member.id == case_id(case)
+        assert one["contact_episodes"].item() == number or number == 5
+        if number == 5:
+            assert one["status"].item() == 2 and np.isnan(one["ibtet"].item())
+        else:
+            assert one["status"].item() == 0 and one["ibtet"].item() == measure(case)
+            assert one["dissipated_fraction"].item() == 0.25
+    assert np.atleast_1d(ensemble.attrs["failed"]).tolist() == ["(0, 1, 1): ArithmeticError: overflow"]
+    for curve, path in curves(ensemble):
+        case = Case.load(path / "case.toml")
+        assert (case.contacts.law, case.drive.cycles) == (curve["law"].item(), curve["cycles"].item())
+
+
+def test_a_law_is_fitted_from_the_largest_value_on():
+    amplitude = np.geomspace(1.0, 100.0, 12)
+    law = 3.0 * amplitude**-0.8
+    curve = np.where(np.arange(12) < 4, [0.1, 0.7, 0.2, 0.3, *[0.0] * 8], law)  # a smaller peak comes before
+    order = np.random.default_rng(3).permutation(12)
+    fit = fit_curve(amplitude[order], curve[order], normalise=False)
+    assert (fit["peak_amplitude"], fit["peak"], fit["points"]) == (amplitude[4], law[4], 8)
+    assert fit["exponent"] == pytest.approx(-0.8, abs=1e-12) and fit["factor"] == pytest.approx(3.0)
+    assert fit["r2_log_log"] == pytest.approx(1.0) and fit["exponent_nonlinear"] == pytest.approx(-0.8)
+    assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])  # two points behind the peak
+
+
+def test_a_linear_wave_arrives_with_its_host():
+    case = Case.builtin(["lattice.cells=30", "contacts.sites=[20, 7, 3]", "drive.cell=5"])
+    cell, time = four_band(), np.linspace(0, 1, 201)
+    velocity, displacement = np.zeros((201, 30, 4)), np.zeros((201, 30, 4))
+    peak = 0.2 + 0.02 * np.arange(30)
+    velocity[..., cell.host] = -np.exp(-(((time[:, None] - peak) / 0.05) ** 2))  # the largest in size is negative
+    velocity[..., cell.resonator] = 5 * np.exp(-(((time[:, None] - peak - 0.1) / 0.05) ** 2))
+    displacement[..., cell.resonator], displacement[..., cell.host] = 3e-3, -1e-3
+    dims = "time", "cell", "dof"
+    data = {"time": time, "displacement": (dims, displacement), "velocity": (dims, velocity)}
+    wave = LinearWave.of(xr.Dataset(data, attrs={"case": case.to_toml()}))
+    assert wave.arrival == pytest.approx(peak, abs=0.0026)
+    assert leading_cell(case) == 7 and wave.arrival_at(case) == wave.arrival[6]
+    rate = np.abs(velocity[..., cell.resonator] - velocity[..., cell.host]).max(axis=0)
+    assert wave.envelope == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
+    reached = case.drive.amplitude * wave.envelope[[19, 6, 2]] / np.asarray(case.contacts.clearance)
+    assert wave.reached(case) == pytest.approx(reached)

@@ -1,0 +1,61 @@
+"""Members of a sweep are scaled where nothing touches, and simulated where something may."""
+
+import numpy as np
+import pytest
+
+from vipetsc.case import Case, Sweep
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.read import open_ensemble, select
+from vipetsc.studies.ensemble import COMPLETE, SCALED
+from vipetsc.studies.members import MemberStore
+from vipetsc.studies.sweep import run_sweep
+
+TABLE = {
+    "name": "margin",
+    "lattice": {"preset": "four-band", "cells": 24},
+    "contacts": {"sites": [8, 13], "clearance": [2e-4, 3e-4]},
+    "drive": {"cycles": 4, "cell": 3},
+    "time": {"end": 0.08, "rtol": 1e-9},
+}
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    """Amplitudes at which the linear wave reaches .6, .85, 1.02, 1.1, 1.25 and 3 times the nearest clearance."""
+    folder = tmp_path_factory.mktemp("members")
+    case = Case.from_table(TABLE | {"drive": TABLE["drive"] | {"amplitude": 1.0}})
+    store = MemberStore(folder / "wave")
+    store.make_linear(case)
+    one = store.wave(case).reached(case).max()
+    shares = np.array([0.6, 0.85, 1.02, 1.1, 1.25, 3.0])
+    table = TABLE | {"sweep": {"drive": {"amplitude": (shares / one).tolist()}}}
+    result = run_sweep(Sweep.from_table(table), folder / "sweep")
+    assert result.complete
+    return shares, open_ensemble(folder / "sweep"), folder / "sweep"
+
+
+def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(sweep):
+    shares, ensemble, _ = sweep
+    assert ensemble["status"].values.tolist() == [SCALED if share < 0.9 else COMPLETE for share in shares]
+    # The wave that reaches a clearance touches it: scaling such a member would lose its contacts.
+    touching = shares > 1.05
+    assert (ensemble["contact_episodes"].values[touching] > 0).all()
+    assert (ensemble["contact_episodes"].values[shares < 1] == 0).all()
+    assert (ensemble["dissipated_fraction"].values[touching] > 0).all()
+
+
+def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
+    _, ensemble, folder = sweep
+    amplitude = ensemble["amplitude"].values[:2]
+    low, high = (folder / str(name) for name in ensemble["member"].values[:2])
+    factor = (amplitude[1] / amplitude[0]) ** 2
+    for file, names in {"run": ("energy/kinetic", "energy/work"), "analysis": ("bands/energy", "bands/total")}.items():
+        with open_netcdf(low / f"{file}.h5", file) as small, open_netcdf(high / f"{file}.h5", file) as large:
+            assert "velocity" not in small
+            for name in names:
+                np.testing.assert_allclose(large[name], factor * small[name], rtol=1e-13)
+            assert Case.of(large).drive.amplitude == amplitude[1]
+            if file == "analysis":
+                assert large["ibtet"].item() == small["ibtet"].item()
+                assert large["bands/edges"].values.tolist() == small["bands/edges"].values.tolist()
+    assert select(ensemble, amplitude=amplitude[0])["work"].item() > 0
