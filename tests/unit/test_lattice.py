@@ -137,10 +137,11 @@ def test_ends_hold_or_let_go(cell, n):
     fixed, free = (Chain(cell, n, ends).stiffness_matrix().toarray() for ends in ("fixed", "free"))
     assert np.array_equal(fixed, fixed.T)
     assert np.allclose(free.sum(axis=1), 0, atol=1e-9)
-    left, right = cell.wall_stiffness
     walls = np.zeros(n * cell.dofs)
-    walls[: cell.dofs] += left
-    walls[-cell.dofs :] += right
+    for spring in cell.springs:
+        if spring.next_cell:
+            walls[spring.end] += spring.stiffness
+            walls[-cell.dofs + spring.start] += spring.stiffness
     assert np.allclose(fixed - free, np.diag(walls), atol=1e-9)
 
 
@@ -189,8 +190,6 @@ def test_force_is_the_slope_of_the_potential(law):
     h = 1e-8
     slope = (contact.potential(w + h, d) - contact.potential(w - h, d)) / (2 * h)
     assert np.allclose(contact.force(w, d), slope, rtol=1e-6, atol=1e-9)
-    stiff = (contact.force(w + h, d) - contact.force(w - h, d)) / (2 * h)
-    assert np.allclose(contact.force_gradient(w, d), stiff, rtol=1e-6)
     assert ContactLaw.named(law.name) is law
     with pytest.raises(KeyError):
         ContactLaw.named("glue")

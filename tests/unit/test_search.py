@@ -107,7 +107,7 @@ def test_paper_choice(found):
         assert (coarse.lam, coarse.eta) == (0.1, 0.5)
         best = found[reading].optimum("weighted")
         assert (best.lam, best.eta) == (0.1, eta)
-        assert found[reading].out_of_phase[best.place]
+        assert found[reading].out_of_phase[best.index]
         paper = search(reading, 0.1, 0.5, KAPPA)
         assert paper.out_of_phase.all()
         assert paper.cost("weighted").item() > 0.97 * best.value

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from vipetsc.lattice.cell import UnitCell
@@ -22,10 +22,10 @@ class BlochPoint:
     (..., band) in cells/s. Of several cells, the axis of cells comes first.
     """
 
-    wavenumber: np.ndarray
-    frequency: np.ndarray
-    vectors: np.ndarray
-    group_velocity: np.ndarray
+    wavenumber: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    vectors: NDArray[np.complex128]
+    group_velocity: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ def bloch(cell: UnitCell | Sequence[UnitCell], kappa: ArrayLike) -> BlochPoint:
     as the limit from kappa > 0 where omega = 0. Several cells of as many masses each are solved together.
     """
     kappa = np.asarray(kappa, float)
-    # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs the acoustic branch's own.
-    at = np.where(np.abs(kappa) < 3e-4, 3e-4, kappa)
+    # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
+    off_zero = np.where(np.abs(kappa) < 3e-4, 3e-4, kappa)
     if isinstance(cell, UnitCell):
         masses = np.asarray(cell.masses)
     else:
@@ -54,35 +54,41 @@ def bloch(cell: UnitCell | Sequence[UnitCell], kappa: ArrayLike) -> BlochPoint:
     scale = root[..., :, None] * root[..., None, :]
     squared, vectors = np.linalg.eigh(_each(UnitCell.stiffness_matrix, cell, kappa) * scale)
     frequency = np.sqrt(np.maximum(squared, 0))
-    near_squared, near = np.linalg.eigh(_each(UnitCell.stiffness_matrix, cell, at) * scale)
-    slope = _each(_stiffness_slope, cell, at) * scale
-    rise = np.einsum("...ij,...ij->...j", near.conj(), slope @ near).real
-    group_velocity = rise / (2 * np.sqrt(np.maximum(near_squared, np.finfo(float).tiny)))
+    eigenvalue, u = np.linalg.eigh(_each(UnitCell.stiffness_matrix, cell, off_zero) * scale)
+    stiffness_slope = _each(_stiffness_slope, cell, off_zero) * scale
+    eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope @ u).real
+    group_velocity = eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny)))
     return BlochPoint(kappa, frequency, vectors * root[..., :, None], group_velocity)
 
 
-def _each(matrix: Callable, cell: UnitCell | Sequence[UnitCell], kappa: np.ndarray) -> np.ndarray:
+Matrix = Callable[[UnitCell, NDArray[np.float64]], NDArray[np.complex128]]
+
+
+def _each(matrix: Matrix, cell: UnitCell | Sequence[UnitCell], kappa: NDArray[np.float64]) -> NDArray[np.complex128]:
     """``matrix(cell, kappa)`` of one cell, or of several along a first axis."""
     return matrix(cell, kappa) if isinstance(cell, UnitCell) else np.stack([matrix(c, kappa) for c in cell])
 
 
-def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
+def _stiffness_slope(cell: UnitCell, kappa: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """dK/dkappa (..., dofs, dofs)."""
     k = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
     for mass, offset, other, stiffness in cell.couplings():
         k[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * kappa * offset)
     return k
 
 
-def _frequency(cell: UnitCell, band: int, kappa: float) -> float:
-    return float(bloch(cell, kappa).frequency[band - 1])
+def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
+    return sign * float(bloch(cell, kappa).frequency[band - 1])
 
 
-def _extremum(function, kappa: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Largest value of ``function`` over [0, pi] and where: the best grid point, refined."""
+def _maximum(
+    function: Callable[[float], float], kappa: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Where in [0, pi] ``function`` is largest, and its value there: the best grid point, refined."""
     best = int(np.argmax(values))
     bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, len(kappa) - 1)]
-    found = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
-    return (float(found.x), float(-found.fun)) if -found.fun > values[best] else (kappa[best], values[best])
+    refined = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
+    return (refined.x, -refined.fun) if -refined.fun > values[best] else (float(kappa[best]), float(values[best]))
 
 
 def pass_bands(cell: UnitCell, points: int = 721) -> list[Band]:
@@ -96,8 +102,8 @@ def _pass_bands(cell: UnitCell, points: int) -> tuple[Band, ...]:
     frequency = bloch(cell, kappa).frequency
     bands = []
     for b in range(cell.dofs):
-        _, high = _extremum(lambda x, b=b: _frequency(cell, b + 1, x), kappa, frequency[:, b])
-        _, low = _extremum(lambda x, b=b: -_frequency(cell, b + 1, x), kappa, -frequency[:, b])
+        _, high = _maximum(partial(_frequency, cell, b + 1), kappa, frequency[:, b])
+        _, low = _maximum(partial(_frequency, cell, b + 1, sign=-1), kappa, -frequency[:, b])
         bands.append(Band(b + 1, max(-low, 0.0), high))
     return tuple(bands)
 
@@ -115,8 +121,8 @@ def max_group_velocity(cell: UnitCell, band: int, points: int = 721) -> tuple[fl
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
 
     kappa = np.linspace(0, np.pi, points)
-    where, fastest = _extremum(speed, kappa, np.abs(bloch(cell, kappa).group_velocity[:, band - 1]))
-    return where, _frequency(cell, band, where), fastest
+    fastest, largest = _maximum(speed, kappa, np.abs(bloch(cell, kappa).group_velocity[:, band - 1]))
+    return fastest, _frequency(cell, band, fastest), largest
 
 
 def waves_at(cell: UnitCell, frequency: float, points: int = 721) -> list[tuple[int, float, float]]:

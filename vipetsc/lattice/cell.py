@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 Reading = Literal["printed", "calibrated"]
 
@@ -55,29 +56,19 @@ class UnitCell:
         """Mass in kg of the contact pair's relative motion, 1/(1/m_host + 1/m_resonator)."""
         return 1 / (1 / self.masses[self.host] + 1 / self.masses[self.resonator])
 
-    @property
-    def wall_stiffness(self) -> tuple[np.ndarray, np.ndarray]:
-        """Stiffness (dofs,) in N/m of the inter-cell springs cut at the left and at the right end."""
-        left, right = np.zeros(self.dofs), np.zeros(self.dofs)
-        for s in self.springs:
-            if s.next_cell:
-                left[s.end] += s.stiffness
-                right[s.start] += s.stiffness
-        return left, right
-
     def couplings(self) -> list[tuple[int, int, int, float]]:
         """Every spring seen from both its ends: (mass, cell offset, other mass, stiffness in N/m).
 
         Sorted by mass and otherwise in the order of ``springs``, which fixes the order of every sum.
         """
-        seen = []
+        ends = []
         for s in self.springs:
             offset = 1 if s.next_cell else 0
-            seen.append((s.start, offset, s.end, s.stiffness))
-            seen.append((s.end, -offset, s.start, s.stiffness))
-        return sorted(seen, key=lambda c: c[0])
+            ends.append((s.start, offset, s.end, s.stiffness))
+            ends.append((s.end, -offset, s.start, s.stiffness))
+        return sorted(ends, key=lambda c: c[0])
 
-    def stiffness_matrix(self, kappa: float | np.ndarray) -> np.ndarray:
+    def stiffness_matrix(self, kappa: ArrayLike) -> NDArray[np.complex128]:
         """Bloch stiffness (..., dofs, dofs) in N/m at wavenumber ``kappa`` in rad per cell; Hermitian.
 
         The paper's printed matrix lacks the -1/2 in row 1, column 2 of Eq. (S1); this one follows from
@@ -94,7 +85,7 @@ class UnitCell:
 def cell_problems(
     masses: tuple[float, ...], springs: tuple[Spring, ...], host: int, resonator: int
 ) -> list[tuple[str, str]]:
-    """Everything wrong with a cell as (key, message) pairs; empty for a sound one.
+    """Everything wrong with a cell as (key, message) pairs; empty for a valid one.
 
     Messages count masses from 1, as case files do.
     """

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
@@ -40,14 +41,14 @@ class Chain:
             if self.ends == "periodic":
                 neighbour, inside = neighbour % n, np.ones(n, bool)
             held = np.ones(n, bool) if self.ends == "fixed" else inside
-            own = index * d + mass
-            rows += [own[held], own[inside]]
-            columns += [own[held], neighbour[inside] * d + other]
+            here = index * d + mass
+            rows += [here[held], here[inside]]
+            columns += [here[held], neighbour[inside] * d + other]
             values += [np.full(held.sum(), stiffness), np.full(inside.sum(), -stiffness)]
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         return coo_matrix(entries, shape=(n * d, n * d)).tocsc()
 
-    def masses(self) -> np.ndarray:
+    def masses(self) -> NDArray[np.float64]:
         """Masses (cells dofs,) in kg, ordered cell by cell."""
         return np.tile(np.asarray(self.cell.masses), self.cells)
 
@@ -58,12 +59,12 @@ class Chain:
         imaginary part stands for the finite burst. Scales exactly with the drive's amplitude. A lattice
         longer than ``longest`` is cut there: the wave is evanescent at that frequency.
         """
-        near = Chain(self.cell, min(self.cells, longest), self.ends)
-        at = cell if cell < near.cells // 2 else max(near.cells - (self.cells - cell), 0)
+        cut = Chain(self.cell, min(self.cells, longest), self.ends)
+        driven = cell if cell < cut.cells // 2 else max(cut.cells - (self.cells - cell), 0)
         omega = drive.frequency * (1 - 1j / drive.cycles)
-        dynamic = near.stiffness_matrix() - diags(near.masses() * omega**2)
-        force = np.zeros(near.cells * self.cell.dofs, complex)
-        force[at * self.cell.dofs + mass] = 1.0
+        dynamic = cut.stiffness_matrix() - diags(cut.masses() * omega**2)
+        force = np.zeros(cut.cells * self.cell.dofs, complex)
+        force[driven * self.cell.dofs + mass] = 1.0
         response = float(np.abs(spsolve(dynamic.tocsc(), force)).max())
         return response * 2 * abs(drive.window_amplitude)
 

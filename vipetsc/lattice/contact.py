@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 Adhesion = Literal["allow", "clip"]
 
@@ -78,7 +78,7 @@ class Contact:
         """3 (1 - r) / 2, the factor of w'/w'_minus in g (Hunt and Crossley 1975)."""
         return 1.5 * (1 - self.restitution)
 
-    def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
+    def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> NDArray[np.float64]:
         """g = 1 + 3 (1 - r)/2 w'/w'_minus for relative velocity and approach velocity in m/s.
 
         The paper prints a minus sign, which feeds energy in; Hunt and Crossley's law has a plus.
@@ -88,20 +88,16 @@ class Contact:
         g = 1 + self.damping * np.asarray(rate, float) / floored
         return np.maximum(g, 0) if self.adhesion == "clip" else g
 
-    def force(self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike = 0.0, approach: ArrayLike = np.inf):
+    def force(
+        self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike = 0.0, approach: ArrayLike = np.inf
+    ) -> NDArray[np.float64]:
         """Restoring force F in N for relative displacement w in m; g = 1 unless an approach is given."""
         w = np.asarray(w, float)
         n = self.law.exponent
         elastic = np.maximum(w - clearance, 0) ** n - np.maximum(-w - clearance, 0) ** n
         return self.stiffness * elastic * self.dissipation_factor(rate, approach)
 
-    def force_gradient(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
-        """dF/dw in N/m of the conservative force."""
-        n = self.law.exponent
-        x = np.abs(np.asarray(w, float)) - clearance
-        return np.where(x > 0, n * self.stiffness * np.maximum(x, 0) ** (n - 1), 0.0)
-
-    def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
+    def potential(self, w: ArrayLike, clearance: ArrayLike) -> NDArray[np.float64]:
         """Elastic energy kc x^(n+1)/(n+1) in J stored at relative displacement w in m."""
         x = np.maximum(np.abs(np.asarray(w, float)) - clearance, 0)
         return self.stiffness * x ** (self.law.exponent + 1) / (self.law.exponent + 1)

@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vipetsc.lattice.bloch import BlochPoint, bloch
 from vipetsc.lattice.cell import Reading, UnitCell, four_band
 
 COSTS = ("deflection", "group_velocity", "weighted")
 DRIVEN = 2  # the band whose wave is to open and close the contacts; waves are to be fast from here upwards
-STANDS_STILL = 1e-12  # of the product of two unit-norm displacements, which then have no phase
+AT_REST = 1e-12  # of the product of two unit-norm displacements, which then have no phase
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """The best cell of a search by one cost: its place (row, column) in the grid, its parameters, its cost."""
+    """The best cell of a search by one cost: its index (row, column) in the grid, its parameters, its cost."""
 
-    place: tuple[int, int]
+    index: tuple[int, int]
     lam: float
     eta: float
     value: float
@@ -43,22 +43,22 @@ class Search:
         Largest |group velocity| over kappa, (lambda, eta, band), in cells/s.
     """
 
-    lam: np.ndarray
-    eta: np.ndarray
-    wavenumber: np.ndarray
-    frequency: np.ndarray
-    signed_deflection: np.ndarray
-    speed: np.ndarray
+    lam: NDArray[np.float64]
+    eta: NDArray[np.float64]
+    wavenumber: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    signed_deflection: NDArray[np.float64]
+    speed: NDArray[np.float64]
 
     @property
-    def out_of_phase(self) -> np.ndarray:
+    def out_of_phase(self) -> NDArray[np.bool_]:
         """Where (lambda, eta) host and resonator move against each other at every kappa of the second band.
 
         Wavenumbers at which either stands still (the zone's border, by symmetry) do not count.
         """
         return (self.signed_deflection >= 0).all(axis=-1) & (self.signed_deflection > 0).any(axis=-1)
 
-    def cost(self, name: str) -> np.ndarray:
+    def cost(self, name: str) -> NDArray[np.float64]:
         """One of ``COSTS`` over (lambda, eta); the larger the better.
 
         ``deflection``: largest signed deflection over kappa, 1. ``group_velocity``: the sum over bands 2 to 4
@@ -85,17 +85,17 @@ def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLi
     ValueError
         If a lambda is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
     """
-    lam, eta, wavenumber = (np.atleast_1d(np.asarray(v, float)) for v in (lam, eta, wavenumber))
+    lams, etas, kappa = (np.atleast_1d(np.asarray(values, float)) for values in (lam, eta, wavenumber))
     rows = []
-    for value in lam:  # row by row, so that the eigenvectors in memory stay few
-        cells = [four_band(reading, value, e) for e in eta]
-        point = bloch(cells, wavenumber)
+    for value in lams:  # row by row, so that the eigenvectors in memory stay few
+        cells = [four_band(reading, value, e) for e in etas]
+        point = bloch(cells, kappa)
         deflection = signed_deflection(cells[0], point)[..., DRIVEN - 1]
         rows.append((point.frequency, deflection, np.abs(point.group_velocity).max(axis=1)))
-    return Search(lam, eta, wavenumber, *(np.stack(part) for part in zip(*rows, strict=True)))
+    return Search(lams, etas, kappa, *(np.stack(part) for part in zip(*rows, strict=True)))
 
 
-def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
+def signed_deflection(cell: UnitCell, point: BlochPoint) -> NDArray[np.float64]:
     """|u3 - u2| sign(-u2 u3) (..., band) of the contact pair: positive where it moves out of phase.
 
     The paper leaves the length of the Bloch vectors open. They have unit norm here, which puts the optimum near the
@@ -104,10 +104,10 @@ def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
     u = unit_vectors(point)
     host, resonator = u[..., cell.host, :], u[..., cell.resonator, :]
     product = (host * resonator.conj()).real
-    side = np.where(np.abs(product) < STANDS_STILL, 0.0, -np.sign(product))
+    side = np.where(np.abs(product) < AT_REST, 0.0, -np.sign(product))
     return np.abs(resonator - host) * side
 
 
-def unit_vectors(point: BlochPoint) -> np.ndarray:
+def unit_vectors(point: BlochPoint) -> NDArray[np.complex128]:
     """Bloch vectors (..., dof, band) scaled to sum_dof |u|^2 = 1."""
     return point.vectors / np.linalg.norm(point.vectors, axis=-2, keepdims=True)

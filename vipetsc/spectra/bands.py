@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from vipetsc.lattice import Band
@@ -27,7 +27,7 @@ class Parts:
     above the top band; pass bands that overlap share a part.
     """
 
-    edges: np.ndarray
+    edges: NDArray[np.float64]
     names: tuple[str, ...]
     bands: tuple[tuple[int, ...], ...]
 
@@ -41,8 +41,10 @@ class Parts:
                 merged.append((low, max(high, band.high), (*numbers, band.number)))
             else:
                 merged.append((band.low, band.high, (band.number,)))
-        edges, names, inside = [0.0], [], []
-        # Rounding leaves the first band of a free lattice a hair above zero; nothing lives below it.
+        edges = [0.0]
+        names: list[str] = []
+        inside: list[tuple[int, ...]] = []
+        # Rounding leaves the first band of a free lattice a hair above zero; nothing is below it.
         tiny = 1e-6 * merged[-1][1]
         for low, high, numbers in merged:
             if low > edges[-1] + tiny:
@@ -54,13 +56,13 @@ class Parts:
             inside.append(numbers)
         return cls(np.array([*edges, np.inf]), (*names, "above"), (*inside, ()))
 
-    def above(self, frequency: float) -> np.ndarray:
+    def above(self, frequency: float) -> NDArray[np.bool_]:
         """Which parts (part) are pass bands above the one driven at ``frequency`` (rad/s)."""
         driven = int(np.searchsorted(self.edges, frequency, side="right")) - 1
         return np.array([bool(b) and i > driven for i, b in enumerate(self.bands)])
 
 
-def split(signal: np.ndarray, interval: float, edges: ArrayLike) -> Iterator[np.ndarray]:
+def split(signal: NDArray[np.float64], interval: float, edges: ArrayLike) -> Iterator[NDArray[np.float64]]:
     """The parts of ``signal`` (t, ...) sampled every ``interval`` s, between consecutive ``edges`` (rad/s).
 
     Yields one array of the signal's shape a part. They add up to the signal, and their mean squares over
@@ -75,7 +77,9 @@ def split(signal: np.ndarray, interval: float, edges: ArrayLike) -> Iterator[np.
         yield fft.idct(inside, type=1, axis=0, overwrite_x=True)
 
 
-def part_energies(velocity: np.ndarray, masses: ArrayLike, interval: float, edges: ArrayLike) -> np.ndarray:
+def part_energies(
+    velocity: NDArray[np.float64], masses: ArrayLike, interval: float, edges: ArrayLike
+) -> NDArray[np.float64]:
     """Kinetic energy (part, t) in J of every part, from ``velocity`` (t, cell, dof) in m/s.
 
     Summed over the cells, a block of them at a time.
@@ -84,33 +88,33 @@ def part_energies(velocity: np.ndarray, masses: ArrayLike, interval: float, edge
     energy = np.zeros((len(np.asarray(edges)) - 1, nt))
     block = max(BLOCK // nt, 1)
     for j, mass in enumerate(np.asarray(masses)):
-        one = velocity[..., j]
+        of_mass = np.asarray(velocity[..., j])
         for first in range(0, cells, block):
-            for p, part in enumerate(split(one[:, first : first + block], interval, edges)):
+            for p, part in enumerate(split(of_mass[:, first : first + block], interval, edges)):
                 energy[p] += 0.5 * mass * np.einsum("tc,tc->t", part, part)
     return energy
 
 
 def part_kinetic_energy(
-    velocity: np.ndarray, masses: ArrayLike, interval: float, low: float, high: float
-) -> np.ndarray:
+    velocity: NDArray[np.float64], masses: ArrayLike, interval: float, low: float, high: float
+) -> NDArray[np.float64]:
     """Kinetic energy (t, cell) in J of what moves between the frequencies ``low`` and ``high`` (rad/s)."""
     edges = [0.0, low, high, np.inf] if low > 0 else [0.0, high, np.inf]
-    place = len(edges) - 3
-    energy = 0.0
+    wanted = len(edges) - 3
+    energy = np.zeros(velocity.shape[:2])
     for j, mass in enumerate(np.asarray(masses)):
-        for p, part in enumerate(split(velocity[..., j], interval, edges)):
-            if p == place:
-                energy = energy + 0.5 * mass * part**2
+        for p, part in enumerate(split(np.asarray(velocity[..., j]), interval, edges)):
+            if p == wanted:
+                energy += 0.5 * mass * part**2
     return energy
 
 
-def front_arrival(energy: np.ndarray, fraction: float = 0.01) -> int:
+def front_arrival(energy: NDArray[np.float64], fraction: float = 0.01) -> int:
     """First sample at which ``energy`` (t) of one cell exceeds ``fraction`` of its largest value."""
     return int(np.argmax(energy > fraction * energy.max()))
 
 
-def ibtet(energy: np.ndarray, above: np.ndarray, start: int = 0) -> float:
+def ibtet(energy: NDArray[np.float64], above: NDArray[np.bool_], start: int = 0) -> float:
     """Inter-band targeted energy transfer: share of the parts ``above`` (part), averaged from ``start`` on.
 
     ``energy`` (part, t) in J. The share is taken of the sum of all parts at every sample, as the paper's

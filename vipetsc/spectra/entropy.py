@@ -1,4 +1,15 @@
-"""Space-wavenumber entropy of a lattice's velocity, and its averages over a run."""
+"""Space-wavenumber entropy of a lattice's velocity, and its averages over a run (the paper's Sec. II C, Eq. (6)).
+
+With the Morlet transform X (kappa, x) of a snapshot (``vipetsc.spectra.wavelet``) and its power S = |X|^2::
+
+    W(x) = sum_kappa S,   P = S/W,   H(x) = -sum_kappa P log2 P = log2 W - (1/W) sum_kappa S log2 S    (a)
+    energy-weighted   H(t) = sum_x Q H,   Q = W / sum_x W                                              (b)
+    joint over kappa and x   H_j(t) = H(t) - sum_x Q log2 Q                                            (c)
+    masked   the mean of H over the points (x, t) with W > .01 max W                                   (d)
+
+Averages are taken from the linear wave's arrival on. A plain mean over all points shows no trend: cells at rest would
+count in it as much as the others.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +18,20 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from vipetsc.compiled import njit
-from vipetsc.spectra.wavelet import padded_length, wavenumbers, window
+from vipetsc.spectra.wavelet import padded_length, wavelet_spectrum, wavenumbers
 
 NODES = 60
-CHUNK = 4
+CHUNK = 4  # snapshots that are transformed together
+GROUP = 4  # nodes that are filtered together
 FLOOR = 0.01
-"""Points below this fraction of the largest weight are masked."""
+"""Points below this fraction of the largest weight are masked, Eq. (d)."""
 
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 Mask = Literal["record", "snapshot"]
 
 
@@ -27,24 +42,24 @@ class Entropy:
     Attributes
     ----------
     local
-        H (t, cell), 0 where nothing moves.
+        H (t, cell) of Eq. (a), 0 where nothing moves.
     weight
         W = sum over the nodes of S (t, cell), in the signal's unit squared.
     snapshot
-        H (t), the mean of ``local`` over the cells with weights W; 0 at rest.
+        H (t) of Eq. (b), 0 at rest.
     energy_weighted
         Mean of ``snapshot`` over the samples from ``start`` on.
     masked
-        Mean of ``local`` over all points from ``start`` on with W > 1 % of its largest value.
+        Eq. (d) over all samples from ``start`` on.
     joint
-        Entropy of S / sum of S over cells and nodes together, per snapshot, averaged from ``start`` on.
+        Mean of Eq. (c) over the samples from ``start`` on.
     error
         Standard deviation over the cells of the masked time mean: each cell's mean over its unmasked samples.
     """
 
-    local: np.ndarray
-    weight: np.ndarray
-    snapshot: np.ndarray
+    local: Floats
+    weight: Floats
+    snapshot: Floats
     energy_weighted: float
     masked: float
     joint: float
@@ -52,7 +67,7 @@ class Entropy:
 
 
 def entropy(
-    velocity: np.ndarray, start: int = 0, *, kc: float = 12.0, nodes: int = NODES, mask: Mask = "record"
+    velocity: Floats, start: int = 0, *, kc: float = 12.0, nodes: int = NODES, mask: Mask = "record"
 ) -> Entropy:
     """Entropy of ``velocity`` (t, cell) with wavelets at the ``nodes`` wavenumbers i pi/nodes, i = 1, 2, ...
 
@@ -81,7 +96,7 @@ def entropy(
     return Entropy(local, weight, snapshot, float(snapshot[start:].mean()), masked, float(joint[start:].mean()), error)
 
 
-def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES) -> tuple[np.ndarray, np.ndarray]:
+def local_entropy(velocity: Floats, *, kc: float = 12.0, nodes: int = NODES) -> tuple[Floats, Floats]:
     """H (t, cell) in bits and W (t, cell) of ``velocity`` (t, cell), a few snapshots at a time.
 
     Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude.
@@ -96,14 +111,14 @@ def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES)
             raise ValueError(f"velocity: not finite in samples {first} to {rows.stop - 1}")
         exponent = np.frexp(largest)[1]
         signal = np.ldexp(signal, -exponent[:, None])
-        total, spread = np.zeros(signal.shape), np.zeros(signal.shape)
+        total, s_log_s = np.zeros(signal.shape), np.zeros(signal.shape)
         for octave in _octaves(cells, kc, nodes):
             spectrum = fft.rfft(signal, octave.length)
             for low, filters in octave.filters:
                 x = np.empty((len(signal), len(filters), octave.length), dtype=complex)
                 _filter(spectrum, filters, low, x)
-                _accumulate(fft.ifft(x, overwrite_x=True), total, spread)
-        _entropies(total, spread, local[rows])
+                _accumulate(fft.ifft(x, overwrite_x=True), total, s_log_s)
+        _entropies(total, s_log_s, local[rows])
         weight[rows] = np.ldexp(total, 2 * exponent[:, None])
     return local, weight
 
@@ -113,7 +128,7 @@ class _Octave:
     """Nodes that share a padded ``length``; for groups of them the band's first row and the filters from there on."""
 
     length: int
-    filters: tuple[tuple[int, np.ndarray], ...]
+    filters: tuple[tuple[int, Floats], ...]
 
 
 @lru_cache(maxsize=8)
@@ -122,23 +137,23 @@ def _octaves(cells: int, kc: float, nodes: int) -> tuple[_Octave, ...]:
     kappa = np.pi * np.arange(1, nodes + 1) / nodes
     octaves = []
     for number in range(int(np.log2(nodes)) + 1):
-        members = kappa[2**number - 1 : 2 ** (number + 1) - 1]
-        length = padded_length(cells, kc, members[0])
-        filters = np.sqrt(kc / members)[:, None] * window(members, kc, wavenumbers(length))
+        some = kappa[2**number - 1 : 2 ** (number + 1) - 1]
+        length = padded_length(cells, kc, some[0])
+        filters = np.sqrt(kc / some)[:, None] * wavelet_spectrum(some, kc, wavenumbers(length))
         if length % 2 == 0:
             filters[:, -1] *= 0.5
         groups = []
-        for first in range(0, len(members), 4):
-            some = filters[first : first + 4]
-            inside = np.flatnonzero(some.max(axis=0) > np.finfo(float).eps * some.max())
+        for first in range(0, len(some), GROUP):
+            group = filters[first : first + GROUP]
+            inside = np.flatnonzero(group.max(axis=0) > np.finfo(float).eps * group.max())
             low, high = int(inside[0]), int(inside[-1]) + 1
-            groups.append((low, np.ascontiguousarray(some[:, low:high])))
+            groups.append((low, np.ascontiguousarray(group[:, low:high])))
         octaves.append(_Octave(length, tuple(groups)))
     return tuple(octaves)
 
 
-@njit("void(c16[:,::1], f8[:,::1], i8, c16[:,:,::1])", cache=True)
-def _filter(spectrum, filters, low, x):
+@njit("void(c16[:,::1], f8[:,::1], i8, c16[:,:,::1])")
+def _filter(spectrum: Complexes, filters: Floats, low: int, x: Complexes) -> None:
     """Spectra ``x`` (t, kappa, k) of the wavelet transforms; ``filters`` (kappa, band) start at row ``low``."""
     for t in range(x.shape[0]):
         for k in range(x.shape[1]):
@@ -148,15 +163,15 @@ def _filter(spectrum, filters, low, x):
             x[t, k, low + filters.shape[1] :] = 0.0
 
 
-@njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", cache=True, error_model="numpy", fastmath={"contract"})
-def _accumulate(x, total, spread):
-    """Add S and S log2 S of the nodes of ``x`` (t, kappa, x) to ``total`` and ``spread`` (t, cell).
+@njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", error_model="numpy", fastmath={"contract"})
+def _accumulate(x: Complexes, weight: Floats, s_log_s: Floats) -> None:
+    """Add the sums of Eq. (a), S and S log2 S of the nodes of ``x`` (t, kappa, x), to arrays (t, cell).
 
     The logarithm is written out so that the loop is vectorised, four times as fast as calls of log2: S = 2^e m
-    with sqrt(1/2) <= m < sqrt(2), ln m = 2 u + u z R(z), u = (m - 1)/(m + 1), z = u^2, with Remez's R of the
-    fdlibm library (error below 2^-58).
+    with sqrt(1/2) <= m < sqrt(2), ln m = 2 u + u z R(z), u = (m - 1)/(m + 1), z = u^2, with the minimax R of
+    fdlibm's e_log.c (error below 2^-58).
     """
-    cells = total.shape[1]
+    cells = weight.shape[1]
     power, mantissa = np.empty(cells), np.empty(cells)
     bits, mantissa_bits = power.view(np.int64), mantissa.view(np.int64)
     for t in range(x.shape[0]):
@@ -176,24 +191,24 @@ def _accumulate(x, total, spread):
                 r = r * z + 2.857142874366239149e-01
                 r = r * z + 3.999999999940941908e-01
                 r = r * z + 6.666666666666735130e-01
-                total[t, c] += power[c]
-                spread[t, c] += power[c] * (e + 1.4426950408889634 * (2.0 * u + u * z * r))
+                weight[t, c] += power[c]
+                s_log_s[t, c] += power[c] * (e + 1.4426950408889634 * (2.0 * u + u * z * r))
 
 
-@njit("void(f8[:,::1], f8[:,::1], f8[:,::1])", cache=True)
-def _entropies(total, spread, local):
-    """H = log2 W - (1/W) sum S log2 S, kept from rounding below zero; W and H are 0 where S stands at its floor."""
-    for t in range(total.shape[0]):
-        for c in range(total.shape[1]):
-            w = total[t, c]
+@njit("void(f8[:,::1], f8[:,::1], f8[:,::1])")
+def _entropies(weight: Floats, s_log_s: Floats, local: Floats) -> None:
+    """Eq. (a) from its sums, kept from rounding below zero; W and H are 0 where S stands at its floor."""
+    for t in range(weight.shape[0]):
+        for c in range(weight.shape[1]):
+            w = weight[t, c]
             if w > 1e-290:
-                local[t, c] = max(np.log2(w) - spread[t, c] / w, 0.0)
+                local[t, c] = max(np.log2(w) - s_log_s[t, c] / w, 0.0)
             else:
-                total[t, c] = local[t, c] = 0.0
+                weight[t, c] = local[t, c] = 0.0
 
 
-def _over_cells(local: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Energy-weighted mean (t) of H, and the joint entropy (t): that mean plus the entropy of W / sum W."""
+def _over_cells(local: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """The energy-weighted mean (t) of Eq. (b) and the joint entropy (t) of Eq. (c)."""
     largest = weight.max(axis=1, keepdims=True)
     share = np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1.0)
@@ -202,13 +217,13 @@ def _over_cells(local: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.n
     return mean, mean + position
 
 
-def _masked(local: np.ndarray, weight: np.ndarray, mask: Mask) -> tuple[float, float]:
-    """Mean of H where the weight exceeds the floor, and the deviation over the cells of its mean over time."""
+def _masked(local: Floats, weight: Floats, mask: Mask) -> tuple[float, float]:
+    """The masked mean of Eq. (d), and the deviation over the cells of each one's mean over time."""
     largest = weight.max(axis=1, keepdims=True) if mask == "snapshot" else weight.max()
-    loud = weight > FLOOR * largest
-    if not loud.any():
+    above_threshold = weight > FLOOR * largest
+    if not above_threshold.any():
         return 0.0, 0.0
-    count = loud.sum(axis=0)
-    sums = np.where(loud, local, 0.0).sum(axis=0)
-    heard = count > 0
-    return float(sums.sum() / count.sum()), float(np.std(sums[heard] / count[heard]))
+    count = above_threshold.sum(axis=0)
+    sums = np.where(above_threshold, local, 0.0).sum(axis=0)
+    counted = count > 0
+    return float(sums.sum() / count.sum()), float(np.std(sums[counted] / count[counted]))

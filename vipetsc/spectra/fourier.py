@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 TAPER = 0.1
@@ -23,9 +23,9 @@ class Dispersion:
     phase velocity omega/kappa > 0 has kappa > 0.
     """
 
-    wavenumber: np.ndarray
-    frequency: np.ndarray
-    energy: np.ndarray
+    wavenumber: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    energy: NDArray[np.float64]
 
     def folded(self) -> Dispersion:
         """The same with kappa and -kappa added up, on [0, pi]."""
@@ -37,26 +37,31 @@ class Dispersion:
         return Dispersion(self.wavenumber[positive : positive + half], self.frequency, energy)
 
 
-def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
+def kinetic_energy(velocity: NDArray[np.float64], masses: ArrayLike) -> NDArray[np.float64]:
     """Kinetic energy (t, cell) in J of every cell, from ``velocity`` (t, cell, dof) in m/s, masses in kg."""
-    return sum(0.5 * m * np.square(velocity[..., j]) for j, m in enumerate(np.asarray(masses)))
+    energy = np.zeros(velocity.shape[:-1])
+    for j, mass in enumerate(np.asarray(masses)):
+        energy += 0.5 * mass * np.square(np.asarray(velocity[..., j]))
+    return energy
 
 
-def wavenumber_content(velocity: np.ndarray, masses: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def wavenumber_content(
+    velocity: NDArray[np.float64], masses: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Kinetic energy per wavenumber over time: kappa (k) in [0, pi] rad per cell, content (t, k) in J.
 
     Both signs of kappa are added up; the content of a sample sums to its kinetic energy (Parseval).
     """
-    cells = velocity.shape[1]
-    content = 0.0
+    samples, cells = velocity.shape[:2]
+    content = np.zeros((samples, cells // 2 + 1))
     for j, mass in enumerate(np.asarray(masses)):
-        spectrum = fft.rfft(velocity[..., j], axis=1)
-        content = content + 0.5 * mass / cells * (spectrum.real**2 + spectrum.imag**2)
+        spectrum = fft.rfft(np.asarray(velocity[..., j]), axis=1)
+        content += 0.5 * mass / cells * (spectrum.real**2 + spectrum.imag**2)
     content[:, 1 : (cells + 1) // 2] *= 2
     return 2 * np.pi * np.arange(cells // 2 + 1) / cells, content
 
 
-def taper(length: int, fraction: float) -> np.ndarray:
+def taper(length: int, fraction: float) -> NDArray[np.float64]:
     """Tukey window (length) with cosine flanks over ``fraction`` of it, scaled to mean square 1."""
     x = (np.arange(length) + 0.5) / length
     flank = np.minimum(x, 1 - x)
@@ -67,7 +72,7 @@ def taper(length: int, fraction: float) -> np.ndarray:
 
 
 def dispersion(
-    velocity: np.ndarray,
+    velocity: NDArray[np.float64],
     masses: ArrayLike,
     interval: float,
     *,
@@ -104,12 +109,12 @@ def dispersion(
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
     frequency = frequency[frequency <= highest]
     window = taper(t, tapers[0])[:, None] * taper(x, tapers[1])
-    energy = 0.0
+    energy = np.zeros((len(frequency), nx))
     for j, mass in enumerate(np.asarray(masses)):
-        spectrum = fft.rfft(velocity[samples, cells, j] * window, nt, axis=0)[: len(frequency)]
+        spectrum = fft.rfft(np.asarray(velocity[samples, cells, j]) * window, nt, axis=0)[: len(frequency)]
         # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
         spectrum = fft.ifft(spectrum, nx, axis=1, norm="forward")
-        energy = energy + mass * (spectrum.real**2 + spectrum.imag**2)
+        energy += mass * (spectrum.real**2 + spectrum.imag**2)
     energy /= 2 * t * nt * nx
     energy[1 : (nt + 1) // 2] *= 2
     order = np.roll(np.arange(nx), (nx - 1) // 2)
@@ -117,7 +122,7 @@ def dispersion(
     return Dispersion(wavenumber, frequency, energy.T[order])
 
 
-def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:
+def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Ridge of a dispersion: energetic wavenumbers (k) and the frequency (k) in rad/s of each one's peak.
 
     A wavenumber counts when its peak exceeds ``floor`` times the largest; the peak is refined by the
@@ -126,9 +131,10 @@ def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.nda
     energy, frequency = spectrum.energy, spectrum.frequency
     peak = np.argmax(energy[:, 1:-1], axis=1) + 1
     rows = np.arange(len(energy))
-    loud = np.nonzero(energy[rows, peak] > floor * energy.max())[0]
-    around = energy[loud[:, None], peak[loud, None] + np.array([-1, 0, 1])]
+    above_threshold = np.nonzero(energy[rows, peak] > floor * energy.max())[0]
+    around = energy[above_threshold[:, None], peak[above_threshold, None] + np.array([-1, 0, 1])]
     left, top, right = np.log(np.maximum(around, np.finfo(float).tiny)).T
     offset = 0.5 * (left - right) / (left - 2 * top + right)
     step = frequency[1] - frequency[0]
-    return spectrum.wavenumber[loud], frequency[peak[loud]] + np.clip(offset, -0.5, 0.5) * step
+    refined = frequency[peak[above_threshold]] + np.clip(offset, -0.5, 0.5) * step
+    return spectrum.wavenumber[above_threshold], refined

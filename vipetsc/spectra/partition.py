@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from vipetsc.spectra.wavelet import BINS, VOICES, Normalisation, filter_bank
@@ -29,28 +29,28 @@ class Partition:
         (t), KE_rec = 1/2 sum m (sum_b v_b)^2.
     """
 
-    energy: np.ndarray
-    field: np.ndarray | None
-    kinetic: np.ndarray
-    reconstructed: np.ndarray
+    energy: NDArray[np.float64]
+    field: NDArray[np.float64] | None
+    kinetic: NDArray[np.float64]
+    reconstructed: NDArray[np.float64]
 
     @property
-    def error(self) -> np.ndarray:
-        """e (t) = |KE_rec - KE| / KE (the paper's appendix A), 0 at rest."""
+    def error(self) -> NDArray[np.float64]:
+        """e (t) = |KE_rec - KE| / KE (the paper's Eq. (A8)), 0 at rest."""
         return _share(np.abs(self.reconstructed - self.kinetic), self.kinetic)
 
     @property
-    def cross_share(self) -> np.ndarray:
+    def cross_share(self) -> NDArray[np.float64]:
         """1 - sum_b KE_b / KE (t): the energy in products of different parts, 0 at rest."""
         return _share(self.kinetic - self.energy.sum(axis=0), self.kinetic)
 
 
-def _share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+def _share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0)
 
 
 def partition(
-    velocity: np.ndarray,
+    velocity: NDArray[np.float64],
     masses: ArrayLike,
     kc: float = 6.0,
     normalisation: Normalisation = "analytic",
@@ -64,21 +64,21 @@ def partition(
     ``masses`` in kg, (dof) or a scalar. A few snapshots at a time are held, so ``velocity`` may be an HDF5
     dataset. With ``fields`` the energies in space-time are kept too.
     """
-    masses = np.atleast_1d(np.asarray(masses, dtype=float))
+    mass_list = np.atleast_1d(np.asarray(masses, dtype=float))
     nt, cells = velocity.shape[:2]
-    if masses.shape != (velocity.shape[2:] or (1,)):
-        raise ValueError(f"masses: {len(masses)} given for velocities of shape {velocity.shape}")
+    if mass_list.shape != (velocity.shape[2:] or (1,)):
+        raise ValueError(f"masses: {len(mass_list)} given for velocities of shape {velocity.shape}")
     bank = filter_bank(cells, kc, normalisation, bins=bins, voices=voices)
     energy, kinetic, reconstructed = np.zeros((bins, nt)), np.zeros(nt), np.zeros(nt)
     field = np.zeros((bins, nt, cells)) if fields else None
     for first in range(0, nt, CHUNK):
         rows = slice(first, min(first + CHUNK, nt))
-        block = np.asarray(velocity[rows], dtype=float).reshape(-1, cells, len(masses))
-        for j, mass in enumerate(masses):
-            one = np.ascontiguousarray(block[..., j])
-            spectrum = fft.rfft(one, bank.length)
-            kinetic[rows] += 0.5 * mass * np.einsum("tc,tc->t", one, one)
-            whole = np.zeros_like(one)
+        block = np.asarray(velocity[rows], dtype=float).reshape(-1, cells, len(mass_list))
+        for j, mass in enumerate(mass_list):
+            of_mass = np.ascontiguousarray(block[..., j])
+            spectrum = fft.rfft(of_mass, bank.length)
+            kinetic[rows] += 0.5 * mass * np.einsum("tc,tc->t", of_mass, of_mass)
+            whole = np.zeros_like(of_mass)
             for b, transfer in enumerate(bank.transfer):
                 part = fft.irfft(transfer * spectrum, bank.length)[:, :cells]
                 whole += part

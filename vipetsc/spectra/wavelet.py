@@ -1,8 +1,8 @@
 """Morlet wavelets in space: transform, inverse per wavenumber bin, and the equivalent bank of FFT filters.
 
-The wavelet of the node kappa is Psi(kc eta / kappa), Psi(s) = exp(-(s - kc)^2 / 2), over the wavenumbers
-0 < eta <= pi alone (the paper's appendix A, its formulas made consistent). A real signal is twice the real part
-of what its positive wavenumbers make; eta = pi belongs to both signs and counts half on either.
+The paper's Eqs. (A4)-(A7), made consistent: the wavelet of the node kappa is Psi(kc eta/kappa), Psi(s) =
+exp(-(s - kc)^2 / 2), over the wavenumbers 0 < eta <= pi alone. A real signal is twice the real part of what its
+positive wavenumbers make; eta = pi belongs to both signs and counts half on either.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 LOWEST = np.pi / 60
@@ -28,7 +28,7 @@ Normalisation = Literal["analytic", "dual"]
 class Nodes:
     """Wavenumbers ``kappa`` (node) in rad per cell on a log grid, and their common weight dkappa/kappa."""
 
-    kappa: np.ndarray
+    kappa: NDArray[np.float64]
     weight: float
 
     @classmethod
@@ -44,12 +44,12 @@ class Nodes:
         kappa = LOWEST * ratio ** (np.arange(steps + 1) / steps)
         return cls(kappa, float(np.log(ratio) / steps))
 
-    def bins(self, count: int = BINS) -> np.ndarray:
+    def bins(self, count: int = BINS) -> NDArray[np.int64]:
         """Bin (node) of every node, from 0: edges k pi/count, all nodes above pi in the last."""
         return np.minimum((self.kappa * count / np.pi).astype(int), count - 1)
 
 
-def window(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
+def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> NDArray[np.float64]:
     """Psi(kc eta/kappa) (kappa, eta), zero for eta <= 0.
 
     Raises ValueError for ``kc`` below 5: the uncorrected Morlet wavelet then has weight at eta = 0.
@@ -79,13 +79,15 @@ def padded_length(cells: int, kc: float, lowest: float = LOWEST) -> int:
     return fft.next_fast_len(cells + int(np.ceil(reach)), real=True)
 
 
-def wavenumbers(length: int) -> np.ndarray:
+def wavenumbers(length: int) -> NDArray[np.float64]:
     """Wavenumbers (k) in rad per cell of a real transform of ``length``."""
     return 2 * np.pi * np.arange(length // 2 + 1) / length
 
 
-def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | None = None) -> np.ndarray:
-    """Complex wavelet transform X (..., kappa, x) of real signals (..., cell), X in the signal's unit.
+def transform(
+    signal: NDArray[np.float64], kappa: ArrayLike, kc: float, length: int | None = None
+) -> NDArray[np.complex128]:
+    """Complex wavelet transform X (..., kappa, x), Eq. (A5), of real signals (..., cell); X in the signal's unit.
 
     X = sqrt(kc/kappa) IFFT[FFT(signal) Psi(kc eta/kappa)] on the line padded to ``length``, by default
     ``padded_length`` of the lowest node. The lattice is its first ``cells`` columns; the rest is needed to
@@ -96,7 +98,7 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
     length = padded_length(cells, kc, float(kappa.min())) if length is None else length
     if length < cells:
         raise ValueError(f"length = {length}: below the {cells} cells of the signal")
-    filters = np.sqrt(kc / kappa)[:, None] * window(kappa, kc, wavenumbers(length))
+    filters = np.sqrt(kc / kappa)[:, None] * wavelet_spectrum(kappa, kc, wavenumbers(length))
     if length % 2 == 0:
         filters[:, -1] *= 0.5
     spectrum = np.zeros((*signal.shape[:-1], len(kappa), length), dtype=complex)
@@ -104,20 +106,20 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
     return fft.ifft(spectrum, overwrite_x=True)
 
 
-def inverse(x: np.ndarray, nodes: Nodes, kc: float, bins: int = BINS) -> np.ndarray:
-    """Parts (bin, ..., x) of the signals whose transform at ``nodes`` is ``x`` (..., kappa, x), uncropped.
+def inverse(x: NDArray[np.complex128], nodes: Nodes, kc: float, bins: int = BINS) -> NDArray[np.float64]:
+    """Parts (bin, ..., x), Eq. (A7), of the signals whose transform at ``nodes`` is ``x`` (..., kappa, x), uncropped.
 
     u_b = 2 Re (1/C) sum over the nodes of bin b of (dkappa/kappa) sqrt(kappa/kc) IFFT[FFT(X) Psi(kc eta/kappa)].
     The parts sum to the signal but for its mean and the wavenumbers near and below pi/60 (see ``Bank``).
     """
     length = x.shape[-1]
     weights = nodes.weight / constant(kc) * np.sqrt(nodes.kappa / kc)
-    filters = weights[:, None] * window(nodes.kappa, kc, wavenumbers(length))
+    filters = weights[:, None] * wavelet_spectrum(nodes.kappa, kc, wavenumbers(length))
     if length % 2 == 0:
         filters[:, -1] *= 2
     spectrum = fft.fft(x)[..., : length // 2 + 1] * filters
-    of = nodes.bins(bins)
-    return np.stack([fft.irfft(spectrum[..., of == b, :].sum(axis=-2), length) for b in range(bins)])
+    bin_of = nodes.bins(bins)
+    return np.stack([fft.irfft(spectrum[..., bin_of == b, :].sum(axis=-2), length) for b in range(bins)])
 
 
 @dataclass(frozen=True)
@@ -132,11 +134,11 @@ class Bank:
     all but 1e-10 already, so the filters have no step.
     """
 
-    transfer: np.ndarray
+    transfer: NDArray[np.float64]
     cells: int
     length: int
 
-    def split(self, signal: np.ndarray) -> np.ndarray:
+    def split(self, signal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Parts (bin, ..., cell) of real signals (..., cell), on the lattice alone."""
         spectrum = fft.rfft(signal, self.length)
         return np.stack([fft.irfft(t * spectrum, self.length)[..., : self.cells] for t in self.transfer])
@@ -157,9 +159,9 @@ def filter_bank(
         raise ValueError(f"normalisation = {normalisation!r}: analytic or dual")
     length = padded_length(cells, kc) if length is None else length
     nodes, eta = Nodes.log(kc, voices), wavenumbers(length)
-    gain = nodes.weight / constant(kc) * window(nodes.kappa, kc, eta) ** 2
-    of = nodes.bins(bins)
-    transfer = np.stack([gain[of == b].sum(axis=0) for b in range(bins)])
+    gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, eta) ** 2
+    bin_of = nodes.bins(bins)
+    transfer = np.stack([gain[bin_of == b].sum(axis=0) for b in range(bins)])
     if normalisation == "dual":
         low = eta < LOWEST
         transfer[:, ~low] /= transfer[:, ~low].sum(axis=0)
