@@ -14,7 +14,6 @@ from vipetsc.case import Case
 from vipetsc.case.schema import TimeTable
 from vipetsc.dynamics.engine import select_engine
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.run import ENGINES
 
 
@@ -35,7 +34,7 @@ class Flight:
         kind, refused = select_engine(case.time.engine, self.model, ENGINES)
         if refused:
             raise RuntimeError(refused)
-        self.engine = kind.create(self.model, self.layout, LatticeOperator(self.model, self.layout), True, None)
+        self.engine = kind(self.model, self.layout)
 
     def advance(self, sample: int) -> None:
         """Go to a sample; samples must be taken in turn."""

@@ -239,7 +239,6 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     from mpi4py import MPI
 
     from vipetsc.dynamics.layout import Layout
-    from vipetsc.dynamics.operator import LatticeOperator
     from vipetsc.dynamics.ts.integrator import Integrator
 
     # Springs so soft that they do nothing during one impact.
@@ -259,13 +258,12 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     )  # fmt: skip
     model = case.model()
     layout = Layout.of(model, MPI.COMM_SELF)
-    operator = LatticeOperator(model, layout)
-    integrator = Integrator(model, layout, operator)
+    integrator = Integrator(model, layout)
     tracker = integrator.tracker
     # Velocities lie behind the displacements, mass by mass: host and resonator of cell 1.
     integrator.state.array[layout.dofs * layout.owned + layout.owned] = 1.0
     integrator.step = integrator.free_step = 1e-5
-    operator.observe(0.0, integrator.state, tracker.start)
+    integrator.observe(tracker.start)
     integrator._first_step = 1e-5
     integrator.advance(0.0025)  # before the rebound meets the other side
     (episode,) = tracker.closed

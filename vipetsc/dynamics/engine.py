@@ -12,7 +12,6 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.contact.episodes import Episode
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.parallel import StopRequest
 
 
@@ -30,12 +29,9 @@ class Engine(ABC):
     state: PETSc.Vec
     time: float
 
-    @classmethod
     @abstractmethod
-    def create(
-        cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
-    ) -> Engine:
-        """An engine for ``model``, at rest at t = 0; all ranks must call it."""
+    def __init__(self, model: Model, layout: Layout, native: bool = True, stop: StopRequest | None = None) -> None:
+        """An engine for ``model`` at rest at t = 0, on all ranks; ``native``: no Python in the right-hand side."""
 
     @classmethod
     @abstractmethod

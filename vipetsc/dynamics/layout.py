@@ -87,21 +87,16 @@ class Layout:
             return left % self.cells, right % self.cells
         return (left if left >= 0 else None), (right if right < self.cells else None)
 
-    def displacement_indices(self, cell: int) -> list[int]:
-        """Global indices of the displacements of ``cell``, mass by mass."""
+    def state_indices(self, cell: int) -> list[int]:
+        """Global indices of the displacements and then of the velocities of ``cell``, mass by mass."""
         rank = next(r for r, (a, b) in enumerate(self.ranges) if a <= cell < b)
         a, b = self.ranges[rank]
-        return [self.offsets[rank] + mass * (b - a) + cell - a for mass in range(self.dofs)]
-
-    def state_indices(self, cell: int) -> list[int]:
-        """Global indices of the displacements and velocities of ``cell``, mass by mass."""
-        first = self.displacement_indices(cell)
-        return first + [first[-1] + (i + 1) * (first[1] - first[0]) for i in range(self.dofs)]
+        return [self.offsets[rank] + i * (b - a) + cell - a for i in range(2 * self.dofs)]
 
     def create_vector(self, array: np.ndarray | None = None) -> PETSc.Vec:
         """A zero state with ghosts for the neighbouring cells' displacements, in ``array`` if one is given."""
-        ghosts = [i for cell in self.neighbours() if cell is not None for i in self.displacement_indices(cell)]
-        indices = np.asarray(ghosts, PETSc.IntType)
+        cells = [cell for cell in self.neighbours() if cell is not None]
+        indices = np.array([self.state_indices(cell)[: self.dofs] for cell in cells], PETSc.IntType).ravel()
         size = (self.size, PETSc.DETERMINE)
         if array is not None:
             return PETSc.Vec().createGhostWithArray(indices, array, size=size, comm=self.comm)

@@ -11,7 +11,8 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.dynamics.energies import FINE, measure
-from vipetsc.dynamics.operator import LatticeOperator
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.records import create_record
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,9 @@ class EnergyMeter:
     far below the run's energy scale, and a finer rest.
     """
 
-    def __init__(self, model: Model, operator: LatticeOperator) -> None:
-        self.operator = operator
-        self.comm = operator.layout.comm
+    def __init__(self, model: Model, layout: Layout) -> None:
+        self.comm = layout.comm
+        self._lattice = create_record(model, layout)
         speed = model.scale * model.drive.frequency
         burst = model.drive.duration * model.speed  # cells that the packet covers
         scale = sum(model.chain.cell.masses) * speed**2 * max(burst, 1.0)
@@ -60,7 +61,7 @@ class EnergyMeter:
         """Energies of ``state``, whose ghosts must be up to date; all ranks must call it."""
         total = self._total
         with state.localForm() as local:
-            measure(local.array, self.operator.lattice, self.unit, total)
+            measure(local.array, self._lattice, self.unit, total)
         self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         *pairs, work = total.tolist()
         sums = [a * self.unit + b * (self.unit / FINE) for a, b in zip(pairs[::2], pairs[1::2], strict=True)]

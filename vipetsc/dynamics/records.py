@@ -1,19 +1,18 @@
 """The lattice as compiled kernels see it: tables of masses, springs and sites, and the drive.
 
-A rank's part of the state is ordered as ``layout`` says. The tables are structured arrays; ``LatticeRecord`` holds them
-for functions compiled by numba, ``CONTEXT`` their addresses for a callback that PETSc hands one pointer.
+A rank's part of the state is ordered as ``layout`` says.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple, get_type_hints
+from typing import NamedTuple
 
 import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.compiled import njit
-from vipetsc.contact.law import Contacts, ForceLaw, create_contacts
+from vipetsc.contact.law import Contacts, create_contacts
 from vipetsc.dynamics.layout import Layout
 from vipetsc.lattice import ToneBurst
 
@@ -73,28 +72,6 @@ class LatticeRecord(NamedTuple):
     burst: Burst
 
 
-_TABLES = ("masses", "couplings", "springs", "site_cells", "sites")
-
-
-def _c_struct(record: type) -> np.dtype:
-    """The fields of a record of numbers, in their order."""
-    return np.dtype(list(get_type_hints(record).items()), align=True)
-
-
-CONTEXT = np.dtype(
-    [
-        ("array", _INT),  # receives the address of a vector's array; first, so that its address is the context's
-        ("shape", _c_struct(Shape)),
-        ("law", _c_struct(ForceLaw)),
-        ("burst", _c_struct(Burst)),
-        ("address", np.dtype([(name, _INT) for name in _TABLES])),
-        ("length", np.dtype([(name, _INT) for name in _TABLES])),
-    ],
-    align=True,
-)
-"""A ``LatticeRecord`` for C: its values, and the addresses and lengths of its tables."""
-
-
 def create_burst(drive: ToneBurst) -> Burst:
     """The record of a tone burst."""
     return Burst(drive.window_amplitude, drive.frequency, float(drive.cycles), drive.duration)
@@ -138,16 +115,6 @@ def _shape(model: Model, layout: Layout) -> Shape:
         work=layout.work,
         dissipated=layout.dissipated,
     )
-
-
-def create_context(lattice: LatticeRecord) -> np.ndarray:
-    """The context (1,) of a record, which must outlive it."""
-    context = np.zeros(1, CONTEXT)
-    tables = lattice._asdict() | {"sites": lattice.contacts.sites}
-    context["shape"], context["law"], context["burst"] = lattice.shape, lattice.contacts.law, lattice.burst
-    context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
-    context["length"] = tuple(tables[name].size for name in _TABLES)
-    return context
 
 
 @njit(error_model="numpy")

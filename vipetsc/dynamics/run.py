@@ -19,7 +19,6 @@ from vipetsc.dynamics.meter import EnergyMeter
 from vipetsc.dynamics.observers import Observer, Recorder, RunawayError, Sample, Setup
 from vipetsc.dynamics.observers.guard import fastest_place
 from vipetsc.dynamics.observers.recorder import recorded_cells
-from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import provenance
@@ -147,10 +146,9 @@ class Run:
     ) -> None:
         self.comm, self.observers = output.comm, observers
         layout = Layout.of(model, self.comm)
-        operator = LatticeOperator(model, layout)
         kind, self._refusal = select_engine(case.time.engine, model, ENGINES)
-        engine = kind.create(model, layout, operator, native, stop)
-        self.setup = Setup(case, model, layout, EnergyMeter(model, operator), engine, output)
+        engine = kind(model, layout, native, stop)
+        self.setup = Setup(case, model, layout, EnergyMeter(model, layout), engine, output)
         self.samples = 0
         self.last: float | None = None
         for observer in observers:

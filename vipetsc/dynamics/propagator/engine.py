@@ -19,7 +19,6 @@ from vipetsc.case import Model
 from vipetsc.contact.episodes import Episode
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.operator import LatticeOperator
 from vipetsc.dynamics.propagator.cluster import group_dofs
 from vipetsc.dynamics.propagator.forces import Forces
 from vipetsc.dynamics.propagator.halo import HaloRegions
@@ -66,7 +65,7 @@ class Propagator(Engine):
 
     name = "propagator"
 
-    def __init__(self, model: Model, layout: Layout, stop: StopRequest | None) -> None:
+    def __init__(self, model: Model, layout: Layout, native: bool = True, stop: StopRequest | None = None) -> None:
         series = step_series(model)
         assert series is not None, "refused"
         self.series = series
@@ -87,13 +86,6 @@ class Propagator(Engine):
         self._ghosts = [self._halo.add(cell, 1) for cell in neighbours]
         self._halo.bind_columns()
         self._status = np.zeros(2)
-
-    @classmethod
-    def create(
-        cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
-    ) -> Propagator:
-        """A propagator at rest at t = 0."""
-        return cls(model, layout, stop)
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:

@@ -20,7 +20,9 @@ from vipetsc.contact.episodes import Episode
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.operator import LatticeOperator
+from vipetsc.dynamics.records import create_record
+from vipetsc.dynamics.ts.native import register
+from vipetsc.dynamics.ts.right_hand_side import observe, right_hand_side
 from vipetsc.lattice import Hertz
 from vipetsc.parallel import StopRequest
 
@@ -48,8 +50,8 @@ class Integrator(Engine):
 
     Parameters
     ----------
-    model, layout, operator
-        The lattice, its distribution and its right-hand side.
+    model, layout
+        The lattice and its distribution.
     native
         Register the compiled right-hand side directly (default), or through Python with the same bits.
     stop
@@ -61,17 +63,10 @@ class Integrator(Engine):
 
     name = "ts"
 
-    def __init__(
-        self,
-        model: Model,
-        layout: Layout,
-        operator: LatticeOperator,
-        native: bool = True,
-        stop: StopRequest | None = None,
-    ) -> None:
+    def __init__(self, model: Model, layout: Layout, native: bool = True, stop: StopRequest | None = None) -> None:
         self.comm = layout.comm
-        self.operator = operator
-        self.tracker = ImpactTracker(operator.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
+        self.lattice = create_record(model, layout)
+        self.tracker = ImpactTracker(self.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
         self._burst_end = model.drive.duration
         self._dissipated = layout.dissipated
         self.counts = StepCounts()
@@ -91,14 +86,7 @@ class Integrator(Engine):
         hertz = model.contact.law is Hertz
         share, order = (1 / 200, 2.5) if hertz else (1 / 20, 8)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
-        operator.observe(0.0, self.state, self.tracker.start)
-
-    @classmethod
-    def create(
-        cls, model: Model, layout: Layout, operator: LatticeOperator, native: bool, stop: StopRequest | None
-    ) -> Integrator:
-        """An integrator at rest at t = 0; see ``Engine``."""
-        return cls(model, layout, operator, native, stop)
+        self.observe(self.tracker.start)
 
     @classmethod
     def refusal(cls, model: Model) -> None:
@@ -124,9 +112,29 @@ class Integrator(Engine):
         ts.setMaxStepRejections(0)
         ts.setErrorIfStepFails(False)
         ts.setSolution(self.state)
-        self.right_hand_side = self.operator.register(ts, native)
+        self.right_hand_side = "native" if native else "python"
+        if native:
+            register(ts, self.lattice)
+        else:
+            ts.setRHSFunction(self._evaluate)
         ts.setFromOptions()
         return ts
+
+    def _exchange(self, u: PETSc.Vec) -> None:
+        """Fetch the neighbouring cells' displacements into the ghosts of ``u``."""
+        if self.lattice.shape.exchange:
+            u.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+
+    def _evaluate(self, ts: PETSc.TS, t: float, u: PETSc.Vec, f: PETSc.Vec) -> None:
+        self._exchange(u)
+        with u.localForm() as local:
+            right_hand_side(t, local.array, f.array, self.lattice)
+
+    def observe(self, motion: np.ndarray, time: float | None = None) -> None:
+        """Fill ``motion`` (sites, 3) from the state; it is taken at ``time``, else at the present one."""
+        self._exchange(self.state)
+        with self.state.localForm() as local:
+            observe(self.time if time is None else time, local.array, self.lattice, motion)
 
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s; returns False if a stop was requested.
@@ -169,7 +177,7 @@ class Integrator(Engine):
             self.step = suggestion
         self.counts.steps += 1
         end = target if count == 1 else self.time + h
-        self.operator.observe(end, self.state, self.tracker.end)
+        self.observe(self.tracker.end, end)
         change = self.tracker.first_change(h)
         self._buffer[:] = change.share, -float(self._stop.requested)
         self.comm.Allreduce(MPI.IN_PLACE, self._buffer, MPI.MIN)
@@ -212,7 +220,7 @@ class Integrator(Engine):
                 self.step = suggestion
                 self.saved.copy(self.state)
                 return
-            self.operator.observe(self.time + length, self.state, tracker.end)
+            self.observe(tracker.end, self.time + length)
             attempt, outcome = comm.bcast(self._judge(attempt, change) if comm.rank == owner else None, owner)
         tracker.accept_step(length)
         self.time += length
@@ -244,7 +252,7 @@ class Integrator(Engine):
             self.step = min(self.step, self._first_share * shortest)
         elif not was_free:
             self.step = self.free_step
-        self.operator.observe(self.time, self.state, tracker.start)
+        self.observe(tracker.start)
         self.ts.restartStep()
 
     def take_episodes(self) -> list[Episode]:
@@ -280,7 +288,7 @@ class Integrator(Engine):
         self._any_open = bool(any_open)
         self.counts = StepCounts(*checkpoint["counts"].tolist())
         self.ts.restartStep()
-        self.operator.observe(self.time, self.state, self.tracker.start)
+        self.observe(self.tracker.start)
 
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""

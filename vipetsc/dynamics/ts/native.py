@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_type_hints
 
 from petsc4py import PETSc
 
@@ -16,8 +16,29 @@ from numba.extending import intrinsic
 
 from vipetsc.compiled import cfunc, njit
 from vipetsc.contact.law import SITE, Contacts, ForceLaw
-from vipetsc.dynamics.records import CONTEXT, COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
+from vipetsc.dynamics.records import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
 from vipetsc.dynamics.ts.right_hand_side import right_hand_side
+
+_TABLES = ("masses", "couplings", "springs", "site_cells", "sites")
+
+
+def _c_struct(record: type) -> np.dtype:
+    """The fields of a record of numbers, in their order."""
+    return np.dtype(list(get_type_hints(record).items()), align=True)
+
+
+CONTEXT = np.dtype(
+    [
+        ("array", np.int64),  # receives the address of a vector's array; first, so that its address is the context's
+        ("shape", _c_struct(Shape)),
+        ("law", _c_struct(ForceLaw)),
+        ("burst", _c_struct(Burst)),
+        ("address", np.dtype([(name, np.int64) for name in _TABLES])),
+        ("length", np.dtype([(name, np.int64) for name in _TABLES])),
+    ],
+    align=True,
+)
+"""A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables."""
 
 
 def _petsc_function(name: str, *arguments: types.Type) -> Any:
@@ -92,6 +113,16 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     return _restore_read(u, address)
 
 
+def _create_context(lattice: LatticeRecord) -> np.ndarray:
+    """The context (1,) of a record."""
+    context = np.zeros(1, CONTEXT)
+    tables = lattice._asdict() | {"sites": lattice.contacts.sites}
+    context["shape"], context["law"], context["burst"] = lattice.shape, lattice.contacts.law, lattice.burst
+    context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
+    context["length"] = tuple(tables[name].size for name in _TABLES)
+    return context
+
+
 def compile_callback() -> CFunc:
     """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
 
@@ -102,3 +133,13 @@ def compile_callback() -> CFunc:
         address = ctypes.cast(getattr(library, function.symbol), ctypes.c_void_p).value
         binding.add_symbol(function.symbol, address)
     return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)
+
+
+def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
+    """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``."""
+    callback, context = compile_callback(), _create_context(lattice)
+    ts.setAttr("callback", (callback, context, lattice))  # PETSc holds bare pointers: all must live as long as ts
+    pointers = (ctypes.c_void_p(p) for p in (ts.handle, None, callback.address, context.ctypes.data))
+    error = petsc_library().TSSetRHSFunction(*pointers)
+    if error:
+        raise RuntimeError(f"TSSetRHSFunction failed with PETSc error {error}")
