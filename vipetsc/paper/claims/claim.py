@@ -15,10 +15,14 @@ if TYPE_CHECKING:
     from vipetsc.paper.claims.evidence import Evidence
 
 HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
-VERDICTS = (HOLDS, IN_PART, FAILS, UNMEASURED)
 DIGITS = 6  # significant ones of the numbers in claims.json
+ROUNDING = 1e-9  # of a measured number beside its threshold
 
 Numbers = dict[str, float | None]
+
+
+class MissingEvidence(Exception):
+    """What a claim is measured from is not there; the message says what."""
 
 
 @dataclass(frozen=True)
@@ -44,38 +48,57 @@ class Claim:
 
 @dataclass(frozen=True)
 class Criterion:
-    """``low`` <= the number called ``name`` <= ``high``; a claim that fails a ``decisive`` one does not hold.
+    """A row of the table of thresholds: what decides on ``claim``.
 
-    With ``of`` the number is a share, and ``low`` counts out of ``of``.
+    ``comparison`` of the number called ``quantity`` with ``threshold``:
+
+    ========  =============  ========================================================
+    "<="      bound          at most
+    ">="      bound          at least
+    "within"  (low, high)    in the closed interval
+    "of"      (count, all)   the quantity is a share: at least ``count`` out of ``all``
+    ========  =============  ========================================================
+
+    ``source`` is where SPEC.md or the paper gives the threshold. A claim that fails a ``decisive`` criterion does not
+    hold.
     """
 
-    name: str
-    low: float = -float("inf")
-    high: float = float("inf")
-    unit: str = ""
-    of: int = 0
+    claim: str
+    quantity: str
+    comparison: str
+    threshold: float | tuple[float, float]
+    unit: str
+    source: str
     decisive: bool = False
 
     def met(self, value: float) -> bool:
-        """Whether ``value`` keeps within the bounds; a number that is not finite does not."""
-        scale = self.of or 1
-        return isfinite(value) and self.low - 1e-9 <= value * scale <= self.high + 1e-9
+        """Whether ``value`` keeps to the threshold; a number that is not finite does not."""
+        low, high = self.interval
+        scale = high if self.comparison == "of" else 1
+        return isfinite(value) and low - ROUNDING <= value * scale <= high + ROUNDING
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Lowest and highest number that meets the criterion; counts for shares."""
+        if isinstance(self.threshold, tuple):
+            return self.threshold
+        return (-float("inf"), self.threshold) if self.comparison == "<=" else (self.threshold, float("inf"))
 
     def __str__(self) -> str:
-        if self.of:
-            return f"{self.name}: at least {self.low:g} of {self.of}"
+        low, high = self.interval
         unit = f" {self.unit}" if self.unit else ""
-        if isfinite(self.low) and isfinite(self.high):
-            return f"{self.name}: {self.low:.4g} to {self.high:.4g}{unit}"
-        sign, bound = (">=", self.low) if isfinite(self.low) else ("<=", self.high)
-        return f"{self.name} {sign} {bound:.4g}{unit}"
+        if self.comparison == "of":
+            return f"{self.quantity}: at least {low:g} of {high:g}"
+        if self.comparison == "within":
+            return f"{self.quantity}: {low:.4g} to {high:.4g}{unit}"
+        return f"{self.quantity} {self.comparison} {self.threshold:.4g}{unit}"
 
 
 @dataclass
 class Measurement:
     """What a measurement gathers: numbers by name, their uncertainties, and sentences that explain them.
 
-    ``figure`` takes the place of the statement's where the picture's name depends on the data.
+    ``figure`` takes the place of the claim's where the picture's name depends on the data.
     """
 
     value: Numbers = field(default_factory=dict)
@@ -86,40 +109,33 @@ class Measurement:
 
 @dataclass(frozen=True)
 class ClaimSpec:
-    """A claim before it is measured.
+    """A claim before it is measured; its criteria are the rows of ``thresholds.THRESHOLDS`` with its ``id``.
 
-    ``figure`` may hold ``{reading}``. ``measure`` (evidence, reading, finding) fills the finding, and raises
+    ``figure`` may hold ``{reading}``. ``measure`` (evidence, reading, measurement) fills the measurement, and raises
     ``MissingEvidence`` when it cannot.
     """
 
     id: str
     claim: str
     figure: str
-    criteria: tuple[Criterion, ...]
     measure: Callable[[Evidence, str, Measurement], None]
-
-    @property
-    def threshold(self) -> str:
-        """All criteria in words, from the numbers that decide."""
-        return "; ".join(map(str, self.criteria))
 
 
 def verdict(criteria: Sequence[Criterion], value: Mapping[str, float | None]) -> tuple[str, list[str]]:
-    """The verdict on the numbers ``value``, and the names of the criteria that are not met or not measured.
+    """The verdict on the numbers ``value``, and the quantities of the criteria that are not met or not measured.
 
     It holds when every criterion is met, not at all when none is or a decisive one is not, and else in part; what
     was not measured keeps it from holding.
     """
-    known = [c for c in criteria if value.get(c.name) is not None]
-    if not known:
-        return UNMEASURED, [c.name for c in criteria]
-    met = [c for c in known if c.met(value[c.name])]
-    missed = [c.name for c in criteria if c not in met]
-    if len(met) == len(criteria):
+    numbers = {c: value.get(c.quantity) for c in criteria}
+    met = [c for c, number in numbers.items() if number is not None and c.met(number)]
+    failed = [c for c, number in numbers.items() if number is not None and c not in met]
+    missed = [c.quantity for c in criteria if c not in met]
+    if not met and not failed:
+        return UNMEASURED, missed
+    if not missed:
         return HOLDS, missed
-    if not met or any(c.decisive for c in known if c not in met):
-        return FAILS, missed
-    return IN_PART, missed
+    return FAILS if not met or any(c.decisive for c in failed) else IN_PART, missed
 
 
 def rounded(numbers: Mapping[str, float | None]) -> Numbers:

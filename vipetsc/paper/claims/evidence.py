@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
+import tomllib
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
+import xarray as xr
 
 from vipetsc.case import Case
-from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.read import axes, member_folder, open_ensemble, select
+from vipetsc.paper.claims.claim import MissingEvidence
 from vipetsc.spectra import normalised
-
-Place = tuple[int, ...]
-
-
-class MissingEvidence(Exception):
-    """What a claim is measured from is not there; the message says what."""
 
 
 @dataclass(frozen=True)
-class Member:
-    """A member of a sweep whose fields were kept: its case, folder and ``analysis.h5``."""
+class MeasuredRun:
+    """A member of a sweep whose fields were kept: its case, folder, ``analysis.h5`` and number of contacts."""
 
     case: Case
     folder: Path
-    analysis: h5py.File
+    analysis: xr.Dataset
     episodes: int
 
     @property
@@ -35,14 +32,29 @@ class Member:
         """Amplitude of the drive in N."""
         return self.case.drive.amplitude
 
+    def arrays(self, *names: str) -> tuple[np.ndarray, ...]:
+        """Variables of the analysis by name."""
+        return tuple(self.analysis[name].values for name in names)
+
 
 @dataclass(frozen=True)
-class Curve:
+class AmplitudeCurve:
     """A measure over rising ``amplitude`` (point) in N, without failed members, and the contact ``episodes``."""
 
     amplitude: np.ndarray
     value: np.ndarray
     episodes: np.ndarray
+
+    @classmethod
+    def of(cls, members: xr.Dataset, name: str) -> AmplitudeCurve:
+        """The measure ``name`` of ``Evidence.select``; raises MissingEvidence."""
+        step = Path(members.attrs["folder"]).name
+        if name not in members:
+            raise MissingEvidence(f"{step} holds no {name} over the amplitude")
+        valid = members.isel(amplitude=np.isfinite(members[name].values))
+        if not valid.sizes["amplitude"]:
+            raise MissingEvidence(f"{step}: every member of a curve of {name} failed")
+        return cls(valid["amplitude"].values, valid[name].values, valid["contact_episodes"].values)
 
     @property
     def untouched(self) -> np.ndarray:
@@ -54,12 +66,19 @@ class Curve:
         """Index of the largest value."""
         return int(np.argmax(self.value))
 
-    def normalised(self) -> np.ndarray:
-        """The values on [.01, 1], as the paper's; NaN if they are all alike."""
-        return normalised(self.value) if np.ptp(self.value) > 0 else np.full(len(self.value), np.nan)
+    @property
+    def peak_amplitude(self) -> float:
+        """Amplitude in N of the largest value."""
+        return float(self.amplitude[self.peak])
 
-    def rise(self, low: float, high: float) -> float:
-        """Ratio of the amplitudes between which the values rise: from the last <= ``low`` to the first >= ``high``.
+    @property
+    def normalised(self) -> AmplitudeCurve:
+        """The same with values on [.01, 1], as the paper's; NaN if they are all equal."""
+        value = normalised(self.value) if np.ptp(self.value) > 0 else np.full(len(self.value), np.nan)
+        return AmplitudeCurve(self.amplitude, value, self.episodes)
+
+    def growth_ratio(self, low: float, high: float) -> float:
+        """Ratio of the amplitudes between which the values grow: from the last <= ``low`` to the first >= ``high``.
 
         Up to the peak; NaN if none is so low before it.
         """
@@ -70,7 +89,7 @@ class Curve:
         first = above[above > before[-1]][0]
         return float(self.amplitude[first] / self.amplitude[before[-1]])
 
-    def at(self, amplitude: float) -> float:
+    def interpolate(self, amplitude: float) -> float:
         """The value at ``amplitude`` in N, interpolated over its logarithm; NaN beyond the ends."""
         x = np.log(self.amplitude)
         return float(np.interp(np.log(amplitude), x, self.value, left=np.nan, right=np.nan))
@@ -79,14 +98,15 @@ class Curve:
 class Evidence:
     """The steps in ``root``, opened as they are asked for. Use it as a context manager.
 
-    ``files`` are those asked for so far, relative to ``root``, in order.
+    ``files`` are those asked for so far, relative to ``root``, in order. Every method raises ``MissingEvidence`` for
+    what is not there.
     """
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root)
-        self._stack = ExitStack()
-        self._ensembles: dict[str, EnsembleFile] = {}
         self.files: list[str] = []
+        self._stack = ExitStack()
+        self._ensembles: dict[str, xr.Dataset] = {}
 
     def __enter__(self) -> Evidence:
         return self
@@ -95,86 +115,63 @@ class Evidence:
         self._stack.close()
 
     def path(self, *parts: str) -> Path:
-        """A file below ``root`` that is there, noted down; raises MissingEvidence."""
-        path = self.root.joinpath(*parts)
-        if not path.exists():
-            raise MissingEvidence(f"{'/'.join(parts)} is missing")
-        name = path.relative_to(self.root).as_posix()
+        """A file below ``root``, noted down."""
+        name = "/".join(parts)
+        if not (self.root / name).exists():
+            raise MissingEvidence(f"{name} is missing")
         if name not in self.files:
             self.files.append(name)
-        return path
+        return self.root / name
 
-    def hdf5(self, *parts: str) -> h5py.File:
-        """An HDF5 file below ``root``; raises MissingEvidence."""
+    def open(self, *parts: str, needs: tuple[str, ...] = ()) -> xr.Dataset:
+        """An HDF5 file below ``root`` with the variables and groups ``needs``."""
         path = self.path(*parts)
         try:
-            return self._stack.enter_context(h5py.File(path, "r"))
-        except OSError as error:
-            raise MissingEvidence(f"{'/'.join(parts)} cannot be read: {error}") from None
+            return self._stack.enter_context(open_netcdf(path, "file of results", needs))
+        except (OSError, ValueError) as error:
+            raise MissingEvidence(str(error).replace(f"{self.root}/", "")) from None
 
-    def ensemble(self, step: str) -> EnsembleFile:
-        """The finished sweep of a step; raises MissingEvidence."""
+    def ensemble(self, step: str) -> xr.Dataset:
+        """The finished sweep of a step."""
         self.path(step, "ensemble.h5")
         if step not in self._ensembles:
             try:
-                self._ensembles[step] = self._stack.enter_context(EnsembleFile(self.root / step))
+                self._ensembles[step] = open_ensemble(self.root / step)
             except (OSError, ValueError) as error:
-                raise MissingEvidence(f"{step}: {error}") from None
+                raise MissingEvidence(f"{step}: {error}".replace(f"{self.root}/", "")) from None
         return self._ensembles[step]
 
-    def place(self, step: str, reading: str, **fixed: Any) -> Place:
-        """Where members of this ``reading`` with the coordinates ``fixed`` stand; raises MissingEvidence."""
-        ensemble = self.ensemble(step)
-        try:
-            if "reading" in ensemble.dimensions:
-                return ensemble.place(reading=reading, **fixed)
-            place = ensemble.place(**fixed)
-        except KeyError:
-            wanted = ", ".join(f"{k} = {v:.6g}" if isinstance(v, float) else f"{k} = {v}" for k, v in fixed.items())
-            wanted = f"reading = {reading}" + (f", {wanted}" if wanted else "")
-            raise MissingEvidence(f"{step} has no members with {wanted}") from None
-        own = ensemble.sweep.table.get("lattice", {}).get("reading", "calibrated")
-        if own != reading:
-            raise MissingEvidence(f"{step} has the reading {own!r} alone")
-        return place
+    def select(self, step: str, reading: str, **wanted: Any) -> xr.Dataset:
+        """The members of a sweep over rising amplitude, in one reading and with the coordinates ``wanted``.
 
-    def curve(self, step: str, name: str, place: Place) -> Curve:
-        """The measure ``name`` over amplitude at ``place`` on the other axes; raises MissingEvidence."""
-        ensemble = self.ensemble(step)
-        if name not in ensemble or "amplitude" not in ensemble.dimensions:
-            raise MissingEvidence(f"{step} holds no {name} over the amplitude")
-        index = along_amplitude(ensemble, place)
-        amplitude, value = ensemble.values("amplitude"), ensemble.values(name)[index]
-        episodes = ensemble.values("contact_episodes")[index]
-        order = np.argsort(amplitude, kind="stable")
-        order = order[np.isfinite(value[order])]
-        if not order.size:
-            raise MissingEvidence(f"{step}: every member of a curve of {name} failed")
-        return Curve(amplitude[order], value[order], episodes[order])
-
-    def members(self, step: str, place: Place, *needed: str) -> list[Member]:
-        """The members with fields at ``place``, one an amplitude, rising; raises MissingEvidence.
-
-        ``needed`` names what their analyses must hold.
+        Of an axis that is not named the first value is taken.
         """
         ensemble = self.ensemble(step)
-        along = ensemble.dimensions.index("amplitude")
-        amplitude = ensemble.values("amplitude")
-        found = []
-        for i in np.argsort(amplitude, kind="stable"):
-            own = (*place[:along], int(i), *place[along + 1 :])
-            folder = ensemble.member(own)
-            if folder == ensemble.folder or not (folder / "analysis.h5").exists():
-                raise MissingEvidence(f"{step}: the member at {amplitude[i]:g} N failed or is missing")
-            analysis = self.hdf5(step, folder.name, "analysis.h5")
-            for name in needed:
-                if name not in analysis:
-                    raise MissingEvidence(f"{step}/{folder.name}/analysis.h5 holds no {name}")
-            episodes = int(ensemble.values("contact_episodes")[own])
-            found.append(Member(ensemble.case(own), folder, analysis, episodes))
-        return found
+        only = tomllib.loads(ensemble.attrs["case"]).get("lattice", {}).get("reading", "calibrated")
+        if "reading" in ensemble.coords:
+            wanted = {"reading": reading} | wanted
+        elif only != reading:
+            raise MissingEvidence(f"{step} has the reading {only!r} alone")
+        try:
+            members = select(ensemble, **wanted)
+        except KeyError:
+            named = ({"reading": reading} | wanted).items()
+            values = ", ".join(f"{k} = {v:.6g}" if isinstance(v, float) else f"{k} = {v}" for k, v in named)
+            raise MissingEvidence(f"{step} has no members with {values}") from None
+        if "amplitude" not in axes(members):
+            raise MissingEvidence(f"{step} holds no members over the amplitude")
+        return members.isel({axis: 0 for axis in axes(members) if axis != "amplitude"}).sortby("amplitude")
 
-
-def along_amplitude(ensemble: EnsembleFile, place: Place) -> tuple[int | slice, ...]:
-    """``place`` with the axis of amplitudes left open."""
-    return tuple(slice(None) if d == "amplitude" else i for d, i in zip(ensemble.dimensions, place, strict=True))
+    def runs(self, step: str, reading: str, *needs: str, **wanted: Any) -> list[MeasuredRun]:
+        """The members of ``select`` with their analyses, which must hold ``needs``."""
+        members = self.select(step, reading, **wanted)[["member", "contact_episodes"]]
+        runs = []
+        for i in range(members.sizes["amplitude"]):
+            member = members.isel(amplitude=i)
+            folder = member_folder(member)
+            if folder is None or not (folder / "analysis.h5").exists():
+                raise MissingEvidence(f"{step}: the member at {member['amplitude']:g} N failed or is missing")
+            analysis = self.open(step, folder.name, "analysis.h5", needs=needs)
+            case = Case.load(folder / "case.toml")
+            runs.append(MeasuredRun(case, folder, analysis, int(member["contact_episodes"])))
+        return runs

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vipetsc.paper.claims.claim import UNMEASURED, Claim, ClaimSpec, Measurement, rounded, verdict
+from vipetsc.paper.claims.claim import UNMEASURED, Claim, ClaimSpec, Measurement, MissingEvidence, rounded, verdict
 from vipetsc.paper.claims.entropy import ENTROPY
-from vipetsc.paper.claims.evidence import Evidence, MissingEvidence
+from vipetsc.paper.claims.evidence import Evidence
 from vipetsc.paper.claims.interband import INTERBAND
 from vipetsc.paper.claims.modes import MODES
 from vipetsc.paper.claims.scattering import SCATTERING
+from vipetsc.paper.claims.thresholds import criteria_of
 
 READINGS = "printed", "calibrated"
-STATEMENTS = (*SCATTERING, *ENTROPY, *INTERBAND, *MODES)
+CLAIMS: tuple[ClaimSpec, ...] = (*SCATTERING, *ENTROPY, *INTERBAND, *MODES)
 
 
 def measure_claims(root: str | Path) -> list[Claim]:
@@ -20,36 +21,34 @@ def measure_claims(root: str | Path) -> list[Claim]:
 
     What cannot be measured because its files are missing has the verdict "not measured" and says what is missing.
     """
-    return [measured(statement, reading, Path(root)) for statement in STATEMENTS for reading in READINGS]
+    return [measure_claim(claim, reading, Path(root)) for claim in CLAIMS for reading in READINGS]
 
 
-def measured(statement: ClaimSpec, reading: str, root: Path) -> Claim:
+def measure_claim(claim: ClaimSpec, reading: str, root: Path) -> Claim:
     """One claim in one reading."""
-    finding = Measurement()
+    result, criteria = Measurement(), criteria_of(claim.id)
+    judgement, missed = UNMEASURED, list[str]()
     with Evidence(root) as evidence:
         try:
-            statement.measure(evidence, reading, finding)
+            claim.measure(evidence, reading, result)
         except MissingEvidence as missing:
-            found, missed = UNMEASURED, []
-            finding.reasons.append(str(missing))
+            result.reasons.append(str(missing))
         except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
-            found, missed = UNMEASURED, []
-            words = " ".join(str(error).split()).replace(f"{root}/", "")
-            finding.reasons.append(f"{evidence.files[-1] if evidence.files else 'a file'} cannot be used: {words}")
+            message = " ".join(str(error).split()).replace(f"{root}/", "")
+            file = evidence.files[-1] if evidence.files else "a file"
+            result.reasons.append(f"{file} cannot be used: {message}")
         else:
-            found, missed = verdict(statement.criteria, finding.value)
-        files = tuple(evidence.files)
-    some = 0 < len(missed) < len(statement.criteria)
-    reasons = [f"not met: {' / '.join(missed)}"] if some else []
+            judgement, missed = verdict(criteria, result.value)
+    reasons = [f"not met: {' / '.join(missed)}"] if 0 < len(missed) < len(criteria) else []
     return Claim(
-        statement.id,
+        claim.id,
         reading,
-        statement.claim,
-        rounded(finding.value),
-        rounded(finding.uncertainty),
-        statement.threshold,
-        found,
-        "; ".join([*reasons, *finding.reasons]),
-        finding.figure or statement.figure.format(reading=reading),
-        files,
+        claim.claim,
+        rounded(result.value),
+        rounded(result.uncertainty),
+        "; ".join(map(str, criteria)),
+        judgement,
+        "; ".join([*reasons, *result.reasons]),
+        result.figure or claim.figure.format(reading=reading),
+        tuple(evidence.files),
     )
