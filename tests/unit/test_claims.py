@@ -612,7 +612,7 @@ def put_bands(root, velocity, change):
     "velocity, change, expected, missed",
     [
         (in_two_bands, as_it_is, HOLDS, ""),
-        (in_two_bands, overlapping, FAILS, "largest error of the mean over the record"),
+        (in_two_bands, overlapping, FAILS, ""),
         (in_two_bands, missing, FAILS, "largest error of the mean over the record"),
         (in_two_bands, swapped, FAILS, "largest difference of a part's share from that in the space-time spectrum"),
         (on_an_edge, as_it_is, FAILS, "mean error over a period of the drive"),
