@@ -10,12 +10,13 @@ from vipetsc.case import Case
 from vipetsc.figures import draw, draw_bands, figure_names
 from vipetsc.figures.lattice import draw_lattice, draw_unit_cell
 from vipetsc.figures.style import new_figure, rc_style
-from vipetsc.io.run_file import ENERGIES, IMPACTS
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.spectra import kinetic_energy
 from vipetsc.studies.reanalyse import measure_run
 
 NT, CELLS, INTERVAL = 240, 24, 2e-4
+ENERGIES = ("kinetic", "spring", "contact", "work", "dissipated")
+IMPACTS = ("site", "side", "onset", "approach_velocity", "separation", "indentation", "force", "loss")
 
 
 def write_run(path, *, sites=(8, 16), window=None, stride=1, episodes=6, fields=("displacement", "velocity")):

@@ -13,14 +13,13 @@ from matplotlib.image import imread
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import FIGURES, draw
 from vipetsc.figures.entropy import AVERAGES, COLOURS
-from vipetsc.figures.entropy_time import QUIET
+from vipetsc.figures.entropy_time import LEAST_WEIGHT
 from vipetsc.figures.partition import bin_colours, shown_bins
-from vipetsc.figures.scattering import KC, snapshot_times
-from vipetsc.figures.series import Wave, in_pi, series_of
-from vipetsc.figures.study import Study
+from vipetsc.figures.scattering import KC
+from vipetsc.figures.series import Wave, series_of
+from vipetsc.figures.study import Study, in_pi
 from vipetsc.figures.style import GREY, rc_style
-from vipetsc.io.ensemble_file import EnsembleFile
-from vipetsc.io.run_file import RunFile
+from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
 from vipetsc.spectra import filter_bank, normalised, transform
 from vipetsc.studies.sweep import run_sweep
@@ -58,14 +57,12 @@ def made(table, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    with EnsembleFile(made(WHOLE, tmp_path_factory)) as ensemble:
-        yield ensemble
+    return open_ensemble(made(WHOLE, tmp_path_factory))
 
 
 @pytest.fixture(scope="module")
 def curves(tmp_path_factory):
-    with EnsembleFile(made(CURVES, tmp_path_factory)) as ensemble:
-        yield ensemble
+    return open_ensemble(made(CURVES, tmp_path_factory))
 
 
 @pytest.fixture(autouse=True)
@@ -95,14 +92,15 @@ def limits(images):
 
 
 def members(ensemble):
-    return [folder for _, folder in ensemble.whole_members()]
+    return [folder for _, folder in whole_members(ensemble)]
 
 
 def test_every_figure_is_drawn_from_files(whole):
-    written = draw("sweep", [whole.folder]) + draw("sweep", [whole.folder], ["amplitudes"], ("pdf",))
+    folder = Path(whole.attrs["folder"])
+    written = draw("sweep", [folder]) + draw("sweep", [folder], ["amplitudes"], ("pdf",))
     assert {p.name for p in written} == {f"{name}-calibrated.png" for name in OF_FIELDS} | {"amplitudes-calibrated.pdf"}
     for path in written:
-        assert path.parent == whole.folder / "figures"
+        assert path.parent == folder / "figures"
         assert path.suffix == ".pdf" or np.ptp(imread(path)[..., :3]) > 0.5
 
 
@@ -123,9 +121,7 @@ def test_suffixes_tell_figures_apart(curves):
 
 def test_amplitudes_share_scales_and_show_what_was_measured(whole):
     figure = only("amplitudes", Study((whole,)))
-    assert (
-        "Calibrated reading, 2 sites, κ* = 5π/9" in figure.get_suptitle() if hasattr(figure, "get_suptitle") else True
-    )
+    assert figure._suptitle.get_text() == "Calibrated reading, 2 sites, κ* = 5π/9"
     panels = [axes for axes in figure.axes if axes.images and axes.get_title(loc="left")]
     assert len(panels) == 9
     for row, name in enumerate(("kinetic_energy", "wavenumber_content", "dispersion")):
@@ -138,7 +134,7 @@ def test_amplitudes_share_scales_and_show_what_was_measured(whole):
             np.testing.assert_allclose(image.get_array(), expected, rtol=1e-12)
             largest = max(largest, expected.max())
         assert images[0].get_clim()[1] == pytest.approx(largest)
-    case = whole.case((0,))
+    case = Case.load(members(whole)[0] / "case.toml")
     cell = case.model().chain.cell
     for axes in panels[6:]:
         for branch in range(2):
@@ -159,14 +155,14 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
         np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
     for row in panels:
         assert len({axes.texts[0].get_text() for axes in row}) == 1
-    (series,) = [snapshot_times(series) for series in series_of(Study((whole,)))]
+    (series,) = [series.snapshot_times() for series in series_of(Study((whole,)))]
     assert np.all(np.diff(series) > 0)
-    with RunFile(members(whole)[2] / "run.h5") as run:
-        site = np.min(run.site_cells)
-        wave = Wave.of(run.case)
+    with open_run(members(whole)[2] / "run.h5") as run:
+        site = np.min(run["sites/cell"].values)
+        wave = Wave.of(Case.of(run))
         assert series[1] - series[0] == pytest.approx(0.5 * (site - 1) / wave.speed)
-        at = int(np.argmin(np.abs(run.field_time - series[1])))
-        host = run.velocity[at, :, 0]
+        at = int(np.argmin(np.abs(field_time(run) - series[1])))
+        host = run["velocity"][at, :, 0].values
     kappa = np.pi * np.arange(1, 121) / 120
     expected = np.abs(transform(host, kappa, KC)[:, :CELLS]) / 20.0
     np.testing.assert_allclose(panels[1, 2].images[0].get_array(), expected, rtol=1e-12)
@@ -204,7 +200,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
     for line, colour in zip(segments, bin_colours(12), strict=True):
         np.testing.assert_allclose(to_rgba(line.get_color()), colour)
         kappa, frequency = line.get_data()
-        expected = bloch(whole.case((0,)).model().chain.cell, np.pi * kappa).frequency[:, 1]
+        expected = bloch(Case.load(members(whole)[0] / "case.toml").model().chain.cell, np.pi * kappa).frequency[:, 1]
         np.testing.assert_allclose(1e3 * frequency, expected)
     panels = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("(b.")]
     assert [bool(axes.collections) for axes in panels] == [True] * 3
@@ -251,14 +247,14 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
     grid = np.reshape(figure.axes, (2, 2))
     fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9}
     for column, sites in enumerate((2, 3)):
-        raw = curves.curve(f"entropy/{average}", "amplitude", sites=sites, **fixed)
-        error = curves.curve("entropy/error", "amplitude", sites=sites, **fixed)
-        reading, wavenumber, _, place = curves.place(sites=sites, **fixed)
-        fit = {k: v[reading, wavenumber, place] for k, v in curves.file[f"fits/entropy/{average}"].items()}
+        row = select(curves, sites=sites, **fixed)
+        raw, error = row[f"entropy/{average}"].values, row["entropy/error"].values
+        names = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
+        fit = {name: row[f"fits/entropy/{average}/{name}"].item() for name in names}
         for axes in grid[:, column]:
             (bars,) = axes.containers
             line, _, (sticks,) = bars.lines
-            np.testing.assert_allclose(line.get_xdata(), curves.values("amplitude"))
+            np.testing.assert_allclose(line.get_xdata(), curves["amplitude"].values)
             np.testing.assert_allclose(line.get_ydata(), normalised(raw))
             assert to_rgba(line.get_color()) == to_rgba(COLOURS[average])
             halves = [0.5 * np.ptp(segment[:, 1]) for segment in sticks.get_segments()]
@@ -276,7 +272,7 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
         else:
             assert not thick
             assert lower.texts[0].get_text() == "no power law"
-        printed = curves.curve(f"entropy/{average}", "amplitude", sites=sites, **fixed | {"reading": "printed"})
+        printed = select(curves, sites=sites, **fixed | {"reading": "printed"})[f"entropy/{average}"].values
         grey = [line for line in lower.lines if line.get_color() == GREY]
         np.testing.assert_allclose(grey[0].get_ydata(), normalised(printed))
         faint = {line.get_color() for line in upper.lines if line.get_alpha() == 0.5}
@@ -284,7 +280,7 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
 
 
 def test_some_configuration_has_a_power_law(curves):
-    assert np.isfinite(curves.values("fits/entropy/energy_weighted/factor")).any()
+    assert np.isfinite(curves["fits/entropy/energy_weighted/factor"]).any()
 
 
 def test_all_panels_by_wavenumber_and_configuration(curves):
@@ -292,11 +288,11 @@ def test_all_panels_by_wavenumber_and_configuration(curves):
     assert len(figures) == 2 * len(AVERAGES)
     grid = np.reshape(figures["printed-masked"].axes, (2, 2))
     assert [axes.get_ylabel() for axes in grid[:, 0]] == ["κ* = 4π/9", "κ* = 5π/9"]
-    for row, wavenumber in enumerate(curves.values("wavenumber")):
+    for row, wavenumber in enumerate(curves["wavenumber"].values):
         for column, sites in enumerate((2, 3)):
-            raw = curves.curve("entropy/masked", "amplitude", reading="printed", wavenumber=wavenumber, sites=sites)
+            chosen = select(curves, reading="printed", wavenumber=wavenumber, sites=sites)
             line = grid[row, column].containers[0].lines[0]
-            np.testing.assert_allclose(line.get_ydata(), normalised(raw))
+            np.testing.assert_allclose(line.get_ydata(), normalised(chosen["entropy/masked"].values))
 
 
 def test_entropy_maps_leave_quiet_cells_blank(whole):
@@ -309,10 +305,10 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
             local, weight = file["entropy/local"][...].T, file["entropy/weight"][...].T
             history, start = file["entropy/history"][...], file["entropy"].attrs["start"]
         shown = np.ma.filled(image.get_array(), np.nan)
-        loud = weight > QUIET * weight.max()
-        np.testing.assert_array_equal(shown[loud], local[loud])
-        assert np.isnan(shown[~loud]).all()
-        assert (~loud).any()
+        above_threshold = weight > LEAST_WEIGHT * weight.max()
+        np.testing.assert_array_equal(shown[above_threshold], local[above_threshold])
+        assert np.isnan(shown[~above_threshold]).all()
+        assert (~above_threshold).any()
         lines = {line.get_label(): line for line in over.lines}
         np.testing.assert_array_equal(lines["H(t)"].get_ydata(), history)
         assert list(lines["averages begin"].get_xdata()) == [start, start]
@@ -324,10 +320,11 @@ def test_entropy_history_is_an_image_over_amplitude(curves):
     for axes, sites in zip(figure.axes, (2, 3), strict=False):
         mesh = axes.collections[0]
         fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9, "sites": sites}
-        expected = curves.curve("entropy/history", "amplitude", **fixed)
+        row = select(curves, **fixed)
+        expected = row["entropy/history"].values
         np.testing.assert_array_equal(np.reshape(mesh.get_array(), expected.shape), expected)
         assert mesh.get_rasterized()
-        touched = curves.values("amplitude")[curves.curve("contact_episodes", "amplitude", **fixed) > 0].min()
+        touched = curves["amplitude"].values[row["contact_episodes"].values > 0].min()
         onset = next(line for line in axes.lines if line.get_linestyle() == ":")
         assert 0.1 < onset.get_ydata()[0] < touched
 

@@ -1,7 +1,5 @@
 """The pictures of inter-band transfer show what the sweep's files hold, and nothing where files lack."""
 
-from pathlib import Path
-
 from mpi4py import MPI
 
 import h5py
@@ -10,14 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from vipetsc.case import Sweep
+from vipetsc.case import Case, Sweep
 from vipetsc.figures import FIGURES, draw, rc_style
 from vipetsc.figures.band_energies import closing_error
-from vipetsc.figures.regimes import Portrait
+from vipetsc.figures.regimes import ContactMotion
 from vipetsc.figures.study import Study
 from vipetsc.figures.transfer_curves import transfer_curves
-from vipetsc.io.ensemble_file import EnsembleFile
-from vipetsc.io.run_file import RunFile
+from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
 from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
 from vipetsc.studies.sweep import run_sweep
 
@@ -70,11 +67,8 @@ def whole(tmp_path_factory):
 
 def drawn(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
-    ensembles = tuple(EnsembleFile(f) for f in folders)
     with rc_style():
-        found = {suffix: make() for suffix, make in FIGURES[name].function(Study(ensembles))}
-    for ensemble in ensembles:
-        ensemble.file.close()
+        found = {suffix: make() for suffix, make in FIGURES[name].function(Study.read(folders))}
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
     return found
 
@@ -97,35 +91,32 @@ def panel(figure, text):
 
 def test_ibtet_shows_the_ensembles_values(reduced):
     (figure,) = drawn("ibtet", reduced).values()
-    with EnsembleFile(reduced) as ensemble:
-        for law in ("hertz", "bilinear"):
-            for row in (1, 2):
-                axes = panel(figure, f".{row}) {law.capitalize()}, calibrated")
-                x, y = lines(axes)["1 site, 4 cycles"]
-                np.testing.assert_array_equal(x, AMPLITUDES)
-                np.testing.assert_array_equal(y, ensemble.curve("ibtet", "amplitude", law=law))
+    for law in ("hertz", "bilinear"):
+        for row in (1, 2):
+            axes = panel(figure, f".{row}) {law.capitalize()}, calibrated")
+            x, y = lines(axes)["1 site, 4 cycles"]
+            np.testing.assert_array_equal(x, AMPLITUDES)
+            np.testing.assert_array_equal(y, select(open_ensemble(reduced), law=law)["ibtet"])
     assert panel(figure, "(a.1)").get_xscale() == panel(figure, "(a.1)").get_yscale() == "linear"
     assert panel(figure, "(a.2)").get_xscale() == panel(figure, "(a.2)").get_yscale() == "log"
 
 
 def test_floor_is_that_of_members_without_contact(reduced):
-    with EnsembleFile(reduced) as ensemble:
-        curves = list(transfer_curves(Study((ensemble,))))
-        assert [c.case.contacts.law for c in curves] == ["hertz", "bilinear"]
-        for curve in curves:
-            assert curve.floor == pytest.approx(curve.ibtet[0], rel=1e-9)
-            assert curve.peak == int(np.argmax(curve.ibtet)) and curve.peak > 1
+    found = list(transfer_curves(Study.read([reduced])))
+    assert [c.case.contacts.law for c in found] == ["hertz", "bilinear"]
+    for curve in found:
+        assert curve.floor == pytest.approx(curve.ibtet[0], rel=1e-9)
+        assert curve.peak == int(np.argmax(curve.ibtet)) and curve.peak > 1
 
 
 def test_shares_are_the_ensembles_and_sum_to_one(reduced):
     figures = drawn("band_energies", reduced)
     assert list(figures) == ["shares-calibrated-1-site-4-cycles"]
     (figure,) = figures.values()
-    with EnsembleFile(reduced) as ensemble:
-        names = list(ensemble.file["bands/share"].attrs["parts"])
-        share = ensemble.curve("bands/share", "amplitude", law="bilinear")
+    share = select(open_ensemble(reduced), law="bilinear")["bands/share"]
+    names = share.attrs["parts"]
     shown = lines(panel(figure, "Bilinear"))
-    for name, values in zip(names, share.T, strict=True):
+    for name, values in zip(names, share.values.T, strict=True):
         np.testing.assert_allclose(shown[name][1], values, rtol=0, atol=1e-299)
     np.testing.assert_allclose(shown["sum"][1], 1.0, rtol=1e-12)
 
@@ -135,14 +126,14 @@ def test_backbone_is_aligned_exactly(reduced):
     assert list(figures) == ["calibrated-1-site-4-cycles"]  # no branch of the bilinear law was given
     (axes,) = all_axes(figures["calibrated-1-site-4-cycles"])
     assert "branch of the printed reading" in axes.get_title(loc="left")
-    with EnsembleFile(reduced) as ensemble, h5py.File(reduced / "backbone.h5") as file:
+    with h5py.File(reduced / "backbone.h5") as file:
         assert "bilinear" in file.attrs["left_out"][0]
         (group,) = file.values()
         about = dict(group.attrs)
-        case, _ = next(ensemble.curves())
-        start = initiation_of(ensemble.folder, case)
-        work = ensemble.curve("work", "amplitude", law="hertz")
-        touched = ensemble.curve("contact_episodes", "amplitude", law="hertz") > 0
+    _, folder = next(curves(open_ensemble(reduced)))
+    start = initiation_of(reduced, Case.load(folder / "case.toml"))
+    curve = select(open_ensemble(reduced), law="hertz")
+    work, touched = curve["work"].values, curve["contact_episodes"] > 0
     np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)
     assert about["initiation_energy"] == start.energy and about["onset_amplitude"] == start.amplitude
     # Work grows with the amplitude's square until the first contact comes back to the drive.
@@ -200,8 +191,8 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole):
 def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
     figure = drawn("transfer", whole)["hertz-calibrated-1-site-4-cycles-60N"]
     axes = panel(figure, "cell 10")
-    with EnsembleFile(whole) as ensemble, RunFile(ensemble.member((0, 1)) / "run.h5") as run:
-        velocity, driven = run.velocity[:, 9], 1e-3 * run.model.drive.frequency
+    with open_run(member_folder(open_ensemble(whole).isel(law=0, amplitude=1)) / "run.h5") as run:
+        velocity, driven = run["velocity"][:, 9].values, 1e-3 * Case.of(run).model().drive.frequency
     (inset,) = axes.child_axes
     for j, line in enumerate(inset.lines):
         np.testing.assert_array_equal(line.get_ydata(), velocity[:, j])
@@ -213,21 +204,19 @@ def test_dispersions_stand_by_law_and_amplitude(whole):
     (figure,) = drawn("transfer_dispersions", whole).values()
     found = all_axes(figure)
     assert [a.get_title(loc="left") for a in found] == ["(a.1) Hertz, 1 N", "(a.2) Hertz, 60 N"]
-    with EnsembleFile(whole) as ensemble:
-        for axes, value in zip(found, ensemble.values("ibtet").ravel(), strict=True):
-            assert axes.texts[0].get_text() == f"IBTET {value:.2g}"
-            assert axes.images[0].get_array().max() == pytest.approx(1.0)
+    for axes, value in zip(found, open_ensemble(whole)["ibtet"].values.ravel(), strict=True):
+        assert axes.texts[0].get_text() == f"IBTET {value:.2g}"
+        assert axes.images[0].get_array().max() == pytest.approx(1.0)
 
 
 def test_band_energies_sum_to_the_total(whole):
     """Over the whole record the parts are orthogonal; the running mean differs from the total by cross terms."""
     figures = drawn("band_energies", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
-    with EnsembleFile(whole) as ensemble:
-        for _, folder in ensemble.whole_members():
-            with h5py.File(folder / "analysis.h5") as file:
-                energy, total = file["bands/energy"][...], file["bands/total"][...]
-            assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=0.01)
+    for _, folder in whole_members(open_ensemble(whole)):
+        with h5py.File(folder / "analysis.h5") as file:
+            energy, total = file["bands/energy"][...], file["bands/total"][...]
+        assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=0.01)
     shown = lines(panel(figures["hertz-calibrated-1-site-4-cycles-60N"], "(a)"))
     parts = sum(y for label, (_, y) in shown.items() if label.startswith(("band", "gap", "above")))
     np.testing.assert_allclose(shown["sum of parts"][1], parts, rtol=1e-9)
@@ -246,22 +235,23 @@ def test_closing_error_is_exact_for_parts_in_quadrature():
 def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     (figure,) = drawn("phase_regimes", whole, reduced).values()
     curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
-    with EnsembleFile(reduced) as ensemble:
-        grey = curve.lines[0].get_xydata().T
-        np.testing.assert_array_equal(grey[1], ensemble.curve("ibtet", "amplitude", law="hertz"))
-    with EnsembleFile(whole) as ensemble:
-        points = np.array([line.get_xydata()[0] for line in curve.lines[1:]])
-        np.testing.assert_array_equal(points[:, 0], ensemble.values("amplitude"))
-        np.testing.assert_array_equal(points[:, 1], ensemble.values("ibtet").ravel())
-        with RunFile(ensemble.member((0, 1)) / "run.h5") as run:
-            portrait = Portrait.of(run, 0.1)
-            w = run.displacement[:, run.site_cells[0] - 1, 2] - run.displacement[:, run.site_cells[0] - 1, 1]
+    grey = curve.lines[0].get_xydata().T
+    np.testing.assert_array_equal(grey[1], select(open_ensemble(reduced), law="hertz")["ibtet"])
+    ensemble = open_ensemble(whole)
+    points = np.array([line.get_xydata()[0] for line in curve.lines[1:]])
+    np.testing.assert_array_equal(points[:, 0], ensemble["amplitude"])
+    np.testing.assert_array_equal(points[:, 1], ensemble["ibtet"].values.ravel())
+    folder = member_folder(ensemble.isel(law=0, amplitude=1))
+    motion = ContactMotion.read(folder)
+    with open_run(folder / "run.h5") as run:
+        u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
+        w, clearance = u[:, 2] - u[:, 1], run["sites/clearance"].values[0]
     assert [a.get_title(loc="left") for a in (first, second)] == ["1: 1 N", "2: 60 N"]
-    shown = np.diff(portrait.displacement, axis=1)
-    assert np.abs(shown).max() >= np.abs(w).max() > portrait.clearance
+    shown = np.diff(motion.displacement, axis=1)
+    assert np.abs(shown).max() >= np.abs(w).max() > clearance
     resonator, host = (line.get_xydata().T for line in second.lines)
-    np.testing.assert_array_equal(resonator[0], 1e3 * portrait.displacement[:, 1])
-    np.testing.assert_array_equal(host[1], portrait.velocity[:, 0])
+    np.testing.assert_array_equal(resonator[0], 1e3 * motion.displacement[:, 1])
+    np.testing.assert_array_equal(host[1], motion.velocity[:, 0])
 
 
 def test_regimes_without_an_ensemble_beside_them(whole):
@@ -278,8 +268,9 @@ def test_files_are_named_by_figure_and_suffix(reduced, kind):
 
 
 def test_curves_of_a_sweep(reduced):
-    with EnsembleFile(reduced) as ensemble:
-        found = list(ensemble.curves())
-        assert [(c.contacts.law, i) for c, i in found] == [("hertz", (0, slice(None))), ("bilinear", (1, slice(None)))]
-        assert list(ensemble.curves("wavenumber")) == []
-        assert Path(ensemble.member((0, 3))).parent == reduced
+    ensemble = open_ensemble(reduced)
+    found = list(curves(ensemble))
+    assert [Case.load(folder / "case.toml").contacts.law for _, folder in found] == ["hertz", "bilinear"]
+    assert [curve["law"].item() for curve, _ in found] == ["hertz", "bilinear"]
+    assert list(curves(ensemble, "wavenumber")) == []
+    assert member_folder(ensemble.isel(law=0, amplitude=3)).parent == reduced

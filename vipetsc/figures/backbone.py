@@ -1,244 +1,199 @@
-"""The frequency-energy plot of a branch, with its grazing inset, slope and phase portraits, from its file."""
+"""Frequency-energy plots of branches, with grazing inset, slope and phase portraits (paper, Fig. 11)."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from vipetsc.figures import style
+from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, panel_title, shade_regions
+from vipetsc.io.netcdf import open_netcdf
 
-UNSTABLE = 1.0 + 1e-6
-_REGIONS = ("", "I", "II", "III", "IV")
-_SHADES = ("#FFFFFF", "#EEEEEE", "#FFFFFF", "#EEEEEE")
-_MARKS = {
+NEEDS = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
+UNSTABLE = 1.0 + 1e-6  # Floquet multipliers above are not those of a stable orbit
+MARKS = {
     "fold-energy": ("o", "energy fold"),
     "fold-frequency": ("s", "frequency fold"),
     "branch-point": ("D", "branch point"),
     "symmetry-breaking": ("^", "symmetry breaking"),
     "period-doubling": ("v", "period doubling"),
 }
+MOST_MARKS = 12  # with more special points, tongues are labelled by their resonance instead
 
 
-@dataclass(frozen=True, eq=False)
-class BranchFile:
-    """What the figure needs of a ``branch-<name>.h5``: arrays over points, orbits (may be empty).
+def read_branch(path: Path) -> xr.Dataset:
+    """A ``branch-<name>.h5``, its points' ``kind`` by name; raises OSError or ValueError."""
+    with open_netcdf(path, "branch", NEEDS) as file:
+        branch = file.load()
+    kinds = np.array(branch["kind"].attrs["flag_meanings"].split())
+    return branch.assign(kind=("point", kinds[branch["kind"].values]))
 
-    ``reading`` is that of the paper's parameters, empty for a cell or a system of one's own.
+
+def backbone(paths: Sequence[Path]) -> Figure:
+    """Frequency, slope and portraits of regions I-IV of the branches in ``paths``; one column a branch.
+
+    Raises OSError or ValueError for a file that holds none.
     """
-
-    name: str
-    law: str
-    reading: str
-    data: dict[str, np.ndarray]
-    kinds: list[str]
-    orbits: dict[str, np.ndarray]
-    flows: dict[str, dict[str, np.ndarray]]
-
-    @classmethod
-    def read(cls, path: Path) -> BranchFile:
-        """Raises OSError or KeyError if the file holds no branch."""
-        with h5py.File(path) as file:
-            names = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
-            data = {name: file[name][...] for name in names}
-            kinds = str(file["kind"].attrs["flag_meanings"]).split()
-            orbits = {n: v[...] for n, v in file["orbits"].items()} if "orbits" in file else {}
-            flows = {f: {n: v[...] for n, v in g.items()} for f, g in file.get("flows", {}).items()}
-            table = tomllib.loads(file.attrs.get("case", ""))
-            law, lattice = table.get("contacts", {}).get("law", ""), table.get("lattice", {})
-            own = "cell" in lattice or table.get("nnm", {}).get("system") == "own"
-            reading = "" if own else lattice.get("reading", "")
-            return cls(str(file.attrs["name"]), law, reading, data, [kinds[k] for k in data["kind"]], orbits, flows)
-
-
-def page(paths: Sequence[Path]) -> Figure:
-    """The branches in ``paths``, a column a branch; raises OSError or KeyError for a file that holds none."""
-    branches = [BranchFile.read(path) for path in paths]
-    if not all(len(b.kinds) for b in branches):
-        return style.without_data("no point of the branch was found")
-    return backbone(branches)
-
-
-def backbone(branches: Sequence[BranchFile]) -> Figure:
-    """The paper's Fig. FEP: frequency, slope and portraits of regions I-IV; one column a branch."""
-    count = len(branches)
-    width = style.COLUMN if count == 1 else style.PAGE
-    with_orbits = any(b.orbits for b in branches)
-    with_flows = any(b.flows for b in branches)
-    heights = (1.5, 1.0) + (1.0,) * with_flows + (0.95,) * with_orbits
-    figure = style.new_figure(width, 1.55 * sum(heights))
-    rows = figure.subfigures(len(heights), count, squeeze=False, height_ratios=heights)
+    branches = [read_branch(path) for path in paths]
+    if not all(branch.sizes["point"] for branch in branches):
+        return empty_figure("no point of the branch was found")
+    flows = [_flows(branch) for branch in branches]
+    has_orbits = any("orbits/number" in branch for branch in branches)
+    heights = (1.5, 1.0) + (1.0,) * any(flows) + (0.95,) * has_orbits
+    figure = style.new_figure(style.COLUMN if len(branches) == 1 else style.PAGE, 1.55 * sum(heights))
+    rows = figure.subfigures(len(heights), len(branches), squeeze=False, height_ratios=heights)
     for column, branch in enumerate(branches):
-        label = chr(ord("a") + column)
-        top = rows[0, column].subplots()
-        frequency_energy(top, branch)
-        words = [branch.name, branch.law if count > 1 else "", branch.reading]
-        style.letter(top, f"({label}) {', '.join(filter(None, words))}")
+        upper = rows[0, column].subplots()
+        frequency_energy(upper, branch)
+        panel_title(upper, f"({'abcdef'[column]}) {_heading(branch, len(branches) > 1)}")
         slope(rows[1, column].subplots(), branch)
-        if with_flows:
-            flow_differences(rows[2, column].subplots(), branch)
-        if with_orbits:
+        if any(flows):
+            flow_differences(rows[2, column].subplots(), branch, flows[column])
+        if has_orbits:
             portraits(rows[-1, column], branch)
     return figure
 
 
-def frequency_energy(axes: Axes, branch: BranchFile) -> None:
+def _heading(branch: xr.Dataset, with_law: bool) -> str:
+    """Name, law and reading; the reading of the paper's parameters only, not of a cell or system of one's own."""
+    table = tomllib.loads(branch.attrs.get("case", ""))
+    lattice, law = table.get("lattice", {}), table.get("contacts", {}).get("law", "")
+    custom = "cell" in lattice or table.get("nnm", {}).get("system") == "own"
+    parts = branch.attrs["name"], law if with_law else "", "" if custom else lattice.get("reading", "")
+    return ", ".join(filter(None, parts))
+
+
+def _flows(branch: xr.Dataset) -> list[str]:
+    """The names of other flows that the branch was compared with."""
+    return list(dict.fromkeys(str(name).split("/")[1] for name in branch.variables if str(name).startswith("flows/")))
+
+
+def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
     """Frequency over energy; unstable parts coloured, special points marked, grazing in the inset."""
+    energy, frequency, kind = (branch[name].values for name in ("energy", "frequency", "kind"))
+    few = np.isin(kind, list(MARKS)).sum() <= MOST_MARKS
     _shade(axes, branch)
     _line(axes, branch)
-    axes.set(xscale="log", yscale=_scale(branch.data["frequency"]), xlabel="energy (J)", ylabel="frequency (Hz)")
-    energy, frequency = branch.data["energy"], branch.data["frequency"]
-    few = sum(k in _MARKS for k in branch.kinds) <= 12
-    for kind, (mark, text) in _MARKS.items():
-        at = [i for i, k in enumerate(branch.kinds) if k == kind]
-        if at and few:
-            axes.plot(
-                energy[at], frequency[at], mark, ms=3, mfc="white", mec=style.BLACK, mew=0.6, label=text, zorder=4
-            )
+    scale = "log" if frequency.max() > 3 * frequency.min() else "linear"
+    axes.set(xscale="log", yscale=scale, xlabel="energy (J)", ylabel="frequency (Hz)")
+    for name, (mark, label) in MARKS.items() if few else ():
+        at = kind == name
+        if at.any():
+            axes.plot(energy[at], frequency[at], mark, ms=3, mfc="white", mec=style.BLACK, mew=0.6, label=label,
+                      zorder=4)  # fmt: skip
     if not few:
         _label_tongues(axes, branch)
     axes.plot([], [], color=style.BLUE, label="stable")
-    if np.any(branch.data["multiplier_max"] > UNSTABLE):
+    if np.any(branch["multiplier_max"] > UNSTABLE):
         axes.plot([], [], color=style.VERMILION, label="unstable")
-    if _scale(frequency) == "log":
+    if scale == "log":
         axes.set_ylim(top=1.8 * frequency.max())  # room for the regions' numerals
-    touched = np.nonzero(branch.data["contacts"] > 0)[0]
-    monotone = np.ptp(frequency) > 0 and (few or not touched.size)
-    inside = few and touched.size > 0
-    axes.legend(loc="upper left" if inside else "lower right" if monotone else "best", fontsize=5.5,
-                bbox_to_anchor=(0, 0.93) if inside else None)  # fmt: skip
-    if touched.size and few:
+    touched = np.nonzero(branch["contacts"].values > 0)[0]
+    if few and touched.size:
+        axes.legend(loc="upper left", fontsize=5.5, bbox_to_anchor=(0, 0.93))
         _grazing_inset(axes, branch, touched[0])
+    else:
+        clear = np.ptp(frequency) > 0 and (few or not touched.size)
+        axes.legend(loc="lower right" if clear else "best", fontsize=5.5)
 
 
-def _label_tongues(axes: Axes, branch: BranchFile, largest: int = 5) -> None:
+def _label_tongues(axes: Axes, branch: xr.Dataset, largest: int = 5) -> None:
     """Write k:1 at the fold of highest frequency of every tongue up to ``largest``:1; later ones crowd together."""
-    energy, frequency, k = (branch.data[n] for n in ("energy", "frequency", "resonance"))
     axes.margins(y=0.08)
     for number in range(3, largest + 1, 2):
-        at = np.nonzero(k == number)[0]
-        if at.size:
-            tip = at[int(np.argmax(frequency[at]))]
-            axes.annotate(f"{number}:1", (energy[tip], frequency[tip]), (1, 3), textcoords="offset points",
-                          fontsize=5.5, color=style.GREY, ha="center")  # fmt: skip
+        tongue = branch.isel(point=branch["resonance"].values == number)
+        if tongue.sizes["point"]:
+            tip = tongue.isel(point=int(np.argmax(tongue["frequency"].values)))
+            axes.annotate(f"{number}:1", (float(tip["energy"]), float(tip["frequency"])), (1, 3), fontsize=5.5,
+                          textcoords="offset points", color=style.GREY, ha="center")  # fmt: skip
 
 
-def slope(axes: Axes, branch: BranchFile) -> None:
-    """|df/dE| over energy where contacts act, with its power laws' local exponents left to the text."""
+def slope(axes: Axes, branch: xr.Dataset) -> None:
+    """|df/dE| over energy at the regular points where contacts act, at all without contact."""
     _shade(axes, branch)
-    energy, steep = branch.data["energy"], np.abs(branch.data["slope"])
-    moving = branch.data["contacts"] > 0 if np.any(branch.data["contacts"] > 0) else np.ones(len(energy), bool)
-    moving &= np.array([k == "regular" for k in branch.kinds])
-    axes.plot(energy[moving], steep[moving], color=style.BLUE, lw=0.9)
+    energy, touches = branch["energy"].values, branch["contacts"].values > 0
+    shown = (touches | (not touches.any())) & (branch["kind"].values == "regular")
+    axes.plot(energy[shown], np.abs(branch["slope"].values[shown]), color=style.BLUE, lw=0.9)
     axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel=r"|d$f$/d$E$| (Hz/J)")
     axes.set_xlim(energy.min(), energy.max())
 
 
-def flow_differences(axes: Axes, branch: BranchFile) -> None:
+def flow_differences(axes: Axes, branch: xr.Dataset, flows: Sequence[str]) -> None:
     """How far other flows are from the branch at the same amplitude: frequency (full) and energy (open marks)."""
-    if not branch.flows:
-        style.say(axes, "no other flow was compared")
+    if not flows:
+        annotate_empty(axes, "no other flow was compared")
         return
-    for (name, found), colour in zip(branch.flows.items(), (style.VERMILION, style.GREEN, style.PURPLE), strict=False):
+    for name, colour in zip(flows, (style.VERMILION, style.GREEN, style.PURPLE), strict=False):
         for key, face in (("frequency", colour), ("energy", "white")):
-            size = np.maximum(np.abs(found[f"{key}_difference"]), 1e-17)
-            axes.plot(found["energy"], size, "o", ms=2.2, mec=colour, mfc=face, mew=0.5, label=f"{name}: {key}")
+            difference = np.maximum(np.abs(branch[f"flows/{name}/{key}_difference"].values), 1e-17)
+            axes.plot(branch[f"flows/{name}/energy"], difference, "o", ms=2.2, mec=colour, mfc=face, mew=0.5,
+                      label=f"{name}: {key}")  # fmt: skip
     axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel="relative difference")
-    axes.set_xlim(branch.data["energy"].min(), branch.data["energy"].max())
+    axes.set_xlim(float(branch["energy"].min()), float(branch["energy"].max()))
     axes.set_ylim(top=10.0)  # room for the legend
     axes.legend(fontsize=5.5, ncols=2, loc="upper right")
 
 
-def portraits(place: object, branch: BranchFile) -> None:
-    """Phase portraits of the stored orbits of regions I-IV: the resonator (or last mass) and the host."""
-    if not branch.orbits:
-        style.say(place.subplots(), "no orbits stored")
+def portraits(page: SubFigure, branch: xr.Dataset) -> None:
+    """Phase portraits of the stored orbits of regions I-IV: the first two masses."""
+    if "orbits/number" not in branch:
+        annotate_empty(page.subplots(), "no orbits stored")
         return
-    number = branch.orbits["number"]
-    shown = min(len(number), 4)
-    axes = place.subplots(1, shown, squeeze=False)[0]
-    regular = [i for i, k in enumerate(branch.kinds) if k == "regular"]
-    for k in range(shown):
-        u, v = branch.orbits["displacement"][k], branch.orbits["velocity"][k]
-        for dof, colour in zip(range(min(u.shape[1], 2)), (style.BLUE, style.VERMILION), strict=False):
-            closed = np.append(np.arange(len(u)), 0)
-            axes[k].plot(
-                u[closed, dof] / np.abs(u).max(),
-                v[closed, dof] / np.abs(v).max(),
-                color=colour,
-                lw=0.8,
-                ls="--" if dof else "-",
-            )
-        region = branch.data["region"][min(regular, key=lambda i: abs(i - _place(branch, branch.orbits["energy"][k])))]
-        axes[k].set_title(f"{_REGIONS[region]}\n{branch.orbits['energy'][k]:.2g} J", loc="center", fontsize=7)
-        axes[k].set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
+    orbits = branch.isel(orbit=slice(4))
+    regular = branch.isel(point=branch["kind"].values == "regular")
+    grid = page.subplots(1, orbits.sizes["orbit"], squeeze=False)[0]
+    for k, axes in enumerate(grid):
+        energy, u, v = (orbits[f"orbits/{name}"].values[k] for name in ("energy", "displacement", "velocity"))
+        closed = np.append(np.arange(len(u)), 0)
+        for dof, (colour, dashes) in zip(range(u.shape[1]), ((style.BLUE, "-"), (style.VERMILION, "--")), strict=False):
+            x, y = u[closed, dof] / np.abs(u).max(), v[closed, dof] / np.abs(v).max()
+            axes.plot(x, y, color=colour, lw=0.8, ls=dashes)
+        nearest = int(np.abs(np.log(regular["energy"] / energy)).argmin())
+        region = REGIONS[int(regular["region"][nearest])]
+        axes.set_title(f"{region}\n{energy:.2g} J", loc="center", fontsize=7)
+        axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
         if k:
-            axes[k].set_yticklabels([])
-    axes[0].set_ylabel(r"$\dot u$/max")
-    place.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
+            axes.set_yticklabels([])
+    grid[0].set_ylabel(r"$\dot u$/max")
+    page.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
 
 
-def _place(branch: BranchFile, energy: float) -> int:
-    return int(np.abs(np.log(branch.data["energy"] / energy)).argmin())
-
-
-def _line(axes: Axes, branch: BranchFile, width: float = 1.1) -> None:
-    """The branch, blue where stable and vermilion where not; neighbours share their end points."""
-    energy, frequency = branch.data["energy"], branch.data["frequency"]
-    loose = branch.data["multiplier_max"] > UNSTABLE
+def _line(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
+    """The branch, blue where stable and vermilion where not."""
+    energy, frequency = branch["energy"].values, branch["frequency"].values
+    unstable = branch["multiplier_max"].values > UNSTABLE
     axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2)
-    either = loose.copy()
-    either[1:] |= loose[:-1] & loose[1:]
-    axes.plot(energy, np.where(either, frequency, np.nan), color=style.VERMILION, lw=width * 1.3, zorder=3)
+    axes.plot(energy, np.where(unstable, frequency, np.nan), color=style.VERMILION, lw=width * 1.3, zorder=3)
 
 
-def _grazing_inset(axes: Axes, branch: BranchFile, first: int) -> None:
-    """The neighbourhood of grazing: up to where the frequency has grown by a fifth, or the folds are passed."""
-    energy, frequency = branch.data["energy"], branch.data["frequency"]
-    folds = [i for i, k in enumerate(branch.kinds) if k == "fold-energy"]
-    last = max(folds, default=first)
+def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
+    """The neighbourhood of grazing: up to where the frequency has grown by a tenth, or the folds are passed."""
+    energy, frequency = branch["energy"].values, branch["frequency"].values
+    folds = np.nonzero(branch["kind"].values == "fold-energy")[0]
+    last = int(folds[-1]) if folds.size else first
     last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
     last = min(max(last, first + 3), len(energy) - 1)
-    window = slice(max(first - 1, 0), last + 1)
+    start = max(first - 1, 0)
     inset = axes.inset_axes([0.55, 0.1, 0.41, 0.36])
     _line(inset, branch, 0.9)
-    at = [i for i in folds if window.start <= i <= last]
+    at = folds[(folds >= start) & (folds <= last)]
     inset.plot(energy[at], frequency[at], "o", ms=2.5, mfc="white", mec=style.BLACK, mew=0.6, zorder=4)
-    low, high = energy[window].min(), energy[window].max()
-    span = high - low
-    inset.set(xlim=(low - 0.15 * span, high + 0.1 * span))
-    rise = np.ptp(frequency[window])
-    inset.set(ylim=(frequency[window].min() - 0.1 * rise, frequency[window].max()))
+    x, y = energy[start : last + 1], frequency[start : last + 1]
+    inset.set(xlim=(x.min() - 0.15 * np.ptp(x), x.max() + 0.1 * np.ptp(x)), ylim=(y.min() - 0.1 * np.ptp(y), y.max()))
     inset.tick_params(labelsize=5, pad=1.5)
     inset.locator_params(axis="both", nbins=3)
     inset.set_title("grazing", fontsize=6, pad=1.5)
 
 
-def _shade(axes: Axes, branch: BranchFile) -> None:
-    """Regions as bands of energy, labelled at the top; left out where they overlap (internal resonances)."""
-    energy, region = branch.data["energy"], branch.data["region"]
-    spans = [
-        (energy[region == k].min(), energy[region == k].max()) if np.any(region == k) else None for k in (1, 2, 3, 4)
-    ]
-    if spans[2] is None:
-        return
-    for k, span in enumerate(spans):
-        if span is None:
-            continue
-        low = spans[k - 1][1] if k and spans[k - 1] else span[0]
-        axes.axvspan(low, max(span[1], low), color=_SHADES[k], lw=0, zorder=0)
-        if max(span[1], low) > low:
-            middle = np.sqrt(low * max(span[1], low))
-            axes.text(middle, 0.985, _REGIONS[k + 1], ha="center", va="top", fontsize=6.5, color=style.GREY,
-                      transform=axes.get_xaxis_transform())  # fmt: skip
-    axes.set_xlim(energy.min(), energy.max())
-
-
-def _scale(values: np.ndarray) -> str:
-    return "log" if values.max() > 3 * values.min() else "linear"
+def _shade(axes: Axes, branch: xr.Dataset) -> None:
+    """Regions as bands of energy; left out where there is no region III (internal resonances)."""
+    energy, region = branch["energy"].values, branch["region"].values
+    if np.any(region == 3):
+        shade_regions(axes, energy, region, energy[region == region.min()].min(), at_top=True)
+        axes.set_xlim(energy.min(), energy.max())

@@ -1,224 +1,247 @@
-"""The unit cell drawn as masses and springs with its clearance, above the lattice with its sites."""
+"""The unit cell drawn as masses and springs with its clearance; the lattice as a strip with its sites."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
 
-import h5py
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
+from vipetsc.case import Case
 from vipetsc.figures import style
-from vipetsc.io.run_file import RunFile
+from vipetsc.figures.panels import panel_title
 from vipetsc.lattice import Chain, UnitCell
+from vipetsc.lattice.cell import Spring
 
 PITCH = 2.0  # distance between neighbouring masses of the drawing
 HALF = 0.34  # half the side of a mass
-WIDE = 1.0  # half the width of a host that holds its resonator
-ROOM = 0.62  # half its height
+WIDE, TALL = 1.0, 0.62  # half the width and height of a host that holds its resonator
 GAP = 0.17  # clearance as drawn
 
+Point = tuple[float, float]
 
-def unit_cell(run: RunFile, analysis: h5py.File | None) -> Figure:
+
+def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """The unit cell of the run's lattice and, below it, the lattice with ends, drive and contact sites."""
-    model = run.model
+    model = Case.of(run).model()
     figure = style.new_figure(style.PAGE, 2.7)
     upper, lower = figure.subplots(2, 1, gridspec_kw={"height_ratios": (2.1, 1)})
     draw_unit_cell(upper, model.chain.cell)
     draw_lattice(lower, model.chain, model.drive_cell)
-    style.letter(upper, "(a) Unit cell")
-    style.letter(lower, f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends")
+    panel_title(upper, "(a) Unit cell")
+    panel_title(lower, f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends")
     return figure
+
+
+class _Layout(NamedTuple):
+    """Where the masses of a cell stand, half their widths, and the cell's left and right border."""
+
+    centre: dict[int, Point]
+    half: dict[int, float]
+    left: float
+    right: float
+    nested: bool  # whether the resonator sits inside its host
+
+    def blocked(self, low: float, high: float, y: float) -> bool:
+        """Whether a mass stands between ``low`` and ``high`` at height ``y``."""
+        return any(low < p < high and abs(q - y) < 0.1 for p, q in self.centre.values())
 
 
 def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     """Masses, springs and the contact pair of ``cell``; a resonator held by its host alone sits inside it."""
-    inside = _held_inside(cell)
-    place = _places(cell, inside)
-    half = {i: WIDE if inside and i == cell.host else HALF for i in place}
-    left = min(x - half[i] for i, (x, _) in place.items()) - 0.9
-    right = max(x + half[i] for i, (x, _) in place.items()) + 1.5
-    level, highest = ROOM + 0.6, ROOM
+    layout = _layout(cell)
+    level, highest = TALL + 0.6, TALL
     for spring in cell.springs:
-        a, b, text = spring.start, spring.end, with_prefix(spring.stiffness, "N/m")
-        if inside and {a, b} == {cell.host, cell.resonator} and not spring.next_cell:
+        if layout.nested and {spring.start, spring.end} == {cell.host, cell.resonator} and not spring.next_cell:
             continue
-        if spring.next_cell:
-            for mass, wall, side in ((a, right, 1), (b, left, -1)):
-                (x, y), edge = place[mass], half[mass]
-                blocked = any(side * (p - x) > 0 and abs(q - y) < 0.1 for p, q in place.values())
-                if blocked:
-                    _route(axes, [(x, y + HALF), (x, level), (wall, level)], text)
-                    highest = level
-                else:
-                    _lead(axes, (x + side * edge, y), (wall, y), text if side > 0 else "")
-            continue
-        (xa, ya), (xb, yb) = sorted((place[a], place[b]))
-        between = any(xa < p < xb and abs(q - ya) < 0.1 for p, q in place.values())
-        if abs(ya - yb) < 0.1 and not between:
-            first, last = sorted((a, b), key=lambda i: place[i])
-            draw_spring(axes, (xa + half[first], ya), (xb - half[last], yb), text)
-        elif abs(xa - xb) < 0.1:
-            top, bottom = sorted((a, b), key=lambda i: -place[i][1])
-            drop = ROOM if inside and top == cell.host else HALF
-            draw_spring(axes, (xa, place[top][1] - drop), (xb, place[bottom][1] + HALF), text)
-        elif abs(ya - yb) < 0.1:
-            _route(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
-            highest, level = level, level + 0.55
-        else:
-            short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
-            draw_spring(axes, tuple(np.array([xa, ya]) + short), tuple(np.array([xb, yb]) - short), text)
-    for i, (x, y) in place.items():
-        if not (inside and i in (cell.host, cell.resonator)):
-            _mass(axes, x, y, i, cell.masses[i], cell)
-    if inside:
-        _host_with_resonator(axes, place[cell.host], cell)
+        used = (_outer_spring if spring.next_cell else _inner_spring)(axes, layout, spring, level, cell.host)
+        highest = max(highest, used)
+        if used and not spring.next_cell:
+            level += 0.55
+    for i, centre in layout.centre.items():
+        if not (layout.nested and i in (cell.host, cell.resonator)):
+            colour = {cell.host: style.SKY, cell.resonator: style.ORANGE}.get(i, style.PALE)
+            draw_mass(axes, centre, HALF, i, colour)
+            # Beside the mass's lower left corner, clear of what hangs below it and of the spring on its left.
+            corner = centre[0] - HALF - 0.05, centre[1] - HALF
+            axes.text(*corner, with_prefix(1e3 * cell.masses[i], "g"), ha="right", va="center", fontsize=6.5, zorder=4)
+    if layout.nested:
+        _host_with_resonator(axes, layout.centre[cell.host], cell)
     else:
-        _contact_link(axes, place[cell.host], place[cell.resonator])
-    low = min(y for _, y in place.values()) - ROOM - 0.55
-    high = highest + 0.5
-    for wall in (left, right):
+        _contact_link(axes, layout.centre[cell.host], layout.centre[cell.resonator])
+    low, high = min(y for _, y in layout.centre.values()) - TALL - 0.55, highest + 0.5
+    for wall in (layout.left, layout.right):
         axes.plot([wall, wall], [low + 0.15, high - 0.1], color=style.GREY, lw=0.6, ls=(0, (4, 3)))
-    axes.text(left + 0.07, low + 0.1, "one cell", color=style.GREY, fontsize=6.5, va="bottom")
-    axes.set(xlim=(left - 0.5, right + 0.5), ylim=(low, high), aspect="equal")
+    axes.text(layout.left + 0.07, low + 0.1, "one cell", color=style.GREY, fontsize=6.5, va="bottom")
+    axes.set(xlim=(layout.left - 0.5, layout.right + 0.5), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
 
 
-def _held_inside(cell: UnitCell) -> bool:
-    """Whether springs join the resonator to its host and to nothing else."""
+def _layout(cell: UnitCell) -> _Layout:
     pairs = [({s.start, s.end}, s.next_cell) for s in cell.springs if cell.resonator in (s.start, s.end)]
-    return bool(pairs) and all(pair == {cell.host, cell.resonator} and not out for pair, out in pairs)
+    nested = bool(pairs) and all(pair == {cell.host, cell.resonator} and not out for pair, out in pairs)
+    centre = _centres(cell, nested)
+    half = {i: WIDE if nested and i == cell.host else HALF for i in centre}
+    left = min(x - half[i] for i, (x, _) in centre.items()) - 0.9
+    right = max(x + half[i] for i, (x, _) in centre.items()) + 1.5
+    return _Layout(centre, half, left, right, nested)
 
 
-def _places(cell: UnitCell, inside: bool) -> dict[int, tuple[float, float]]:
+def _centres(cell: UnitCell, nested: bool) -> dict[int, Point]:
     """Position of every mass: the shortest way through the cell on one line, the others below it."""
     neighbours: dict[int, list[int]] = {i: [] for i in range(cell.dofs)}
     for s in cell.springs:
         if not s.next_cell:
             neighbours[s.start].append(s.end)
             neighbours[s.end].append(s.start)
+    centre: dict[int, Point] = {}
+    x = 0.0
+    for i in _through(cell, neighbours):
+        extra = (WIDE - HALF) * (nested and i == cell.host)
+        centre[i] = (x + extra, 0.0)
+        x += PITCH + 2 * extra
+    if nested:
+        centre.setdefault(cell.host, (x, 0.0))
+        centre[cell.resonator] = centre[cell.host]
+    while len(centre) < cell.dofs:
+        # A mass off the line hangs below one that has its position, or stands at the end of the line.
+        missing = [i for i in range(cell.dofs) if i not in centre]
+        hanging = next((i for i in missing if set(neighbours[i]) & centre.keys()), None)
+        if hanging is None:
+            centre[missing[0]] = (max(p for p, _ in centre.values()) + PITCH, 0.0)
+            continue
+        x, y = centre[next(j for j in neighbours[hanging] if j in centre)]
+        y -= 0.75 * PITCH
+        while (x, y) in centre.values():
+            x += 0.5 * PITCH
+        centre[hanging] = (x, y)
+    return centre
+
+
+def _through(cell: UnitCell, neighbours: dict[int, list[int]]) -> list[int]:
+    """The masses on the shortest way from one border of the cell to the other, breadth first."""
     through = next(s for s in cell.springs if s.next_cell)
-    paths, line = [[through.end]], [through.end]
-    reached = {through.end}
+    paths, reached = [[through.end]], {through.end}
     while paths:
         path = paths.pop(0)
         if path[-1] == through.start:
-            line = path
-            break
+            return path
         fresh = [i for i in neighbours[path[-1]] if i not in reached]
         reached.update(fresh)
         paths += [[*path, i] for i in fresh]
-    place, x = {}, 0.0
-    for i in line:
-        x += (WIDE - HALF) * (inside and i == cell.host)
-        place[i] = (x, 0.0)
-        x += PITCH + (WIDE - HALF) * (inside and i == cell.host)
-    if inside:
-        place.setdefault(cell.host, (x, 0.0))
-        place[cell.resonator] = place[cell.host]
-    while len(place) < cell.dofs:
-        # A mass off the line hangs below one that is placed already, or stands at the end of the line.
-        i = next((i for i in range(cell.dofs) if i not in place and set(neighbours[i]) & place.keys()), None)
-        if i is None:
-            i = next(i for i in range(cell.dofs) if i not in place)
-            place[i] = (max(p for p, _ in place.values()) + PITCH, 0.0)
+    return [through.end]
+
+
+def _inner_spring(axes: Axes, layout: _Layout, spring: Spring, level: float, host: int) -> float:
+    """A spring between two masses of the cell; returns the height at which it goes round others, else 0."""
+    a, b = sorted((spring.start, spring.end), key=lambda i: layout.centre[i])
+    (xa, ya), (xb, yb) = layout.centre[a], layout.centre[b]
+    text = with_prefix(spring.stiffness, "N/m")
+    if abs(xa - xb) < 0.1:
+        top, bottom = (a, b) if ya > yb else (b, a)
+        drop = TALL if layout.nested and top == host else HALF
+        draw_spring(axes, (xa, layout.centre[top][1] - drop), (xb, layout.centre[bottom][1] + HALF), text)
+    elif abs(ya - yb) >= 0.1:
+        short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
+        draw_spring(axes, (xa + short[0], ya + short[1]), (xb - short[0], yb - short[1]), text)
+    elif layout.blocked(xa, xb, ya):
+        _route(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
+        return level
+    else:
+        draw_spring(axes, (xa + layout.half[a], ya), (xb - layout.half[b], yb), text)
+    return 0.0
+
+
+def _outer_spring(axes: Axes, layout: _Layout, spring: Spring, level: float, host: int) -> float:
+    """A spring to the next cell and the end of the last one's; returns the height at which it goes round masses."""
+    used, text = 0.0, with_prefix(spring.stiffness, "N/m")
+    for mass, wall, side in ((spring.start, layout.right, 1), (spring.end, layout.left, -1)):
+        x, y = layout.centre[mass]
+        if layout.blocked(min(x, side * np.inf), max(x, side * np.inf), y):
+            _route(axes, [(x, y + HALF), (x, level), (wall, level)], text)
+            used = level
             continue
-        above = place[next(j for j in neighbours[i] if j in place)]
-        spot = (above[0], above[1] - 0.75 * PITCH)
-        while spot in place.values():
-            spot = (spot[0] + 0.5 * PITCH, spot[1])
-        place[i] = spot
-    return place
+        start = x + side * layout.half[mass]
+        if side > 0:
+            draw_spring(axes, (start, y), (wall, y), text)
+        else:
+            axes.plot([start, wall], [y, y], color=style.BLACK, lw=0.7, zorder=2)
+        axes.plot([wall, wall + 0.4 * side], [y, y], color=style.BLACK, lw=0.7, ls=(0, (1, 1.5)), zorder=2)
+    return used
 
 
-def _mass(axes: Axes, x: float, y: float, index: int, mass: float, cell: UnitCell) -> None:
-    colour = {cell.host: style.SKY, cell.resonator: style.ORANGE}.get(index, style.PALE)
-    look = {"boxstyle": "round,pad=0,rounding_size=0.08", "fc": colour, "ec": style.BLACK, "lw": 0.7, "zorder": 3}
-    axes.add_patch(FancyBboxPatch((x - HALF, y - HALF), 2 * HALF, 2 * HALF, **look))
-    axes.text(x, y, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
-    # Beside the mass's lower left corner, clear of what hangs below it and of the spring on its left.
-    axes.text(x - HALF - 0.05, y - HALF, with_prefix(1e3 * mass, "g"), ha="right", va="center", fontsize=6.5, zorder=4)
+def draw_mass(axes: Axes, centre: Point, half: float, index: int, colour: str) -> None:
+    """A box of half the side ``half`` with the mass's symbol; ``index`` counts from 0."""
+    box = {"boxstyle": "round,pad=0,rounding_size=0.08", "fc": colour, "ec": style.BLACK, "lw": 0.7, "zorder": 3}
+    axes.add_patch(FancyBboxPatch((centre[0] - half, centre[1] - half), 2 * half, 2 * half, **box))
+    axes.text(*centre, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
 
 
-def _host_with_resonator(axes: Axes, centre: tuple[float, float], cell: UnitCell) -> None:
+def draw_wall(axes: Axes, corner: Point, width: float, height: float) -> None:
+    """A hatched wall."""
+    axes.add_patch(Rectangle(corner, width, height, fc="white", ec=style.GREY, hatch="//////", lw=0.0))
+
+
+def _host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None:
     """The host as a box with two stops, the resonator between them on its spring."""
     x, y = centre
-    box = {"ec": style.BLACK, "lw": 0.7}
-    axes.add_patch(Rectangle((x - WIDE, y - ROOM), 2 * WIDE, 2 * ROOM, fc=style.SKY, zorder=3, **box))
-    axes.add_patch(
-        Rectangle((x - WIDE + 0.1, y - ROOM + 0.1), 2 * WIDE - 0.2, 2 * ROOM - 0.2, fc="white", zorder=3, **box)
-    )
     reach = HALF * 0.82
-    for side in (-1, 1):
-        stop = x + side * (reach + GAP)
-        for end in (-1, 1):
-            axes.add_patch(Rectangle((min(stop, stop + side * 0.1), y + (0.2 if end > 0 else -0.52)), 0.1, 0.32,
-                                     fc=style.SKY, zorder=4, **box))  # fmt: skip
+
+    def box(left: float, bottom: float, width: float, height: float, colour: str, zorder: int) -> None:
+        axes.add_patch(Rectangle((left, bottom), width, height, fc=colour, ec=style.BLACK, lw=0.7, zorder=zorder))
+
+    box(x - WIDE, y - TALL, 2 * WIDE, 2 * TALL, style.SKY, 3)
+    box(x - WIDE + 0.1, y - TALL + 0.1, 2 * WIDE - 0.2, 2 * TALL - 0.2, "white", 3)
+    for left, bottom in itertools.product((x - reach - GAP - 0.1, x + reach + GAP), (y - 0.52, y + 0.2)):
+        box(left, bottom, 0.1, 0.32, style.SKY, 4)
     stiffness = sum(s.stiffness for s in cell.springs if cell.resonator in (s.start, s.end))
     draw_spring(axes, (x - WIDE + 0.1, y), (x - reach, y), "", turns=3, height=0.09)
-    axes.add_patch(Rectangle((x - reach, y - reach), 2 * reach, 2 * reach, fc=style.ORANGE, zorder=5, **box))
+    box(x - reach, y - reach, 2 * reach, 2 * reach, style.ORANGE, 5)
     axes.text(x, y, f"$m_{{{cell.resonator + 1}}}$", ha="center", va="center", zorder=6)
-    axes.annotate("Δ", (x + reach + GAP / 2, y + 0.36), (x + reach + GAP / 2, y + ROOM + 0.2), ha="center",
-                  fontsize=7, color=style.VERMILION, zorder=7,
-                  arrowprops={"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6,
-                              "shrinkA": 0, "shrinkB": 0})  # fmt: skip
-    axes.text(x, y - ROOM - 0.08, f"$m_{{{cell.host + 1}}}$ {with_prefix(1e3 * cell.masses[cell.host], 'g')},  "
-              f"$m_{{{cell.resonator + 1}}}$ {with_prefix(1e3 * cell.masses[cell.resonator], 'g')}\n"
-              f"inner spring {with_prefix(stiffness, 'N/m')}",
+    line = {"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("Δ", (x + reach + GAP / 2, y + 0.36), (x + reach + GAP / 2, y + TALL + 0.2), ha="center",
+                  fontsize=7, color=style.VERMILION, zorder=7, arrowprops=line)  # fmt: skip
+    masses = (f"$m_{{{i + 1}}}$ {with_prefix(1e3 * cell.masses[i], 'g')}" for i in (cell.host, cell.resonator))
+    axes.text(x, y - TALL - 0.08, f"{',  '.join(masses)}\ninner spring {with_prefix(stiffness, 'N/m')}",
               ha="center", va="top", fontsize=6.5, linespacing=1.3)  # fmt: skip
 
 
-def _contact_link(axes: Axes, host: tuple[float, float], resonator: tuple[float, float]) -> None:
+def _contact_link(axes: Axes, host: Point, resonator: Point) -> None:
     """A bowed double arrow between the pair, for a resonator that other masses hold too."""
-    axes.annotate("", resonator, host, zorder=2, arrowprops={
-        "arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)),
-        "shrinkA": 9, "shrinkB": 9, "connectionstyle": "arc3,rad=0.45"})  # fmt: skip
+    arrow = {"arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)), "shrinkA": 9,
+             "shrinkB": 9, "connectionstyle": "arc3,rad=0.45"}  # fmt: skip
+    axes.annotate("", resonator, host, zorder=2, arrowprops=arrow)
     middle = (host[0] + resonator[0]) / 2, (host[1] + resonator[1]) / 2
     axes.annotate("contact, Δ", middle, (-16, 0), textcoords="offset points", ha="right", va="center",
                   fontsize=6.5, color=style.VERMILION)  # fmt: skip
 
 
-def draw_spring(
-    axes: Axes,
-    start: tuple[float, float],
-    end: tuple[float, float],
-    text: str,
-    turns: int = 5,
-    height: float = 0.13,
-) -> None:
+def draw_spring(axes: Axes, start: Point, end: Point, text: str, turns: int = 5, height: float = 0.13) -> None:
     """A zigzag from ``start`` to ``end`` with straight leads, its stiffness beside it."""
-    start, end = np.array(start), np.array(end)
-    along = end - start
+    origin, along = np.array(start), np.subtract(end, start)
     across = np.array([-along[1], along[0]]) / np.hypot(*along)
     s = np.concatenate([[0, 0.2], 0.2 + 0.6 * (np.arange(2 * turns) + 0.5) / (2 * turns), [0.8, 1]])
     swing = np.zeros(len(s))
     swing[2:-2] = height * (-1.0) ** np.arange(2 * turns)
-    points = start + s[:, None] * along + swing[:, None] * across
+    points = origin + s[:, None] * along + swing[:, None] * across
     axes.plot(*points.T, color=style.BLACK, lw=0.7, zorder=2 if height > 0.1 else 6, solid_joinstyle="round")
     if text:
-        x, y = (start + end) / 2
+        x, y = origin + along / 2
         upright = abs(along[1]) > abs(along[0])
         axes.text(x + (0.2 if upright else 0), y + (0 if upright else 0.2), text, fontsize=6.5,
                   ha="left" if upright else "center", va="center" if upright else "bottom")  # fmt: skip
 
 
-def _lead(axes: Axes, start: tuple[float, float], wall: tuple[float, float], text: str) -> None:
-    """The way out of the cell: the spring to the next one if it has a ``text``, else the last one's end."""
-    if text:
-        draw_spring(axes, start, wall, text)
-    else:
-        axes.plot([start[0], wall[0]], [start[1], wall[1]], color=style.BLACK, lw=0.7, zorder=2)
-    beyond = wall[0] + (0.4 if wall[0] > start[0] else -0.4)
-    axes.plot([wall[0], beyond], [wall[1], wall[1]], color=style.BLACK, lw=0.7, ls=(0, (1, 1.5)), zorder=2)
-
-
-def _route(axes: Axes, corners: list[tuple[float, float]], text: str) -> None:
+def _route(axes: Axes, corners: Sequence[Point], text: str) -> None:
     """A spring that goes round the masses in its way: a line through ``corners``, zigzag on the longest leg."""
-    lengths = [np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(corners)]
-    longest = int(np.argmax(lengths))
-    for i, (a, b) in enumerate(itertools.pairwise(corners)):
+    legs = list(itertools.pairwise(corners))
+    longest = int(np.argmax([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in legs]))
+    for i, (a, b) in enumerate(legs):
         if i == longest:
             draw_spring(axes, a, b, text)
         else:
@@ -236,41 +259,25 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = Fa
         axes.vlines(np.arange(1, n) + 0.5, 0, 1, color="white", lw=0.5)
     if chain.ends == "fixed":
         for wall in (0.5 - 0.02 * n, n + 0.5):
-            axes.add_patch(Rectangle((wall, -0.25), 0.02 * n, 1.5, fc="white", ec=style.GREY, hatch="//////", lw=0.0))
+            draw_wall(axes, (wall, -0.25), 0.02 * n, 1.5)
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
-    axes.annotate("" if brief else "drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75),
-                  ha="left", va="center", fontsize=7, color=style.BLUE,
+    axes.annotate("" if brief else "drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left",
+                  va="center", fontsize=7, color=style.BLUE,
                   arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
-    last = -np.inf
+    below = {"ha": "center", "va": "top", "fontsize": 6.5}
+    last, width = -np.inf, max(0.006 * n, 1)
     for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
-        width = max(0.006 * n, 1)
         axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
         # Labels need about a tenth of the strip each; neighbouring sites go without.
         if site - last > 0.085 * n:
             axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
-            axes.text(
-                site + 1,
-                -0.2,
-                f"{clearance * 1e3:#.3g}",
-                ha="center",
-                va="top",
-                fontsize=6.5,
-                color=style.VERMILION,
-            )
+            axes.text(site + 1, -0.2, f"{clearance * 1e3:#.3g}", color=style.VERMILION, **below)
             last = site
-    if chain.sites and not brief:
+    if not chain.sites:
+        axes.text(n / 2, -0.2, "no contact sites", color=style.GREY, **below)
+    elif not brief:
         middle = (chain.sites[0] + chain.sites[-1]) / 2 + 1
-        axes.text(
-            middle,
-            -0.95,
-            "clearance Δ (mm) of the contact sites",
-            ha="center",
-            va="top",
-            fontsize=6.5,
-            color=style.VERMILION,
-        )
-    elif not chain.sites:
-        axes.text(n / 2, -0.2, "no contact sites", ha="center", va="top", fontsize=6.5, color=style.GREY)
+        axes.text(middle, -0.95, "clearance Δ (mm) of the contact sites", color=style.VERMILION, **below)
     axes.set(xlim=(-0.035 * n, 1.035 * n), ylim=(-1.7, 2.3))
     axes.set_axis_off()
 

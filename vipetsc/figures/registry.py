@@ -10,9 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import h5py
-
-from vipetsc.figures import backbone, design, style
+from vipetsc.figures import design, style
+from vipetsc.figures.backbone import backbone
 from vipetsc.figures.band_energies import band_energies
 from vipetsc.figures.bands import bands
 from vipetsc.figures.dispersion import dispersion
@@ -33,7 +32,8 @@ from vipetsc.figures.transfer import transfer
 from vipetsc.figures.transfer_backbone import ibtet_backbone
 from vipetsc.figures.transfer_curves import ibtet
 from vipetsc.figures.transfer_dispersions import transfer_dispersions
-from vipetsc.io.run_file import RunFile
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.read import open_run
 from vipetsc.lattice import UnitCell
 
 RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
@@ -73,7 +73,7 @@ FIGURES: dict[str, FigureSpec] = {
         "entropy",
     ),
     **_specs(SWEEP, (transfer, transfer_dispersions, band_energies, ibtet, ibtet_backbone, phase_regimes), "transfer"),
-    "branch": FigureSpec(backbone.page, BRANCHES),
+    "branch": FigureSpec(backbone, BRANCHES),
     **_specs(
         DESIGN,
         (design.deflections, design.cost_maps, design.dispersion_against_lambda, design.dispersion_against_eta),
@@ -149,16 +149,15 @@ def study_drawings(study: Study, names: Iterable[str]) -> Iterator[Drawing]:
 
 def _of_run(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
     with ExitStack() as stack:
-        run = stack.enter_context(RunFile(folders[0] / "run.h5"))
+        run = stack.enter_context(open_run(folders[0] / "run.h5"))
         path = folders[0] / "analysis.h5"
-        analysis = stack.enter_context(h5py.File(path, "r")) if path.exists() else None
+        analysis = stack.enter_context(open_netcdf(path, "analysis")) if path.exists() else None
         for name in names:
             yield name, partial(FIGURES[name].function, run, analysis)
 
 
 def _of_sweep(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
-    with Study.open(folders) as study:
-        yield from study_drawings(study, names)
+    yield from study_drawings(Study.read(folders), names)
 
 
 def _of_branches(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
@@ -169,7 +168,7 @@ def _of_branches(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Draw
 
 
 def _of_design(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
-    with h5py.File(folders[0] / "design.h5", "r") as search:
+    with open_netcdf(folders[0] / "design.h5", "search", ("cost", "frequency")) as search:
         for name in names:
             yield name, partial(FIGURES[name].function, search)
 

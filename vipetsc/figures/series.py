@@ -1,26 +1,22 @@
-"""What the pictures of a sweep with full fields are drawn from: one configuration at three amplitudes."""
+"""One configuration of a sweep with full fields at three amplitudes, and the linear wave that it drives."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
+import xarray as xr
 
 from vipetsc.case import Case
-from vipetsc.case.schema import LatticeTable
-from vipetsc.figures.study import Study
-from vipetsc.io.ensemble_file import EnsembleFile
-from vipetsc.io.run_file import RunFile
+from vipetsc.figures.panels import recorded_sites
+from vipetsc.figures.study import AMPLITUDE, MeasuredRun, Study, counted, grouped, in_pi, sites_of, suffix
+from vipetsc.io.read import axes, field_time, whole_members
 from vipetsc.lattice.bloch import waves_at
 
-AMPLITUDE = "amplitude"
 LEVELS = ("Low", "Medium", "High")
 
 
@@ -36,144 +32,94 @@ class Wave:
     def of(cls, case: Case) -> Wave | None:
         """The wave that ``case`` drives; None in a gap."""
         model = case.model()
-        there = waves_at(model.chain.cell, model.drive.frequency)
-        return cls(there[0][0], float(there[0][1]), abs(float(there[0][2]))) if there else None
+        waves = waves_at(model.chain.cell, model.drive.frequency)
+        return cls(waves[0][0], float(waves[0][1]), abs(float(waves[0][2]))) if waves else None
 
 
 @dataclass(frozen=True)
-class WholeRun:
-    """A member of a sweep with its fields: the drive's ``amplitude`` in N, ``run.h5`` and ``analysis.h5``."""
-
-    amplitude: float
-    run: RunFile
-    analysis: h5py.File
-
-    @property
-    def sites(self) -> np.ndarray:
-        """Recorded cells (site) that carry contacts."""
-        cells = self.run.site_cells
-        return cells[(cells >= self.run.cells[0]) & (cells <= self.run.cells[-1])]
-
-
-@dataclass(frozen=True)
-class Series:
+class AmplitudeSeries:
     """One configuration at a low, a medium and a high amplitude.
 
-    ``suffix`` tells it from the others of a study; ``words`` are the values of what else the sweep varies.
+    ``suffix`` tells it from the others of a study; ``varied`` are the values of what else the sweep varies.
     """
 
     suffix: str
-    runs: tuple[WholeRun, WholeRun, WholeRun]
-    words: tuple[str, ...] = ()
+    runs: tuple[MeasuredRun, ...]
+    varied: tuple[str, ...] = ()
 
     @property
     def case(self) -> Case:
         """The case at the low amplitude; the others differ from it in the amplitude alone."""
-        return self.runs[0].run.case
+        return self.runs[0].case
 
     @cached_property
-    def wave(self) -> Wave | None:
-        """The linear wave at the drive's frequency."""
-        return Wave.of(self.case)
+    def drives_a_wave(self) -> bool:
+        """Whether the drive's frequency lies in a pass band."""
+        return Wave.of(self.case) is not None
+
+    @cached_property
+    def wave(self) -> Wave:
+        """The linear wave at the drive's frequency; raises ValueError in a gap."""
+        wave = Wave.of(self.case)
+        if wave is None:
+            raise ValueError("the drive's frequency lies in a gap")
+        return wave
 
     @property
     def title(self) -> str:
-        """Reading, sites and wavenumber in words, and what else the sweep varies."""
-        sites = len(self.case.contacts.sites)
-        parts = [f"{self.case.lattice.reading.capitalize()} reading", *self.words, counted(sites, "site")]
-        return ", ".join(parts + ([f"κ* = {in_pi(self.wave.wavenumber)}"] if self.wave else []))
+        """Reading, sites and wavenumber, and what else the sweep varies."""
+        parts = [f"{self.case.lattice.reading.capitalize()} reading", *self.varied]
+        parts.append(counted(len(sites_of(self.case)), "site"))
+        return ", ".join(parts + ([f"κ* = {in_pi(self.wave.wavenumber)}"] if self.drives_a_wave else []))
 
-    def headings(self) -> Iterator[tuple[int, WholeRun, str]]:
+    def headings(self) -> Iterator[tuple[int, MeasuredRun, str]]:
         """Column, run and the column's title."""
         for column, (level, member) in enumerate(zip(LEVELS, self.runs, strict=True)):
             yield column, member, f"{level} amplitude, {member.amplitude:g} N"
 
+    def snapshot_times(self) -> np.ndarray:
+        """Four times in s, from the linear wave: half way to the first site, at it, past the last, near the end.
 
-def series_of(study: Study, *needed: str) -> Iterator[Series]:
+        The packet's middle leaves the driven cell when half the burst is over.
+        """
+        member, speed = self.runs[0], self.wave.speed
+        distance = np.abs(recorded_sites(member.run) - 1 - member.model.drive_cell)
+        burst, end = member.model.drive.duration, field_time(member.run)[-1]
+        near, far = distance.min() / speed, distance.max() / speed
+        return np.minimum(np.array([0.5 * burst + 0.5 * near, 0.5 * burst + near, burst + far, 0.95 * end]), end)
+
+
+def series_of(study: Study, *needs: str) -> Iterator[AmplitudeSeries]:
     """Every configuration of the sweeps with full fields at its lowest, middle and highest amplitude.
 
-    ``needed`` names what their analyses must hold. Files are open until the next one is asked for.
+    ``needs`` names what their analyses must hold. Files are open until the next one is asked for.
     """
-    found = [(e, trios) for e in study.ensembles if (trios := _trios(e))]
-    for ensemble, trios in found:
-        for places in trios:
+    triples = [(ensemble, found) for ensemble in study.ensembles if (found := _triples(ensemble))]
+    for ensemble, configurations in triples:
+        for triple in configurations:
             with ExitStack() as stack:
-                runs = tuple(_opened(stack, *pair) for pair in places)
-                if all("velocity" in r.run.file and all(name in r.analysis for name in needed) for r in runs):
-                    place = places[0][0]
-                    yield Series(suffix(ensemble, place, len(found) > 1), runs, _words(ensemble, place))
+                runs = tuple(stack.enter_context(MeasuredRun.open(folder)) for _, folder in triple)
+                if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
+                    first = triple[0][0]
+                    yield AmplitudeSeries(suffix(first, ensemble, len(triples) > 1), runs, _varied(first, ensemble))
 
 
-def _trios(ensemble: EnsembleFile) -> list[tuple[tuple[tuple[int, ...], Path], ...]]:
-    """Places and folders of the lowest, middle and highest amplitude of every configuration that has three."""
-    if AMPLITUDE not in ensemble.dimensions:
+def _triples(ensemble: xr.Dataset) -> list[list[tuple[xr.Dataset, Path]]]:
+    """Members and folders at the lowest, middle and highest amplitude of every configuration that has three."""
+    if AMPLITUDE not in axes(ensemble):
         return []
-    along = ensemble.dimensions.index(AMPLITUDE)
-    amplitude = ensemble.values(AMPLITUDE)
-    rows: dict[tuple[int, ...], list[tuple[tuple[int, ...], Path]]] = {}
-    for place, folder in ensemble.whole_members():
-        rows.setdefault(place[:along] + place[along + 1 :], []).append((place, folder))
-    trios = []
+    others = [name for name in axes(ensemble) if name != AMPLITUDE]
+    rows = grouped(whole_members(ensemble), lambda pair: repr([pair[0][name].item() for name in others]))
+    triples = []
     for row in rows.values():
-        row.sort(key=lambda pair: amplitude[pair[0][along]])
+        row.sort(key=lambda pair: pair[0][AMPLITUDE].item())
         if len(row) >= len(LEVELS):
-            trios.append((row[0], row[len(row) // 2], row[-1]))
-    return trios
+            triples.append([row[0], row[len(row) // 2], row[-1]])
+    return triples
 
 
-def _opened(stack: ExitStack, _: tuple[int, ...], folder: Path) -> WholeRun:
-    run = stack.enter_context(RunFile(folder / "run.h5"))
-    return WholeRun(run.case.drive.amplitude, run, stack.enter_context(h5py.File(folder / "analysis.h5", "r")))
-
-
-def suffix(
-    ensemble: EnsembleFile, place: tuple[int, ...], named: bool = False, kept: Collection[str] | None = None
-) -> str:
-    """What tells the member at ``place`` from others, for a file's name; the amplitude aside.
-
-    The sweep's name if it is to be ``named``, the reading, and whatever else has several values; of the dimensions
-    only those ``kept``, by default all.
-    """
-    parts = [ensemble.sweep.name] if named else []
-    parts += [] if "reading" in ensemble.dimensions else [reading_of(ensemble)]
-    for name, index in zip(ensemble.dimensions, place, strict=True):
-        values = ensemble.values(name)
-        told = name in ("reading", "wavenumber") or len(values) > 1
-        if name != AMPLITUDE and told and (kept is None or name in kept):
-            parts.append(_word(name, values[index]))
-    return "-".join(parts)
-
-
-def _words(ensemble: EnsembleFile, place: tuple[int, ...]) -> tuple[str, ...]:
-    """Values at ``place`` of the dimensions that a title does not name otherwise."""
-    named = (AMPLITUDE, "reading", "wavenumber", "sites")
-    varied = [(n, ensemble.values(n)[i]) for n, i in zip(ensemble.dimensions, place, strict=True) if n not in named]
-    return tuple(value if isinstance(value, str) else f"{name} {value:g}" for name, value in varied)
-
-
-def _word(name: str, value: Any) -> str:
-    if name == "wavenumber":
-        return in_pi(value).replace("π", "pi").replace("/", "-")
-    text = value if isinstance(value, str) else f"{name}-{value:g}"
-    return "".join(c if c.isalnum() or c in "-." else "-" for c in text)
-
-
-def reading_of(ensemble: EnsembleFile) -> str:
-    """The reading that all members of a sweep share which does not vary it."""
-    given = ensemble.sweep.table.get("lattice", {})
-    return str(given.get("reading", LatticeTable.model_fields["reading"].default))
-
-
-def in_pi(wavenumber: float) -> str:
-    """A wavenumber in rad/cell as 5π/9, or as a decimal where no such fraction is near."""
-    share = float(wavenumber) / np.pi
-    near = Fraction(share).limit_denominator(36)
-    if abs(float(near) - share) > 1e-6:
-        return f"{share:.3f}π"
-    over = f"/{near.denominator}" if near.denominator > 1 else ""
-    return f"{'' if near.numerator == 1 else near.numerator}π{over}"
-
-
-def counted(number: int, noun: str) -> str:
-    """``1 site``, ``5 sites``."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+def _varied(member: xr.Dataset, ensemble: xr.Dataset) -> tuple[str, ...]:
+    """Values of the axes that a title does not name otherwise."""
+    names = [name for name in axes(ensemble) if name not in (AMPLITUDE, "reading", "wavenumber", "sites")]
+    values = [(name, member[name].item()) for name in names]
+    return tuple(value if isinstance(value, str) else f"{name} {value:g}" for name, value in values)

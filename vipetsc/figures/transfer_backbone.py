@@ -1,11 +1,12 @@
-"""Inter-band transfer against normalised energy with the slope of the frequency-energy branch over it."""
+"""Inter-band transfer against normalised energy, the slope of a branch over it (paper, Figs. 12, S7 and S8)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import h5py
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,84 +14,73 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.members import configuration, configuration_stem, law_name
-from vipetsc.figures.study import Study
+from vipetsc.figures.panels import panel_title, shade_regions
+from vipetsc.figures.study import Study, configuration_heading, configuration_stem, grouped, law_name
+from vipetsc.io.netcdf import open_netcdf
 
-NUMERALS = {1: "I", 2: "II", 3: "III", 4: "IV"}
-SHADES = {1: "#FFFFFF", 2: "#E4E4E4", 3: "#FFFFFF", 4: "#F1F1F1"}
 RED = "#CC0000"
 
 
+class AlignedCurve(NamedTuple):
+    """A transfer curve in the energies of a branch: a group of ``backbone.h5``, its values and attributes by name."""
+
+    case: Case
+    values: dict[str, Any]
+
+
 def ibtet_backbone(study: Study) -> Iterator[Drawing]:
-    """The paper's Fig. Ejump_FEP for every reading and configuration, from ``backbone.h5``; laws in columns.
-
-    A ``backbone.h5`` that was made of another sweep is passed over.
-    """
+    """Every reading and configuration of ``backbone.h5``, laws in columns; one made of another sweep is passed over."""
     for ensemble in study.ensembles:
-        path = ensemble.folder / "backbone.h5"
-        if not path.exists():
-            continue
-        with h5py.File(path) as file:
-            if file.attrs.get("case") != ensemble.file.attrs["case"]:
-                continue
-            pages: dict[str, list[tuple[Case, h5py.Group]]] = {}
-            for group in file.values():
-                case = Case.from_toml(group.attrs["case"])
-                pages.setdefault(configuration_stem(case), []).append((case, group))
-            for name, columns in pages.items():
-                yield name, partial(_page, columns)
+        path = Path(ensemble.attrs["folder"]) / "backbone.h5"
+        if path.exists():
+            aligned = _read(path, ensemble.attrs["case"])
+            for name, columns in grouped(aligned, lambda curve: configuration_stem(curve.case)).items():
+                yield name, partial(_page, sorted(columns, key=lambda c: c.case.contacts.law, reverse=True))
 
 
-def _page(columns: Sequence[tuple[Case, h5py.Group]]) -> Figure:
-    columns = sorted(columns, key=lambda c: c[0].contacts.law, reverse=True)
-    case, _ = columns[0]
-    figure = style.new_figure(style.PAGE if len(columns) > 1 else 4.0, 3.0)
-    figure.suptitle(f"{case.lattice.reading.capitalize()}, {configuration(case)}", fontsize=8, x=0.01, ha="left")
+def _read(path: Path, sweep: str) -> list[AlignedCurve]:
+    """The curves in ``path``; none if it was made of another sweep than that of the case file's text ``sweep``."""
+    with open_netcdf(path, "backbone", ("case",)) as file:
+        if file.attrs["case"] != sweep:
+            return []
+        groups: dict[str, dict[str, Any]] = {}
+        for name, value in [*file.attrs.items(), *((n, v.values) for n, v in file.variables.items())]:
+            group, _, rest = str(name).partition("/")
+            if rest:
+                groups.setdefault(group, {})[rest] = value
+    return [AlignedCurve(Case.from_toml(values["case"]), values) for values in groups.values()]
+
+
+def _page(columns: Sequence[AlignedCurve]) -> Figure:
+    width = style.PAGE if len(columns) > 1 else 4.0
+    figure = style.new_figure(width, 3.0, configuration_heading(columns[0].case), left=True)
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
-    for i, (axes, (own, group)) in enumerate(zip(panels, columns, strict=True)):
-        _superposition(axes, group)
-        style.letter(axes, f"({'abcdef'[i]}) {law_name(own)}; branch of the {group.attrs['branch_reading']} reading")
+    for i, (axes, (case, values)) in enumerate(zip(panels, columns, strict=True)):
+        _superposition(axes, values)
+        reading = values["branch_reading"]
+        panel_title(axes, f"({'abcdef'[i]}) {law_name(case)}; branch of the {reading} reading")
     panels[0].set_ylabel("Inter-band transfer, normalised slope (1)")
     return figure
 
 
-def _superposition(axes: Axes, group: h5py.Group) -> None:
+def _superposition(axes: Axes, curve: dict[str, Any]) -> None:
     """Points of the lattice, red where fitted; slope over the divisor dashed, with the floor grey; the law green."""
-    about = group.attrs
-    energy, ibtet, fitted = (group[n][...] for n in ("energy", "ibtet", "fitted"))
-    fitted = fitted.astype(bool)
-    place, steep, region = (group[f"branch/{n}"][...] for n in ("energy", "slope", "region"))
-    scaled = np.where(region == 1, 0.0, np.abs(steep)) / about["divisor"]
-    left = 0.5 * min(energy.min(), 0.1 * about["grazing_energy"])
+    energy, transfer, fitted = curve["energy"], curve["ibtet"], curve["fitted"].astype(bool)
+    branch, slope, region = (curve[f"branch/{name}"] for name in ("energy", "slope", "region"))
+    grazing, floor = curve["grazing_energy"], curve["floor"]
+    scaled = np.where(region == 1, 0.0, np.abs(slope)) / curve["divisor"]
+    left = 0.5 * min(energy.min(), 0.1 * grazing)
     # Region I goes on to the left: below the first point of the branch its slope is zero as well.
-    whole = np.append(left, place), about["floor"] + np.append(0.0, scaled)
-    axes.plot(*whole, color=style.GREY, lw=2.2, alpha=0.55, label="slope + floor")
-    bare, text = np.where(scaled > 0, scaled, np.nan), f"slope, $E^{{{about['slope_exponent']:.2f}}}$ there"
-    axes.plot(place, bare, color=style.BLACK, lw=0.8, ls=(0, (4, 2)), label=text)
-    axes.plot(energy, ibtet, "-o", color=style.BLUE, ms=2.6, mfc="white", mew=0.6, lw=0.6, label="lattice")
-    axes.plot(energy[fitted], ibtet[fitted], "o", color=RED, ms=2.8, label="in region III")
-    law = about["factor"] * energy[fitted] ** about["exponent"]
-    exponent, adjusted = about["exponent"], about["r2_adjusted"]
-    text = f"$E^{{{exponent:.2f}}}$, adj. $R^2$ {adjusted:.3f}"
-    axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4, label=text)
-    axes.set(xscale="log", yscale="log", xlabel="Normalised energy (J)")
-    axes.set_xlim(left, 2 * energy.max())
-    axes.set_ylim(0.25 * about["floor"], 4.0)
-    _regions(axes, place, region, about["grazing_energy"])
+    with_floor = np.append(left, branch), floor + np.append(0.0, scaled)
+    axes.plot(*with_floor, color=style.GREY, lw=2.2, alpha=0.55, label="slope + floor")
+    label = f"slope, $E^{{{curve['slope_exponent']:.2f}}}$ there"
+    axes.plot(branch, np.where(scaled > 0, scaled, np.nan), color=style.BLACK, lw=0.8, ls=style.DASHED, label=label)
+    axes.plot(energy, transfer, "-o", color=style.BLUE, ms=2.6, mfc="white", mew=0.6, lw=0.6, label="lattice")
+    axes.plot(energy[fitted], transfer[fitted], "o", color=RED, ms=2.8, label="in region III")
+    label = f"$E^{{{curve['exponent']:.2f}}}$, adj. $R^2$ {curve['r2_adjusted']:.3f}"
+    law = curve["factor"] * energy[fitted] ** curve["exponent"]
+    axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4, label=label)
+    right = 2 * energy.max()
+    shade_regions(axes, np.minimum(np.where(region == 1, grazing, branch), right), region, left, at_top=False)
+    axes.set(xscale="log", yscale="log", xlabel="Normalised energy (J)", xlim=(left, right), ylim=(0.25 * floor, 4.0))
     axes.legend(loc="upper right", fontsize=6)
-
-
-def _regions(axes: Axes, energy: np.ndarray, region: np.ndarray, grazing: float) -> None:
-    """Shade regions I-IV and name them at the bottom; each begins where the one below it ends."""
-    left, right = axes.get_xlim()
-    ends = [(k, energy[region == k].max()) for k in NUMERALS if np.any(region == k)]
-    low = left
-    for k, high in ends:
-        high = min(grazing if k == 1 else high, right)
-        if high <= low:
-            continue
-        axes.axvspan(low, high, color=SHADES[k], lw=0, zorder=0)
-        axes.text(np.sqrt(low * high), 0.015, NUMERALS[k], ha="center", va="bottom", fontsize=6.5, color=style.GREY,
-                  transform=axes.get_xaxis_transform())  # fmt: skip
-        low = high
-    axes.set_xlim(left, right)

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import h5py
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case
-from vipetsc.figures.backbone import BranchFile, backbone
+from vipetsc.figures.backbone import backbone
 from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.registry import FIGURES, study_drawings
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.study import Study
+from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.presets import PRESETS
 
 READINGS = "calibrated", "printed"
@@ -64,18 +64,19 @@ def _study(family: str, *steps: str, only: Collection[str] = (), prefix: str = "
     """The pictures of a family of sweeps whose name holds all the words of ``only``."""
 
     def offers(folders: Mapping[str, Path]) -> Iterator[Drawing]:
-        with Study.open(folders.values()) as study:
-            for stem, make in study_drawings(study, [family]) if study.ensembles else ():
-                if all(f"-{word}-" in f"{stem}-" for word in only):
-                    yield prefix + stem, make
+        study = Study.read(folders.values())
+        for stem, make in study_drawings(study, [family]) if study.ensembles else ():
+            if all(f"-{word}-" in f"{stem}-" for word in only):
+                yield prefix + stem, make
 
     return Part(steps, offers)
 
 
 def _search(*names: str) -> Part:
     def page(path: Path, name: str) -> Figure:
-        with h5py.File(path, "r") as file:
-            return FIGURES[name].function(file)
+        with open_netcdf(path, "search") as search:
+            figure: Figure = FIGURES[name].function(search)
+        return figure
 
     def offers(folders: Mapping[str, Path]) -> Iterator[Drawing]:
         for name in names:
@@ -92,7 +93,7 @@ def _branches(name: str, reading: str) -> Part:
         paths = [folder / f"branch-{name}.h5" for folder in folders.values()]
         there = [path for path in paths if path.exists()]
         if there:
-            yield f"branches-{name}-{reading}", lambda: backbone([BranchFile.read(path) for path in there])
+            yield f"branches-{name}-{reading}", lambda: backbone(there)
 
     return Part(tuple(steps), offers)
 

@@ -1,0 +1,168 @@
+"""Panels that figures share: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.image import AxesImage
+
+from vipetsc.figures import style
+from vipetsc.lattice import UnitCell, bloch, pass_bands
+from vipetsc.lattice.bloch import gaps
+
+DECADES = 5  # of energy that a map shows
+PIXELS = 600  # most rows and columns of a map: a printed page shows no more
+ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii")
+REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
+REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
+KAPPA, OMEGA = "Wavenumber κ (π rad/cell)", "Angular frequency ω (krad/s)"
+
+
+def panel_title(axes: Axes, text: str) -> None:
+    """Title of a panel at its left, such as "(a) Before the first site"."""
+    axes.set_title(text, pad=3)
+
+
+def annotate_empty(axes: Axes, reason: str) -> None:
+    """Fill ``axes`` with the ``reason`` why they show nothing."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, reason, ha="center", va="center", color=style.GREY, wrap=True, transform=axes.transAxes)
+
+
+def empty_figure(reason: str) -> Figure:
+    """A figure of one column that shows the ``reason`` why it is empty."""
+    figure = style.new_figure(style.COLUMN, 1.6)
+    annotate_empty(figure.subplots(), reason)
+    return figure
+
+
+def block_means(values: np.ndarray, rows: int = PIXELS, columns: int = PIXELS) -> np.ndarray:
+    """Means over blocks of ``values`` (row, column), so that at most ``rows`` x ``columns`` are left."""
+    for axis, most in ((0, rows), (1, columns)):
+        length = values.shape[axis]
+        block = -(-length // most)
+        if block > 1:
+            starts = np.arange(0, length, block)
+            sizes = np.diff(np.append(starts, length))
+            values = np.add.reduceat(values, starts, axis=axis) / np.expand_dims(sizes, 1 - axis)
+    return values
+
+
+def log_norm(largest: float, decades: float = DECADES) -> LogNorm:
+    """Logarithmic colours over ``decades`` below ``largest``, below 1 for a field that vanishes."""
+    top = largest if np.isfinite(largest) and largest > 0 else 1.0
+    return LogNorm(top * 10.0**-decades, top, clip=True)
+
+
+def draw_map(
+    axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize, cmap: str = "inferno"
+) -> AxesImage:
+    """Image of ``values`` (y, x) at evenly spaced positions, pooled to what a printed page can show."""
+    half = [0.5 * (axis[-1] - axis[0]) / max(len(axis) - 1, 1) or 0.5 for axis in (x, y)]
+    extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
+    options = {"extent": extent, "origin": "lower", "aspect": "auto", "interpolation": "nearest"}
+    return axes.imshow(block_means(values), norm=norm, cmap=cmap, **options)
+
+
+def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, cmap: str = "inferno") -> AxesImage:
+    """Map of ``field`` (t, cell), time to the right; the coordinates name the axes."""
+    time, cells = (field[dim].values for dim in field.dims)
+    image = draw_map(axes, time, cells, field.values.T, norm, cmap)
+    axes.set(xlabel="Time (s)", ylabel="Cell")
+    return image
+
+
+def recorded_sites(run: xr.Dataset) -> np.ndarray:
+    """Cells (site), from 1, of the contact sites inside the recorded window."""
+    cells, sites = run["cell"].values, run["sites/cell"].values
+    return sites[(sites >= cells[0]) & (sites <= cells[-1])]
+
+
+def mark_sites(axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y") -> None:
+    """Dotted lines at the contact sites, triangles on the edge of the axis ``along`` ("x" or "y") of cells."""
+    sites = recorded_sites(run)
+    marks = {"color": style.SKY, "mec": "white", "mew": 0.3, "ms": 3.5, "ls": "", "label": "contact sites"}
+    for site in sites:
+        line = axes.axhline if along == "y" else axes.axvline
+        line(site, color=colour, lw=0.5, ls=style.DOTTED, alpha=0.8)
+    if along == "y":
+        edge = np.full(len(sites), 0.015)
+        axes.plot(edge, sites, marker=">", transform=axes.get_yaxis_transform(), **marks)
+    else:
+        edge = np.full(len(sites), 0.03)
+        axes.plot(sites, edge, marker="^", transform=axes.get_xaxis_transform(), **marks)
+
+
+def below_cutoff(analysis: xr.Dataset, cell: UnitCell, names: Sequence[str]) -> xr.Dataset:
+    """Spectra ``names`` (wavenumber, frequency) up to a tenth above the highest pass band of ``cell``."""
+    return analysis[list(names)].sel(frequency=slice(0, 1.1 * pass_bands(cell)[-1].high)).load()
+
+
+def dispersion_map(axes: Axes, spectrum: xr.DataArray, norm: Normalize, cell: UnitCell) -> AxesImage:
+    """Map of ``spectrum`` (wavenumber, frequency) with the Bloch branches of ``cell`` over it, dashed."""
+    wavenumber, frequency = spectrum["wavenumber"].values / np.pi, spectrum["frequency"].values / 1e3
+    image = draw_map(axes, wavenumber, frequency, spectrum.values.T, norm)
+    kappa = np.linspace(0, np.pi, 181)
+    axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color="white", lw=0.5, ls=(0, (4, 3)), alpha=0.75)
+    axes.set(xlim=(0, wavenumber[-1]), ylim=(0, frequency[-1]))
+    return image
+
+
+def band_diagram(axes: Axes, cell: UnitCell, frequency: float | None = None) -> None:
+    """Bloch branches of ``cell`` in colours, gaps shaded, the drive's ``frequency`` (rad/s) dotted."""
+    kappa, bands = np.linspace(0, np.pi, 361), pass_bands(cell)
+    for branch, colour in zip(bloch(cell, kappa).frequency.T, colours(len(bands)), strict=True):
+        axes.plot(kappa / np.pi, branch / 1e3, color=colour)
+    shade_bands(axes, gaps(bands))
+    if frequency is not None:
+        axes.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
+    axes.set(xlim=(0, 1), ylim=(0, 1.08 * bands[-1].high / 1e3), xlabel=KAPPA, ylabel=OMEGA)
+
+
+def shade_bands(axes: Axes, spans: Iterable[tuple[float, float]], along: str = "y") -> None:
+    """Shade ``spans`` of frequency (rad/s) on the axis ``along``, which shows krad/s."""
+    for low, high in spans:
+        (axes.axhspan if along == "y" else axes.axvspan)(low / 1e3, high / 1e3, color=style.PALE, alpha=0.7, lw=0)
+
+
+def colours(count: int) -> list[str]:
+    """The first ``count`` colours of a series, which then begins again."""
+    return [style.SERIES[i % len(style.SERIES)] for i in range(count)]
+
+
+def colour_bar(
+    figure: FigureBase, image: AxesImage, axes: Axes | Iterable[Axes], label: str, pad: float = 0.01, aspect: float = 20
+) -> Colorbar:
+    """Colour bar of a map whose lowest colour stands for what is below it as well."""
+    panels = axes if isinstance(axes, Axes) else list(axes)
+    return figure.colorbar(image, ax=panels, label=label, pad=pad, aspect=aspect, extend="min")
+
+
+def centred_limits(axes: Axes, x: np.ndarray, y: np.ndarray, margin: float) -> None:
+    """Limits symmetric about zero that hold ``x`` and ``y`` with a ``margin`` (a factor)."""
+    for set_limits, values in ((axes.set_xlim, x), (axes.set_ylim, y)):
+        reach = margin * np.abs(values).max() or 1.0
+        set_limits(-reach, reach)
+
+
+def shade_regions(axes: Axes, energy: np.ndarray, region: np.ndarray, left: float, at_top: bool) -> None:
+    """Shade the regions I-IV (1-4) of energy (J) of a branch's points, named at the top or the bottom of the panel.
+
+    Each begins where the one below it ends, the first at ``left``.
+    """
+    low = left
+    for number in range(1, 5):
+        high = energy[region == number].max(initial=0.0)
+        if high <= low:
+            continue
+        axes.axvspan(low, high, color=REGION_SHADES[number], lw=0, zorder=0)
+        axes.text(np.sqrt(low * high), 0.985 if at_top else 0.015, REGIONS[number], ha="center",
+                  va="top" if at_top else "bottom", fontsize=6.5, color=style.GREY,
+                  transform=axes.get_xaxis_transform())  # fmt: skip
+        low = high
