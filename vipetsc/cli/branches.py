@@ -46,10 +46,9 @@ def branch_table(branch: Branch) -> str:
         )
     special = [p for p in branch.points if p.kind != "regular"]
     for kind in sorted({p.kind for p in special}):
-        found = [p for p in special if p.kind == kind]
-        lines.append(f"  {kind}: {len(found)}")
-        for p in found[:4]:
-            lines.append(f"    E = {p.energy:.12g} J, f = {p.frequency:.11g} Hz")
+        of_kind = [p for p in special if p.kind == kind]
+        lines.append(f"  {kind}: {len(of_kind)}")
+        lines += [f"    E = {p.energy:.12g} J, f = {p.frequency:.11g} Hz" for p in of_kind[:4]]
     for region, law in branch.fits().items():
         lines.append(
             f"  region {region}: df/dE ~ E^{law['exponent']:.4f}, adjusted R^2 {law['adjusted_r2']:.5f}"

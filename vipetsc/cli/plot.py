@@ -49,7 +49,7 @@ def draw_source(
     source: str, folders: Sequence[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm
 ) -> list[Path]:
     """Draw what ``folders`` hold (see `vipetsc.figures.draw`), measured first where that is missing or older."""
-    from vipetsc.figures import draw, figure_names
+    from vipetsc.figures.registry import draw, figure_names
 
     def prepare() -> None:
         try:

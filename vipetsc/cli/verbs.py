@@ -1,0 +1,187 @@
+"""The verbs: each takes the parsed options and the communicator, and returns the exit code; all ranks call it.
+
+What a verb alone needs is imported inside it: compiled kernels and matplotlib take seconds to load.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TextIO, TypeVar
+
+from mpi4py import MPI
+
+from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
+from vipetsc.case.reading import read_toml
+from vipetsc.cli.doctor import doctor_table
+from vipetsc.cli.plot import draw_folders, draw_source
+from vipetsc.cli.tables import bands_report, bands_table, run_table, sweep_table, validate_table
+from vipetsc.io.atomic import write_text
+from vipetsc.parallel import StopRequest, on_root
+
+DONE, FAILED, BAD_INPUT = 0, 1, 2
+
+AnyCase = TypeVar("AnyCase", bound=CaseFile)
+
+
+def echo(comm: MPI.Comm, text: str, stream: TextIO | None = None) -> None:
+    """Print ``text`` on rank 0."""
+    if comm.rank == 0:
+        print(text, file=stream or sys.stdout, flush=True)
+
+
+def echo_paths(comm: MPI.Comm, paths: Iterable[Path]) -> None:
+    """Print on rank 0 which files were written."""
+    for path in paths:
+        echo(comm, f"  {path}")
+
+
+def _load(kind: type[AnyCase], options: argparse.Namespace, comm: MPI.Comm) -> AnyCase:
+    """The case, read on rank 0 alone; raises CaseError on all ranks."""
+    return on_root(comm, lambda: kind.load(options.case, options.set))
+
+
+def _output(options: argparse.Namespace, name: str) -> Path:
+    return Path(options.out or Path("runs") / name)
+
+
+def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """One simulation, its analysis and pictures."""
+    from vipetsc.dynamics import simulate
+    from vipetsc.studies.reanalyse import measure_run
+
+    case = _load(Case, options, comm)
+    for warning in on_root(comm, case.warnings):
+        echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
+    folder, stop = _output(options, case.name), StopRequest().install()
+    result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
+    echo(comm, run_table(result))
+    if result.resumable:
+        return FAILED
+    if case.output.fields and result.statistics["samples"] > 1:
+        on_root(comm, lambda: measure_run(folder))
+        if case.output.figures:
+            echo_paths(comm, draw_source("run", [folder], None, ("png",), comm))
+    return DONE if result.complete else FAILED
+
+
+def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Every combination in the section [sweep] of a case; goes on where it was stopped."""
+    from vipetsc.studies.sweep import run_sweep
+
+    plan = _load(Sweep, options, comm)
+    folder = _output(options, plan.name)
+    result = run_sweep(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
+    echo(comm, sweep_table(result))
+    if plan.figures and (folder / "ensemble.h5").exists():
+        echo_paths(comm, draw_source("sweep", [folder], None, ("png",), comm))
+    return DONE if result.complete else FAILED
+
+
+def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Nonlinear normal modes: the branches of a case, their files and pictures."""
+    from vipetsc.cli.branches import BranchLog, branch_table
+    from vipetsc.modes.follow import follow_all, prepare_folder
+
+    case = _load(NnmCase, options, comm)
+    folder = _output(options, case.name)
+    on_root(comm, lambda: prepare_folder(case, folder, options.force, options.resume))
+    branches = follow_all(case, folder, comm, options.resume, BranchLog(sys.stderr))
+    for branch in branches:
+        echo(comm, branch_table(branch))
+    echo_paths(comm, draw_source("branches", [folder], None, ("png",), comm))
+    failed = comm.bcast(any(branch.ending.startswith("failed") for branch in branches))
+    return FAILED if failed else DONE
+
+
+def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Check a case and print what follows from it."""
+    case = _load(Case, options, comm)
+
+    def report() -> str:
+        lines = [validate_table(case, comm.size)]
+        if options.case is not None and "sweep" in read_toml(options.case):
+            plan = Sweep.load(options.case, options.set)
+            members = plan.members()
+            counts = " x ".join(map(str, plan.shape))
+            impossible = sum(member.case is None for member in members)
+            lines.append(f"  sweep        {len(members)} members ({counts}), {impossible} of them impossible")
+        return "\n".join(lines + [f"warning: {warning}" for warning in case.warnings()])
+
+    echo(comm, on_root(comm, report))
+    return DONE
+
+
+def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Pass bands, gaps and group velocities of a case's cell; a table and a picture."""
+    case = _load(Case, options, comm)
+    folder = _output(options, f"{case.name}-bands")
+
+    def report() -> str:
+        from vipetsc.figures.registry import draw_bands
+
+        cell = case.unit_cell()
+        folder.mkdir(parents=True, exist_ok=True)
+        picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
+        text = json.dumps(bands_table(cell) | {"picture": str(picture)}, indent=2)
+        write_text(folder / "bands.json", text + "\n")
+        return text if options.json else f"{bands_report(cell)}\n  {picture}"
+
+    echo(comm, on_root(comm, report))
+    return DONE
+
+
+def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """The (lambda, eta) search of the four-band cell: ``design.h5``, its pictures, a table of the optima."""
+    from vipetsc.studies.design import search_design
+
+    case = _load(DesignCase, options, comm)
+    folder = _output(options, case.name)
+    echo(comm, on_root(comm, lambda: search_design(case, folder, options.force)))
+    echo_paths(comm, draw_source("design", [folder], None, ("png",), comm))
+    return DONE
+
+
+def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
+    from vipetsc.studies.reanalyse import reanalyse_folders
+
+    echo_paths(comm, reanalyse_folders(options.path, comm))
+    return DONE
+
+
+def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Pictures of what folders hold again, from their files."""
+    echo_paths(comm, draw_folders(options.path, options.fig, tuple(options.format or ("png",)), comm))
+    return DONE
+
+
+def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Every figure and claim of the paper: what is missing is computed, drawn, measured, and put into a report."""
+    from vipetsc.paper.make import make_paper
+    from vipetsc.paper.plan import FULL, QUICK, paper_plan
+    from vipetsc.paper.tables import claims_table, plan_table
+
+    plan = paper_plan(QUICK if options.quick else FULL)
+    folder = _output(options, "paper-quick" if options.quick else "paper")
+    if options.list:
+        echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
+        return DONE
+    stop = StopRequest().install()
+    result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
+    if result.stopped:
+        echo(comm, "stopped on request; the same command goes on")
+        return FAILED
+    echo(comm, claims_table(result.claims))
+    echo(comm, f"  {len(result.made)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
+    return DONE if result.complete else FAILED
+
+
+def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Versions, MPI, HDF5 and ranks; what is missing and how to get it."""
+    text, healthy = doctor_table(comm)
+    echo(comm, text)
+    return DONE if healthy else FAILED
