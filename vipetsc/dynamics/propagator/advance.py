@@ -5,23 +5,22 @@ Sec. 2 to 4 of the derivation in the package's docstring.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.landing import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
 from vipetsc.contact.law import CLOSED, FREE, contact_force
-from vipetsc.dynamics.propagator.collocation import EXIT, ONSET, PLAIN
+from vipetsc.dynamics.propagator.collocation import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.substep import (
+    ClusterMotion,
     ClusterRecord,
-    NodeValues,
     Substep,
+    Trial,
     accumulate_moments,
     collocate,
     error_ratio,
-    site_motion,
+    evaluate_site_motion,
     update_taylor,
 )
 from vipetsc.dynamics.propagator.taylor import ROUNDING, first_onset, shift
@@ -42,29 +41,6 @@ LEAST_GROWTH, MOST_GROWTH = 0.2, 2.0
 # A substep that could not be collocated is repeated at this share of its length.
 CUT = 0.4
 
-HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
-"""A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
-
-
-class ClusterMotion(NamedTuple):
-    """What changes while a cluster is advanced.
-
-    ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``trial`` those after the
-    substep at hand; ``start`` and ``end`` (site, 3) w, w', w'' at both ends of it; ``values`` its nodes. ``moments``
-    (dof, 2 term) in N s are those of the step's forces about its end, ``energy`` (dof,) in J what sites dissipated and
-    the work of the drive; ``history`` (site,) is of dtype ``HISTORY``, ``state`` (1,) of dtype ``SUBSTEP_STATE``.
-    """
-
-    taylor: np.ndarray
-    trial: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
-    values: NodeValues
-    moments: np.ndarray
-    energy: np.ndarray
-    history: np.ndarray
-    state: np.ndarray
-
 
 @njit(error_model="numpy")
 def _advance_freely(cluster: ClusterRecord, motion: ClusterMotion) -> int:
@@ -78,12 +54,12 @@ def _advance_freely(cluster: ClusterRecord, motion: ClusterMotion) -> int:
         return DONE
     shift(motion.taylor, first, motion.taylor)
     state.position += first
-    site_motion(cluster, state, motion.taylor, motion.start)
+    evaluate_site_motion(cluster, state, motion.taylor, motion.site_motion)
     state.landings += 1
     return CHANGED
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", inline="always")
 def _active_dofs(cluster: ClusterRecord, motion: ClusterMotion) -> np.ndarray:
     """The DoFs on which a force acts: sites in contact, then the driven mass."""
     state, sites, dofs = motion.state[0], cluster.contacts.sites, motion.taylor.shape[0]
@@ -95,7 +71,7 @@ def _active_dofs(cluster: ClusterRecord, motion: ClusterMotion) -> np.ndarray:
     return active[:count]
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", inline="always")
 def _choose_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray) -> Substep:
     """The next substep: as long as its error allows, not beyond the drive's end, short while a contact is young."""
     state, sites = motion.state[0], cluster.contacts.sites
@@ -115,22 +91,24 @@ def _choose_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.nd
     return Substep(PLAIN, length)
 
 
-@njit(error_model="numpy")
-def _try_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep) -> bool:
-    """Leave the end of a substep in ``motion.trial`` and ``motion.end``; whether it could be collocated."""
-    state = motion.state[0]
-    if not collocate(cluster, state, motion.taylor, active, substep, motion.values):
+@njit(error_model="numpy", inline="always")
+def _try_substep(
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
+) -> bool:
+    """Leave the end of a substep in ``trial``; whether it could be collocated."""
+    if not collocate(cluster, motion, active, trial, substep):
         return False
-    update_taylor(cluster, motion.taylor, active, substep, motion.values.force, motion.trial)
+    update_taylor(cluster, motion, active, trial, substep)
+    state = motion.state[0]
     state.position += substep.length
-    site_motion(cluster, state, motion.trial, motion.end)
+    evaluate_site_motion(cluster, state, trial.taylor, trial.site_motion)
     state.position -= substep.length
     return True
 
 
 @njit(error_model="numpy")
 def _land(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep, change: Change
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep, change: Change
 ) -> tuple[float, bool]:
     """Repeat a substep so that it ends on a ``change``; the length taken, and whether the change was met.
 
@@ -140,15 +118,15 @@ def _land(
     landing = begin_landing(change.share, substep.length)
     while True:
         if landing.length <= ROUNDING:
-            begin = switching(contacts, site, change.function, motion.start[site])
+            begin = switching(contacts, site, change.function, motion.site_motion[site])
             return 0.0, begin.value > begin.tolerance or (begin.value >= -begin.tolerance and begin.rate > 0.0)
-        if not _try_substep(cluster, motion, active, Substep(substep.kind, landing.length)):
+        if not _try_substep(cluster, motion, active, trial, Substep(substep.kind, landing.length)):
             return -landing.length, False
-        end = switching(contacts, site, change.function, motion.end[site])
+        end = switching(contacts, site, change.function, trial.site_motion[site])
         # Landings come to the rounding of w where Newton's steps still help.
         landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, 1e-4 * end.tolerance)
         if outcome == SEARCH:
-            share = first_change(contacts, motion.start, motion.end, h * landing.length).share
+            share = first_change(contacts, motion.site_motion, trial.site_motion, h * landing.length).share
             if share > 1.0:
                 return landing.length, False
             landing = shorten(landing, share)
@@ -156,16 +134,16 @@ def _land(
             return landing.length, outcome == LANDED
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", inline="always")
 def _search_and_land(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
 ) -> tuple[Substep, bool]:
     """Search a substep just tried for a change and land on the first one: the substep taken, whether it was met.
 
     A substep of negative length was rejected; ``state.length`` has the next one to try.
     """
     state = motion.state[0]
-    change = first_change(cluster.contacts, motion.start, motion.end, cluster.interval * substep.length)
+    change = first_change(cluster.contacts, motion.site_motion, trial.site_motion, cluster.interval * substep.length)
     if change.share > 1.0:
         return substep, False
     separates = (
@@ -179,20 +157,20 @@ def _search_and_land(
         return Substep(ONSET, -1.0), False
     kind = EXIT if separates else substep.kind
     state.landings += 1
-    taken, landed = _land(cluster, motion, active, Substep(kind, substep.length), change)
+    taken, landed = _land(cluster, motion, active, trial, Substep(kind, substep.length), change)
     if taken < 0.0:
         state.rejected += 1
         state.length = -CUT * taken
     return Substep(kind, taken), landed
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", inline="always")
 def _control_length(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, taken: float, landed: bool
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, taken: float, landed: bool
 ) -> bool:
     """Set the next substep's length by the error of the one ``taken``; whether that is small enough."""
     state = motion.state[0]
-    ratio = error_ratio(cluster, active, taken, motion.values.force)
+    ratio = error_ratio(cluster, active, taken, trial.force)
     factor = min(max(0.9 * (1.0 / max(ratio, 1e-30)) ** (1.0 / ORDER), LEAST_GROWTH), MOST_GROWTH)
     if ratio > 1.0 and taken > SHORTEST:
         state.rejected += 1
@@ -203,33 +181,32 @@ def _control_length(
     return True
 
 
-@njit(error_model="numpy")
-def _accept(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, substep: Substep) -> None:
-    """Take the substep tried last as done."""
-    state = motion.state[0]
-    accumulate_moments(cluster, state, active, substep, motion.values, motion.moments, motion.energy)
+@njit(error_model="numpy", inline="always")
+def _accept(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep) -> None:
+    """Take a substep as done."""
+    accumulate_moments(cluster, motion, active, trial, substep)
     for i in active:
         if i < cluster.contacts.sites.size:
-            _update_extremes(cluster, motion, i, cluster.interval * substep.length)
-    state.position += substep.length
-    motion.taylor[:] = motion.trial
-    motion.start[:] = motion.end
+            _update_extremes(cluster, motion, trial, i, cluster.interval * substep.length)
+    motion.state[0].position += substep.length
+    motion.taylor[:] = trial.taylor
+    motion.site_motion[:] = trial.site_motion
 
 
 @njit(error_model="numpy")
-def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, i: int, seconds: float) -> None:
+def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, i: int, seconds: float) -> None:
     """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
-    start, end, history = motion.start[i], motion.end[i], motion.history[i]
+    start, end, history = motion.site_motion[i], trial.site_motion[i], motion.history[i]
     side = 1.0 if cluster.contacts.sites[i].mode > 0 else -1.0
     depth = max(side * start[0], side * end[0]) - cluster.contacts.sites[i].clearance
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]
     force, smallest = max(first, last), min(first, last)
-    inside = -side * motion.values.force[i]
+    inside = -side * trial.force[i]
     smallest = min(smallest, inside.min())
     if inside.max() > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
         # A turn lies inside.
-        depth, force, smallest = extremes(cluster.contacts, i, motion.start, motion.end, seconds)
+        depth, force, smallest = extremes(cluster.contacts, i, motion.site_motion, trial.site_motion, seconds)
     history.indentation = max(history.indentation, depth)
     history.force = max(history.force, force)
     history.smallest_force = min(history.smallest_force, smallest)
@@ -239,15 +216,16 @@ def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, i: int, seco
 def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float) -> int:
     """Advance a cluster in the step that begins at ``begin`` in s, to the first change of modes or to the step's end.
 
-    Returns ``DONE``, ``CHANGED`` (``motion.start`` holds the motion there) or ``FAILED``.
+    Returns ``DONE``, ``CHANGED`` (``motion`` is that after it) or ``FAILED``.
     """
     state, blind = motion.state[0], False
     if begin != state.begin:
         state.begin, state.position = begin, 0.0
         state.drive_end = (cluster.burst.duration - begin) / cluster.interval
         motion.moments[:] = 0.0
-    for values in motion.values:
-        values[:] = 0.0
+    dofs, sites = motion.taylor.shape[0], cluster.contacts.sites.size
+    force, w, v = np.zeros((dofs, NODES)), np.zeros((dofs, NODES)), np.zeros((dofs, NODES))
+    trial = Trial(force, w, v, np.empty_like(motion.taylor), np.empty((sites, 3)))
     for _ in range(MOST_SUBSTEPS):
         if 1.0 - state.position <= ROUNDING:
             state.position = 1.0
@@ -255,12 +233,12 @@ def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float)
         active = _active_dofs(cluster, motion)
         if active.size == 0:
             return _advance_freely(cluster, motion)
-        site_motion(cluster, state, motion.taylor, motion.start)
+        evaluate_site_motion(cluster, state, motion.taylor, motion.site_motion)
         substep = _choose_substep(cluster, motion, active)
         if blind:
             substep = Substep(substep.kind, min(substep.length, BLIND))
         state.substeps += 1
-        if not _try_substep(cluster, motion, active, substep):
+        if not _try_substep(cluster, motion, active, trial, substep):
             state.rejected += 1
             state.length = CUT * substep.length
             if substep.length < ROUNDING:
@@ -268,16 +246,16 @@ def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float)
             continue
         landed = False
         if not blind:
-            substep, landed = _search_and_land(cluster, motion, active, substep)
+            substep, landed = _search_and_land(cluster, motion, active, trial, substep)
             if substep.length < 0.0:
                 continue
         # A change at the very start that is none: past it.
         blind = substep.length == 0.0 and not landed
         if substep.length > 0.0:
             # Judged only now: a force continued beyond its end is no smooth function.
-            if not _control_length(cluster, motion, active, substep.length, landed):
+            if not _control_length(cluster, motion, active, trial, substep.length, landed):
                 continue
-            _accept(cluster, motion, active, substep)
+            _accept(cluster, motion, active, trial, substep)
         if landed:
             return CHANGED
     return FAILED

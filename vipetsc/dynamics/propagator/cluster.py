@@ -12,10 +12,10 @@ from vipetsc.contact.episodes import Episode
 from vipetsc.contact.law import create_contacts
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.dynamics.engine import StalledError
-from vipetsc.dynamics.propagator.advance import DONE, FAILED, HISTORY, ORDER, ClusterMotion, advance_cluster
-from vipetsc.dynamics.propagator.collocation import NODES, collocation
+from vipetsc.dynamics.propagator.advance import DONE, FAILED, ORDER, advance_cluster
+from vipetsc.dynamics.propagator.collocation import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.propagator.substep import SUBSTEP_STATE, ClusterRecord, NodeValues
+from vipetsc.dynamics.propagator.substep import HISTORY, SUBSTEP_STATE, ClusterMotion, ClusterRecord
 from vipetsc.dynamics.records import Burst
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
@@ -109,10 +109,7 @@ class Cluster:
         self.tracker = ImpactTracker(self._record.contacts, self.sites, reduced_mass)
         self._motion = ClusterMotion(
             taylor=taylor,
-            trial=np.zeros_like(taylor),
-            start=self.tracker.start,
-            end=self.tracker.end,
-            values=NodeValues(*np.zeros((3, len(dofs), NODES))),
+            site_motion=self.tracker.start,
             moments=moments,
             energy=energy,
             history=np.zeros(len(self.sites), HISTORY),

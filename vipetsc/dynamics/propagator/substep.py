@@ -32,6 +32,10 @@ SUBSTEP_STATE = np.dtype(
 end of the drive; counts of substeps, of rejected ones and of landings."""
 
 
+HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
+"""A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
+
+
 class ClusterRecord(NamedTuple):
     """A cluster's constants.
 
@@ -51,6 +55,23 @@ class ClusterRecord(NamedTuple):
     atol: float
 
 
+class ClusterMotion(NamedTuple):
+    """What changes while a cluster is advanced.
+
+    ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``site_motion`` (site, 3)
+    w, w', w'' there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end, ``energy`` (dof,)
+    in J what sites dissipated and the work of the drive; ``history`` (site,) is of dtype ``HISTORY``, ``state`` (1,)
+    of dtype ``SUBSTEP_STATE``.
+    """
+
+    taylor: np.ndarray
+    site_motion: np.ndarray
+    moments: np.ndarray
+    energy: np.ndarray
+    history: np.ndarray
+    state: np.ndarray
+
+
 class Substep(NamedTuple):
     """A substep: how its nodes lie (``collocation``), its length as a share of the step."""
 
@@ -58,29 +79,35 @@ class Substep(NamedTuple):
     length: float
 
 
-class NodeValues(NamedTuple):
-    """Force in N, displacement in m and velocity in m/s (dof, node) of the DoFs in a substep."""
+class Trial(NamedTuple):
+    """A substep that has been computed but not yet taken.
+
+    ``force`` in N, ``w`` in m and ``v`` in m/s (dof, node) at its nodes; at its end ``taylor`` (dof, 2 term) and
+    ``site_motion`` (site, 3) as in ``ClusterMotion``.
+    """
 
     force: np.ndarray
     w: np.ndarray
     v: np.ndarray
+    taylor: np.ndarray
+    site_motion: np.ndarray
 
 
 @njit(error_model="numpy")
-def site_motion(cluster: ClusterRecord, state: Any, taylor: np.ndarray, motion: np.ndarray) -> None:
-    """``motion`` (site, 3): w, w', w'' of every site at the present position, where the series is ``taylor``."""
+def evaluate_site_motion(cluster: ClusterRecord, state: Any, taylor: np.ndarray, out: np.ndarray) -> None:
+    """``out`` (site, 3) = w, w', w'' of every site at the present position, where the series is ``taylor``."""
     sites, h = cluster.contacts.sites.size, cluster.interval
     forces = np.zeros(taylor.shape[0])
     for i in range(sites):
-        motion[i, 0], motion[i, 1] = taylor[i, 0], taylor[i, 1] / h
-        forces[i] = -contact_force(cluster.contacts, i, motion[i, 0], motion[i, 1])[0]
+        out[i, 0], out[i, 1] = taylor[i, 0], taylor[i, 1] / h
+        forces[i] = -contact_force(cluster.contacts, i, out[i, 0], out[i, 1])[0]
     if forces.size > sites:
         forces[sites] = drive_force(cluster.burst, state.begin + state.position * h)
     for i in range(sites):
         acceleration = 2.0 * taylor[i, 2]
         for j in range(forces.size):
             acceleration += cluster.response[i, j, 0] * forces[j]
-        motion[i, 2] = acceleration / (h * h)
+        out[i, 2] = acceleration / (h * h)
 
 
 @njit(error_model="numpy")
@@ -111,12 +138,13 @@ def _node_responses(
 
 @njit(error_model="numpy")
 def collocate(
-    cluster: ClusterRecord, state: Any, taylor: np.ndarray, active: np.ndarray, substep: Substep, values: NodeValues
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
 ) -> bool:
-    """Solve for the ``values`` of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
+    """Solve for the force and motion of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
 
-    Picard's iteration, which begins with the forces that ``values`` hold.
+    Picard's iteration, which begins with the forces that ``trial`` holds.
     """
+    state, taylor = motion.state[0], motion.taylor
     contacts, h, n = cluster.contacts, cluster.interval, active.size
     free_w, free_v = np.empty((n, NODES)), np.empty((n, NODES))
     for a in range(n):
@@ -125,7 +153,7 @@ def collocate(
             free_w[a, node], slope = evaluate(taylor[active[a]], at)
             free_v[a, node] = slope / h
             if active[a] == contacts.sites.size:
-                values.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
+                trial.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
     to_w, to_v = np.zeros((n, n, NODES, NODES)), np.zeros((n, n, NODES, NODES))
     reaches = np.zeros((n, n), np.bool_)
     for a in range(n):
@@ -140,11 +168,11 @@ def collocate(
             for b in range(n):
                 if reaches[a, b]:
                     for k in range(NODES):
-                        force = values.force[active[b], k]
+                        force = trial.force[active[b], k]
                         for node in range(NODES):
                             w[node] += to_w[a, b, k, node] * force
                             v[node] += to_v[a, b, k, node] * force
-            change = max(change, _replace(contacts, active[a], w, v, values))
+            change = max(change, _replace(contacts, active[a], w, v, trial))
         if change < 1e-15 or (change < 1e-13 and change >= last):
             return True
         if change == np.inf:
@@ -153,14 +181,14 @@ def collocate(
         for i in active:
             if i < contacts.sites.size:
                 for node in range(NODES):
-                    values.force[i, node] = -contact_force(contacts, i, values.w[i, node], values.v[i, node])[0]
-    values.force[: contacts.sites.size] = 0.0
+                    trial.force[i, node] = -contact_force(contacts, i, trial.w[i, node], trial.v[i, node])[0]
+    trial.force[: contacts.sites.size] = 0.0
     return False
 
 
 @njit(error_model="numpy")
-def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, values: NodeValues) -> float:
-    """Put the motion ``w``, ``v`` (node,) of DoF ``i`` into ``values``; returns its largest change.
+def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
+    """Put the motion ``w``, ``v`` (node,) of DoF ``i`` into ``trial``; returns its largest change.
 
     Changes of a site count against its clearance and against its velocity; inf where the motion is not finite.
     """
@@ -170,24 +198,24 @@ def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, values: N
             return np.inf
         if i < contacts.sites.size:
             site = contacts.sites[i]
-            change = max(change, abs(w[node] - values.w[i, node]) / site.clearance)
-            change = max(change, abs(v[node] - values.v[i, node]) / (abs(v[node]) + abs(site.approach)))
-        values.w[i, node], values.v[i, node] = w[node], v[node]
+            change = max(change, abs(w[node] - trial.w[i, node]) / site.clearance)
+            change = max(change, abs(v[node] - trial.v[i, node]) / (abs(v[node]) + abs(site.approach)))
+        trial.w[i, node], trial.v[i, node] = w[node], v[node]
     return change
 
 
 @njit(error_model="numpy")
 def update_taylor(
-    cluster: ClusterRecord, taylor: np.ndarray, active: np.ndarray, substep: Substep, force: np.ndarray, out: np.ndarray
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
 ) -> None:
-    """Series ``out`` of all DoFs' free motion after a substep in which the ``force`` (dof, node) acted."""
-    shift(taylor, substep.length, out)
-    dofs, terms = taylor.shape[0], cluster.response.shape[2]
+    """The series of all DoFs' free motion after a substep in which the forces of ``trial`` acted, into ``trial``."""
+    shift(motion.taylor, substep.length, trial.taylor)
+    dofs, _, terms = cluster.response.shape
     moments, series = np.empty(2 * terms), np.empty((terms, 2 * terms))
     for source in active:
         moments[:] = 0.0
         for node in range(NODES):
-            amount = substep.length * cluster.nodes.weight[substep.kind, node] * force[source, node]
+            amount = substep.length * cluster.nodes.weight[substep.kind, node] * trial.force[source, node]
             lag = substep.length * (1.0 - cluster.nodes.share[substep.kind, node])
             for k in range(2 * terms):
                 moments[k] += amount
@@ -200,7 +228,7 @@ def update_taylor(
                 g = cluster.response[i, source, m]
                 if g != 0.0:
                     for k in range(2 * m + 2):
-                        out[i, k] += g * series[m, k]
+                        trial.taylor[i, k] += g * series[m, k]
 
 
 @njit(error_model="numpy")
@@ -223,23 +251,19 @@ def error_ratio(cluster: ClusterRecord, active: np.ndarray, length: float, force
 
 @njit(error_model="numpy")
 def accumulate_moments(
-    cluster: ClusterRecord, state: Any, active: np.ndarray, substep: Substep, values: NodeValues,
-    moments: np.ndarray, energy: np.ndarray,
-) -> None:  # fmt: skip
-    """Add a substep's forces to the ``moments`` (dof, 2 term) about the step's end, their work to ``energy`` (dof,).
-
-    Of a site, ``energy`` is what it dissipates; of the driven mass, the work of the drive.
-    """
-    h = cluster.interval
+    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
+) -> None:
+    """Add a substep's forces to the moments about the step's end, and their work to the energies."""
+    h, position = cluster.interval, motion.state[0].position
     for i in active:
         for node in range(NODES):
             duration = h * substep.length * cluster.nodes.weight[substep.kind, node]
-            power = values.force[i, node] * values.v[i, node]
+            power = trial.force[i, node] * trial.v[i, node]
             if i < cluster.contacts.sites.size:
-                power = contact_force(cluster.contacts, i, values.w[i, node], values.v[i, node])[1]
-            energy[i] += duration * power
-            rest = 1.0 - state.position - substep.length * cluster.nodes.share[substep.kind, node]
-            amount = duration * values.force[i, node]
-            for k in range(moments.shape[1]):
-                moments[i, k] += amount
+                power = contact_force(cluster.contacts, i, trial.w[i, node], trial.v[i, node])[1]
+            motion.energy[i] += duration * power
+            rest = 1.0 - position - substep.length * cluster.nodes.share[substep.kind, node]
+            amount = duration * trial.force[i, node]
+            for k in range(motion.moments.shape[1]):
+                motion.moments[i, k] += amount
                 amount *= rest
