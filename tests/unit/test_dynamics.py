@@ -1,0 +1,90 @@
+"""The right-hand side, the sites' motion and the energies of a lattice, against matrices assembled here."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.contact.law import CLOSED
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.meter import EnergyMeter
+from vipetsc.dynamics.ts.integrator import Integrator
+
+CELLS, DRIVEN, SITES = 7, 3, (3, 7)
+
+
+def stiffness_matrix(chain):
+    """(cells * dofs) squared, in N/m; a wall holds the other end of a spring that leaves a fixed lattice."""
+    n, d = chain.cells, chain.cell.dofs
+    k = np.zeros((n * d, n * d))
+    for s in chain.cell.springs:
+        for cell in range(-1, n) if s.next_cell else range(n):
+            ends = [(cell, s.start), (cell + s.next_cell, s.end)]
+            if chain.ends == "periodic":
+                if cell < 0:
+                    continue
+                ends = [(c % n, mass) for c, mass in ends]
+            inside = [c * d + mass for c, mass in ends if 0 <= c < n]
+            if len(inside) < 2 and chain.ends == "free":
+                continue
+            stretch = np.zeros(n * d)
+            stretch[inside] = [1, -1][: len(inside)]
+            k += s.stiffness * np.outer(stretch, stretch)
+    return k
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+@pytest.mark.parametrize("native", [True, False])
+def test_rates_motion_and_energies_are_those_of_the_equations(ends, native):
+    case = small_case(
+        lattice={"cells": CELLS, "ends": ends},
+        contacts={"law": "hertz", "sites": list(SITES), "clearance": 1e-5, "restitution": 0.7},
+        drive={"cell": DRIVEN, "mass": 2},
+    )
+    model = case.model()
+    layout = Layout.of(model, MPI.COMM_SELF)
+    engine = Integrator(model, layout, native)
+    chain, d, t = model.chain, layout.dofs, 0.3 * model.drive.duration
+    host, resonator = chain.cell.host, chain.cell.resonator
+    rng = np.random.default_rng(5)
+    u, v = 1e-5 * rng.normal(size=(CELLS, d)), 1e-2 * rng.normal(size=(CELLS, d))
+    u[SITES[0] - 1, [host, resonator]] = -2e-5, 1e-5  # indentation 2e-5 m at the first site
+    u[SITES[1] - 1, [host, resonator]] = 1e-6, 2e-6
+    engine.lattice.contacts.sites[0] = (CLOSED, 1e-5, 0.02)
+    work, lost = 0.25, np.array([0.5, 0.125])
+    engine.state.array[:] = np.concatenate([u.T.ravel(), v.T.ravel(), [work], lost])
+    f = engine.state.duplicate()
+    engine.ts.computeRHSFunction(t, engine.state, f)
+
+    masses = np.tile(chain.cell.masses, (CELLS, 1))
+    springs = stiffness_matrix(chain)
+    force = -(springs @ u.ravel()).reshape(CELLS, d)
+    drive = float(model.drive.force(t))
+    force[DRIVEN - 1, 1] += drive
+    site, rate = SITES[0] - 1, float(np.diff(v[SITES[0] - 1, [host, resonator]])[0])
+    push = float(model.contact.force(3e-5, 1e-5, rate, 0.02))
+    elastic = float(model.contact.force(3e-5, 1e-5))
+    force[site, host] += push
+    force[site, resonator] -= push
+    acceleration = force / masses
+    scale = np.abs(acceleration).max()
+    np.testing.assert_array_equal(f.array[: CELLS * d], v.T.ravel())
+    np.testing.assert_allclose(f.array[CELLS * d : 2 * CELLS * d], acceleration.T.ravel(), atol=1e-13 * scale)
+    assert f.array[2 * CELLS * d] == pytest.approx(drive * v[DRIVEN - 1, 1])
+    assert f.array[2 * CELLS * d + 1] == pytest.approx((push - elastic) * rate)
+    assert f.array[2 * CELLS * d + 2] == 0.0
+
+    motion = np.empty((2, 3))
+    engine.observe(motion, t)
+    rows = [x[SITES[i] - 1, resonator] - x[SITES[i] - 1, host] for i in range(2) for x in (u, v, acceleration)]
+    np.testing.assert_allclose(motion.ravel(), rows, rtol=1e-12)
+
+    energies = EnergyMeter(model, layout).measure(engine.state)
+    assert energies.kinetic == pytest.approx(0.5 * np.sum(masses * v**2), rel=1e-12)
+    assert energies.spring == pytest.approx(0.5 * u.ravel() @ springs @ u.ravel(), rel=1e-12)
+    assert energies.contact == pytest.approx(float(model.contact.potential(3e-5, 1e-5)), rel=1e-10)
+    assert (energies.work, energies.dissipated) == (work, lost.sum())
+    engine.destroy()
