@@ -1,7 +1,8 @@
 """Landing on a change: which length of the step to try next.
 
 The trajectory is known at the end of a step only, and each engine takes its own kind of step. What they share is the
-safeguarded Newton iteration on the switching function at the end of the repeated step.
+safeguarded Newton iteration on the switching function at the end of the repeated step. (``vipetsc.modes.changes`` keeps
+a bracket instead: it lands to the rounding of the time, where a residual no longer halves.)
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class Integrator(Engine):
         self._first_step = 0.002 / model.drive.frequency
         options = PETSc.Options()
         self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
-        self._fixed = options.getString("ts_adapt_type", "basic") == "none"
+        self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
         self._buffer = np.empty(2)
         self._stop = stop or StopRequest()
         self._any_open = False
@@ -100,7 +100,7 @@ class Integrator(Engine):
         tolerances = self.state.duplicate()
         half = layout.dofs * layout.owned
         tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol
-        tolerances.array[2 * half :] = 1e30  # the ledger follows the trajectory's steps
+        tolerances.array[2 * half :] = 1e30  # work and losses do not decide the step
         ts = PETSc.TS().create(layout.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
         ts.setType(PETSc.TS.Type.RK)
@@ -173,7 +173,7 @@ class Integrator(Engine):
             self.ts.restartStep()
             return True
         # A step cut short to meet a sample says little about the longest one possible.
-        if not self._fixed and (suggestion < 4 * h or suggestion > self.step):
+        if not self._fixed_step and (suggestion < 4 * h or suggestion > self.step):
             self.step = suggestion
         self.counts.steps += 1
         end = target if count == 1 else self.time + h
@@ -246,7 +246,7 @@ class Integrator(Engine):
         self.counts.switches += tracker.switch(self.time, self.state.array_r[self._dissipated :])
         shortest = self.comm.allreduce(tracker.contact_time(), MPI.MIN)
         self._any_open = bool(np.isfinite(shortest))
-        if self._any_open and not self._fixed:
+        if self._any_open and not self._fixed_step:
             if was_free:
                 self.free_step = self.step
             self.step = min(self.step, self._first_share * shortest)
