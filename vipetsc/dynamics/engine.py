@@ -34,9 +34,9 @@ class Engine(ABC):
         """An engine for ``model`` at rest at t = 0, on all ranks; ``native``: no Python in the right-hand side."""
 
     @classmethod
-    @abstractmethod
     def refusal(cls, model: Model) -> str | None:
         """Why this engine is not the one for ``model``, in words; None if it is."""
+        return None
 
     @abstractmethod
     def advance(self, target: float) -> bool:

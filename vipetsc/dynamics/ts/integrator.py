@@ -88,10 +88,6 @@ class Integrator(Engine):
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
         self.observe(self.tracker.start)
 
-    @classmethod
-    def refusal(cls, model: Model) -> None:
-        """None: any lattice can be stepped."""
-
     def _create_ts(self, model: Model, layout: Layout, native: bool) -> PETSc.TS:
         options = PETSc.Options()
         # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.

@@ -41,17 +41,16 @@ CONTEXT = np.dtype(
 """A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables."""
 
 
-def _petsc_function(name: str, *arguments: types.Type) -> Any:
-    """A function of PETSc for compiled code; handles and pointers are int64."""
-    return types.ExternalFunction(name, types.int32(*arguments))
-
-
-_ghosts_begin = _petsc_function("VecGhostUpdateBegin", types.int64, types.int32, types.int32)
-_ghosts_end = _petsc_function("VecGhostUpdateEnd", types.int64, types.int32, types.int32)
-_get_read = _petsc_function("VecGetArrayRead", types.int64, types.int64)
-_restore_read = _petsc_function("VecRestoreArrayRead", types.int64, types.int64)
-_get_write = _petsc_function("VecGetArrayWrite", types.int64, types.int64)
-_restore_write = _petsc_function("VecRestoreArrayWrite", types.int64, types.int64)
+# Functions of PETSc for compiled code; handles and pointers are int64.
+_external: Any = types.ExternalFunction
+_ghosts_begin, _ghosts_end = (
+    _external(f"VecGhostUpdate{part}", types.int32(types.int64, types.int32, types.int32)) for part in ("Begin", "End")
+)
+_get_read, _restore_read, _get_write, _restore_write = (
+    _external(f"Vec{verb}Array{access}", types.int32(types.int64, types.int64))
+    for access in ("Read", "Write")
+    for verb in ("Get", "Restore")
+)
 
 
 def petsc_library() -> ctypes.CDLL:
