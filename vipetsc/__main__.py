@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 
@@ -11,20 +12,21 @@ def main(arguments: list[str] | None = None) -> int:
     # One thread a rank: the ranks are the parallelism, and threads would fight over the cores.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("vipetsc").setLevel(logging.INFO)
     arguments = sys.argv[1:] if arguments is None else arguments
-    at = arguments.index("--") if "--" in arguments else len(arguments)
-    own, petsc = arguments[:at], arguments[at + 1 :]
+    end = arguments.index("--") if "--" in arguments else len(arguments)
 
     import petsc4py
 
     # Signals are ours: SIGTERM ends a run at its next step, with a checkpoint.
-    petsc4py.init([sys.argv[0], "-no_signal_handler", *petsc])
+    petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
     from vipetsc.parallel import install_abort_hook
 
     install_abort_hook()
     from vipetsc.cli.main import main as run_verb
 
-    return run_verb(own)
+    return run_verb(arguments[:end])
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
@@ -9,7 +10,7 @@ import time
 import traceback
 from collections.abc import Callable
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -17,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 T = TypeVar("T")
+logger = logging.getLogger(__name__)
 
 
 def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
@@ -28,12 +30,10 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         where = f"rank {comm.rank}: " if comm.size > 1 else ""
         if isinstance(error, OSError):
             # A full disk or a missing right is the machine's matter: the trace would hide the message.
-            sys.stderr.write(f"vipetsc: {where}{error}\n")
+            logger.critical("vipetsc: %s%s", where, error)
         else:
-            text = "".join(traceback.format_exception(kind, error, trace))
-            sys.stderr.write(f"vipetsc: {where}{text}")
+            logger.critical("vipetsc: %s%s", where, "".join(traceback.format_exception(kind, error, trace)).rstrip())
         sys.stdout.flush()
-        sys.stderr.flush()
         if comm.size > 1:
             comm.Abort(1)
         # Without the usual farewell: HDF5 crashes in its own after a full disk.
@@ -52,40 +52,43 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
             error = caught
     value, error = comm.bcast((value, error))
     if error is not None:
-        error.from_root = True
-        raise error
-    return value
+        raise _from_root(error)
+    return cast(T, value)
 
 
 def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
-    value: list[T] = []
-    error: Any = None
+    value, error = None, None
     try:
-        value.append(function())
+        value = function()
     except Exception as caught:
         error = caught
-    first = next((e for e in comm.allgather(error) if e is not None), None)
-    if first is not None:
-        first.from_root = True
-        raise first
-    return value[0]
+    for first in comm.allgather(error):
+        if first is not None:
+            raise _from_root(first)
+    return cast(T, value)
+
+
+def _from_root(error: Exception) -> Exception:
+    """``error``, marked as one that rank 0 raises as well, which reports it for all."""
+    error.from_root = True  # type: ignore[attr-defined]
+    return error
 
 
 class SharedCounter:
     """A count that all ranks of ``comm`` draw from, one-sided: no rank has to wait on another to hand out work."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        self._window = MPI.Win.Allocate(8 if comm.rank == 0 else 0, 8, comm=comm)
+        self._window = MPI.Win.Allocate(8 if comm.rank == 0 else 0, 8, comm=cast(MPI.Intracomm, comm))
         if comm.rank == 0:
-            np.frombuffer(self._window.tomemory(), np.int64)[:] = 0
+            np.frombuffer(self._window.tomemory(), np.int64)[:] = 0  # type: ignore[call-overload]
         comm.Barrier()
 
     def draw(self, step: int = 1) -> int:
         """The count before ``step`` is added to it."""
-        value, step = np.empty(1, np.int64), np.array([step], np.int64)
+        value, added = np.empty(1, np.int64), np.array([step], np.int64)
         self._window.Lock(0, MPI.LOCK_SHARED)
-        self._window.Fetch_and_op(step, value, 0, 0, MPI.SUM)
+        self._window.Fetch_and_op(added, value, 0, 0, MPI.SUM)
         self._window.Unlock(0)
         return int(value[0])
 
@@ -112,7 +115,7 @@ class StopRequest:
 
 
 class Progress:
-    """How far a run is, on rank 0: a bar on a terminal, otherwise a line every ``interval`` seconds."""
+    """How far a run is, on rank 0: a bar on a terminal, otherwise a line of the log every ``interval`` seconds."""
 
     def __init__(self, comm: MPI.Comm, total: float, unit: str, interval: float = 5.0, show: bool = True) -> None:
         self._total, self._unit, self._interval = total, unit, interval
@@ -141,8 +144,7 @@ class Progress:
             rate = (done - self._first) / (now - self._begin)
             left = (self._total - done) / rate if rate > 0 else float("inf")
             share = f"{100 * done / self._total:3.0f} %  {done:.4g} of {self._total:.4g} {self._unit}"
-            sys.stderr.write(f"{share}, {left:.0f} s left\n")
-            sys.stderr.flush()
+            logger.info("%s, %.0f s left", share, left)
             self._last = now
 
     def close(self) -> None:

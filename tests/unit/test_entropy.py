@@ -108,18 +108,16 @@ def test_snapshots_do_not_see_each_other():
         assert np.array_equal(weight[first:], late[1])
 
 
-@pytest.mark.parametrize("mask", ["record", "snapshot"])
-def test_averages_are_what_they_say(mask):
+def test_averages_are_what_they_say():
     signal, start = run(), 5
     signal[:5] *= 100  # loud before the averages start: it must not count
     signal[8:] *= 0.05
-    found = entropy(signal, start, mask=mask)
+    found = entropy(signal, start)
     h, w = found.local[start:], found.weight[start:]
     assert found.snapshot.shape == (12,)
     assert found.snapshot[start:] == pytest.approx((h * w).sum(axis=1) / w.sum(axis=1), rel=1e-12)
     assert found.energy_weighted == pytest.approx(found.snapshot[start:].mean(), rel=1e-14)
-    largest = np.full(len(w), w.max()) if mask == "record" else w.max(axis=1)
-    loud = w > 0.01 * largest[:, None]
+    loud = w > 0.01 * w.max()
     assert found.masked == pytest.approx(h[loud].mean(), rel=1e-12)
     means = [h[loud[:, c], c].mean() for c in range(600) if loud[:, c].any()]
     assert found.error == pytest.approx(np.std(means), rel=1e-12)
@@ -130,11 +128,10 @@ def test_averages_are_what_they_say(mask):
     assert found.joint == pytest.approx(np.mean(joint), abs=1e-6)
 
 
-def test_the_masks_differ_where_the_run_grows_quiet():
+def test_the_mask_leaves_out_where_the_run_grows_quiet():
     signal = run()
     signal[8:] *= 0.01
-    assert entropy(signal, mask="record").masked == pytest.approx(entropy(signal[:8]).masked)
-    assert entropy(signal, mask="snapshot").masked != pytest.approx(entropy(signal[:8]).masked, rel=1e-6)
+    assert entropy(signal).masked == pytest.approx(entropy(signal[:8]).masked)
 
 
 def test_scattering_raises_every_average():
@@ -157,8 +154,6 @@ def test_rest_has_no_entropy():
 
 def test_bad_requests_are_named():
     signal = noise((3, 20))
-    with pytest.raises(ValueError, match="mask"):
-        entropy(signal, mask="loud")
     with pytest.raises(ValueError, match="start"):
         entropy(signal, 3)
     signal[1, 4] = np.nan

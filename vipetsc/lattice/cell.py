@@ -29,11 +29,7 @@ class Spring:
 class UnitCell:
     """Masses in kg, springs in N/m, and the contact pair; mass indices are 0-based.
 
-    Raises
-    ------
-    ValueError
-        If a mass or a stiffness is not positive, an index lies outside the cell, a spring joins a
-        mass to itself, host and resonator coincide, or no spring reaches the next cell.
+    Raises ValueError with all of ``cell_problems``.
     """
 
     masses: tuple[float, ...]

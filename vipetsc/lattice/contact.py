@@ -51,20 +51,10 @@ def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
 
 @dataclass(frozen=True)
 class Contact:
-    """A contact law with its stiffness and restitution.
+    """A contact law with its ``stiffness`` kc in N/m^n and its ``restitution`` r in [0, 1]; 1 conserves energy.
 
-    Parameters
-    ----------
-    law
-        The power law, ``Hertz`` or ``Bilinear``.
-    stiffness
-        kc in N/m^n.
-    restitution
-        r in [0, 1]; 1 conserves energy.
-    adhesion
-        ``"allow"`` lets g become negative (a pull at fast separation), ``"clip"`` keeps g >= 0.
-    approach_floor
-        Smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded.
+    ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
+    smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded.
     """
 
     law: type[ContactLaw]

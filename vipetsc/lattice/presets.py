@@ -34,18 +34,13 @@ class Preset:
         return log_clearances(*self.clearance_span(count), count)
 
 
+CONTACTS: dict[str, Any] = {"law": "hertz", "radius": 0.005, "poisson": 0.3, "restitution": 0.7, "sites": 5}
+
 PRESETS: dict[str, Preset] = {
     "four-band": Preset(
         cell=four_band,
         cells=300,
-        contacts={
-            "law": "hertz",
-            "modulus": 1e8,
-            "radius": 0.005,
-            "poisson": 0.3,
-            "restitution": 0.7,
-            "sites": 5,
-        },
+        contacts=CONTACTS | {"modulus": 1e8},
         drive={"amplitude": 24.33, "cycles": 30, "band": 2, "at": "max-group-velocity"},
         site_span=lambda n, count: (n / 3, n / 3) if count == 1 else (n / 4, 2 * n / 3),
         clearance_span=lambda count: (10 ** (-2.75 if count == 1 else -2.65), 10**-2.75),
@@ -53,14 +48,7 @@ PRESETS: dict[str, Preset] = {
     "diatomic": Preset(
         cell=diatomic,
         cells=600,
-        contacts={
-            "law": "hertz",
-            "modulus": 2e8,
-            "radius": 0.005,
-            "poisson": 0.3,
-            "restitution": 0.7,
-            "sites": 5,
-        },
+        contacts=CONTACTS | {"modulus": 2e8},
         drive={"amplitude": 1.0, "cycles": 30, "wavenumber": "5pi/9", "band": 2},
         site_span=lambda n, count: (n / 4, n / 2),
         clearance_span=lambda count: (2e-4, 1e-4),

@@ -29,18 +29,10 @@ class Optimum:
 class Search:
     """Bloch bands over a grid of four-band cells, and what makes a cell good.
 
-    Attributes
-    ----------
-    lam, eta
-        The grid (lambda) and (eta), 1.
-    wavenumber
-        Wavenumbers (kappa) of the irreducible Brillouin zone in rad per cell.
-    frequency
-        Bands (lambda, eta, kappa, band) in rad/s.
-    signed_deflection
-        |u3 - u2| sign(-u2 u3) on the second band, (lambda, eta, kappa); Bloch vectors of unit norm.
-    speed
-        Largest |group velocity| over kappa, (lambda, eta, band), in cells/s.
+    Over the grid ``lam`` (lambda), ``eta`` (eta) and wavenumbers (kappa, rad per cell) of the irreducible Brillouin
+    zone: ``frequency`` (lambda, eta, kappa, band) in rad/s; ``signed_deflection`` (lambda, eta, kappa), which is
+    |u3 - u2| sign(-u2 u3) on the second band for Bloch vectors of unit norm; ``speed`` (lambda, eta, band), the
+    largest |group velocity| in cells/s.
     """
 
     lam: NDArray[np.float64]
@@ -80,10 +72,7 @@ class Search:
 def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLike) -> Search:
     """Solve the Bloch problem of every four-band cell of the grid ``lam`` x ``eta`` at every ``wavenumber``.
 
-    Raises
-    ------
-    ValueError
-        If a lambda is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
+    Raises ValueError if a lambda is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
     """
     lams, etas, kappa = (np.atleast_1d(np.asarray(values, float)) for values in (lam, eta, wavenumber))
     rows = []

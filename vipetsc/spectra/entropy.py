@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,29 +32,15 @@ FLOOR = 0.01
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-Mask = Literal["record", "snapshot"]
 
 
 @dataclass(frozen=True)
 class Entropy:
-    """Entropy in bits of the distribution P = S / sum S of S = |X|^2 over the wavenumber nodes.
+    """Entropies in bits over the wavenumber nodes; the means are over the samples from ``start`` on.
 
-    Attributes
-    ----------
-    local
-        H (t, cell) of Eq. (a), 0 where nothing moves.
-    weight
-        W = sum over the nodes of S (t, cell), in the signal's unit squared.
-    snapshot
-        H (t) of Eq. (b), 0 at rest.
-    energy_weighted
-        Mean of ``snapshot`` over the samples from ``start`` on.
-    masked
-        Eq. (d) over all samples from ``start`` on.
-    joint
-        Mean of Eq. (c) over the samples from ``start`` on.
-    error
-        Standard deviation over the cells of the masked time mean: each cell's mean over its unmasked samples.
+    ``local`` H and ``weight`` W (t, cell) of Eq. (a), 0 where nothing moves (W in the signal's unit squared);
+    ``snapshot`` (t) of Eq. (b), 0 at rest, and its mean ``energy_weighted``; ``joint``, the mean of Eq. (c);
+    ``masked``, Eq. (d), with the standard deviation ``error`` over the cells of each one's masked time mean.
     """
 
     local: Floats
@@ -66,33 +52,18 @@ class Entropy:
     error: float
 
 
-def entropy(
-    velocity: Floats, start: int = 0, *, kc: float = 12.0, nodes: int = NODES, mask: Mask = "record"
-) -> Entropy:
-    """Entropy of ``velocity`` (t, cell) with wavelets at the ``nodes`` wavenumbers i pi/nodes, i = 1, 2, ...
+def entropy(velocity: Floats, start: int = 0, *, kc: float = 12.0, nodes: int = NODES) -> Entropy:
+    """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the ``nodes`` wavenumbers i pi/nodes, i = 1, 2, ...
 
-    Parameters
-    ----------
-    velocity
-        (t, cell) in m/s; an HDF5 dataset will do, a few snapshots at a time are read.
-    start
-        Sample from which the averages are taken, that of the linear wave's arrival at the first site.
-    mask
-        Whether a point is held against the largest weight of the "record" from ``start`` on, or of its "snapshot".
-
-    Raises
-    ------
-    ValueError
-        For an unknown ``mask``, no sample from ``start`` on, or a velocity that is not finite.
+    ``velocity`` may be an HDF5 dataset: a few snapshots at a time are read. ``start`` is the sample of the linear
+    wave's arrival at the first site. Raises ValueError if no sample comes from there on, or one is not finite.
     """
-    if mask not in ("record", "snapshot"):
-        raise ValueError(f"mask = {mask!r}: record or snapshot")
     nt = len(velocity)
     if not 0 <= start < nt:
         raise ValueError(f"start = {start}: outside the {nt} samples")
     local, weight = local_entropy(velocity, kc=kc, nodes=nodes)
     snapshot, joint = _over_cells(local, weight)
-    masked, error = _masked(local[start:], weight[start:], mask)
+    masked, error = _masked(local[start:], weight[start:])
     return Entropy(local, weight, snapshot, float(snapshot[start:].mean()), masked, float(joint[start:].mean()), error)
 
 
@@ -123,12 +94,11 @@ def local_entropy(velocity: Floats, *, kc: float = 12.0, nodes: int = NODES) -> 
     return local, weight
 
 
-@dataclass(frozen=True)
-class _Octave:
+class _Octave(NamedTuple):
     """Nodes that share a padded ``length``; for groups of them the band's first row and the filters from there on."""
 
     length: int
-    filters: tuple[tuple[int, Floats], ...]
+    filters: list[tuple[int, Floats]]
 
 
 @lru_cache(maxsize=8)
@@ -138,17 +108,16 @@ def _octaves(cells: int, kc: float, nodes: int) -> tuple[_Octave, ...]:
     octaves = []
     for number in range(int(np.log2(nodes)) + 1):
         some = kappa[2**number - 1 : 2 ** (number + 1) - 1]
-        length = padded_length(cells, kc, some[0])
-        filters = np.sqrt(kc / some)[:, None] * wavelet_spectrum(some, kc, wavenumbers(length))
-        if length % 2 == 0:
+        octave = _Octave(padded_length(cells, kc, some[0]), [])
+        filters = np.sqrt(kc / some)[:, None] * wavelet_spectrum(some, kc, wavenumbers(octave.length))
+        if octave.length % 2 == 0:
             filters[:, -1] *= 0.5
-        groups = []
         for first in range(0, len(some), GROUP):
             group = filters[first : first + GROUP]
             inside = np.flatnonzero(group.max(axis=0) > np.finfo(float).eps * group.max())
             low, high = int(inside[0]), int(inside[-1]) + 1
-            groups.append((low, np.ascontiguousarray(group[:, low:high])))
-        octaves.append(_Octave(length, tuple(groups)))
+            octave.filters.append((low, np.ascontiguousarray(group[:, low:high])))
+        octaves.append(octave)
     return tuple(octaves)
 
 
@@ -217,10 +186,9 @@ def _over_cells(local: Floats, weight: Floats) -> tuple[Floats, Floats]:
     return mean, mean + position
 
 
-def _masked(local: Floats, weight: Floats, mask: Mask) -> tuple[float, float]:
+def _masked(local: Floats, weight: Floats) -> tuple[float, float]:
     """The masked mean of Eq. (d), and the deviation over the cells of each one's mean over time."""
-    largest = weight.max(axis=1, keepdims=True) if mask == "snapshot" else weight.max()
-    above_threshold = weight > FLOOR * largest
+    above_threshold = weight > FLOOR * weight.max()
     if not above_threshold.any():
         return 0.0, 0.0
     count = above_threshold.sum(axis=0)

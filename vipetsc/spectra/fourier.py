@@ -84,25 +84,12 @@ def dispersion(
 ) -> Dispersion:
     """Energy over wavenumber and frequency by 2-D FFT of mass-weighted velocities, added over the masses.
 
-    Parameters
-    ----------
-    velocity
-        (t, cell, dof) in m/s, sampled every ``interval`` seconds.
-    masses
-        Masses (dof) in kg; ones give a plain velocity spectrum.
-    cells, samples
-        Windows in space and time.
-    tapers
-        Fractions of the (time, space) window under cosine flanks at its two ends together; 0 for none.
-    lengths
-        Transform lengths (time, space), zero-padded; by default the next that is fast.
-    highest
-        Frequencies above are dropped, rad/s.
+    ``velocity`` (t, cell, dof) in m/s every ``interval`` s, of which the windows ``cells`` and ``samples`` are taken;
+    ``masses`` (dof) in kg, ones for a plain velocity spectrum. ``tapers``: the fractions of the (time, space) window
+    under cosine flanks at its two ends together. ``lengths``: of the transforms (time, space), zero-padded; by
+    default the next that are fast. Frequencies above ``highest`` (rad/s) are dropped.
 
-    Returns
-    -------
-    Dispersion
-        On kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
+    Returns the energy on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
     """
     t, x = (len(range(n)[window]) for n, window in zip(velocity.shape, (samples, cells), strict=False))
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))

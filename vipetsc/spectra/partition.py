@@ -17,16 +17,8 @@ CHUNK = 16
 class Partition:
     """Kinetic energies in J of the parts v_b of a velocity field.
 
-    Attributes
-    ----------
-    energy
-        (bin, t), summed over the lattice.
-    field
-        (bin, t, cell), or None when not asked for.
-    kinetic
-        (t), of the velocities themselves.
-    reconstructed
-        (t), KE_rec = 1/2 sum m (sum_b v_b)^2.
+    ``energy`` (bin, t) summed over the lattice, ``field`` (bin, t, cell) or None, ``kinetic`` (t) of the velocities
+    themselves, ``reconstructed`` (t): KE_rec = 1/2 sum m (sum_b v_b)^2.
     """
 
     energy: NDArray[np.float64]
