@@ -1,0 +1,104 @@
+"""Ranks that write together: attributes that all agree on, failures that all hear of, files that are whole."""
+
+from __future__ import annotations
+
+import json
+
+from mpi4py import MPI
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.dynamics import simulate
+from vipetsc.io import store
+from vipetsc.io.chunks import ChunkFiles
+from vipetsc.io.folder import FolderError
+from vipetsc.io.store import RunMemory
+from vipetsc.parallel import on_every_rank
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("writer", ["gather", "parallel"])
+def test_all_ranks_agree_on_the_statistics_in_the_file(folder, writer):
+    result = simulate(small_case(output={"writer": writer}, time={"end": 0.01}), folder / "run")
+    assert len(set(COMM.allgather(json.dumps(result.statistics)))) == 1
+    with h5py.File(folder / "run" / "run.h5") as file:
+        assert json.loads(file.attrs["statistics"]) == result.statistics
+        assert file.attrs["ranks"] == COMM.size
+
+
+@pytest.mark.parallel([2, 3])
+def test_a_run_in_memory_is_gathered_on_rank_0(folder):
+    case = small_case(output={"writer": "parallel"}, time={"end": 0.02})
+    memory = RunMemory(COMM)
+    simulate(case, memory)
+    simulate(case, folder / "run")
+    if COMM.rank:
+        assert memory.dataset is None
+        return
+    run = datasets(folder / "run" / "run.h5")
+    assert_same_bits(run, {str(name): item.values for name, item in memory.dataset.variables.items()})
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("writer", ["gather", "parallel"])
+def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch, writer):
+    path = folder / "run"
+    simulate(small_case(time={"end": 0.01}), path)
+    before = (path / "run.h5").read_bytes()
+    failing = COMM.size - 1 if writer == "parallel" else 0
+    case = small_case(output={"writer": writer}, time={"end": 0.02})
+
+    def fails(*arguments):
+        if COMM.rank == failing:
+            raise OSError(28, "No space left on device")
+        put_chunks(*arguments)
+
+    put_chunks = store.put_chunks
+    monkeypatch.setattr(store, "put_chunks", fails)
+    with pytest.raises(OSError, match="could not be written; make room"):
+        simulate(case, path, force=True)
+    COMM.Barrier()
+    assert (path / "run.h5").read_bytes() == before
+    assert not (path / ".run.h5.part").exists()
+    assert (path / "parts").is_dir()
+
+
+@pytest.mark.parallel([2, 3])
+def test_what_one_rank_raises_all_raise():
+    assert on_every_rank(COMM, lambda: COMM.rank) == COMM.rank
+
+    def fails() -> None:
+        if COMM.rank == COMM.size - 1:
+            raise KeyError("only here")
+
+    with pytest.raises(KeyError, match="only here"):
+        on_every_rank(COMM, fails)
+
+
+@pytest.mark.parallel(2)
+def test_only_checkpoints_that_all_ranks_wrote_count(folder):
+    chunks = ChunkFiles(folder / "parts", COMM)
+    if COMM.rank == 0:
+        chunks.folder.mkdir()
+    COMM.Barrier()
+    for number in range(4):
+        chunks.append({"x": np.array(number)})
+        chunks.save_state({"number": np.array(number)})
+    COMM.Barrier()
+    assert sorted(path.name for path in chunks.folder.glob(f"state-*-{COMM.rank}-2.npy")) == [
+        f"state-00000{number}-{COMM.rank}-2.npy" for number in (2, 3)
+    ]
+    COMM.Barrier()
+    if COMM.rank == 1:
+        (chunks.folder / "state-000003-1-2.npy").unlink()  # killed while it wrote the last one
+    COMM.Barrier()
+    again = ChunkFiles(folder / "parts", COMM)
+    assert again.last_state()["number"] == 2
+    assert again.count == 3
+    with pytest.raises(FolderError, match="resume with mpirun -n 2"):
+        ChunkFiles(folder / "parts", MPI.COMM_SELF).last_state()

@@ -1,0 +1,129 @@
+"""What watches a run: the guard's threshold, the ledger over a checkpoint, observers of one's own."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.conftest import StopAt, assert_same_bits, datasets, small_case
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.meter import Energies
+from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample
+from vipetsc.dynamics.observers import recorder as recording
+
+
+def sample(work: float, total: float, dissipated: float = 0.0) -> Sample:
+    return Sample(0, 0.0, None, Energies(kinetic=total, spring=0.0, contact=0.0, work=work, dissipated=dissipated))
+
+
+def begun(kind: type[Observer]) -> Observer:
+    observer = kind()
+    observer.begin(SimpleNamespace(meter=SimpleNamespace(largest=1e6)))
+    return observer
+
+
+def test_the_guard_allows_a_tenth_of_the_largest_work():
+    guard = begun(Guard)
+    guard.observe(sample(work=2.0, total=1.81))
+    guard.observe(sample(work=1.0, total=1.19))  # a tenth of the largest work so far, not of the work now
+    with pytest.raises(RunawayError, match=r"the energy runs away: 1.21 J in the lattice, 1 J of work done"):
+        guard.observe(sample(work=1.0, total=1.21))
+    resumed = begun(Guard)
+    resumed.restore(guard.checkpoint())
+    resumed.observe(sample(work=1.0, total=1.19))
+    with pytest.raises(RunawayError, match="runs away"):
+        begun(Guard).observe(sample(work=1.0, total=1.19))
+
+
+@pytest.mark.parametrize("energies", [(np.nan, 1.0), (1.0, np.nan), (1.0, 2e6), (np.inf, 1.0)])
+def test_the_guard_refuses_what_is_not_finite(energies):
+    with pytest.raises(RunawayError, match="not finite"):
+        begun(Guard).observe(sample(*energies))
+
+
+def test_a_lattice_at_rest_cannot_run_away():
+    begun(Guard).observe(sample(work=0.0, total=1e-7))  # rounding, before the drive has worked
+
+
+def test_the_ledger_of_a_resumed_run_knows_what_came_before():
+    ledger = begun(Ledger)
+    assert ledger.statistics() == {"ledger_error": 0.0}
+    ledger.observe(sample(work=4.0, total=2.0, dissipated=1.5))
+    ledger.observe(sample(work=3.0, total=2.75, dissipated=0.0))
+    expected = {"ledger_error": 0.125, "work": 3.0, "dissipated": 0.0}
+    assert ledger.statistics() == expected
+    resumed = begun(Ledger)
+    resumed.restore(ledger.checkpoint())
+    assert resumed.statistics() == expected
+    resumed.observe(sample(work=3.5, total=3.5))
+    assert resumed.statistics()["ledger_error"] == 0.125
+
+
+class Watch(Observer):
+    """Counts samples, and keeps the largest velocity."""
+
+    name = "test-watch"
+    calls: list
+
+    def begin(self, setup):
+        super().begin(setup)
+        Watch.calls = ["begin"]
+        self.fastest, self.seen = 0.0, []
+
+    def observe(self, sample):
+        half = self.setup.layout.dofs * self.setup.layout.owned
+        self.seen.append((sample.number, sample.time))
+        self.fastest = max(self.fastest, float(np.abs(sample.state.array_r[half : 2 * half]).max()))
+
+    def flush(self):
+        Watch.calls.append("flush")
+
+    def checkpoint(self):
+        Watch.calls.append("checkpoint")
+        return {"fastest": np.array(self.fastest)}
+
+    def restore(self, state):
+        assert state.keys() == {"fastest"}
+        self.fastest = float(state["fastest"])
+        Watch.calls.append("restore")
+
+    def finish(self, stopped):
+        Watch.calls.append("stopped" if stopped else "finish")
+
+    def statistics(self):
+        return {"fastest": self.fastest, "watched": self.seen}
+
+
+def test_an_observer_is_taken_by_its_name_and_goes_on_with_the_run(folder):
+    case = small_case(time={"end": 0.04})
+    straight = simulate(case, folder / "straight", observers=["test-watch"])
+    assert Watch.calls == ["begin", "finish"]
+    run = datasets(folder / "straight" / "run.h5")
+    assert straight.statistics["fastest"] == np.abs(run["velocity"]).max()
+    assert straight.statistics["watched"] == list(enumerate(run["time"].tolist()))
+
+    stopped = simulate(case, folder / "stopped", stop=StopAt(150), observers=["test-watch"])
+    assert Watch.calls == ["begin", "flush", "checkpoint", "stopped"]
+    resumed = simulate(case, folder / "stopped", resume=True, observers=["test-watch"])
+    assert Watch.calls == ["begin", "restore", "finish"]
+    assert stopped.statistics["watched"] + resumed.statistics["watched"] == straight.statistics["watched"]
+    for name in ("fastest", "ledger_error", "work", "dissipated", "episodes", "samples"):
+        assert resumed.statistics[name] == straight.statistics[name], name
+    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "stopped")))
+
+
+def test_a_run_stopped_at_its_end_still_knows_its_work(folder, monkeypatch):
+    """Killed while its files are put together: nothing is left to simulate, and nothing is forgotten."""
+    case = small_case(time={"end": 0.0254})
+    assert case.model().samples % 128 == 0
+    monkeypatch.setattr(recording, "CHUNK_SAMPLES", 128)
+    straight = simulate(case, folder / "straight")
+    monkeypatch.setattr("vipetsc.io.store.RunFolder.finish", lambda *_: None)
+    simulate(case, folder / "killed")
+    monkeypatch.undo()
+    resumed = simulate(case, folder / "killed", resume=True)
+    for name in ("samples", "end", "work", "dissipated", "ledger_error", "episodes"):
+        assert resumed.statistics[name] == straight.statistics[name], name
+    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "killed")))

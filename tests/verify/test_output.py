@@ -1,0 +1,104 @@
+"""Where a run goes: chunks of any length, a folder or memory, and what is left when writing fails."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.observers import recorder as recording
+from vipetsc.io import store
+from vipetsc.io.chunks import ChunkList, load_arrays, save_arrays
+from vipetsc.io.netcdf import open_netcdf, write_netcdf
+from vipetsc.io.store import IMPACTS, LEDGER, RunDescription, RunMemory, run_dataset
+
+PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
+
+
+@pytest.mark.parametrize("sections", [{}, PART, {"output": {"fields": []}}])
+def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
+    case = small_case(**sections, time={"end": 0.04})
+    simulate(case, folder / "long")
+    monkeypatch.setattr(recording, "CHUNK_SAMPLES", 7)
+    simulate(case, folder / "short")
+    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("long", "short")))
+
+
+@pytest.mark.parametrize("sections", [{}, PART, {"contacts": {"sites": []}}, {"output": {"writer": "parallel"}}])
+def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
+    case = small_case(**sections, time={"end": 0.04})
+    result = simulate(case, folder / "run")
+    memory = RunMemory()
+    assert simulate(case, memory).folder is None
+    with open_netcdf(folder / "run" / "run.h5", "run") as run:
+        assert memory.dataset.variables.keys() == run.variables.keys()
+        for name, item in run.variables.items():
+            assert memory.dataset[name].dims == item.dims, name
+            assert memory.dataset[name].attrs == item.attrs, name
+            assert memory.dataset[name].values.tobytes() == item.values.tobytes(), name
+        assert memory.dataset.attrs.keys() == run.attrs.keys()
+        assert json.loads(run.attrs["statistics"]) == result.statistics
+    write_netcdf(folder / "saved.h5", memory.dataset)
+    assert_same_bits(datasets(folder / "run" / "run.h5"), datasets(folder / "saved.h5"))
+
+
+def test_a_run_in_memory_cannot_be_resumed():
+    with pytest.raises(ValueError, match="cannot be resumed"):
+        simulate(small_case(), RunMemory(), resume=True)
+
+
+def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, monkeypatch):
+    path = folder / "run"
+    simulate(small_case(time={"end": 0.01}), path)
+    before = (path / "run.h5").read_bytes()
+    case = small_case(time={"end": 0.02})
+
+    def fails(fields, *_):
+        fields["velocity"][0] = 1.0
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(store, "put_chunks", fails)
+    monkeypatch.setattr(recording, "CHUNK_SAMPLES", 16)
+    with pytest.raises(OSError, match=r"run\.h5 could not be written; make room and go on with --resume: .*No space"):
+        simulate(case, path, force=True)
+    assert (path / "run.h5").read_bytes() == before
+    assert {p.name for p in path.iterdir()} == {"run.h5", "case.toml", "parts", "summary.json"}
+    monkeypatch.undo()
+    assert simulate(case, path, resume=True).complete
+    simulate(case, folder / "straight")
+    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "run")))
+
+
+def test_episodes_stand_in_the_order_of_their_onsets():
+    """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
+    chunks = ChunkList()
+    for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
+        chunk = {f"impact_{name}": np.arange(len(sites)) * 1.0 for name in IMPACTS}
+        chunk |= {"impact_site": np.array(sites), "impact_onset": np.array(onsets)}
+        chunk |= dict.fromkeys(LEDGER, np.zeros(1)) | {"dissipated_by_site": np.zeros((1, 3))}
+        chunks.append(chunk | {"time": np.zeros(1), "field_time": np.zeros(1)})
+    description = RunDescription("", np.arange(1, 5), 4, (1, 2, 3), (1e-4,) * 3, ())
+    run = run_dataset(description, chunks, {})
+    assert run["impacts/onset"].values.tolist() == [0.1, 0.2, 0.3, 0.5, 0.5]
+    assert run["impacts/site"].values.tolist() == [1, 2, 1, 1, 3]
+    assert run["impacts/loss"].values.tolist() == [1, 0, 2, 1, 0]
+
+
+def test_arrays_come_back_as_they_were(tmp_path):
+    arrays = {
+        "a": np.arange(6.0).reshape(2, 3)[:, ::2],
+        "b": np.array(7),
+        "c": np.zeros((0, 4)),
+        "d": np.array([1, -1]),
+    }
+    save_arrays(tmp_path / "x.npy", arrays)
+    back = load_arrays(tmp_path / "x.npy")
+    assert list(back) == list(arrays)
+    for name, values in arrays.items():
+        assert back[name].dtype == values.dtype
+        np.testing.assert_array_equal(back[name], values)
+    assert load_arrays(tmp_path / "x.npy", ["d"]).keys() == {"d"}
+    assert [p.name for p in tmp_path.iterdir()] == ["x.npy"]
