@@ -24,6 +24,8 @@ def measured() -> xr.Dataset:
             "bands/part": variable("bands/part", np.array([1, 2, 3]), "1", "part"),
             "bands/energy": variable(("bands/part", "time"), np.eye(3), "J", "energy", parts=["A", "gap", "B"]),
             "bands/cell": variable("bands/part", np.array([7, 7, 3], np.int8), "1", "not the coordinate of the root"),
+            "coarse/time": variable("coarse/time", [0.0, 1.0], "s", "a time of the group's own"),
+            "coarse/total": variable("coarse/time", [3.0, 4.0], "J", "kinetic energy"),
             "law": variable("law", ["hertz", "bilinear"], "1", "contact law"),
             "ibtet": variable((), 0.25, "1", "transfer", start=0.5),
         },
@@ -42,6 +44,7 @@ def test_what_is_written_is_read_back(tmp_path):
         assert data["bands/cell"].dtype == np.int8
         assert json.loads(data.attrs["statistics"]) == {"steps": 3}
         assert data.attrs["bands/start"] == 0.5
+        assert data["coarse/total"].sel({"coarse/time": 1.0}).item() == 4.0
         assert data["velocity"].sel(cell=7, time=0.5).item() == 3.0
         assert data["bands/energy"].sel({"bands/part": 2}).values.tolist() == [0, 1, 0]
 

@@ -102,3 +102,19 @@ def test_arrays_come_back_as_they_were(tmp_path):
         np.testing.assert_array_equal(back[name], values)
     assert load_arrays(tmp_path / "x.npy", ["d"]).keys() == {"d"}
     assert [p.name for p in tmp_path.iterdir()] == ["x.npy"]
+
+
+def test_contacts_that_still_last_at_the_end_are_logged(folder):
+    simulate(small_case(), folder / "whole")
+    log = datasets(folder / "whole" / "run.h5")
+    onset, separation = log["impacts/onset"], log["impacts/separation"]
+    interval = small_case().model().sample_interval
+    lasting = np.flatnonzero(np.floor(separation / interval) > np.ceil(onset / interval))
+    end = float(np.ceil(onset[lasting[0]] / interval) * interval)  # the first sample in a contact
+    result = simulate(small_case(time={"end": end}), folder / "cut")
+    cut = datasets(folder / "cut" / "run.h5")
+    expected = onset <= end
+    assert cut["impacts/onset"].tolist() == onset[expected].tolist()
+    assert np.isnan(cut["impacts/separation"]).tolist() == (separation[expected] > end).tolist()
+    assert np.isnan(cut["impacts/separation"]).any()
+    assert result.statistics["episodes"] == expected.sum()
