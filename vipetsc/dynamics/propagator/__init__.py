@@ -1,1 +1,59 @@
-"""To be described."""
+r"""Exact steps of the linear lattice, with the forces of contacts and drive collocated within them.
+
+Between its contact sites the lattice is linear, M u'' = -K u + f(t), and f acts on few masses. In the step from t_0 to
+t_0 + H, with s = (t - t_0)/H in [0, 1], variation of constants (Hochbruck and Ostermann 2010, sec. 2) gives the state
+
+    y(t_0 + H) = P(H) y(t_0) + integral over the step of P(H - t + t_0) (0, M^-1 f(t)) dt,   y = (u, u').
+
+**1. The propagator** (``series``, ``stencil``). With A = H^2 M^-1 K the free motion is the series
+
+    u(s) = sum_m (-A)^m [u_0 s^2m / (2m)! + H u'_0 s^(2m+1) / (2m+1)!].
+
+Each power of K reaches one cell further, so that P is banded up to what the series has lost by then. With theta =
+omega_max H, omega_max from Gershgorin's circles of M^-1/2 K M^-1/2, the terms from m on are at most theta^(2m-1)
+(1 + theta)/(2m-1)! of the velocity's amplitude; ``reach`` r is the distance in cells beyond which the rows of P sum to
+less than the tolerance. Both bounds and the entries dropped within the band make up ``truncation``. Since theta <= 3.2,
+no term exceeds the result by much, and the series is as good as rounding allows (Moler and Van Loan 2003). Cells at
+least r from an end share one stencil; the others have rows of their own.
+
+**2. Free motion of the contact DoFs** (``free_motion``, ``taylor``). A DoF x = c u is the relative displacement w of a
+site or the driven mass's displacement. Its rows c (-A)^m give its free motion x(s) = sum_k a_k s^k beforehand: a site
+with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k (k - 1) |a_k| bounds w by a parabola: on the side sigma
+one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and such steps
+converge to the first one.
+
+**3. Forces** (``collocation``, ``substep``). An impulse on DoF l moves DoF i by G_il(s) = sum_m g_ilm s^(2m+1), odd
+coefficients as in 1. While forces act,
+
+    x_i(s) = a_i(s) + H sum_l integral_0^s G_il(s - z) F_l(z, x_l, x'_l) dz,
+
+a Volterra equation. In substeps of length h it is collocated at eight Gauss nodes (Hairer, Norsett and Wanner 1993,
+sec. II.7): F is its interpolant through the nodes, the integrals of s^k times Lagrange's polynomials are tables, and
+Picard's iteration solves for the values at the nodes. With Hertz's law F begins and ends as the power 3/2 of time; in
+the root of the time since the onset, s = h z^2, or before the separation, s = h z (2 - z), it is smooth (Brunner 2004,
+sec. 6.2), and the nodes lie evenly in z. The last two Legendre coefficients of F at the nodes estimate the error, by
+which h is controlled. After the substep the a_i are shifted to its end, and the motion caused by F is added to them.
+
+**4. Changes** (``advance``). Substeps are searched for changes of a site's mode on the quintic Hermite interpolant of w
+and repeated so that they end on the first one: see ``vipetsc.contact``.
+
+**5. What forces leave in the lattice** (``free_motion``). K and M are symmetric, and so is (-A)^m M^-1: the motion
+after an impulse on a DoF, (-A)^m M^-1 c^T = M^-1 (c (-A)^m)^T, has the rows of 2 again (Maxwell's reciprocity). With
+the moments mu_k = integral of F (1 - s)^k dt over the step,
+
+    u += M^-1 sum_m (c (-A)^m)^T H mu_(2m+1) / (2m+1)!,   u' += M^-1 sum_m (c (-A)^m)^T mu_2m / (2m)!
+
+in the cells within r. Nothing else of the forces' history is needed.
+
+**6. Clusters and ranks** (``cluster``, ``forces``, ``halo``). DoFs within r cells of one another must be solved for
+together and form a cluster. Every rank that owns a cell within r of a cluster advances it, from the same numbers to the
+same bits, so that one exchange of ``HaloRegions`` a step is all that ranks must say to each other. ``engine`` weighs a
+step's cost against the size of its clusters.
+
+References
+----------
+H. Brunner, Collocation Methods for Volterra Integral and Related Functional Differential Equations, Cambridge 2004.
+E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential Equations I, 2nd ed., Springer 1993.
+M. Hochbruck and A. Ostermann, Exponential integrators, Acta Numerica 19 (2010) 209-286.
+C. Moler and C. Van Loan, Nineteen dubious ways to compute the exponential of a matrix, SIAM Review 45 (2003) 3-49.
+"""

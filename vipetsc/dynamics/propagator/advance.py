@@ -92,13 +92,11 @@ def _choose_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.nd
 
 
 @njit(error_model="numpy", inline="always")
-def _try_substep(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
-) -> bool:
+def _try_substep(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep) -> bool:
     """Leave the end of a substep in ``trial``; whether it could be collocated."""
-    if not collocate(cluster, motion, active, trial, substep):
+    if not collocate(cluster, motion, trial, substep):
         return False
-    update_taylor(cluster, motion, active, trial, substep)
+    update_taylor(cluster, motion, trial, substep)
     state = motion.state[0]
     state.position += substep.length
     evaluate_site_motion(cluster, state, trial.taylor, trial.site_motion)
@@ -108,7 +106,7 @@ def _try_substep(
 
 @njit(error_model="numpy")
 def _land(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep, change: Change
+    cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep, change: Change
 ) -> tuple[float, bool]:
     """Repeat a substep so that it ends on a ``change``; the length taken, and whether the change was met.
 
@@ -120,7 +118,7 @@ def _land(
         if landing.length <= ROUNDING:
             begin = switching(contacts, site, change.function, motion.site_motion[site])
             return 0.0, begin.value > begin.tolerance or (begin.value >= -begin.tolerance and begin.rate > 0.0)
-        if not _try_substep(cluster, motion, active, trial, Substep(substep.kind, landing.length)):
+        if not _try_substep(cluster, motion, trial, Substep(substep.kind, landing.length)):
             return -landing.length, False
         end = switching(contacts, site, change.function, trial.site_motion[site])
         # Landings come to the rounding of w where Newton's steps still help.
@@ -136,7 +134,7 @@ def _land(
 
 @njit(error_model="numpy", inline="always")
 def _search_and_land(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
+    cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep
 ) -> tuple[Substep, bool]:
     """Search a substep just tried for a change and land on the first one: the substep taken, whether it was met.
 
@@ -157,7 +155,7 @@ def _search_and_land(
         return Substep(ONSET, -1.0), False
     kind = EXIT if separates else substep.kind
     state.landings += 1
-    taken, landed = _land(cluster, motion, active, trial, Substep(kind, substep.length), change)
+    taken, landed = _land(cluster, motion, trial, Substep(kind, substep.length), change)
     if taken < 0.0:
         state.rejected += 1
         state.length = -CUT * taken
@@ -165,27 +163,25 @@ def _search_and_land(
 
 
 @njit(error_model="numpy", inline="always")
-def _control_length(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, taken: float, landed: bool
-) -> bool:
+def _control_length(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, taken: float, landed: bool) -> bool:
     """Set the next substep's length by the error of the one ``taken``; whether that is small enough."""
     state = motion.state[0]
-    ratio = error_ratio(cluster, active, taken, trial.force)
+    ratio = error_ratio(cluster, trial, taken)
     factor = min(max(0.9 * (1.0 / max(ratio, 1e-30)) ** (1.0 / ORDER), LEAST_GROWTH), MOST_GROWTH)
     if ratio > 1.0 and taken > SHORTEST:
         state.rejected += 1
         state.length = factor * taken
         return False
-    if not landed and active[0] < cluster.contacts.sites.size:
+    if not landed and trial.active[0] < cluster.contacts.sites.size:
         state.length = max(factor * taken, state.length if taken < state.length else 0.0)
     return True
 
 
 @njit(error_model="numpy", inline="always")
-def _accept(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep) -> None:
+def _accept(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep) -> None:
     """Take a substep as done."""
-    accumulate_moments(cluster, motion, active, trial, substep)
-    for i in active:
+    accumulate_moments(cluster, motion, trial, substep)
+    for i in trial.active:
         if i < cluster.contacts.sites.size:
             _update_extremes(cluster, motion, trial, i, cluster.interval * substep.length)
     motion.state[0].position += substep.length
@@ -223,9 +219,9 @@ def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float)
         state.begin, state.position = begin, 0.0
         state.drive_end = (cluster.burst.duration - begin) / cluster.interval
         motion.moments[:] = 0.0
-    dofs, sites = motion.taylor.shape[0], cluster.contacts.sites.size
+    dofs = motion.taylor.shape[0]
     force, w, v = np.zeros((dofs, NODES)), np.zeros((dofs, NODES)), np.zeros((dofs, NODES))
-    trial = Trial(force, w, v, np.empty_like(motion.taylor), np.empty((sites, 3)))
+    taylor, site_motion = np.empty_like(motion.taylor), np.empty_like(motion.site_motion)
     for _ in range(MOST_SUBSTEPS):
         if 1.0 - state.position <= ROUNDING:
             state.position = 1.0
@@ -233,12 +229,13 @@ def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float)
         active = _active_dofs(cluster, motion)
         if active.size == 0:
             return _advance_freely(cluster, motion)
+        trial = Trial(active, force, w, v, taylor, site_motion)
         evaluate_site_motion(cluster, state, motion.taylor, motion.site_motion)
         substep = _choose_substep(cluster, motion, active)
         if blind:
             substep = Substep(substep.kind, min(substep.length, BLIND))
         state.substeps += 1
-        if not _try_substep(cluster, motion, active, trial, substep):
+        if not _try_substep(cluster, motion, trial, substep):
             state.rejected += 1
             state.length = CUT * substep.length
             if substep.length < ROUNDING:
@@ -246,16 +243,16 @@ def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float)
             continue
         landed = False
         if not blind:
-            substep, landed = _search_and_land(cluster, motion, active, trial, substep)
+            substep, landed = _search_and_land(cluster, motion, trial, substep)
             if substep.length < 0.0:
                 continue
         # A change at the very start that is none: past it.
         blind = substep.length == 0.0 and not landed
         if substep.length > 0.0:
             # Judged only now: a force continued beyond its end is no smooth function.
-            if not _control_length(cluster, motion, active, trial, substep.length, landed):
+            if not _control_length(cluster, motion, trial, substep.length, landed):
                 continue
-            _accept(cluster, motion, active, trial, substep)
+            _accept(cluster, motion, trial, substep)
         if landed:
             return CHANGED
     return FAILED

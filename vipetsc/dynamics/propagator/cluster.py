@@ -88,7 +88,6 @@ class Cluster:
         self.sites = [dof.site for dof in dofs if dof.site >= 0]
         self.driven = len(self.sites) < len(dofs)
         self.logs = logs
-        self.switches = 0
         self._energy = energy
         self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
         fastest = series.omega_max_h
@@ -145,7 +144,7 @@ class Cluster:
         tracker, state = self.tracker, self._motion.state
         self._update_episodes()
         before = set(tracker.open)
-        self.switches += tracker.switch(now, self._energy)
+        state["switches"] += tracker.switch(now, self._energy)
         for site in set(tracker.open) - before:
             duration = tracker.duration(abs(float(self._record.contacts.sites["approach"][site])))
             self._motion.history[site] = now, duration, 0.0, 0.0, 0.0
@@ -173,8 +172,8 @@ class Cluster:
     def counts(self) -> dict[str, int]:
         """Substeps, landings, switches and limits of the contact law."""
         state = self._motion.state[0]
-        counts = {name: int(state[name]) for name in ("substeps", "rejected", "landings")}
-        return counts | {"switches": self.switches} | asdict(self.tracker.counts)
+        counts = {name: int(state[name]) for name in ("substeps", "rejected", "landings", "switches")}
+        return counts | asdict(self.tracker.counts)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs."""
@@ -182,7 +181,6 @@ class Cluster:
             "energy": self._energy.copy(),
             "history": self._motion.history.copy(),
             "state": self._motion.state.copy(),
-            "switches": np.array(self.switches),
         }
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
@@ -191,4 +189,3 @@ class Cluster:
         self._energy[:] = checkpoint["energy"]
         self._motion.history[:] = checkpoint["history"]
         self._motion.state[:] = checkpoint["state"]
-        self.switches = int(checkpoint["switches"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from itertools import pairwise
 from math import factorial
 from typing import Any
 
@@ -14,7 +15,7 @@ from vipetsc.case import Model
 from vipetsc.contact.episodes import Episode, ImpactCounts
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.cluster import Cluster, ContactDof, group_dofs
-from vipetsc.dynamics.propagator.free_motion import ClusterIndex, LatticeRows, active_clusters, apply_impulses
+from vipetsc.dynamics.propagator.free_motion import DofTables, active_clusters, apply_impulses
 from vipetsc.dynamics.propagator.halo import HaloRegions
 from vipetsc.dynamics.propagator.series import StepSeries
 
@@ -27,42 +28,22 @@ class Forces:
 
     def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
         self._comm, self._interval, self._halo = layout.comm, series.interval, halo
-        groups = [g for g in group_dofs(model, series.reach)
-                  if any((_owned_cells(dof.cell, series.reach, layout) >= 0).any() for dof in g)]  # fmt: skip
-        dofs = [dof for group in groups for dof in group]
-        self._lattice = _lattice_rows(groups, layout, series, halo)
-        first = np.cumsum([0, *map(len, groups)])
-        # An onset within rounding of the clearance is one.
-        clearances = [model.chain.clearances[dof.site] if dof.site >= 0 else np.inf for dof in dofs]
-        self._taylor = np.zeros((len(dofs), 2 * series.terms))
-        self._moments, self._energy = np.zeros_like(self._taylor), np.zeros(len(dofs))
+        groups = [group for group in group_dofs(model, series.reach)
+                  if any((_owned_cells(dof.cell, series.reach, layout) >= 0).any() for dof in group)]  # fmt: skip
+        self._dofs = _dof_tables(model, groups, layout, series, halo)
+        self._taylor = np.zeros((len(self._dofs.column), 2 * series.terms))
+        self._moments, self._energy = np.zeros_like(self._taylor), np.zeros(len(self._taylor))
+        self._active = np.zeros(len(groups), np.int64)
+        self._of_cluster = [slice(a, b) for a, b in pairwise(self._dofs.first.tolist())]
         self.clusters = []
-        for group, a, b in zip(groups, first[:-1], first[1:], strict=True):
+        for group, own in zip(groups, self._of_cluster, strict=True):
             logs = layout.start <= group[0].cell < layout.stop
-            response = self._response(group, slice(a, b), layout, series)
-            arrays = (values[a:b] for values in (self._taylor, self._moments, self._energy))
+            response = _responses(group, self._dofs, own, layout, series)
+            arrays = self._taylor[own], self._moments[own], self._energy[own]
             self.clusters.append(Cluster(model, group, series, response, logs, *arrays))
-        self._index = ClusterIndex(
-            first=first,
-            clearance=np.array(clearances) * (1 - 1e-9),
-            busy=np.array([cluster.is_busy(0.0) for cluster in self.clusters], bool),
-            active=np.zeros(len(groups), np.int64),
-        )
-        numbers = {dof.site: i for i, dof in enumerate(dofs)}
+        self._dofs.busy[:] = [cluster.is_busy(0.0) for cluster in self.clusters]
+        numbers = {dof.site: i for i, dof in enumerate(dof for group in groups for dof in group)}
         self._ledger = [numbers[site] for site in ((-1,) if layout.owns_drive else ()) + layout.sites]
-
-    def _response(self, group: list[ContactDof], own: slice, layout: Layout, series: StepSeries) -> np.ndarray:
-        """Motion of each DoF after an impulse on each, (dof, dof, term), in powers 2 m + 1 of t/H, times H."""
-        lattice, r = self._lattice, series.reach
-        factors = lattice.factors[1::2] * series.interval
-        response = np.zeros((len(group), len(group), series.terms))
-        for i, table in enumerate(lattice.table[own]):
-            for j, source in enumerate(group):
-                offset = _unwrapped(source.cell, group[i].cell, layout) - group[i].cell
-                if abs(offset) <= r:
-                    weights = lattice.inverse_masses * source.form
-                    response[i, j] = factors * (weights @ lattice.rows[table][:, r + offset])
-        return response
 
     @property
     def ledger(self) -> np.ndarray:
@@ -74,12 +55,12 @@ class Forces:
 
         The halo holds the state then. Raises StalledError.
         """
-        index = self._index
-        count = active_clusters(self._lattice, index, self._halo.columns, self._taylor)
-        for i in index.active[:count].tolist():
+        dofs = self._dofs
+        count = active_clusters(dofs, self._halo.columns, self._taylor, self._active)
+        for i in self._active[:count].tolist():
             self.clusters[i].advance(begin)
-            apply_impulses(self._lattice, index.first[i], self._moments[index.first[i] : index.first[i + 1]], out)
-            index.busy[i] = self.clusters[i].is_busy(begin + self._interval)
+            apply_impulses(dofs, dofs.first[i], self._moments[self._of_cluster[i]], out)
+            dofs.busy[i] = self.clusters[i].is_busy(begin + self._interval)
 
     def take_episodes(self) -> list[Episode]:
         """Episodes closed since the last call that this rank logs."""
@@ -101,11 +82,11 @@ class Forces:
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs."""
         clusters = {f"cluster-{i}-{k}": v for i, c in enumerate(self.clusters) for k, v in c.checkpoint().items()}
-        return clusters | {"busy": self._index.busy.copy()}
+        return clusters | {"busy": self._dofs.busy.copy()}
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Go back to a checkpoint."""
-        self._index.busy[:] = checkpoint["busy"]
+        self._dofs.busy[:] = checkpoint["busy"]
         for i, cluster in enumerate(self.clusters):
             prefix = f"cluster-{i}-"
             cluster.restore({k.removeprefix(prefix): v for k, v in checkpoint.items() if k.startswith(prefix)})
@@ -123,32 +104,45 @@ def _owned_cells(cell: int, reach: int, layout: Layout) -> np.ndarray:
     return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
 
 
-def _lattice_rows(groups: list[list[ContactDof]], layout: Layout, series: StepSeries, halo: HaloRegions) -> LatticeRows:
+def _dof_tables(
+    model: Model, groups: list[list[ContactDof]], layout: Layout, series: StepSeries, halo: HaloRegions
+) -> DofTables:
     """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
-    r, cell = series.reach, series.chain.cell
+    r, chain = series.reach, model.chain
     columns: list[int] = []
-    owned, tables = [], []
-    rows: list[np.ndarray] = []
-    numbers: dict[tuple, int] = {}  # DoFs away from the ends share their rows
     for group in groups:
         cells = [_unwrapped(dof.cell, group[0].cell, layout) for dof in group]
-        first = min(cells)
-        column = halo.add(first - r, max(cells) - first + 2 * r + 1)
-        columns += [column + c - first for c in cells]
-        for dof in group:
-            owned.append(_owned_cells(dof.cell, r, layout))
-            key = (None if series.is_interior(dof.cell) else dof.cell, dof.form)
-            if key not in numbers:
-                numbers[key] = len(rows)
-                around = series.rows(dof.cell, dof.cell - r, 2 * r + 1).astype(float)
-                rows.append(np.einsum("i,imjc->jcm", np.array(dof.form), around))
-            tables.append(numbers[key])
-    shape = (len(rows), cell.dofs, 2 * r + 1, series.terms)
-    return LatticeRows(
+        column = halo.add(min(cells) - r, max(cells) - min(cells) + 2 * r + 1)
+        columns += [column + cell - min(cells) for cell in cells]
+    dofs = [dof for group in groups for dof in group]
+    # DoFs away from the ends share their rows.
+    keys = [(None if series.is_interior(dof.cell) else dof.cell, dof.form) for dof in dofs]
+    rows = {}
+    for key, dof in dict(zip(keys, dofs, strict=True)).items():
+        around = series.rows(dof.cell, dof.cell - r, 2 * r + 1).astype(float)
+        rows[key] = np.einsum("i,imjc->jcm", np.array(dof.form), around)
+    clearances = [chain.clearances[dof.site] if dof.site >= 0 else np.inf for dof in dofs]
+    return DofTables(
         column=np.array(columns, np.int64),
-        owned=np.array(owned, np.int64).reshape(-1, 2 * r + 1),
-        table=np.array(tables, np.int64),
-        rows=np.ascontiguousarray(np.array(rows).reshape(shape)),
+        owned=np.array([_owned_cells(dof.cell, r, layout) for dof in dofs], np.int64).reshape(-1, 2 * r + 1),
+        table=np.array([list(rows).index(key) for key in keys], np.int64),
+        rows=np.array(list(rows.values())).reshape(len(rows), chain.cell.dofs, 2 * r + 1, series.terms),
         factors=np.array([series.interval ** (k % 2) / factorial(k) for k in range(2 * series.terms)]),
-        inverse_masses=1 / np.asarray(cell.masses),
+        inverse_masses=1 / np.asarray(chain.cell.masses),
+        clearance=np.array(clearances) * (1 - 1e-9),  # an onset within rounding of the clearance is one
+        first=np.cumsum([0, *map(len, groups)]),
+        busy=np.zeros(len(groups), bool),
     )
+
+
+def _responses(group: list[ContactDof], dofs: DofTables, own: slice, layout: Layout, series: StepSeries) -> np.ndarray:
+    """Motion (dof, dof, term) of each DoF of a ``group`` after an impulse on each, times H, in powers 2 m + 1 of s."""
+    factors = dofs.factors[1::2] * series.interval
+    response = np.zeros((len(group), len(group), series.terms))
+    for i, rows in enumerate(dofs.rows[dofs.table[own]]):
+        for j, source in enumerate(group):
+            offset = _unwrapped(source.cell, group[i].cell, layout) - group[i].cell
+            if abs(offset) <= series.reach:
+                weights = dofs.inverse_masses * source.form
+                response[i, j] = factors * (weights @ rows[:, series.reach + offset])
+    return response

@@ -1,4 +1,4 @@
-"""Free motion of the contact DoFs within a step, and what impulses on them leave in the lattice.
+"""Free motion of the contact DoFs within a step, and what impulses on them leave in the dofs.
 
 Both directions use the same rows, by Maxwell's reciprocity: sec. 2 and 5 of the derivation in the package's docstring.
 """
@@ -12,12 +12,14 @@ import numpy as np
 from vipetsc.compiled import njit
 
 
-class LatticeRows(NamedTuple):
-    """How the contact DoFs of a rank's clusters hang together with the lattice.
+class DofTables(NamedTuple):
+    """The contact DoFs of a rank, cluster by cluster, and what joins them to the dofs.
 
     ``column`` (dof,) is the first column in the halo of the cells that a DoF reaches, ``owned`` (dof, cell) which of
     the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
-    mass, cell, term); ``factors`` (2 term,) are H^(k mod 2)/k!; ``inverse_masses`` (mass,) are in 1/kg.
+    mass, cell, term); ``factors`` (2 term,) are H^(k mod 2)/k!; ``inverse_masses`` (mass,) are in 1/kg. ``clearance``
+    (dof,) in m is infinite for the driven mass. The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``; it is
+    ``busy`` (cluster,) when a force acts on it as the step begins.
     """
 
     column: np.ndarray
@@ -26,29 +28,18 @@ class LatticeRows(NamedTuple):
     rows: np.ndarray
     factors: np.ndarray
     inverse_masses: np.ndarray
-
-
-class ClusterIndex(NamedTuple):
-    """The clusters of a rank.
-
-    The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``; ``clearance`` (dof,) in m is infinite for the driven
-    mass. A cluster is ``busy`` (cluster,) when a force acts on it as the step begins. ``active`` (cluster,) takes
-    those in which a force may act within the step.
-    """
-
-    first: np.ndarray
     clearance: np.ndarray
+    first: np.ndarray
     busy: np.ndarray
-    active: np.ndarray
 
 
 @njit(error_model="numpy")
-def taylor_coefficients(lattice: LatticeRows, dof: int, columns: np.ndarray, taylor: np.ndarray) -> float:
+def taylor_coefficients(dofs: DofTables, dof: int, columns: np.ndarray, taylor: np.ndarray) -> float:
     """Coefficients ``taylor`` (2 term,) in m of a DoF's free motion in powers of t/H; returns a bound on |motion|.
 
     ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
     """
-    rows, first = lattice.rows[lattice.table[dof]], lattice.column[dof]
+    rows, first = dofs.rows[dofs.table[dof]], dofs.column[dof]
     masses, width, terms = rows.shape
     even, odd = np.zeros(terms), np.zeros(terms)
     for j in range(masses):
@@ -60,49 +51,49 @@ def taylor_coefficients(lattice: LatticeRows, dof: int, columns: np.ndarray, tay
                 odd[m] += v * row[m]
     bound = 0.0
     for m in range(terms):
-        taylor[2 * m] = even[m] * lattice.factors[2 * m]
-        taylor[2 * m + 1] = odd[m] * lattice.factors[2 * m + 1]
+        taylor[2 * m] = even[m] * dofs.factors[2 * m]
+        taylor[2 * m + 1] = odd[m] * dofs.factors[2 * m + 1]
         bound += abs(taylor[2 * m]) + abs(taylor[2 * m + 1])
     return bound
 
 
 @njit(error_model="numpy")
-def active_clusters(lattice: LatticeRows, clusters: ClusterIndex, columns: np.ndarray, taylor: np.ndarray) -> int:
+def active_clusters(dofs: DofTables, columns: np.ndarray, taylor: np.ndarray, active: np.ndarray) -> int:
     """Find the clusters that are busy or have a site whose free motion may reach its clearance; returns how many.
 
-    Fills ``taylor`` (dof, 2 term) and ``clusters.active``.
+    Fills ``taylor`` (dof, 2 term) of all DoFs and puts the clusters' numbers into ``active`` (cluster,).
     """
     count = 0
-    for cluster in range(clusters.busy.size):
-        is_active = clusters.busy[cluster]
-        for dof in range(clusters.first[cluster], clusters.first[cluster + 1]):
-            is_active |= not taylor_coefficients(lattice, dof, columns, taylor[dof]) < clusters.clearance[dof]
+    for cluster in range(dofs.busy.size):
+        is_active = dofs.busy[cluster]
+        for dof in range(dofs.first[cluster], dofs.first[cluster + 1]):
+            is_active |= not taylor_coefficients(dofs, dof, columns, taylor[dof]) < dofs.clearance[dof]
         if is_active:
-            clusters.active[count] = cluster
+            active[count] = cluster
             count += 1
     return count
 
 
 @njit(error_model="numpy")
-def apply_impulses(lattice: LatticeRows, first: int, moments: np.ndarray, out: np.ndarray) -> None:
+def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
     """Add to the owned cells ``out`` (2 mass, cell) what forces within the step leave there at its end.
 
     Row i of ``moments`` (dof, 2 term) belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt.
     """
-    masses, width, terms = lattice.rows.shape[1:]
+    masses, width, terms = dofs.rows.shape[1:]
     for i in range(moments.shape[0]):
         if not moments[i].any():
             continue
         dof = first + i
         for k in range(width):
-            c = lattice.owned[dof, k]
+            c = dofs.owned[dof, k]
             if c < 0:
                 continue
             for j in range(masses):
                 u = v = 0.0
-                row = lattice.rows[lattice.table[dof], j, k]
+                row = dofs.rows[dofs.table[dof], j, k]
                 for m in range(terms):
-                    v += row[m] * lattice.factors[2 * m] * moments[i, 2 * m]
-                    u += row[m] * lattice.factors[2 * m + 1] * moments[i, 2 * m + 1]
-                out[j, c] += u * lattice.inverse_masses[j]
-                out[masses + j, c] += v * lattice.inverse_masses[j]
+                    v += row[m] * dofs.factors[2 * m] * moments[i, 2 * m]
+                    u += row[m] * dofs.factors[2 * m + 1] * moments[i, 2 * m + 1]
+                out[j, c] += u * dofs.inverse_masses[j]
+                out[masses + j, c] += v * dofs.inverse_masses[j]

@@ -26,10 +26,10 @@ BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 
 SUBSTEP_STATE = np.dtype(
     [("begin", float), ("position", float), ("length", float), ("drive_end", float)]
-    + [(name, np.int64) for name in ("substeps", "rejected", "landings")]
+    + [(name, np.int64) for name in ("substeps", "rejected", "landings", "switches")]
 )
 """Where a cluster stands: the step's begin in s; in shares of the step the position, the next substep's length and the
-end of the drive; counts of substeps, of rejected ones and of landings."""
+end of the drive; counts of substeps, of rejected ones, of landings and of switches of a site's mode."""
 
 
 HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
@@ -80,12 +80,13 @@ class Substep(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A substep that has been computed but not yet taken.
+    """A substep that has been computed but not yet taken: a force acts on the ``active`` DoFs.
 
     ``force`` in N, ``w`` in m and ``v`` in m/s (dof, node) at its nodes; at its end ``taylor`` (dof, 2 term) and
     ``site_motion`` (site, 3) as in ``ClusterMotion``.
     """
 
+    active: np.ndarray
     force: np.ndarray
     w: np.ndarray
     v: np.ndarray
@@ -137,15 +138,13 @@ def _node_responses(
 
 
 @njit(error_model="numpy")
-def collocate(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
-) -> bool:
+def collocate(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep) -> bool:
     """Solve for the force and motion of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
 
     Picard's iteration, which begins with the forces that ``trial`` holds.
     """
     state, taylor = motion.state[0], motion.taylor
-    contacts, h, n = cluster.contacts, cluster.interval, active.size
+    contacts, h, active, n = cluster.contacts, cluster.interval, trial.active, trial.active.size
     free_w, free_v = np.empty((n, NODES)), np.empty((n, NODES))
     for a in range(n):
         for node in range(NODES):
@@ -205,14 +204,12 @@ def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, trial: Tr
 
 
 @njit(error_model="numpy")
-def update_taylor(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
-) -> None:
+def update_taylor(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep) -> None:
     """The series of all DoFs' free motion after a substep in which the forces of ``trial`` acted, into ``trial``."""
     shift(motion.taylor, substep.length, trial.taylor)
     dofs, _, terms = cluster.response.shape
     moments, series = np.empty(2 * terms), np.empty((terms, 2 * terms))
-    for source in active:
+    for source in trial.active:
         moments[:] = 0.0
         for node in range(NODES):
             amount = substep.length * cluster.nodes.weight[substep.kind, node] * trial.force[source, node]
@@ -232,16 +229,16 @@ def update_taylor(
 
 
 @njit(error_model="numpy")
-def error_ratio(cluster: ClusterRecord, active: np.ndarray, length: float, force: np.ndarray) -> float:
+def error_ratio(cluster: ClusterRecord, trial: Trial, length: float) -> float:
     """Estimated error of a substep over the allowed one, by the forces' last two Legendre coefficients."""
     worst = 0.0
-    for i in active:
+    for i in trial.active:
         if i < cluster.contacts.sites.size:
             last = 0.0
             for row in range(2):
                 coefficient = 0.0
                 for node in range(NODES):
-                    coefficient += cluster.nodes.tail[row, node] * force[i, node]
+                    coefficient += cluster.nodes.tail[row, node] * trial.force[i, node]
                 last += abs(coefficient)
             allowed = cluster.rtol * abs(cluster.contacts.sites[i].approach) + cluster.atol
             error = SUPERCONVERGENCE * last * length * cluster.response[i, i, 0] / cluster.interval
@@ -250,12 +247,10 @@ def error_ratio(cluster: ClusterRecord, active: np.ndarray, length: float, force
 
 
 @njit(error_model="numpy")
-def accumulate_moments(
-    cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray, trial: Trial, substep: Substep
-) -> None:
+def accumulate_moments(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep) -> None:
     """Add a substep's forces to the moments about the step's end, and their work to the energies."""
     h, position = cluster.interval, motion.state[0].position
-    for i in active:
+    for i in trial.active:
         for node in range(NODES):
             duration = h * substep.length * cluster.nodes.weight[substep.kind, node]
             power = trial.force[i, node] * trial.v[i, node]
