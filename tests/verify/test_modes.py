@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 
 from vipetsc.lattice import Bilinear, Chain, Contact, Hertz, contact_stiffness, four_band
-from vipetsc.modes.audit import Watch, is_jump, suspects
+from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
 from vipetsc.modes.chart import Relative
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
 from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.orbit import Dop853Flow, FiniteDifferences
 from vipetsc.modes.point import Point, linear_start
-from vipetsc.modes.portrait import resonance
+from vipetsc.modes.samples import resonance
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
-from vipetsc.modes.special import Locator
-from vipetsc.modes.switching import switch
+from vipetsc.modes.special import Locator, switch
 from vipetsc.modes.system import SmoothSpring, System
 from vipetsc.modes.tsrk import Tsrk
 
@@ -54,14 +53,14 @@ def at_energy(corrector: Corrector, points: list[Point], energy: float) -> Point
     i = max(k for k, p in enumerate(points[:-1]) if p.energy <= energy < points[k + 1].energy)
     last = points[i]
     for _ in range(8):  # Newton in the energy along the branch
-        share = (energy - last.energy) / last.rise
+        share = (energy - last.energy) / last.energy_tangent
         chart = Relative(corrector.problem.system, last.x, last.period)
         xi = chart.encode(last.x, last.period)
         tangent = np.linalg.solve(chart.derivative(xi), last.tangent)
         row = tangent / np.linalg.norm(tangent)
         attempt = corrector.solve(chart, xi + share * tangent, row, row @ (xi + share * tangent))
         assert attempt.converged, attempt.history
-        null = np.linalg.svd(corrector.matrix(attempt.xi)[:-1])[2][-1]
+        null = np.linalg.svd(corrector.matrix(attempt.xi))[2][-1]
         last = Point.of(corrector.problem, attempt, chart, tangent=chart.derivative(attempt.xi) @ null)
     assert last.energy == pytest.approx(energy, rel=1e-12)
     return last
@@ -231,8 +230,8 @@ def test_in_phase_through_the_first_tongues():
     assert max(p.residual for p in points) <= 1e-11
     assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
     assert not list(suspects(points))
-    watch = Watch(corrector)
-    assert not [s for s in map(watch.see, points) if s]
+    monitor = BranchMonitor(corrector)
+    assert not [s for s in map(monitor.check, points) if s]
 
 
 def test_in_phase_through_every_odd_tongue_to_the_limit():
@@ -252,7 +251,7 @@ def test_in_phase_through_every_odd_tongue_to_the_limit():
     assert np.ptp(distance) <= 1e-2 * abs(distance[0])  # f_limit - f ~ E^(-1/2)
     labels, last = set(), points[0]
     for point in points[1:]:
-        if last.rise < 0 < point.rise and point.episodes > 0:  # the inner end of a tongue
+        if last.energy_tangent < 0 < point.energy_tangent and point.episodes > 0:  # the inner end of a tongue
             k = resonance(corrector.problem, point)
             if point.episodes == (k + 1) // 2:
                 labels.add(k)
@@ -273,15 +272,15 @@ def test_degenerate_tangent_is_named():
 
 
 def test_both_directions_give_the_same_curve():
-    """Down from above grazing returns through both folds to the linear mode, which the watch reports."""
+    """Down from above grazing returns through both folds to the linear mode, which the monitor reports."""
     system = reduced()
     corrector, points, _ = follow(system, OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.5))
     down = Continuation(corrector, points[-1], StepControl(points=2000, energy=(1e-3, 1.0)), step=1e-3)
     down.point = dataclasses.replace(points[-1], tangent=-points[-1].tangent)
-    watch, back, said = Watch(corrector), [], None
+    monitor, back, said = BranchMonitor(corrector), [], None
     for point in down:
         back.append(point)
-        said = watch.see(point)
+        said = monitor.check(point)
         if said:
             break
     assert "returned to linear mode 2" in said

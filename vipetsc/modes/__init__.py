@@ -16,8 +16,7 @@ from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.orbit import Dop853Flow
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
-from vipetsc.modes.special import Locator
-from vipetsc.modes.switching import switch
+from vipetsc.modes.special import Locator, switch
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.modes.tsrk import Tsrk
 

@@ -51,8 +51,8 @@ def is_jump(corrector: Corrector, left: Point, right: Point, control: StepContro
     return True
 
 
-class Watch:
-    """Watches a branch grow: tells when it retraces itself and when it returns to a linear mode."""
+class BranchMonitor:
+    """Tells when a growing branch retraces itself and when it returns to a linear mode."""
 
     def __init__(self, corrector: Corrector) -> None:
         self.problem = corrector.problem
@@ -61,7 +61,7 @@ class Watch:
         self._count = 0
         self._touched = False
 
-    def see(self, point: Point) -> str | None:
+    def check(self, point: Point) -> str | None:
         """A sentence when the branch does what it should not; None otherwise."""
         if self._count == len(self._track):
             self._track = np.vstack([self._track, np.empty_like(self._track)])

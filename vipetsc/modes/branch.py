@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
+import xarray as xr
 
-from vipetsc.io.atomic import atomic_write, write_text
-from vipetsc.io.store import Coordinates
-from vipetsc.modes.compare import Comparison
+from vipetsc.io.atomic import write_text
+from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.modes.point import Point
-from vipetsc.modes.portrait import Portrait
-from vipetsc.modes.regions import regions, slope_law
+from vipetsc.modes.regions import slope_laws, tell_regions
+from vipetsc.modes.samples import Comparison, OrbitSamples
 
 KINDS = (
     "regular",
@@ -28,31 +26,30 @@ KINDS = (
     "period-doubling",
     "grazing",
 )
-_COLUMNS = {
-    "energy": ("J", "energy"),
-    "frequency": ("Hz", "frequency"),
-    "period": ("s", "period"),
-    "slope": ("Hz/J", "slope df/dE of the branch"),
-    "multiplier_max": ("1", "largest modulus of a Floquet multiplier"),
-    "residual": ("1", "scaled residual of the shooting equations"),
-    "closed": ("1", "fraction of the time with a contact closed"),
-    "rise": ("J", "dE along the tangent"),
-    "step": ("1", "arclength of the step that led here"),
+# Quantities of a point: name in the files, type, unit, description.
+QUANTITIES: dict[str, tuple[str, type, str, str]] = {
+    "energy": ("energy", float, "J", "energy"),
+    "frequency": ("frequency", float, "Hz", "frequency"),
+    "period": ("period", float, "s", "period"),
+    "slope": ("slope", float, "Hz/J", "slope df/dE of the branch"),
+    "multiplier": ("multiplier_max", float, "1", "largest modulus of a Floquet multiplier"),
+    "residual": ("residual", float, "1", "scaled residual of the shooting equations"),
+    "closed": ("closed", float, "1", "fraction of the time with a contact closed"),
+    "energy_tangent": ("rise", float, "J", "dE along the tangent"),
+    "step": ("step", float, "1", "arclength of the step that led here"),
+    "episodes": ("contacts", int, "1", "contact episodes in the arc that is shot"),
+    "newton": ("newton", int, "1", "Newton steps"),
+    "index": ("number", int, "1", "number of the regular point, or of the one after a special point"),
+    "resonance": ("resonance", int, "1", "k of the k:1 internal resonance at an energy fold; 0 elsewhere"),
 }
-_COUNTS = {
-    "contacts": "contact episodes in the arc that is shot",
-    "newton": "Newton steps",
-    "number": "number of the regular point, or of the one after a special point",
-    "resonance": "k of the k:1 internal resonance at an energy fold; 0 elsewhere",
-    "region": "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 not told",
-}
+REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 not told"
 
 
 @dataclass(eq=False)
 class Branch:
     """Points of a branch, special points in their places; ``next_step`` and ``case`` allow to go on later.
 
-    ``finding`` are sentences about the branch: jumps, retracing, return to the linear mode, how it ended.
+    ``findings`` are sentences about the branch: jumps, retracing, return to the linear mode.
     """
 
     name: str
@@ -63,166 +60,128 @@ class Branch:
     complete: bool = False
     ending: str = "not finished"
     findings: list[str] = field(default_factory=list)
-    orbits: list[tuple[Point, Portrait]] = field(default_factory=list)
+    orbits: list[tuple[Point, OrbitSamples]] = field(default_factory=list)
     comparisons: list[Comparison] = field(default_factory=list)
 
     def regular(self) -> list[Point]:
         """The points of the continuation itself."""
-        return [p for p in self.points if p.kind == "regular"]
+        return self.special("regular")
 
     def special(self, kind: str) -> list[Point]:
-        """The special points of one kind."""
+        """The points of one kind."""
         return [p for p in self.points if p.kind == kind]
 
     def column(self, name: str) -> np.ndarray:
-        """One quantity of every point (points,), by its name in the files."""
-        names = {"multiplier_max": "multiplier", "contacts": "episodes", "number": "index"}
-        if name == "region":
-            slope = self.column("slope")
-            return regions(self.column("energy"), slope, self.column("contacts"), self.column("closed"))
-        return np.array([getattr(p, names.get(name, name)) for p in self.points])
+        """One quantity of every point (points,)."""
+        return np.array([getattr(p, name) for p in self.points], QUANTITIES[name][1])
+
+    def regions(self) -> np.ndarray:
+        """Region of every point (points,), see ``regions``."""
+        return tell_regions(*(self.column(name) for name in ("energy", "slope", "episodes", "closed")))
 
     def fits(self) -> dict[str, dict[str, float]]:
-        """Power laws of the slope in regions II (its falling part), III and IV."""
-        energy, slope, region = (self.column(n) for n in ("energy", "slope", "region"))
+        """Power laws of the slope over the energy in regions II (its falling part), III and IV."""
         regular = np.array([p.kind == "regular" for p in self.points], bool)
-        found = {}
-        for number, label in ((2, "II"), (3, "III"), (4, "IV")):
-            inside = np.nonzero((region == number) & regular)[0]
-            if number == 2 and inside.size:
-                backwards = np.nonzero(~(slope[inside] > 0))[0]
-                inside = inside[backwards[-1] + 1 if backwards.size else 0 :]
-                inside = inside[int(np.argmax(slope[inside])) if inside.size else 0 :]
-            law = slope_law(energy[inside], slope[inside])
-            if law is not None:
-                found[label] = {"exponent": law.exponent, "factor": law.factor, "adjusted_r2": law.r2_adjusted}
-                found[label]["points"] = law.points
-        return found
+        columns = self.column("energy"), self.column("slope"), self.regions()
+        return slope_laws(*(column[regular] for column in columns))
 
     def write(self, folder: Path, about: dict[str, Any]) -> None:
-        """Write ``branch-<name>.h5`` and ``.csv``, each complete or as it was."""
-        with atomic_write(folder / f"branch-{self.name}.h5") as aside, h5py.File(aside, "w") as file:
-            self._fill(file, about)
+        """Write ``branch-<name>.h5`` and ``.csv``, each complete or as it was; ``about`` are further attributes."""
+        write_netcdf(folder / f"branch-{self.name}.h5", self.to_dataset().assign_attrs(about))
         write_text(folder / f"branch-{self.name}.csv", self.to_csv())
 
     def to_csv(self) -> str:
         """The branch as CSV text, a row a point; numbers in full precision."""
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
-        pairs = range(1, self.dofs)
-        traces = ["half_trace"] if self.dofs == 2 else [f"half_trace_{i}" for i in pairs]
-        initial = [f"x{i + 1}" for i in range(self.dofs)]
-        table.writerow(
-            [
-                "energy",
-                "frequency",
-                "period",
-                *initial,
-                *traces,
-                "multiplier_max",
-                "slope",
-                "contacts",
-                "region",
-                "kind",
-            ]
-        )
-        for p, region in zip(self.points, self.column("region"), strict=True):
-            half_traces = [
-                repr(complex(c)) if np.iscomplexobj(p.half_traces) else repr(float(c)) for c in p.half_traces
-            ]
-            numbers = [repr(float(v)) for v in (p.energy, p.frequency, p.period, *p.x)]
-            table.writerow(
-                [*numbers, *half_traces, repr(p.multiplier), repr(float(p.slope)), p.episodes, int(region), p.kind]
-            )
+        traces = ["half_trace"] if self.dofs == 2 else [f"half_trace_{i}" for i in range(1, self.dofs)]
+        names = ["energy", "frequency", "period", *(f"x{i + 1}" for i in range(self.dofs)), *traces]
+        table.writerow([*names, "multiplier_max", "slope", "contacts", "region", "kind"])
+        for p, region in zip(self.points, self.regions(), strict=True):
+            numbers = [p.energy, p.frequency, p.period, *p.x.tolist(), *p.half_traces.tolist()]
+            numbers += [p.multiplier, float(p.slope)]
+            table.writerow([*map(repr, numbers), p.episodes, int(region), p.kind])
         return text.getvalue()
 
-    def _fill(self, file: h5py.File, about: dict[str, Any]) -> None:
-        put = Coordinates(file)
-        put.add("point", np.arange(len(self.points)), "1", "place along the branch")
-        put.add("dof", np.arange(1, self.dofs + 1), "1", "degree of freedom, from 1")
-        put.add("pair", np.arange(1, self.dofs), "1", "pair of Floquet multipliers, the trivial one left out")
-        for name, (unit, text) in _COLUMNS.items():
-            put.put(name, ("point",), self.column(name).astype(float), unit, text)
-        for name, text in _COUNTS.items():
-            put.put(name, ("point",), self.column(name).astype(np.int64), "1", text)
-        put.put("kind", ("point",), np.array([KINDS.index(p.kind) for p in self.points], np.int8), "1", "kind of point")
-        file["kind"].attrs["flag_values"] = np.arange(len(KINDS), dtype=np.int8)
-        file["kind"].attrs["flag_meanings"] = " ".join(KINDS)
-        shape = (len(self.points), self.dofs)
-        x = np.array([p.x for p in self.points]).reshape(shape)
-        put.put("initial", ("point", "dof"), x, "m", "initial displacement (velocity in m/s for maps from the centre)")
-        tangent = np.array([p.tangent for p in self.points]).reshape(len(self.points), self.dofs + 1)
-        put.put("tangent", ("point", "dof"), tangent[:, :-1], "m", "tangent of the branch: initial values")
-        put.put("tangent_period", ("point",), tangent[:, -1], "s", "tangent of the branch: period")
-        c = np.array([p.half_traces for p in self.points], complex).reshape(len(self.points), self.dofs - 1)
-        put.put("half_trace", ("point", "pair"), c.real, "1", "Floquet half-trace, real part")
-        put.put("half_trace_imaginary", ("point", "pair"), c.imag, "1", "Floquet half-trace, imaginary part")
-        if self.orbits:
-            samples = len(self.orbits[0][1].time)
-            put.add("orbit", np.arange(len(self.orbits)), "1", "stored orbit")
-            put.add("phase", np.arange(samples) / samples, "1", "time over the period")
-            put.put("orbits/energy", ("orbit",), np.array([p.energy for p, _ in self.orbits]), "J", "energy")
-            put.put("orbits/period", ("orbit",), np.array([p.period for p, _ in self.orbits]), "s", "period")
-            place = np.array([p.index for p, _ in self.orbits])
-            put.put("orbits/number", ("orbit",), place, "1", "number of the regular point")
-            axes = ("orbit", "phase", "dof")
-            for name, unit in (("displacement", "m"), ("velocity", "m/s")):
-                put.put(f"orbits/{name}", axes, np.array([getattr(o, name) for _, o in self.orbits]), unit, name)
+    def to_dataset(self) -> xr.Dataset:
+        """The branch as it is in its file."""
+        count, n = len(self.points), self.dofs
+        kinds = np.array([KINDS.index(p.kind) for p in self.points], np.int8)
+        flags = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
+        x = np.array([p.x for p in self.points]).reshape(count, n)
+        tangent = np.array([p.tangent for p in self.points], float).reshape(count, n + 1)
+        traces = np.array([p.half_traces for p in self.points], complex).reshape(count, n - 1)
+        at_rest = "initial displacement (velocity in m/s for maps from the centre)"
+        data = {
+            "point": variable("point", np.arange(count), "1", "place along the branch"),
+            "dof": variable("dof", np.arange(1, n + 1), "1", "degree of freedom, from 1"),
+            "pair": variable("pair", np.arange(1, n), "1", "pair of Floquet multipliers, the trivial one left out"),
+            "region": variable("point", self.regions().astype(np.int64), "1", REGION),
+            "kind": variable("point", kinds, "1", "kind of point", **flags),
+            "initial": variable(("point", "dof"), x, "m", at_rest),
+            "tangent": variable(("point", "dof"), tangent[:, :-1], "m", "tangent of the branch: initial values"),
+            "tangent_period": variable("point", tangent[:, -1], "s", "tangent of the branch: period"),
+            "half_trace": variable(("point", "pair"), traces.real, "1", "Floquet half-trace, real part"),
+            "half_trace_imaginary": variable(("point", "pair"), traces.imag, "1", "Floquet half-trace, imaginary part"),
+        }
+        for name, (stored, _, units, text) in QUANTITIES.items():
+            data[stored] = variable("point", self.column(name), units, text)
+        attributes = {"name": self.name, "case": self.case, "complete": int(self.complete), "ending": self.ending}
+        attributes |= {"next_step": self.next_step, "findings": "\n".join(self.findings), "fits": self.fits()}
+        return xr.Dataset(data | self._orbit_variables() | self._comparison_variables(), attrs=attributes)
+
+    def _orbit_variables(self) -> dict[str, xr.Variable]:
+        if not self.orbits:
+            return {}
+        points, orbits = zip(*self.orbits, strict=True)
+        samples, axes = len(orbits[0].time), ("orbit", "phase", "dof")
+        return {
+            "orbit": variable("orbit", np.arange(len(points)), "1", "stored orbit"),
+            "phase": variable("phase", np.arange(samples) / samples, "1", "time over the period"),
+            "orbits/energy": variable("orbit", [p.energy for p in points], "J", "energy"),
+            "orbits/period": variable("orbit", [p.period for p in points], "s", "period"),
+            "orbits/number": variable("orbit", [p.index for p in points], "1", "number of the regular point"),
+            "orbits/displacement": variable(axes, [o.displacement for o in orbits], "m", "displacement"),
+            "orbits/velocity": variable(axes, [o.velocity for o in orbits], "m/s", "velocity"),
+        }
+
+    def _comparison_variables(self) -> dict[str, xr.Variable]:
+        data = {}
         for c in self.comparisons:
-            scale = f"compared_{c.name}"
-            put.add(scale, c.number, "1", f"number of the point compared with {c.name}")
-            put.put(f"flows/{c.name}/energy", (scale,), c.energy, "J", "energy of the branch")
+            axis, group = f"compared_{c.name}", f"flows/{c.name}"
+            data[axis] = variable(axis, c.number, "1", f"number of the point compared with {c.name}")
+            data[f"{group}/energy"] = variable(axis, c.energy, "J", "energy of the branch")
             for name in ("energy_difference", "frequency_difference"):
                 text = f"relative {name.replace('_', ' ')} of {c.name} at the same amplitude"
-                put.put(f"flows/{c.name}/{name}", (scale,), getattr(c, name), "1", text)
-        attributes = {
-            "name": self.name,
-            "case": self.case,
-            "complete": int(self.complete),
-            "ending": self.ending,
-            "next_step": self.next_step,
-            "findings": "\n".join(self.findings),
-            "fits": self.fits(),
-        }
-        for key, value in (about | attributes).items():
-            file.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
+                data[f"{group}/{name}"] = variable(axis, getattr(c, name), "1", text)
+        return data
 
     @classmethod
     def read(cls, path: Path) -> Branch:
-        """The branch in an HDF5 file, without its orbits; raises OSError or KeyError if it holds none."""
-        with h5py.File(path) as file:
-            data = {name: file[name][...] for name in file if isinstance(file[name], h5py.Dataset)}
-            attributes = dict(file.attrs)
-        c = data["half_trace"] + 1j * data["half_trace_imaginary"]
+        """The branch in an HDF5 file, without its orbits; raises OSError or ValueError if it holds none."""
+        with open_netcdf(path, "branch", ("point", "tangent", "half_trace", "next_step")) as file:
+            data, about = file.load(), file.attrs
+        traces = data["half_trace"].values + 1j * data["half_trace_imaginary"].values
+        tangents = np.column_stack([data["tangent"].values, data["tangent_period"].values])
+        columns = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
+        del columns["frequency"]  # a property
         points = [
             Point(
-                x=data["initial"][i],
-                period=float(data["period"][i]),
-                energy=float(data["energy"][i]),
-                residual=float(data["residual"][i]),
-                half_traces=c[i] if np.any(c[i].imag != 0) else c[i].real,
-                multiplier=float(data["multiplier_max"][i]),
-                episodes=int(data["contacts"][i]),
-                closed=float(data["closed"][i]),
-                newton=int(data["newton"][i]),
-                tangent=np.append(data["tangent"][i], data["tangent_period"][i]),
-                slope=float(data["slope"][i]),
-                rise=float(data["rise"][i]),
-                index=int(data["number"][i]),
-                step=float(data["step"][i]),
-                kind=KINDS[data["kind"][i]],
-                resonance=int(data["resonance"][i]),
+                x=data["initial"].values[i],
+                half_traces=traces[i] if np.any(traces[i].imag != 0) else traces[i].real,
+                tangent=tangents[i],
+                kind=KINDS[kind],
+                **{name: column[i] for name, column in columns.items()},
             )
-            for i in range(len(data["point"]))
+            for i, kind in enumerate(data["kind"].values)
         ]
-        findings = [line for line in str(attributes["findings"]).split("\n") if line]
         return cls(
-            name=str(attributes["name"]),
-            case=str(attributes["case"]),
-            dofs=len(data["dof"]),
+            name=str(about["name"]),
+            case=str(about["case"]),
+            dofs=data.sizes["dof"],
             points=points,
-            next_step=float(attributes["next_step"]),
-            complete=bool(attributes["complete"]),
-            ending=str(attributes["ending"]),
-            findings=findings,
+            next_step=float(about["next_step"]),
+            complete=bool(about["complete"]),
+            ending=str(about["ending"]),
+            findings=[line for line in str(about["findings"]).split("\n") if line],
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,8 +52,7 @@ class StepControl:
 
     ``first``, ``smallest`` and ``largest`` steps are in units of the chart (relative changes); the branch ends
     outside ``energy`` (J), outside ``frequency`` (Hz) or after ``points`` points. ``chart`` is ``relative``,
-    ``logarithmic``,
-    ``grazing`` or ``auto`` (grazing near a contact at the arc's start, relative elsewhere).
+    ``logarithmic``, ``grazing`` or ``auto`` (grazing near a contact at the arc's start, relative elsewhere).
     """
 
     first: float = 1e-3
@@ -66,12 +66,30 @@ class StepControl:
     guards: Guards = field(default_factory=Guards)
 
 
+# What a guard holds down, for messages.
+GUARDED = {
+    "half_trace": "the half-trace changes too much",
+    "contacts": "more than one contact appears or goes",
+    "corrector": "the corrector goes too far",
+    "turn": "the branch turns too sharply",
+}
+
+
+class _Predictor(NamedTuple):
+    """A step from point ``last`` at ``xi`` along the unit ``tangent`` of the chart."""
+
+    last: Point
+    chart: Chart
+    xi: np.ndarray
+    tangent: np.ndarray
+    step: float
+
+
 class Continuation:
     """Iterates over the points of a branch, from ``start`` in the direction of growing or falling energy.
 
     Each point is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended, ``finished``
-    whether it left its range. The
-    iterator's whole state is its last point and the next step, so that a stored branch can be resumed.
+    whether it left its range. The whole state is the last point and the next step: a stored branch can be resumed.
 
     Raises
     ------
@@ -80,12 +98,7 @@ class Continuation:
     """
 
     def __init__(
-        self,
-        corrector: Corrector,
-        start: Point,
-        control: StepControl,
-        direction: int = 1,
-        step: float | None = None,
+        self, corrector: Corrector, start: Point, control: StepControl, direction: int = 1, step: float | None = None
     ) -> None:
         self.corrector, self.problem, self.control = corrector, corrector.problem, control
         self.point = start
@@ -93,7 +106,6 @@ class Continuation:
             self.point = replace(start, tangent=first_tangent(corrector, start, direction))
         self.step = control.first if step is None else step
         self.ending, self.finished = "not finished", False
-        self.rejected: list[str] = []
 
     def __iter__(self) -> Iterator[Point]:
         for _ in range(self.control.points):
@@ -113,60 +125,51 @@ class Continuation:
                 return True
         return False
 
-    def chart(self, point: Point) -> Chart:
-        """The unknowns used for the step that leaves ``point``."""
-        return chart_at(self.problem, self.control.chart, point)
-
     def _next(self) -> Point:
         last = self.point
-        chart = self.chart(last)
+        chart = chart_at(self.problem, self.control.chart, last)
         xi = chart.encode(last.x, last.period)
-        tangent = unit(np.linalg.solve(chart.derivative(xi), last.tangent))
-        last_attempt, why = None, "no step tried"
+        tangent = unit(np.linalg.solve(chart.derivative(xi), last.direction))
+        attempt, why, knob = None, "no step tried", "nnm.max_newton or nnm.tolerance"
         while self.step >= self.control.smallest:
             attempt = self.corrector.solve(chart, xi + self.step * tangent, tangent, tangent @ xi + self.step)
             if not attempt.converged:
-                last_attempt, why = attempt, f"no convergence ({attempt.reason})"
+                why, knob = f"no convergence ({attempt.reason})", "nnm.max_newton or nnm.tolerance"
                 self.step *= 0.4
                 continue
-            point, strain, what = self._judge(last, chart, xi, tangent, attempt)
+            predictor = _Predictor(last, chart, xi, tangent, self.step)
+            point, strain, guard = self._judge(predictor, attempt)
             if strain <= 1.0:
                 effort = max(strain / 0.7, attempt.newton / 5, 1 / self.control.growth)
                 self.step = min(self.step / effort, self.control.largest)
                 return point
-            last_attempt, why = attempt, what
+            why, knob = GUARDED[guard], f"nnm.guards.{guard}"
             self.step *= min(max(0.8 / strain, 0.1), 0.7)
-        raise ContinuationError(failure(last, why, last_attempt, self.control))
-
-    def _judge(
-        self, last: Point, chart: Chart, xi: np.ndarray, tangent: np.ndarray, attempt: Attempt
-    ) -> tuple[Point, float, str]:
-        """The corrected point, how far it strains the guards (1 is the bound), and which guard most."""
-        guards = self.control.guards
-        direction = null_vector(self.corrector.matrix(attempt.xi)[:-1])
-        turn = direction @ tangent
-        if turn < 0:
-            direction, turn = -direction, -turn
-        point = Point.of(
-            self.problem,
-            attempt,
-            chart,
-            tangent=chart.derivative(attempt.xi) @ direction,
-            index=last.index + 1,
-            step=self.step,
+        residuals = attempt.residuals if attempt else "none"
+        raise ContinuationError(
+            f"step below {self.control.smallest:g} after point {last.index} "
+            f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {why}; "
+            f"residuals of the last attempt: {residuals}; turn nnm.smallest_step or {knob}"
         )
+
+    def _judge(self, predictor: _Predictor, attempt: Attempt) -> tuple[Point, float, str]:
+        """The corrected point, how far it strains the guards (1 is the bound), and which guard most."""
+        last, chart, xi, tangent, step = predictor
+        guards = self.control.guards
+        direction = tangent_at(self.corrector, attempt.xi, tangent)
+        point = Point.of(
+            self.problem, attempt, chart, chart.derivative(attempt.xi) @ direction, index=last.index + 1, step=step
+        )
+        correction = float(np.linalg.norm(attempt.xi - xi - step * tangent))
         strains = {
-            "the half-trace changes too much": half_trace_change(last, point) / guards.half_trace,
-            "more than one contact appears or goes": abs(point.episodes - last.episodes) / guards.contacts,
-            "the corrector goes too far": np.linalg.norm(attempt.xi - xi - self.step * tangent)
-            / self.step
-            / guards.corrector,
-            "the branch turns too sharply": np.arccos(min(turn, 1.0)) / guards.turn,
+            "half_trace": half_trace_change(last, point) / guards.half_trace,
+            "contacts": abs(point.episodes - last.episodes) / guards.contacts,
+            "corrector": correction / step / guards.corrector,
+            "turn": float(np.arccos(min(direction @ tangent, 1.0))) / guards.turn,
         }
-        worst = max(strains, key=strains.get)
-        if worst.startswith("more") and strains[worst] <= 1:  # one contact more is no reason to slow down
-            others = {k: v for k, v in strains.items() if k != worst}
-            worst = max(others, key=others.get)
+        if strains["contacts"] <= 1:  # one contact more is no reason to slow down
+            strains["contacts"] = 0.0
+        worst = max(strains, key=lambda guard: strains[guard])
         return point, float(strains[worst]), worst
 
 
@@ -188,6 +191,12 @@ def unit(vector: np.ndarray) -> np.ndarray:
 def null_vector(matrix: np.ndarray) -> np.ndarray:
     """Unit null vector (n + 1,) of an (n, n + 1) matrix."""
     return np.linalg.svd(matrix)[2][-1]
+
+
+def tangent_at(corrector: Corrector, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Unit tangent (n + 1,) in the chart of the last attempt, at its ``xi``, turned towards ``reference``."""
+    direction = null_vector(corrector.matrix(xi))
+    return -direction if direction @ reference < 0 else direction
 
 
 def half_trace_change(a: Point, b: Point) -> float:
@@ -227,21 +236,5 @@ def first_tangent(corrector: Corrector, start: Point, direction: int) -> np.ndar
             "start elsewhere (nnm.start_energy) or switch branches there"
         )
     tangent = chart.derivative(xi) @ null_vector(matrix)
-    rise = problem.energy_gradient(start.x) @ tangent[:-1]
-    return tangent * (np.sign(rise) * direction or direction)
-
-
-def failure(last: Point, why: str, attempt: Attempt | None, control: StepControl) -> str:
-    """The message of a step that became too small: where, why, the residuals, the option to turn."""
-    history = " ".join(f"{r:.1e}" for r in attempt.history) if attempt else "none"
-    knob = {
-        "the half": "nnm.guards.half_trace",
-        "more tha": "nnm.guards.contacts",
-        "the corr": "nnm.guards.corrector",
-        "the bran": "nnm.guards.turn",
-    }.get(why[:8], "nnm.max_newton or nnm.tolerance")
-    return (
-        f"step below {control.smallest:g} after point {last.index} "
-        f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): "
-        f"{why}; residuals of the last attempt: {history}; turn nnm.smallest_step or {knob}"
-    )
+    energy_tangent = problem.energy_gradient(start.x) @ tangent[:-1]
+    return tangent * (np.sign(energy_tangent) * direction or direction)

@@ -9,19 +9,55 @@ import numpy as np
 from vipetsc.modes.chart import Chart, Relative
 from vipetsc.modes.orbit import Arc
 from vipetsc.modes.shooting import Attempt, Corrector, Shooting
-from vipetsc.modes.stability import stability
+
+
+def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
+    """Half-traces c (n - 1,) = (mu + 1/mu)/2 of the basic map's multipliers, the trivial pair left out.
+
+    The basic map is the half period (seen with the sign reversed) for the quarter-period map and the period for the
+    others. With S = [[A, B], [C, D]] in mass-normalised coordinates and its mirror image after the end, it has the
+    diagonal block I + 2 B^T C (-I + 2 D^T A for a quarter period), whose eigenvalues are the half-traces. One of
+    them is trivial and its left eigenvector is known, so that it is removed exactly.
+    """
+    root = np.sqrt(problem.system.masses)
+    a, b, c, d = (root[:, None] * block / root for block in arc.blocks())
+    n, quarter = len(root), problem.map.quarter
+    trivial = (arc.start[n:] if problem.map.start == "centre" else arc.acceleration[0]) * root
+    if problem.map.fraction == 1.0:  # the whole period needs no mirror image
+        product = (a - np.eye(n)) / 2
+    elif problem.map.start == "rest":
+        product = d.T @ a if quarter else b.T @ c
+    else:
+        product = c.T @ b
+    if n == 2:  # the trace is more exact than a projection
+        rest = np.array([np.trace(product)])
+    else:
+        basis = np.linalg.svd(trivial[None, :])[2][1:].T
+        rest = np.linalg.eigvals(basis.T @ product @ basis)
+    traces = 1 - 2 * rest if quarter else 1 + 2 * rest
+    traces = traces[np.argsort(traces.real)]
+    return traces.real if np.all(np.abs(traces.imag) == 0) else traces
+
+
+def multipliers(traces: np.ndarray, quarter: bool) -> np.ndarray:
+    """Floquet multipliers (2n - 2,) over the whole period from half-traces (n - 1,)."""
+    c = traces.astype(complex)
+    root = np.sqrt(c * c - 1)
+    mu = np.where(np.abs(c + root) >= np.abs(c - root), c + root, c - root)  # the larger one, no cancellation
+    mu = np.concatenate([mu, 1 / mu])
+    return mu**2 if quarter else mu
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
     """A periodic orbit on a branch.
 
-    ``x`` (n,) initial displacements in m (velocities in m/s for maps from the centre), ``period`` in s,
-    ``energy`` in J, ``residual`` scaled, ``half_traces`` (n - 1,), ``multiplier`` the largest modulus,
-    ``episodes`` contact episodes of the arc, ``closed`` the fraction of the time with a contact closed,
-    ``tangent`` d(x, period) (n + 1,) of any length, ``slope`` df/dE in Hz/J along it, ``newton`` steps, ``step``
-    the arclength that led here, ``kind`` regular or the name of a special point,
-    ``resonance`` k of the k:1 tongue that an energy fold belongs to (0: not told).
+    ``x`` (n,) initial displacements in m (velocities in m/s for maps from the centre), ``period`` in s, ``energy`` in
+    J, ``residual`` scaled, ``half_traces`` (n - 1,), ``multiplier`` the largest modulus, ``episodes`` contact
+    episodes of the arc, ``closed`` the fraction of the time with a contact closed, ``tangent`` d(x, period) (n + 1,)
+    of any length, ``energy_tangent`` dE in J and ``slope`` df/dE in Hz/J along it, ``newton`` steps, ``step`` the
+    arclength that led here, ``kind`` regular or the name of a special point, ``resonance`` k of the k:1 tongue that
+    an energy fold belongs to (0: not told).
     """
 
     x: np.ndarray
@@ -35,7 +71,7 @@ class Point:
     newton: int
     tangent: np.ndarray | None = None
     slope: float = np.nan
-    rise: float = np.nan
+    energy_tangent: float = np.nan
     index: int = 0
     step: float = 0.0
     kind: str = "regular"
@@ -46,6 +82,12 @@ class Point:
         """Frequency in Hz."""
         return 1 / self.period
 
+    @property
+    def direction(self) -> np.ndarray:
+        """The tangent (n + 1,) of a point that has one."""
+        assert self.tangent is not None
+        return self.tangent
+
     @classmethod
     def of(
         cls,
@@ -55,33 +97,30 @@ class Point:
         tangent: np.ndarray | None = None,
         index: int = 0,
         step: float = 0.0,
-        kind: str = "regular",
     ) -> Point:
-        """The point that a converged attempt found."""
+        """The point of a converged attempt."""
         x, period = chart.decode(attempt.xi)
-        arc: Arc = attempt.arc
-        found = stability(problem, arc)
-        scale = problem.residual_scale(float(np.abs(x).max()), period)
-        rise = slope = np.nan
+        arc = attempt.arc
+        traces = half_traces(problem, arc)
+        energy_tangent = slope = np.nan
         if tangent is not None:
-            rise = float(problem.energy_gradient(x) @ tangent[:-1])
-            slope = float(-tangent[-1] / period**2 / rise) if rise else np.inf
+            energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
+            slope = float(-tangent[-1] / period**2 / energy_tangent) if energy_tangent else np.inf
         return cls(
             x=x,
             period=period,
             energy=problem.energy(x),
-            residual=float(np.abs(problem.residual(arc)).max()) / scale,
-            half_traces=found.half_traces,
-            multiplier=found.largest,
+            residual=float(np.abs(problem.residual(arc)).max()) / problem.residual_scale(np.abs(x).max(), period),
+            half_traces=traces,
+            multiplier=float(np.abs(multipliers(traces, problem.map.quarter)).max(initial=1.0)),
             episodes=arc.episodes,
             closed=arc.closed / arc.duration,
             newton=attempt.newton,
             tangent=tangent,
             slope=slope,
-            rise=rise,
+            energy_tangent=energy_tangent,
             index=index,
             step=step,
-            kind=kind,
         )
 
 
@@ -101,18 +140,10 @@ def linear_start(corrector: Corrector, mode: int, energy: float) -> Point:
     x, period = shapes[:, mode] * amplitude, 2 * np.pi / omega[mode]
     chart = Relative(problem.system, x, period)
     xi = chart.encode(x, period)
-    row = np.append(unit_row(x), 0.0)  # keep the amplitude
+    row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
     attempt = corrector.solve(chart, xi, row, row @ xi)
     if not attempt.converged:
-        history = " ".join(f"{r:.1e}" for r in attempt.history)
         raise ValueError(
-            f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J "
-            f"({attempt.reason}; residuals {history}): "
-            "lower nnm.start_energy"
+            f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J ({attempt}): lower nnm.start_energy"
         )
     return Point.of(problem, attempt, chart)
-
-
-def unit_row(x: np.ndarray) -> np.ndarray:
-    """x over its length."""
-    return x / np.linalg.norm(x)

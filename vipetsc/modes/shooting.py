@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 from petsc4py import PETSc
 
@@ -27,6 +27,11 @@ class ShootingMap:
     start: Section
     end: Section
     fraction: float
+
+    @property
+    def quarter(self) -> bool:
+        """Whether it goes from one section to the other; the orbit is then odd about its end."""
+        return self.start != self.end
 
 
 MAPS = {
@@ -65,10 +70,6 @@ class Shooting:
         start[self._part(self.map.start, free=True)] = x
         return self.flow.arc(start, self.map.fraction * period, period)
 
-    def unknowns(self, arc: Arc) -> np.ndarray:
-        """The initial values (n,) of an arc."""
-        return arc.start[self._part(self.map.start, free=True)]
-
     def residual(self, arc: Arc) -> np.ndarray:
         """What should vanish at the arc's end (n,): displacements in m or velocities in m/s."""
         return arc.end[self._part(self.map.end, free=False)]
@@ -81,9 +82,8 @@ class Shooting:
 
     def residual_scale(self, size: float, period: float) -> float:
         """Size of a residual that is as large as initial values of ``size``."""
-        if self.map.start == self.map.end:
-            return size
-        return size * 2 * np.pi / period if self.map.end == "rest" else size
+        to_rest = self.map.quarter and self.map.end == "rest"
+        return size * 2 * np.pi / period if to_rest else size
 
     def energy(self, x: np.ndarray) -> float:
         """Energy in J of the orbit with initial values ``x``."""
@@ -102,18 +102,41 @@ class Shooting:
 
 @dataclass(eq=False)
 class Attempt:
-    """What a corrector did: ``history`` of residual norms, and ``reason`` why it stopped."""
+    """What a corrector did: ``history`` of residual norms, ``reason`` why it stopped, the last ``xi`` and its orbit."""
 
     converged: bool
     reason: str
-    history: list[float] = field(default_factory=list)
-    xi: np.ndarray | None = None
-    arc: Arc | None = None
+    history: list[float]
+    xi: np.ndarray
+    orbit: Arc | None = None
+
+    def __str__(self) -> str:
+        return f"{self.reason}; residuals {self.residuals}"
+
+    @property
+    def residuals(self) -> str:
+        """The history as text."""
+        return " ".join(f"{r:.1e}" for r in self.history)
 
     @property
     def newton(self) -> int:
         """Newton steps taken."""
         return max(len(self.history) - 1, 0)
+
+    @property
+    def arc(self) -> Arc:
+        """The orbit of an attempt that has one."""
+        assert self.orbit is not None
+        return self.orbit
+
+
+class Equation(NamedTuple):
+    """What is solved: shooting in a ``chart`` over ``scale``, and row . xi = value."""
+
+    chart: Chart
+    row: np.ndarray
+    value: float
+    scale: float
 
 
 class Corrector:
@@ -154,46 +177,48 @@ class Corrector:
         if not options.hasName("snes_linesearch_type"):
             options["snes_linesearch_type"] = "basic"  # step control is the continuation's business
         snes.setFromOptions()
-        self._equation: tuple[Chart, np.ndarray, float] | None = None
+        self._equation: Equation | None = None
         self._last: tuple[np.ndarray, Arc] | None = None
         self._history: list[float] = []
 
     def solve(self, chart: Chart, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Solve shooting(xi) = 0 and row . xi = value, starting from ``guess`` (n + 1,)."""
-        self._equation, self._last, self._history = (chart, row, value), None, []
+        scale = self.problem.residual_scale(chart.size, chart.period)
+        self._equation, self._last, self._history = Equation(chart, row, value, scale), None, []
         self._xi.setArray(guess)
         try:
             self._snes.solve(None, self._xi)
         except FlowError as error:
-            return Attempt(False, str(error), self._history)
+            return Attempt(False, str(error), self._history, guess)
         reason = self._snes.getConvergedReason()
-        name = _REASONS.get(reason, str(reason))
         xi = self._xi.getArray().copy()
-        return Attempt(reason > 0, name, self._history, xi, self._arc(xi))
+        return Attempt(reason > 0, _REASONS.get(reason, str(reason)), self._history, xi, self._arc(xi))
+
+    def matrix(self, xi: np.ndarray) -> np.ndarray:
+        """The scaled Jacobian (n, n + 1) of the shooting equations at ``xi``, in the chart of the last attempt."""
+        equation = self._current
+        return self.problem.jacobian(self._arc(xi)) @ equation.chart.derivative(xi) / equation.scale
+
+    @property
+    def _current(self) -> Equation:
+        assert self._equation is not None
+        return self._equation
 
     def _arc(self, xi: np.ndarray) -> Arc:
         if self._last is None or not np.array_equal(self._last[0], xi):
-            self._last = xi.copy(), self.problem.arc(*self._equation[0].decode(xi))
+            self._last = xi.copy(), self.problem.arc(*self._current.chart.decode(xi))
         return self._last[1]
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        chart, row, value = self._equation
-        xi = x.getArray(readonly=True)
-        if not np.all(np.isfinite(xi)) or chart.decode(xi)[1] <= 0:
+        equation, xi = self._current, x.getArray(readonly=True)
+        if not np.all(np.isfinite(xi)) or equation.chart.decode(xi)[1] <= 0:
             raise FlowError("Newton left the domain: the period is not positive")
-        scale = self.problem.residual_scale(chart.size, chart.period)
-        f.setArray(np.append(self.problem.residual(self._arc(xi)) / scale, row @ xi - value))
+        residual = self.problem.residual(self._arc(xi)) / equation.scale
+        f.setArray(np.append(residual, equation.row @ xi - equation.value))
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
-        matrix.getDenseArray()[:] = self.matrix(x.getArray(readonly=True))
+        matrix.getDenseArray()[:] = np.vstack([self.matrix(x.getArray(readonly=True)), self._current.row])
         matrix.assemble()
-
-    def matrix(self, xi: np.ndarray) -> np.ndarray:
-        """The scaled Jacobian (n + 1, n + 1) at ``xi``; its last row is the linear one."""
-        chart, row, _ = self._equation
-        scale = self.problem.residual_scale(chart.size, chart.period)
-        shooting = self.problem.jacobian(self._arc(xi)) @ chart.derivative(xi) / scale
-        return np.vstack([shooting, row])
 
     def _test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | bool:
         _, step, residual = norms

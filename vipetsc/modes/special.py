@@ -1,4 +1,4 @@
-"""Special points between two points of a branch: folds, changes of stability, grazing; located, not interpolated."""
+"""Special points between two points of a branch, located and not interpolated, and the branches that cross there."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq
 
-from vipetsc.modes.continuation import chart_at, null_vector, unit
+from vipetsc.modes.chart import Relative
+from vipetsc.modes.continuation import ContinuationError, chart_at, tangent_at, unit
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Corrector
-
-Test = Callable[[Point], float]
+from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 
 
 @dataclass(frozen=True)
@@ -20,32 +19,35 @@ class SpecialPoint:
     """A kind of special point: where ``test`` changes sign by more than ``floor`` on both sides."""
 
     kind: str
-    test: Test
+    test: Callable[[Point], float]
     floor: float = 0.0
 
 
-def kinds(corrector: Corrector) -> list[SpecialPoint]:
-    """What can happen on a branch of a problem; a half-trace has one meaning for every map (see ``Stability``).
+def special_points(problem: Shooting) -> list[SpecialPoint]:
+    """What can happen on a branch: folds, and half-traces that cross 1, -1 or 0.
 
-    Half-traces of one system cross +-1 tangentially along narrow tongues, to rounding; crossings below 1e-6
-    are not told from those.
+    A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
+    doubles the period (the others); 0 doubles the period of quarter-period orbits. Half-traces of one system cross
+    +-1 tangentially along narrow tongues, to rounding; crossings below 1e-6 are not told from those.
     """
-    quarter = corrector.problem.map.start != corrector.problem.map.end
-    found = [
-        SpecialPoint("fold-energy", lambda p: p.rise),
-        SpecialPoint("fold-frequency", lambda p: p.tangent[-1] / p.period),
+    points = [
+        SpecialPoint("fold-energy", lambda p: p.energy_tangent),
+        SpecialPoint("fold-frequency", lambda p: float(p.direction[-1] / p.period)),
     ]
-    levels = {1.0: "branch-point", -1.0: "symmetry-breaking" if quarter else "period-doubling"}
-    if quarter:
+    levels = {1.0: "branch-point", -1.0: "symmetry-breaking" if problem.map.quarter else "period-doubling"}
+    if problem.map.quarter:
         levels[0.0] = "period-doubling"
+
+    def crossing(level: float, i: int) -> Callable[[Point], float]:
+        return lambda p: float(np.real(p.half_traces[i])) - level
+
     for level, kind in levels.items():
-        for i in range(corrector.problem.system.dofs - 1):
-            found.append(SpecialPoint(kind, lambda p, i=i, level=level: float(np.real(p.half_traces[i])) - level, 1e-6))
-    return found
+        points += [SpecialPoint(kind, crossing(level, i), 1e-6) for i in range(problem.system.dofs - 1)]
+    return points
 
 
 class Locator:
-    """Finds the special points inside one step of a branch.
+    """Locates the special points inside one step of a branch.
 
     Parameters
     ----------
@@ -59,76 +61,122 @@ class Locator:
 
     def __init__(self, corrector: Corrector, chart: str = "relative", grazing: bool = False) -> None:
         self.corrector, self.chart_name, self.grazing = corrector, chart, grazing
-        self.kinds = kinds(corrector)
+        self.special = special_points(corrector.problem)
 
     def between(self, left: Point, right: Point) -> list[Point]:
         """Special points between two consecutive points, in order; their ``index`` is the right one's.
 
         An energy fold always has a half-trace of 1 and is not reported as a branch point too.
         """
-        found: list[tuple[float, Point]] = []
-        segment = Segment(self.corrector, self.chart_name, left, right)
+        points: list[Point] = []
+        segment = _Segment(self.corrector, self.chart_name, left, right)
         smooth = len(self.corrector.problem.system.springs) > 0
         touching = sum(p.episodes > 0 for p in (left, right))
-        for special in self.kinds:
+        for special in self.special:
             if not smooth and touching < (2 if special.kind.startswith("fold") else 1):
                 continue  # a linear branch has folds of rounding only
             a, b = special.test(left), special.test(right)
             if not (a * b < 0 and min(abs(a), abs(b)) > special.floor):
                 continue
-            if special.kind == "branch-point" and any(p.kind == "fold-energy" for _, p in found):
+            if special.kind == "branch-point" and any(p.kind == "fold-energy" for p in points):
                 continue
-            point = segment.root(special.test, a)
-            if point is not None:
-                found.append((segment.place, replace(point, kind=special.kind)))
+            points += segment.root(special.kind, special.test)
         if self.grazing and left.episodes != right.episodes:
-            point = segment.root(lambda p: 1.0 if p.episodes == right.episodes else -1.0, -1.0, 1e-11)
-            if point is not None:
-                found.append((segment.place, replace(point, kind="grazing")))
-        return [point for _, point in sorted(found, key=lambda pair: pair[0])]
+            points += segment.root("grazing", lambda p: 1.0 if p.episodes == right.episodes else -1.0, 1e-11)
+        return sorted(points, key=lambda p: p.step)
 
 
-class Segment:
-    """The branch between two points, parametrised by arclength along the left point's tangent.
-
-    ``place`` is the arclength of the last root found.
-    """
+class _Segment:
+    """The branch between two points, parametrised by arclength along the left point's tangent."""
 
     def __init__(self, corrector: Corrector, chart: str, left: Point, right: Point) -> None:
         self.corrector, self.left, self.right = corrector, left, right
         self.chart = chart_at(corrector.problem, chart, left)
         self.xi = self.chart.encode(left.x, left.period)
-        self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), left.tangent))
+        self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), left.direction))
         self.chord = self.chart.encode(right.x, right.period) - self.xi
         self.length = float(self.tangent @ self.chord)
-        self.place = 0.0
 
-    def at(self, place: float) -> Point:
-        """The point at arclength ``place``; raises ArithmeticError if the corrector fails there."""
-        share = place / self.length
+    def at(self, arclength: float) -> Point:
+        """The point at an arclength; raises ArithmeticError if the corrector fails there."""
+        share = arclength / self.length
         # a parabola through both points, tangent at the left one
-        guess = self.xi + place * self.tangent + share**2 * (self.chord - self.length * self.tangent)
-        attempt = self.corrector.solve(self.chart, guess, self.tangent, self.tangent @ self.xi + place)
+        guess = self.xi + arclength * self.tangent + share**2 * (self.chord - self.length * self.tangent)
+        attempt = self.corrector.solve(self.chart, guess, self.tangent, self.tangent @ self.xi + arclength)
         if not attempt.converged:
             raise ArithmeticError(attempt.reason)
-        direction = null_vector(self.corrector.matrix(attempt.xi)[:-1])
-        if direction @ self.tangent < 0:
-            direction = -direction
-        tangent = self.chart.derivative(attempt.xi) @ direction
-        return Point.of(
-            self.corrector.problem, attempt, self.chart, tangent=tangent, index=self.right.index, step=place
-        )
+        tangent = self.chart.derivative(attempt.xi) @ tangent_at(self.corrector, attempt.xi, self.tangent)
+        return Point.of(self.corrector.problem, attempt, self.chart, tangent, self.right.index, arclength)
 
-    def root(self, test: Test, at_left: float, accuracy: float = 1e-14) -> Point | None:
-        """The point where ``test`` vanishes, to ``accuracy`` of the step; None if the corrector fails on the way."""
+    def root(self, kind: str, test: Callable[[Point], float], accuracy: float = 1e-14) -> list[Point]:
+        """The point where ``test`` vanishes, to ``accuracy`` of the step; none if the corrector fails on the way."""
 
-        def value(place: float) -> float:
-            if place == 0:
-                return at_left
-            return test(self.right) if place == self.length else test(self.at(place))
+        def value(arclength: float) -> float:
+            if arclength == 0:
+                return test(self.left)
+            return test(self.right) if arclength == self.length else test(self.at(arclength))
 
         try:
-            self.place = brentq(value, 0.0, self.length, xtol=accuracy * self.length, rtol=1e-14)
-            return self.at(self.place)
+            arclength = brentq(value, 0.0, self.length, xtol=accuracy * self.length, rtol=1e-14)
+            return [replace(self.at(arclength), kind=kind)]
         except (ArithmeticError, ValueError):
-            return None
+            return []
+
+
+def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: int = 1) -> tuple[Corrector, Point]:
+    """A corrector and a first point, with its tangent, on the branch that crosses at a special ``point``.
+
+    The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
+    centre, whichever map has a second null direction at ``point``; over the doubled period at a period doubling.
+
+    Parameters
+    ----------
+    amplitude
+        First step along the new direction, relative to the orbit's size.
+    sign
+        Which side of a pitchfork, 1 or -1.
+
+    Raises
+    ------
+    ContinuationError
+        If no map has a second null direction, or the corrector falls back or fails.
+    """
+    singular, old = [], corrector.problem
+    for name in ("quarter", "half", "half-centre") if old.map.quarter else (old.map.name,):
+        problem = Shooting(old.flow, MAPS[name])
+        x, period = _re_expressed(old, point, problem)
+        chart = Relative(problem.system, x, period, rest=problem.map.start == "rest")
+        xi = chart.encode(x, period)
+        scale = problem.residual_scale(chart.size, chart.period)
+        arc = problem.arc(x, period)
+        if np.abs(problem.residual(arc)).max() > 1e-6 * scale:
+            continue  # not an orbit of this map: the doubled period's quarter
+        matrix = problem.jacobian(arc) @ chart.derivative(xi) / scale
+        values, directions = np.linalg.svd(matrix)[1:]
+        singular.append(f"{name} {values[-1] / values[0]:.1e}")
+        if values[-1] > 1e-5 * values[0]:
+            continue
+        along = np.zeros(len(xi))
+        if point.tangent is not None:
+            x_later, period_later = point.x + 1e-6 * point.tangent[:-1], point.period + 1e-6 * point.tangent[-1]
+            later = replace(point, x=x_later, period=period_later)
+            along = chart.encode(*_re_expressed(old, later, problem)) - xi
+        first, second = directions[-2:] @ (directions[-2:].T @ directions[-2:] @ along)
+        row = sign * unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
+        fresh = Corrector(problem, corrector.tolerance, corrector.step_tolerance)
+        attempt = fresh.solve(chart, xi + amplitude * row, row, row @ xi + amplitude)
+        if not attempt.converged:
+            where = f"at E = {point.energy:.9g} J ({attempt}): lower nnm.switch_amplitude"
+            raise ContinuationError(f"no convergence on the crossing branch {where}")
+        tangent = chart.derivative(attempt.xi) @ tangent_at(fresh, attempt.xi, row)
+        return fresh, Point.of(problem, attempt, chart, tangent)
+    where = f"at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz"
+    raise ContinuationError(f"no branch crosses {where}: smallest singular values {', '.join(singular)}")
+
+
+def _re_expressed(old: Shooting, point: Point, new: Shooting) -> tuple[np.ndarray, float]:
+    """Initial values and period of a special point's orbit for another map; the period is doubled where it doubles."""
+    period = (2 if point.kind == "period-doubling" else 1) * point.period
+    if old.map.start == new.map.start:
+        return point.x, period
+    return old.arc(point.x, point.period).end[old.system.dofs :], period  # the centre of a quarter-period orbit
