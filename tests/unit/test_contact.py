@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from vipetsc.contact import changes, landing
 from vipetsc.contact.law import (
@@ -17,6 +18,7 @@ from vipetsc.contact.law import (
     elastic_force_and_slope,
     force_law,
 )
+from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.lattice import Bilinear, Contact, Hertz
 
 KC, D, R = 3e5, 2e-4, 0.7
@@ -96,6 +98,16 @@ def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
     assert extremes.force == pytest.approx(max(push), rel=1e-6)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_earliest_of_several_sites_changes_first(order):
+    h, clearances = 1e-3, np.array([D, 3 * D, 5 * D])[::order]
+    rate = 6 * D / h
+    start, end = np.array([[0.0, rate, 0.0]] * 3), np.array([[6 * D, rate, 0.0]] * 3)
+    change = changes.first_change(create_contacts(Contact(Hertz, KC, R), clearances), start, end, h)
+    assert change.site == (0 if order == 1 else 2)
+    assert change.share == pytest.approx(1 / 6)
+
+
 def test_clipping_begins_where_g_falls_through_zero():
     h, approach = 1e-3, 0.01
     w = np.poly1d([D + 1e-4]) - np.poly1d([20.0, 0.02, 0.0])  # ever faster out
@@ -146,3 +158,51 @@ def test_a_landing_within_the_tolerance_goes_on_while_it_gains():
     assert attempt.length == 0.5 - 1e-11
     assert landing.correct(attempt, 0.9e-11, 1.0, 1e-10, 1e-14)[1] == landing.LANDED
     assert landing.correct(attempt, 0.9e-14, 1.0, 1e-10, 1e-14)[1] == landing.LANDED
+
+
+def test_the_tracker_follows_an_impact_from_onset_to_separation():
+    contact = Contact(Hertz, KC, R, approach_floor=0.05)
+    tracker = ImpactTracker(create_contacts(contact, [D, D]), (4, 9), 0.003)
+    site = tracker.contacts.sites[1]
+    tracker.start[1] = -D, 0.01, 0.0  # touches on the side -1, moving away: a graze
+    assert tracker.switch(0.1, np.array([0.0, 0.25])) == 0
+    assert tracker.counts.grazes == 1
+    tracker.start[1] = -D, -0.01, 0.0
+    assert tracker.switch(0.2, np.array([0.0, 0.25])) == 1
+    assert (site["mode"], site["approach"]) == (-CLOSED, -0.05)
+    assert (tracker.counts.floored, tracker.counts.grazes) == (1, 1)
+    assert tracker.contact_time() == tracker.duration(0.05)
+
+    tracker.end[1] = -1.5 * D, 0.0, 0.0
+    tracker.accept_step(1e-3)
+    tracker.end[1] = -D, 0.2, 0.0  # g = 1 + .45 (-.2/.05) < 0: the contact pulls
+    tracker.accept_step(1e-3)
+    (episode,) = tracker.unfinished(np.array([0.0, 0.5]))
+    assert (episode.site, episode.side, episode.onset, episode.approach_velocity) == (9, -1, 0.2, -0.01)
+    assert episode.loss == 0.25
+    assert np.isnan(episode.separation)
+    assert episode.indentation == pytest.approx(0.5 * D, rel=0.05)
+    assert episode.force > KC * (0.5 * D) ** 1.5
+    assert tracker.counts.pulled == 1
+
+    resumed = ImpactTracker(create_contacts(contact, [D, D]), (4, 9), 0.003)
+    resumed.restore(tracker.checkpoint())
+    for each in (tracker, resumed):
+        each.start[1] = -D, 0.2, 0.0
+        assert each.switch(0.3, np.array([0.0, 0.75])) == 1
+        (closed,) = each.take_closed()
+        assert (closed.separation, closed.loss, closed.indentation) == (0.3, 0.5, episode.indentation)
+        assert (each.take_closed(), each.open, each.contacts.sites["mode"].tolist()) == ([], {}, [FREE, FREE])
+        assert each.counts == tracker.counts
+    assert tracker.contact_time() == np.inf
+
+
+@LAWS
+def test_the_contact_time_is_that_of_a_simulated_impact(law):
+    contacts, mass, speed = create_contacts(Contact(law, KC), [D]), 0.003, 0.3
+    contacts.sites[0] = (CLOSED, D, speed)
+    rest = solve_ivp(
+        lambda t, z: [z[1], -contact_force(contacts, 0, D + z[0], z[1])[0] / mass],
+        (0, 1), [0.0, speed], rtol=1e-10, atol=1e-13, events=lambda t, z: z[1],
+    )  # fmt: skip
+    assert 2 * rest.t_events[0][0] == pytest.approx(ImpactTracker(contacts, (0,), mass).duration(speed), rel=1e-6)

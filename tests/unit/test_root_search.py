@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from vipetsc.contact.search import bernstein, evaluate, first_upcrossing
+from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
 coefficient = st.floats(-1, 1, allow_subnormal=False)
 
@@ -54,3 +54,12 @@ def test_a_pair_of_crossings_inside_one_step_is_found():
     assert b[5] < 0
     np.testing.assert_allclose(first_upcrossing(b), peak - width, atol=1e-10)
     np.testing.assert_allclose(first_upcrossing(b - 1.01 * polynomial(peak)), 2)
+
+
+def test_a_start_that_has_just_landed_is_no_crossing():
+    """s (s - .4), raised by the rounding of a landing: on zero and falling at first."""
+    b = np.array([0.0, -0.2, 0.6]) + 1e-12
+    assert first_upcrossing(b) == 0.0
+    np.testing.assert_allclose(first_upcrossing_after_start(b, 1e-10), 0.4, atol=1e-10)
+    assert first_upcrossing_after_start(b, 1e-13) == 0.0
+    assert first_upcrossing_after_start(-b, 1e-10) == 0.0
