@@ -1,33 +1,37 @@
-"""The whole paper in one folder: steps made, figures drawn, claims measured, the report written."""
+"""The whole paper in one folder: steps made, figures drawn, claims measured, the report written.
+
+What is made from results is made again when the hash of its inputs changed: the steps' resolved cases, the contents of
+their results, the version of the package. ``made.json`` keeps the hashes.
+"""
 
 from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
-from vipetsc import figures
+import vipetsc
 from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing, draw_each
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import FolderError, provenance
-from vipetsc.paper.figures import PaperFigure, words
-from vipetsc.paper.plan import Plan
-from vipetsc.paper.report import Picture, Report, Shown, write_report
-from vipetsc.paper.steps import DONE, MISSING, STALE, newest
+from vipetsc.io.folder import PAPER, claim_folder, provenance
+from vipetsc.paper.pictures import PaperFigure
+from vipetsc.paper.plan import TRANSFER, Plan
+from vipetsc.paper.report import FigureEntry, Report, write_report
+from vipetsc.paper.steps import BRANCHES, DONE, STALE, fingerprint
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
+from vipetsc.studies.backbone import is_related, relate_folders
 
 FORMATS = ("png", "pdf")
-CODE = Path(figures.__file__).parent
-PAPER = Path(__file__).parent
-STAMP = "plan.json"  # which grid a folder holds
+MADE = "made.json"
 Tell = Callable[[str], None]
+Record = dict[str, Any]
+"""Of ``made.json``: hashes of inputs of "claims" and "report", of "figures" by id with the stems of their pictures."""
 
 
 @dataclass(frozen=True)
@@ -72,145 +76,149 @@ def make_paper(
     FolderError
         If ``root`` holds the paper on another grid, or something else, or for an unknown id.
     CaseError
-        If a case file is not sound.
+        If a case file cannot be used.
     """
     root, stop, part = Path(root), stop or StopRequest(), plan.only(only)
     on_root(comm, lambda: _claim(plan, root))
-    made, stopped = [], False
-    for step in part.steps:
-        state = on_root(comm, lambda step=step: step.state(root))
-        stopped = comm.allreduce(stop.requested, MPI.LOR)
-        if stopped:
+    made, drawn = _make_steps(part, root, comm, stop, tell), ()
+    if not comm.allreduce(stop.requested, MPI.LOR):
+        on_root(comm, lambda: _relate(plan, root))
+        drawn = draw_paper(part, root, comm, stop, tell)
+    if comm.allreduce(stop.requested, MPI.LOR):
+        return PaperResult(made, drawn, (), False, True, root)
+    claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
+    complete = on_root(comm, lambda: all(s.state(root) == DONE and s.without_failure(root) for s in part.steps))
+    return PaperResult(made, drawn, claims, complete, False, root)
+
+
+def _claim(plan: Plan, root: Path) -> None:
+    """Make ``root`` the folder of this plan; a case that cannot be used raises before anything is written."""
+    for step in plan.steps:
+        _ = step.text
+
+    def difference(text: str) -> str | None:
+        grid = json.loads(text)["grid"]
+        other = f"holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
+        return other if grid != plan.grid else None
+
+    claim_folder(root, PAPER, json.dumps({"grid": plan.grid}) + "\n", resume=None, difference=difference)
+
+
+def _make_steps(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> tuple[str, ...]:
+    """Make the steps that are not done, until a request to stop; returns their names."""
+    made = []
+    for step in plan.steps:
+        state, left = on_root(comm, lambda step=step: (step.state(root), step.left(root)))  # type: ignore[misc]
+        if comm.allreduce(stop.requested, MPI.LOR):
             break
         if state != DONE:
-            on_root(comm, lambda step=step: tell(f"{step.name}: about {duration(step.left(root) / comm.size)}"))
-            step.make(step.folder(root), comm, stop, state == STALE)
+            if comm.rank == 0:
+                tell(f"{step.name}: about {duration(left / comm.size)}")
+            step.make(root, comm, stop, state == STALE)
             made.append(step.name)
-    if stopped or comm.allreduce(stop.requested, MPI.LOR):
-        return PaperResult(tuple(made), (), (), False, True, root)
-    if plan.relation:
-        plan.relation.make(root, comm)
-    drawn = draw_paper(part, root, comm, stop, tell)
-    if comm.allreduce(stop.requested, MPI.LOR):
-        return PaperResult(tuple(made), drawn, (), False, True, root)
-    claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
-    complete = on_root(comm, lambda: all(s.state(root) == DONE and s.sound(root) for s in part.steps))
-    return PaperResult(tuple(made), drawn, claims, complete, False, root)
+    return tuple(made)
+
+
+def _relate(plan: Plan, root: Path) -> None:
+    """Lay the transfer of the four-band lattice over the branches, as far as they are done (``backbone.h5``)."""
+    folders = plan.folders(root)
+    branches = [folders[s.name] for s in plan.steps if s.kind is BRANCHES and s.name in folders]
+    if TRANSFER in folders and branches and not is_related(folders[TRANSFER], branches):
+        relate_folders([folders[TRANSFER], *branches])
 
 
 def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> tuple[Path, ...]:
-    """Draw the figures that are missing or older than what they show; returns the files written, on all ranks.
+    """Draw the figures that are missing or stale; returns the files written, on all ranks.
 
     The ranks draw pictures from one count, so that they end together whatever a picture costs; none is begun after
     a request to stop.
     """
-    folders = on_root(comm, lambda: plan.folders(root))
-    since = on_root(comm, lambda: {plate.id: shown_since(plan, plate, root) for plate in plan.plates})
     target = root / "figures"
-    on_root(comm, lambda: target.mkdir(exist_ok=True))
-    on_root(comm, lambda: tell("figures"))
-    offered: dict[str, list[str]] = {}
-
-    def keep(path: Path) -> bool:
-        return path.exists() and path.stat().st_mtime_ns >= since[path.name.partition("-")[0]]
-
+    folders = on_root(comm, lambda: plan.folders(root))
+    record = on_root(comm, lambda: _drop_stale(plan, root))
+    if comm.rank == 0:
+        target.mkdir(exist_ok=True)
+        tell("figures")
+    comm.Barrier()
     counter = SharedCounter(comm)
 
     def turns() -> Iterator[int]:
         while not stop.requested:
             yield counter.draw()
 
+    stems: dict[str, list[str]] = {figure.id: [] for figure in plan.figures}
     with style.rc_style():
-        drawings = _noted(plan.plates, folders, offered)
-        own = draw_each(drawings, target, FORMATS, turns(), plan.note, keep)
-    drawn = sorted(path for paths in comm.allgather(own) for path in paths)
+        drawings = _listed(plan.figures, folders, stems)
+        mine = draw_each(drawings, target, FORMATS, turns(), plan.note, keep=Path.exists)
+    drawn = sorted(path for paths in comm.allgather(mine) for path in paths)
     counter.free()
-    on_root(comm, lambda: _note_pictures(target, offered))
+    for figure, pictures in stems.items():
+        record["figures"][figure]["pictures"] = pictures
+    on_root(comm, lambda: _write_record(root, record))
     return tuple(drawn)
 
 
-def _noted(plates: Sequence[PaperFigure], folders: Any, offered: dict[str, list[str]]) -> Iterator[Drawing]:
-    """All pictures of ``plates``; ``offered`` gets their stems by plate."""
-    for plate in plates:
-        offered[plate.id] = []
-        for stem, make in plate.offers(folders):
-            offered[plate.id].append(stem)
+def _listed(figures: Sequence[PaperFigure], folders: Mapping[str, Path], stems: dict[str, list[str]]) -> Iterator[Drawing]:
+    """All pictures of ``figures``; their stems are added to ``stems``."""
+    for figure in figures:
+        for stem, make in figure.offers(folders):
+            stems[figure.id].append(stem)
             yield stem, make
 
 
-def shown_since(plan: Plan, plate: PaperFigure, root: Path) -> int:
-    """When what ``plate`` shows last changed, in ns: its data, or the code that draws it."""
-    return max(*_written(CODE, "*.py"), newest((step for step in plan.steps if step.name in plate.steps), root))
+def inputs_of(plan: Plan, root: Path) -> dict[str, str]:
+    """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
+    steps = {step.name: step.identity(root) for step in plan.steps if step.state(root) == DONE}
+    version = vipetsc.__version__, plan.note
+    inputs = {f.id: fingerprint(*version, *(n + steps[n] for n in f.steps if n in steps)) for f in plan.figures}
+    return inputs | {"claims": fingerprint(*version, *(name + identity for name, identity in steps.items()))}
 
 
-def _note_pictures(target: Path, offered: dict[str, list[str]]) -> None:
-    """Keep which pictures belong to which figure, and drop those that no data of this plan offer any more."""
-    index = target / "index.json"
-    known = json.loads(index.read_text(encoding="utf-8")) if index.exists() else {}
-    for plate, stems in offered.items():
-        for stem in set(known.get(plate, [])) - set(stems):
-            for kind in FORMATS:
-                (target / f"{stem}.{kind}").unlink(missing_ok=True)
-    text = json.dumps(known | offered, indent=1) + "\n"
-    if not index.exists() or index.read_text(encoding="utf-8") != text:
-        write_text(index, text)
+def _drop_stale(plan: Plan, root: Path) -> Record:
+    """Remove pictures of other inputs than those of now, so that every picture that is there is up to date."""
+    record, inputs = read_record(root), inputs_of(plan, root)
+    for figure in plan.figures:
+        if record["figures"].get(figure.id, {}).get("inputs") != inputs[figure.id]:
+            for path in (root / "figures").glob(f"{figure.id}-*"):
+                path.unlink()
+            record["figures"][figure.id] = {"inputs": inputs[figure.id], "pictures": []}
+    _write_record(root, record)
+    return record
 
 
-def pictures(root: Path) -> dict[str, list[str]]:
-    """The stems of the pictures that belong into ``root``, by figure; empty before any was drawn."""
-    index = root / "figures" / "index.json"
-    return json.loads(index.read_text(encoding="utf-8")) if index.exists() else {}
+def read_record(root: Path) -> Record:
+    """``made.json``, or an empty record."""
+    path = root / MADE
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"figures": {}}
+
+
+def _write_record(root: Path, record: Record) -> None:
+    if record != read_record(root):
+        write_text(root / MADE, json.dumps(record, indent=1) + "\n")
 
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[str, Any], ...]:
-    """``claims.json`` and ``report.html`` as far as something is newer; returns the claims."""
-    module = importlib.import_module(plan.claims)
+    """``claims.json`` and ``report.html`` as far as their inputs changed; returns the claims."""
+    record, inputs = read_record(root), inputs_of(plan, root)["claims"]
     path, report = root / "claims.json", root / "report.html"
-    if _older(path, [newest(plan.steps, root), *_written(Path(module.__file__).parent, "*.py")]):
+    if not path.exists() or record.get("claims") != inputs:
         tell("claims")
+        module = importlib.import_module(plan.claims)
         module.write_claims(module.measure_claims(root), path)
-    claims = json.loads(path.read_text(encoding="utf-8"))
-    if _older(report, _written(root, "claims.json", "figures/*.png") + _written(PAPER, "report.*", "figures.py")):
+        record["claims"] = inputs
+    text = path.read_text(encoding="utf-8")
+    versions = {key: value for key, value in provenance(comm).items() if key.endswith("_version")}
+    inputs = fingerprint(text, json.dumps([inputs, record["figures"], versions]))
+    if not report.exists() or record.get("report") != inputs:
         tell("report")
-        drawn = pictures(root)
-        shown = []
-        for plate in plan.plates:
-            paths = [root / "figures" / f"{stem}.png" for stem in drawn.get(plate.id, [])]
-            shown.append(Shown(plate, [Picture(path, words(path.stem)) for path in paths if path.exists()]))
-        statistics = {s.name: s.statistics(root) for s in plan.steps if s.state(root) == DONE}
-        write_report(Report(plan.note, claims, shown, statistics, provenance(comm)), report)
-    return tuple(claims)
-
-
-def _written(folder: Path, *patterns: str) -> list[int]:
-    return [path.stat().st_mtime_ns for pattern in patterns for path in folder.glob(pattern)]
-
-
-def _older(path: Path, times: list[int]) -> bool:
-    """Whether ``path`` is missing, or older than any of ``times`` in ns."""
-    return not path.exists() or path.stat().st_mtime_ns < max(times, default=0)
-
-
-def _claim(plan: Plan, root: Path) -> None:
-    """Make ``root`` the folder of this plan."""
-    for step in plan.steps:
-        _ = step.text  # an unsound case is said before anything is written
-    if root.exists() and not root.is_dir():
-        raise FolderError(f"{root}: is a file, not a folder; choose another --out")
-    stamp = root / STAMP
-    if stamp.exists():
-        grid = "?"
-        with suppress(ValueError, KeyError):
-            grid = json.loads(stamp.read_text(encoding="utf-8"))["grid"]
-        if grid != plan.grid:
-            raise FolderError(
-                f"{root}: holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
-            )
-    elif root.is_dir() and any(root.iterdir()) and all(s.state(root) in (MISSING, STALE) for s in plan.steps):
-        raise FolderError(f"{root}: holds other files; choose another --out")
-    root.mkdir(parents=True, exist_ok=True)
-    if not stamp.exists():
-        write_text(stamp, json.dumps({"grid": plan.grid}) + "\n")
+        stems = {key: entry["pictures"] for key, entry in record["figures"].items()}
+        paths = {f: [root / "figures" / f"{stem}.png" for stem in stems.get(f.id, ())] for f in plan.figures}
+        entries = [FigureEntry(figure, [path for path in paths[figure] if path.exists()]) for figure in plan.figures]
+        statistics = {step.name: step.statistics(root) for step in plan.steps if step.state(root) == DONE}
+        write_report(Report(plan.note, json.loads(text), entries, statistics, versions), report)
+        record["report"] = inputs
+    _write_record(root, record)
+    return tuple(json.loads(text))
 
 
 def duration(seconds: float) -> str:

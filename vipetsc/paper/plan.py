@@ -4,35 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 
 from vipetsc.io.folder import FolderError
-from vipetsc.paper.figures import PAPER_FIGURES, PaperFigure
-from vipetsc.paper.steps import BranchStep, DesignStep, Relation, Step, SweepStep
+from vipetsc.paper.figures import PAPER_FIGURES, RELATED, TRANSFER
+from vipetsc.paper.pictures import PaperFigure
+from vipetsc.paper.steps import BRANCHES, DONE, SEARCH, SWEEP, Step, StepKind
 
 FULL, QUICK = "full", "quick"
 CLAIMS = tuple(f"C{number}" for number in range(1, 18))
 COARSE = "quick: coarse grid"
 
-# What a claim is measured from besides the figures that show it.
-BESIDE = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear")}
+# Steps that a claim is measured from besides those of the figures that show it.
+FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
 
-BRANCHES = ("nnm-hertz", "nnm-bilinear", "nnm-hertz-calibrated", "nnm-bilinear-calibrated")
 OUT_OF_PHASE = "nnm.modes=[2]"
 
-# CPU time in s: of a member of a sweep, else of the whole step.
-COSTS = {
-    "scattering-amplitudes": 4.0,
-    "interband-amplitudes": 5.0,
-    "interband-one-site": 4.0,
-    "design": 15.0,
-    "nnm-hertz": 45.0,
-    "nnm-bilinear": 45.0,
-    "nnm-hertz-calibrated": 20.0,
-    "nnm-bilinear-calibrated": 20.0,
-    "interband": 1.2,
-    "scattering-neighbours": 0.4,
-    "scattering": 0.4,
+# Kind of each step and its CPU time in s: of a member of a sweep, else of the whole step. The cheap ones come first,
+# so that most figures are there early.
+STEPS: dict[str, tuple[StepKind, float]] = {
+    "scattering-amplitudes": (SWEEP, 4.0),
+    "interband-amplitudes": (SWEEP, 5.0),
+    "interband-one-site": (SWEEP, 4.0),
+    "design": (SEARCH, 15.0),
+    "nnm-hertz": (BRANCHES, 45.0),
+    "nnm-bilinear": (BRANCHES, 45.0),
+    "nnm-hertz-calibrated": (BRANCHES, 20.0),
+    "nnm-bilinear-calibrated": (BRANCHES, 20.0),
+    TRANSFER: (SWEEP, 1.2),
+    "scattering-neighbours": (SWEEP, 0.4),
+    "scattering": (SWEEP, 0.4),
 }
 
 RUNS = ("output.figures=false",)  # of all sweeps: the figures of the paper are drawn from all of them together
@@ -56,7 +58,7 @@ COARSER = {
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps in the order in which they are made, the relation drawn between some, and the figures of the paper.
+    """Steps in the order in which they are made, and the figures of the paper.
 
     ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``claims`` names the module that measures
     (``measure_claims``, ``write_claims``).
@@ -64,8 +66,7 @@ class Plan:
 
     grid: str
     steps: tuple[Step, ...]
-    relation: Relation | None = None
-    plates: Sequence[PaperFigure] = PAPER_FIGURES
+    figures: Sequence[PaperFigure] = PAPER_FIGURES
     note: str = ""
     claims: str = "vipetsc.paper.claims"
 
@@ -80,56 +81,46 @@ class Plan:
         ids = list(ids)
         if not ids:
             return self
-        known = {plate.id.lower(): plate for plate in self.plates}
-        unknown = [i for i in ids if i.lower() not in known and i.upper() not in CLAIMS]
+        names = {figure.id.lower() for figure in self.figures}
+        unknown = [i for i in ids if i.lower() not in names and i.upper() not in CLAIMS]
         if unknown:
             raise FolderError(
-                f"--only {' '.join(unknown)}: figures are {', '.join(p.id for p in self.plates)}; "
+                f"--only {' '.join(unknown)}: figures are {', '.join(f.id for f in self.figures)}; "
                 f"claims are {CLAIMS[0]} to {CLAIMS[-1]}"
             )
-        claims = {i.upper() for i in ids}
-        plates = [p for p in self.plates if p.id.lower() in {i.lower() for i in ids} or claims & set(p.claims)]
-        needed = {step for plate in plates for step in plate.steps}
-        needed |= {step for claim in claims for step in BESIDE.get(claim, ())}
-        if self.relation and any(p.id in ("fig12", "figS7", "figS8") for p in plates):
-            needed |= {step.name for step in self.relation.branches}
-        return replace(self, steps=tuple(s for s in self.steps if s.name in needed), plates=plates)
+        claims, wanted = {i.upper() for i in ids}, {i.lower() for i in ids}
+        figures = [f for f in self.figures if f.id.lower() in wanted or claims & set(f.claims)]
+        needed = {step for figure in figures for step in figure.needs}
+        needed |= {step for claim in claims for step in FURTHER_STEPS.get(claim, ())}
+        return replace(self, steps=tuple(s for s in self.steps if s.name in needed), figures=figures)
 
     def folders(self, root: Path) -> Mapping[str, Path]:
         """The folders of the steps that are done, by name."""
-        return {step.name: step.folder(root) for step in self.steps if step.state(root) == "done"}
+        return {step.name: step.folder(root) for step in self.steps if step.state(root) == DONE}
 
     def claims_of(self, step: Step) -> list[str]:
         """The claims that rest on a step."""
-        resting = {c for plate in self.plates if step.name in plate.steps for c in plate.claims}
-        resting |= {claim for claim, steps in BESIDE.items() if step.name in steps}
-        if self.relation and step in self.relation.branches:
-            resting.add("C16")
-        return sorted(resting, key=lambda claim: int(claim[1:]))
+        claims = {claim for figure in self.figures if step.name in figure.steps for claim in figure.claims}
+        claims |= {claim for claim, steps in FURTHER_STEPS.items() if step.name in steps}
+        return sorted(claims, key=CLAIMS.index)
 
 
-def paper_plan(grid: str = FULL, cases: Path | None = None) -> Plan:
-    """The whole paper, from the case files in ``cases`` (those of the package by default).
+def paper_plan(grid: str = FULL) -> Plan:
+    """The whole paper, from the case files of the package.
 
-    The cheap steps come first, so that most figures are there early. The quick grid has fewer amplitudes,
-    wavenumbers and sites and leaves out the in-phase branches; both laws and both readings stay.
-
-    Raises
-    ------
-    FolderError
-        If the case files are not there.
+    The quick grid has fewer amplitudes, wavenumbers and sites and leaves out the in-phase branches; both laws and both
+    readings stay.
     """
-    cases = cases or Path(__file__).parent / "cases"
-    if not (cases / "scattering.toml").exists():
-        raise FolderError(f"{cases}: holds no scattering.toml; the case files of the paper are needed")
-    steps: list[Step] = []
-    for name, cost in COSTS.items():
-        kind = DesignStep if name == "design" else BranchStep if name in BRANCHES else SweepStep
-        file = cases / f"{name.removesuffix('-calibrated')}.toml"
-        changes = ("lattice.reading=calibrated", OUT_OF_PHASE) if name.endswith("-calibrated") else ()
+    steps = []
+    for name, (kind, cost) in STEPS.items():
+        changes = RUNS if kind is SWEEP else ()
+        if name.endswith("-calibrated"):
+            changes += ("lattice.reading=calibrated", OUT_OF_PHASE)
         changes += COARSER.get(name, ()) if grid == QUICK else ()
-        changes = (*RUNS, *changes) if kind is SweepStep else changes
-        steps.append(kind(name, file, changes, cost))
-    found = {step.name: step for step in steps}
-    relation = Relation(found["interband"], tuple(found[name] for name in BRANCHES))
-    return Plan(grid, tuple(steps), relation, note=COARSE if grid == QUICK else "")
+        steps.append(Step(name, kind, case_file(name), changes, cost))
+    return Plan(grid, tuple(steps), note=COARSE if grid == QUICK else "")
+
+
+def case_file(step: str) -> Path:
+    """The case file of a step, shipped with the package; that of the printed reading serves both."""
+    return Path(str(files("vipetsc.paper") / "cases" / f"{step.removesuffix('-calibrated')}.toml"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,42 +14,20 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from vipetsc.io.atomic import write_text
-from vipetsc.paper.figures import READINGS, PaperFigure
+from vipetsc.paper.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED
+from vipetsc.paper.pictures import READINGS, PaperFigure, describe
 
 WIDEST = 1500  # pixels of a picture in the page
 COLOURS = 200
-VERDICTS = "holds", "holds in part", "does not hold", "not measured"
+VERDICTS = HOLDS, IN_PART, FAILS, UNMEASURED
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture of a figure: its PNG, and what tells it from the others in words."""
+class FigureEntry:
+    """A figure of the paper and its pictures (PNG) that were drawn."""
 
-    path: Path
-    words: str
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels as shown in the page."""
-        with Image.open(self.path) as image:
-            return _shown(image.size)
-
-    @property
-    def data(self) -> str:
-        """The picture as a data URI, no larger than a screen needs."""
-        with Image.open(self.path) as image:
-            small = image.convert("RGB").resize(_shown(image.size), Image.LANCZOS)
-        out = io.BytesIO()
-        small.quantize(COLOURS, dither=Image.Dither.NONE).save(out, "png", optimize=True)
-        return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A figure of the paper and the pictures of it that were drawn."""
-
-    plate: PaperFigure
-    pictures: Sequence[Picture]
+    figure: PaperFigure
+    pictures: Sequence[Path]
 
 
 @dataclass(frozen=True)
@@ -57,13 +36,13 @@ class Report:
 
     note: str
     claims: Sequence[Mapping[str, Any]]
-    figures: Sequence[Shown]
+    figures: Sequence[FigureEntry]
     statistics: Mapping[str, Mapping[str, Any]]
     versions: Mapping[str, Any]
 
 
-def write_report(report: Report, path: Path) -> Path:
-    """Write the page to ``path``, whole or not at all; returns it."""
+def write_report(report: Report, path: Path) -> None:
+    """Write the page to ``path``, whole or not at all."""
     environment = Environment(
         loader=PackageLoader("vipetsc.paper", "."),
         autoescape=True,
@@ -71,50 +50,45 @@ def write_report(report: Report, path: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"numbers": numbers, "sources": sources}
-    rows = {}
+    environment.filters |= {"numbers": numbers, "sources": sources, "picture": picture, "describe": describe}
+    rows: dict[str, dict[str, Mapping[str, Any]]] = {}
     for claim in report.claims:
         rows.setdefault(claim["id"], {})[claim["reading"]] = claim
     readings = [r for r in READINGS if any(r in row for row in rows.values())]
-    counts = {r: _counted([row[r]["verdict"] for row in rows.values() if r in row]) for r in readings}
-    figure_of = {claim: shown.plate for shown in reversed(report.figures) for claim in shown.plate.claims}
-    sweeps = {name: found for name, found in report.statistics.items() if "members" in found}
-    branches = {name: found for name, found in report.statistics.items() if "points" in found}
+    verdicts = {r: Counter(row[r]["verdict"] for row in rows.values() if r in row) for r in readings}
     page = environment.get_template("report.html").render(
         report=report,
         rows=rows,
         readings=readings,
-        counts=counts,
-        figure_of=figure_of,
-        sweeps=sweeps,
-        branches=branches,
+        counts={r: [(v, verdicts[r][v]) for v in VERDICTS if verdicts[r][v]] for r in readings},
+        figure_of={claim: entry.figure for entry in reversed(report.figures) for claim in entry.figure.claims},
+        sweeps={name: numbers for name, numbers in report.statistics.items() if "members" in numbers},
+        branches={name: numbers for name, numbers in report.statistics.items() if "points" in numbers},
     )
     write_text(path, page)
-    return path
 
 
-def numbers(found: Any) -> list[str]:
+def picture(path: Path) -> tuple[int, int, str]:
+    """Width and height in pixels as shown in the page, and the picture as a data URI, no larger than needed."""
+    with Image.open(path) as image:
+        width = min(image.width, WIDEST)
+        small = image.convert("RGB").resize((width, round(image.height * width / image.width)), Image.LANCZOS)
+    out = io.BytesIO()
+    small.quantize(COLOURS, dither=Image.Dither.NONE).save(out, "png", optimize=True)
+    return *small.size, "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
+
+
+def numbers(value: Any) -> list[str]:
     """Named numbers, or one of them, as short texts; those that could not be had are left out."""
-    named = found if isinstance(found, Mapping) else {"": found}
-    return [f"{name} = {_text(value)}" if name else _text(value) for name, value in named.items() if value is not None]
+    named = value if isinstance(value, Mapping) else {"": value}
+    return [f"{name} = {_text(v)}" if name else _text(v) for name, v in named.items() if v is not None]
 
 
 def sources(files: Sequence[str]) -> str:
     """The steps that ``files`` belong to, with how many of each."""
-    steps = [name.partition("/")[0] for name in files]
-    counts = {step: steps.count(step) for step in dict.fromkeys(steps)}
+    counts = Counter(name.partition("/")[0] for name in files)
     return ", ".join(step if n == 1 else f"{step} ({n} files)" for step, n in counts.items())
 
 
 def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
-
-
-def _counted(verdicts: Sequence[str]) -> list[tuple[str, int]]:
-    order = sorted(set(verdicts), key=lambda v: (VERDICTS.index(v) if v in VERDICTS else len(VERDICTS), v))
-    return [(verdict, verdicts.count(verdict)) for verdict in order]
-
-
-def _shown(size: tuple[int, int]) -> tuple[int, int]:
-    width = min(size[0], WIDEST)
-    return width, round(size[1] * width / size[0])

@@ -2,36 +2,49 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tomllib
-from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
 import h5py
 import numpy as np
 
-from vipetsc.case import Sweep
-from vipetsc.case.design import DesignCase
-from vipetsc.case.nnm import NnmCase
-from vipetsc.io.ensemble_file import EnsembleFile
+from vipetsc.case import CaseFile, DesignCase, NnmCase, Sweep
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.read import open_ensemble
 from vipetsc.modes.follow import follow_all, prepare_folder
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest, on_root
-from vipetsc.studies.backbone import relate_folders
 from vipetsc.studies.design import search_design
 from vipetsc.studies.sweep import run_sweep
 
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
+RELATION = "backbone.h5"  # beside a sweep that is laid over branches
+
+
+class StepKind(NamedTuple):
+    """What differs between steps.
+
+    ``files`` (case) are the names of the results; ``make`` (case, folder, comm, stop, afresh) makes what is missing on
+    all ranks, everything if ``afresh``, and may leave early on ``stop``; ``statistics`` (paths of the results) gives
+    numbers for a report.
+    """
+
+    case: type[CaseFile]
+    files: Callable[[Any], Sequence[str]]
+    make: Callable[[Any, Path, MPI.Comm, StopRequest, bool], object]
+    statistics: Callable[[Sequence[Path]], dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class Step(ABC):
+class Step:
     """One case made in ``root/<name>``.
 
     ``file`` is the case file, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time in s
@@ -39,6 +52,7 @@ class Step(ABC):
     """
 
     name: str
+    kind: StepKind
     file: Path
     changes: tuple[str, ...] = ()
     cost: float = 1.0
@@ -51,215 +65,128 @@ class Step(ABC):
         """The same step with further changes to its case."""
         return replace(self, changes=(*self.changes, *changes))
 
-    @property
-    @abstractmethod
+    @cached_property
+    def case(self) -> Any:
+        """The resolved case; raises CaseError."""
+        return self.kind.case.load(self.file, self.changes)
+
+    @cached_property
     def text(self) -> str:
-        """The resolved case as TOML; raises CaseError or OSError."""
+        """The resolved case as TOML; raises CaseError."""
+        return self.case.to_toml()
 
-    @abstractmethod
-    def complete(self, folder: Path) -> bool:
-        """Whether all results of this case are in ``folder``."""
-
-    @abstractmethod
-    def results(self, folder: Path) -> list[Path]:
-        """The files in ``folder`` that pictures and claims are made from."""
-
-    @abstractmethod
-    def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-        """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``."""
+    def results(self, root: Path) -> list[Path]:
+        """The files that pictures and claims are made from."""
+        return [self.folder(root) / name for name in self.kind.files(self.case)]
 
     def state(self, root: Path) -> str:
         """DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
-        folder = self.folder(root)
-        if not (folder / "case.toml").exists():
+        marker = self.folder(root) / "case.toml"
+        if not marker.exists():
             return MISSING
-        if not self._is_own((folder / "case.toml").read_text(encoding="utf-8")):
+        if not self._is_same_case(marker.read_text(encoding="utf-8")):
             return STALE
-        return DONE if self.complete(folder) else BEGUN
+        return DONE if all(map(self._is_complete, self.results(root))) else BEGUN
 
-    def _is_own(self, text: str) -> bool:
+    def _is_complete(self, path: Path) -> bool:
+        """Whether a result is of this case; a branch has ended, by itself or in a failure that it names."""
+        if not path.exists():
+            return False
+        with h5py.File(path) as file:
+            if "ending" in file.attrs:
+                return bool(file.attrs["complete"]) or str(file.attrs["ending"]).startswith("failed")
+            return self._is_same_case(file.attrs["case"])
+
+    def _is_same_case(self, text: str) -> bool:
         """Whether a case in TOML is this step's, in whatever order its keys stand."""
         return tomllib.loads(text) == tomllib.loads(self.text)
 
-    def left(self, root: Path) -> float:
-        """CPU time in s that is still needed."""
-        return 0.0 if self.state(root) == DONE else self.cost
+    def make(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
+        """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``."""
+        self.kind.make(self.case, self.folder(root), comm, stop, afresh)
 
-    def changed_at(self, root: Path) -> int:
-        """When the results were last written, in ns; 0 without any."""
-        return max((p.stat().st_mtime_ns for p in self.results(self.folder(root)) if p.exists()), default=0)
-
-    def statistics(self, root: Path) -> dict[str, Any]:
-        """Numbers about the results for a report; empty where there are none to tell."""
-        return {}
-
-    def sound(self, root: Path) -> bool:
-        """Whether nothing of the step failed, once it is done."""
-        found = self.statistics(root)
-        return not found.get("failed") and not any("failed" in ending for ending in found.get("endings", ()))
-
-
-class SweepStep(Step):
-    """A sweep; its members are kept when it is stopped."""
-
-    @cached_property
-    def plan(self) -> Sweep:
-        """The sweep of the case file."""
-        return Sweep.load(self.file, self.changes)
-
-    @property
-    def text(self) -> str:
-        """See ``Step``."""
-        return self.plan.to_toml()
-
-    def complete(self, folder: Path) -> bool:
-        """See ``Step``."""
-        if not (folder / "ensemble.h5").exists():
-            return False
-        with h5py.File(folder / "ensemble.h5") as file:
-            return self._is_own(file.attrs["case"])
-
-    def results(self, folder: Path) -> list[Path]:
-        """See ``Step``."""
-        return [folder / "ensemble.h5", folder / "backbone.h5"]
-
-    def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-        """See ``Step``."""
-        run_sweep(self.plan, folder, comm, force=afresh, stop=stop, progress=True)
+    def identity(self, root: Path) -> str:
+        """Hash of the case and of what the results hold."""
+        paths = [*self.results(root), self.folder(root) / RELATION]
+        return fingerprint(self.text, *(path.read_bytes() for path in paths if path.exists()))
 
     def left(self, root: Path) -> float:
-        """CPU time of the members not made, at the mean of those that were, or at ``cost`` if that is more."""
-        state, folder = self.state(root), self.folder(root)
+        """CPU time in s that is still needed; of a sweep, for the members not made, at the mean of those that were."""
+        state = self.state(root)
         if state == DONE:
             return 0.0
-        made = _cpu_times(folder) if state == BEGUN else []
-        rate = max(float(np.mean(made)), self.cost) if made else self.cost  # measuring a run takes time as well
-        return rate * max(int(np.prod(self.plan.shape)) - len(made), 0)
+        if self.kind is not SWEEP:
+            return self.cost
+        times = _cpu_times(self.folder(root)) if state == BEGUN else []
+        rate = max(float(np.mean(times)), self.cost) if times else self.cost  # measuring a run takes time as well
+        return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
 
     def statistics(self, root: Path) -> dict[str, Any]:
-        """Members and how they ended, contact episodes, the largest error of the ledger, CPU time in s."""
-        with EnsembleFile(self.folder(root)) as ensemble:
-            status, episodes = ensemble.values("status"), ensemble.values("contact_episodes")
-            ledger = ensemble.values("ledger_error")
-        return {
-            "members": int(status.size),
-            "simulated": int((status == 0).sum()),
-            "scaled": int((status == 1).sum()),
-            "failed": int((status == 2).sum()),
-            "episodes": int(np.nansum(episodes)),
-            "ledger": float(np.nanmax(ledger, initial=0.0)),
-            "cpu": float(sum(_cpu_times(self.folder(root)))),
-        }
+        """Numbers about the results for a report, once they are there; empty where there are none to tell."""
+        return self.kind.statistics(self.results(root))
+
+    def without_failure(self, root: Path) -> bool:
+        """Whether no member and no branch of the step failed, once it is done."""
+        statistics = self.statistics(root)
+        return not statistics.get("failed") and not any("failed" in e for e in statistics.get("endings", ()))
 
 
-class BranchStep(Step):
-    """Frequency-energy branches; a branch that was cut off goes on."""
-
-    @cached_property
-    def case(self) -> NnmCase:
-        """The case of the branches."""
-        return NnmCase.load(self.file, self.changes)
-
-    @property
-    def text(self) -> str:
-        """See ``Step``."""
-        return self.case.to_toml()
-
-    def results(self, folder: Path) -> list[Path]:
-        """See ``Step``."""
-        system = System.from_case(self.case)
-        return [folder / f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
-
-    def complete(self, folder: Path) -> bool:
-        """Whether every branch ended, by itself or in a failure that it names."""
-        return all(path.exists() and _ended(path) for path in self.results(folder))
-
-    def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-        """See ``Step``."""
-        resume = not afresh and on_root(comm, (folder / "case.toml").exists)
-        on_root(comm, lambda: prepare_folder(self.case, folder, afresh, resume))
-        follow_all(self.case, folder, comm, resume)
-
-    def statistics(self, root: Path) -> dict[str, Any]:
-        """Points, largest residual and endings of the branches."""
-        points, residual, endings = 0, 0.0, []
-        for path in self.results(self.folder(root)):
-            with h5py.File(path) as file:
-                regular = file["kind"][...] == 0
-                points += int(regular.sum())
-                residual = max(residual, float(file["residual"][...][regular].max(initial=0.0)))
-                endings.append(f"{file.attrs['name']}: {file.attrs['ending']}")
-        return {"points": points, "residual": residual, "endings": endings}
+def fingerprint(*parts: str | bytes) -> str:
+    """One hash of all ``parts``, in this order."""
+    digests = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
+    return hashlib.sha256(" ".join(digests).encode()).hexdigest()
 
 
-class DesignStep(Step):
-    """The (lambda, eta) search, on one rank."""
-
-    @cached_property
-    def case(self) -> DesignCase:
-        """The case of the search."""
-        return DesignCase.load(self.file, self.changes)
-
-    @property
-    def text(self) -> str:
-        """See ``Step``."""
-        return self.case.to_toml()
-
-    def results(self, folder: Path) -> list[Path]:
-        """See ``Step``."""
-        return [folder / "design.h5"]
-
-    def complete(self, folder: Path) -> bool:
-        """See ``Step``."""
-        if not (folder / "design.h5").exists():
-            return False
-        with h5py.File(folder / "design.h5") as file:
-            return self._is_own(file.attrs["case"])
-
-    def make(self, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-        """See ``Step``."""
-        begun = on_root(comm, (folder / "case.toml").exists)
-        on_root(comm, lambda: search_design(self.case, folder, afresh or begun))
+def _make_sweep(case: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
+    run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True)
 
 
-@dataclass(frozen=True)
-class Relation:
-    """A sweep laid over branches: ``backbone.h5`` beside the sweep, made again when one of them is newer."""
+def _make_branches(case: NnmCase, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
+    resume = not afresh and on_root(comm, (folder / "case.toml").exists)
+    on_root(comm, lambda: prepare_folder(case, folder, afresh, resume))
+    follow_all(case, folder, comm, resume)
 
-    sweep: Step
-    branches: tuple[Step, ...]
 
-    def make(self, root: Path, comm: MPI.Comm) -> bool:
-        """Relate what there is, on rank 0; whether something was written."""
-        return on_root(comm, lambda: self._make(root))
+def _make_search(case: DesignCase, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
+    on_root(comm, lambda: search_design(case, folder, afresh or (folder / "case.toml").exists()))
 
-    def _make(self, root: Path) -> bool:
-        branches = [b for b in self.branches if b.state(root) == DONE]
-        if self.sweep.state(root) != DONE or not branches:
-            return False
-        path = self.sweep.folder(root) / "backbone.h5"
-        newest = max(step.changed_at(root) for step in (self.sweep, *branches))
-        if path.exists() and path.stat().st_mtime_ns >= newest:
-            return False
-        return bool(relate_folders([self.sweep.folder(root), *(b.folder(root) for b in branches)]))
+
+def _branch_files(case: NnmCase) -> list[str]:
+    system = System.from_case(case)
+    return [f"branch-{system.branch_name(mode - 1)}.h5" for mode in case.nnm.modes]
+
+
+def _sweep_statistics(paths: Sequence[Path]) -> dict[str, Any]:
+    """Members and how they ended, contact episodes, the largest error of the ledger, CPU time in s."""
+    ensemble = open_ensemble(paths[0].parent)
+    status = ensemble["status"].values
+    counts = {name: int((status == code).sum()) for code, name in enumerate(("simulated", "scaled", "failed"))}
+    return {"members": int(status.size)} | counts | {
+        "episodes": int(np.nansum(ensemble["contact_episodes"].values)),
+        "ledger": float(np.nanmax(ensemble["ledger_error"].values, initial=0.0)),
+        "cpu": float(sum(_cpu_times(paths[0].parent))),
+    }  # fmt: skip
+
+
+def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
+    """Points, largest residual and endings of the branches."""
+    points, residual, endings = 0, 0.0, []
+    for path in paths:
+        with open_netcdf(path, "branch", ("kind", "residual", "ending")) as branch:
+            regular = branch["residual"].values[branch["kind"].values == 0]
+            points += len(regular)
+            residual = max(residual, float(regular.max(initial=0.0)))
+            endings.append(f"{branch.attrs['name']}: {branch.attrs['ending']}")
+    return {"points": points, "residual": residual, "endings": endings}
 
 
 def _cpu_times(folder: Path) -> list[float]:
     """CPU times in s of the members in ``folder`` that are complete; 0 for scaled ones."""
-    found = []
-    for path in folder.glob("*/summary.json"):
-        about = json.loads(path.read_text(encoding="utf-8"))
-        statistics = about.get("statistics", {})
-        if about.get("complete"):
-            found.append(0.0 if "scaled_from" in statistics else float(statistics.get("cpu_seconds", 0.0)))
-    return found
+    summaries = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*/summary.json")]
+    statistics = [summary.get("statistics", {}) for summary in summaries if summary.get("complete")]
+    return [0.0 if "scaled_from" in s else float(s.get("cpu_seconds", 0.0)) for s in statistics]
 
 
-def _ended(path: Path) -> bool:
-    with h5py.File(path) as file:
-        return bool(file.attrs["complete"]) or str(file.attrs["ending"]).startswith("failed")
-
-
-def newest(steps: Iterable[Step], root: Path) -> int:
-    """When the results of any of ``steps`` were last written, in ns."""
-    return max((step.changed_at(root) for step in steps), default=0)
+SWEEP = StepKind(Sweep, lambda case: ("ensemble.h5",), _make_sweep, _sweep_statistics)
+BRANCHES = StepKind(NnmCase, _branch_files, _make_branches, _branch_statistics)
+SEARCH = StepKind(DesignCase, lambda case: ("design.h5",), _make_search, lambda paths: {})

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vipetsc.paper.make import FORMATS, duration, pictures, shown_since
+from vipetsc.paper.make import FORMATS, duration, inputs_of, read_record
 from vipetsc.paper.plan import Plan
 from vipetsc.paper.steps import DONE, MISSING, STALE
 
@@ -20,16 +20,16 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
         lines.append(f"{step.name:<26}{step.state(root):<10}{duration(left):>9}  {' '.join(plan.claims_of(step))}")
     lines += [f"{'all steps on ' + str(ranks) + (' ranks' if ranks > 1 else ' rank'):<36}{duration(total):>9}", ""]
     lines.append(f"{'figure':<8}{'paper':<9}{'pictures':<10}{'state':<9}claims      shows")
-    drawn = pictures(root)
-    for plate in plan.plates:
-        paths = [root / "figures" / f"{stem}.{kind}" for stem in drawn.get(plate.id, []) for kind in FORMATS]
-        since = shown_since(plan, plate, root)
-        there = [path for path in paths if path.exists()]
-        fresh = len(there) == len(paths) and all(path.stat().st_mtime_ns >= since for path in there)
-        state = MISSING if not there else DONE if fresh else STALE
+    record, inputs = read_record(root)["figures"], inputs_of(plan, root)
+    for figure in plan.figures:
+        entry = record.get(figure.id, {"inputs": "", "pictures": []})
+        paths = [root / "figures" / f"{stem}.{kind}" for stem in entry["pictures"] for kind in FORMATS]
+        drawn = [path for path in paths if path.exists()]
+        current = len(drawn) == len(paths) and entry["inputs"] == inputs[figure.id]
+        state = MISSING if not drawn else DONE if current else STALE
         lines.append(
-            f"{plate.id:<8}{plate.label:<9}{len(there) // len(FORMATS):<10}{state:<9}"
-            f"{' '.join(plate.claims):<12}{plate.title}"
+            f"{figure.id:<8}{figure.label:<9}{len(drawn) // len(FORMATS):<10}{state:<9}"
+            f"{' '.join(figure.claims):<12}{figure.title}"
         )
     return "\n".join(lines)
 
@@ -39,7 +39,7 @@ def claims_table(claims: Sequence[dict[str, Any]]) -> str:
     readings = list(dict.fromkeys(claim["reading"] for claim in claims))
     lines = [f"{'':<5}" + "".join(f"{reading:<18}" for reading in readings) + "claim"]
     for key in dict.fromkeys(claim["id"] for claim in claims):
-        own = {claim["reading"]: claim for claim in claims if claim["id"] == key}
-        verdicts = "".join(f"{own[r]['verdict'] if r in own else '':<18}" for r in readings)
-        lines.append(f"{key:<5}{verdicts}{next(iter(own.values()))['claim']}")
+        rows = {claim["reading"]: claim for claim in claims if claim["id"] == key}
+        verdicts = "".join(f"{rows[r]['verdict'] if r in rows else '':<18}" for r in readings)
+        lines.append(f"{key:<5}{verdicts}{next(iter(rows.values()))['claim']}")
     return "\n".join(lines)

@@ -1,0 +1,132 @@
+"""How the figures of the paper are drawn: those of the registry from the folders of steps, and schematics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+
+from vipetsc.case import Case
+from vipetsc.figures.drawing import Drawing
+from vipetsc.figures.registry import drawings
+from vipetsc.figures.schematics import lattice_page, reduced_model
+from vipetsc.lattice.presets import PRESETS
+
+READINGS = "calibrated", "printed"
+
+
+class Drawn(NamedTuple):
+    """Pictures of the registry's figure ``name`` from the folders of ``steps``, those that are there.
+
+    Of its pictures those are taken whose names hold all of ``only``; ``stem`` gives them their names, with ``{stem}``
+    for the registry's. ``behind`` are steps that the results of ``steps`` are made from.
+    """
+
+    source: str
+    name: str
+    steps: tuple[str, ...]
+    only: tuple[str, ...] = ()
+    stem: str = "{stem}"
+    behind: tuple[str, ...] = ()
+
+    def offers(self, folders: Mapping[str, Path]) -> Iterator[Drawing]:
+        """Stems and drawings that the ``folders`` (step -> folder) of finished steps allow."""
+        finished = [folders[step] for step in self.steps if step in folders]
+        for stem, make in drawings(self.source, finished, [self.name]) if finished else ():
+            if all(f"-{word}-" in f"{stem}-" for word in self.only):
+                yield self.stem.format(stem=stem), make
+
+
+class Schematic(NamedTuple):
+    """A drawing of ``function`` (reading) for every reading, from no files."""
+
+    name: str
+    function: Callable[[str], Figure]
+    steps: tuple[str, ...] = ()
+    behind: tuple[str, ...] = ()
+
+    def offers(self, folders: Mapping[str, Path]) -> Iterator[Drawing]:
+        """See ``Drawn.offers``."""
+        for reading in READINGS:
+            yield f"{self.name}-{reading}", partial(self.function, reading)
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """A figure of the paper; ours are one or more pictures, for every reading (and law, and average).
+
+    ``id`` begins the names of their files, ``label`` is the paper's number, ``caption`` says in our words what is
+    seen, ``claims`` are those that it bears on.
+    """
+
+    id: str
+    label: str
+    title: str
+    caption: str
+    claims: tuple[str, ...]
+    parts: Sequence[Drawn | Schematic]
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """The steps whose results the figure shows."""
+        return tuple(dict.fromkeys(step for part in self.parts for step in part.steps))
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """``steps`` and those that their results are made from."""
+        return (*self.steps, *(step for part in self.parts for step in part.behind))
+
+    def offers(self, folders: Mapping[str, Path]) -> Iterator[Drawing]:
+        """The stems and drawings that the ``folders`` (step -> folder) of finished steps allow."""
+        for part in self.parts:
+            for stem, make in part.offers(folders):
+                yield f"{self.id}-{stem}", make
+
+
+def lattice(preset: str, sites: tuple[int, ...], reading: str) -> Figure:
+    """The cell, the bands and the lattice of a preset with each of these numbers of contact sites."""
+    return lattice_page(_case(preset, reading), sites)
+
+
+def two_masses(reading: str) -> Figure:
+    """The reduced model of the four-band cell: host and resonator."""
+    cell = _case("four-band", reading).unit_cell()
+    masses = cell.masses[cell.host], cell.masses[cell.resonator]
+    inner = [s.stiffness for s in cell.springs if {s.start, s.end} == {cell.host, cell.resonator}]
+    # Half of the total of springs that are held at their middles, as the paper shares them out.
+    outer = [s.stiffness for s in cell.springs if cell.host in (s.start, s.end) and s.stiffness not in inner]
+    return reduced_model(masses, (sum(outer), sum(inner)), PRESETS["four-band"].clearances(1)[0])
+
+
+def _case(preset: str, reading: str) -> Case:
+    return Case.from_table({"name": preset, "lattice": {"preset": preset, "reading": reading}})
+
+
+# Pattern in the name of a picture's file, and what it says.
+NAMES = (
+    (r"neighbours", "neighbouring sites"),
+    (r"-hertz(?=-|$)", "Hertz"),
+    (r"-bilinear(?=-|$)", "bilinear"),
+    (r"out-of-phase", "out of phase"),
+    (r"-in-phase", "in phase"),
+    (r"calibrated", "calibrated reading"),
+    (r"printed", "printed reading"),
+    (r"(\d+)pi-(\d+)", r"\1π/\2"),
+    (r"(?<!\d)1-site(?=-|$)", "1 site"),
+    (r"(\d+)-sites", r"\1 sites"),
+    (r"([\d.]+)-cycles", r"\1 cycles"),
+    (r"-([\d.e+]+)N(?=-|$)", r"\1 N"),
+    (r"energy_weighted$", "energy-weighted average"),
+    (r"masked$", "masked average"),
+    (r"joint$", "joint average"),
+)
+
+
+def describe(stem: str) -> str:
+    """What the name of a picture's file says, in words: "calibrated reading, 5π/9, energy-weighted average"."""
+    return ", ".join(match.expand(text) for pattern, text in NAMES for match in re.finditer(pattern, stem))
