@@ -12,7 +12,9 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -93,10 +95,10 @@ def test_every_figure_of_the_paper_is_offered(killed):
     plan = tiny_plan()
     folders = plan.folders(killed)
     assert set(folders) == {step.name for step in plan.steps}
-    stems = [stem for plate in PAPER_FIGURES for stem, _ in plate.offers(folders)]
+    stems = [stem for figure in PAPER_FIGURES for stem, _ in figure.offers(folders)]
     assert len(stems) == len(set(stems))
-    assert {stem.partition("-")[0] for stem in stems} == {plate.id for plate in PAPER_FIGURES}
-    drawn = {path.name for path in (killed / "figures").iterdir()} - {"index.json"}
+    assert {stem.partition("-")[0] for stem in stems} == {figure.id for figure in PAPER_FIGURES}
+    drawn = {path.name for path in (killed / "figures").iterdir()}
     ours = [stem for stem in stems if stem.partition("-")[0] in DRAWN]
     assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf")}
 
@@ -112,9 +114,9 @@ def test_every_claim_and_figure_leads_to_steps():
     for grid in ("full", "quick"):
         plan = paper_plan(grid)
         assert {claim for step in plan.steps for claim in plan.claims_of(step)} == set(CLAIMS)
-        for plate in plan.plates:
-            part = plan.only([plate.id])
-            assert {step.name for step in part.steps} >= set(plate.steps)
+        for figure in plan.figures:
+            part = plan.only([figure.id])
+            assert {step.name for step in part.steps} >= set(figure.steps)
         assert [step.name for step in plan.only(["C10"]).steps] == ["design"]
         assert {step.name for step in plan.only(["figs8"]).steps} > {"interband", "nnm-hertz-calibrated"}
         assert plan.only([]) == plan
@@ -135,7 +137,7 @@ def test_list_says_what_is_left(vipetsc, tmp_path):
     listed = vipetsc(0, "paper", "--list", "--out", tmp_path / "none")
     assert listed.returncode == 0, listed.stderr
     assert re.search(r"^scattering +missing +\d+ min +.*C7 C8", listed.stdout, re.M)
-    assert all(re.search(rf"^{plate.id} .*missing", listed.stdout, re.M) for plate in PAPER_FIGURES)
+    assert all(re.search(rf"^{figure.id} .*missing", listed.stdout, re.M) for figure in PAPER_FIGURES)
     assert not (tmp_path / "none").exists()
 
 
@@ -149,7 +151,7 @@ def test_bad_ids_and_foreign_folders_are_refused(vipetsc, tmp_path):
     (tmp_path / "foreign" / "letter.txt").write_text("mine")
     foreign = vipetsc(0, "paper", "--only", "fig10", "--out", tmp_path / "foreign")
     assert foreign.returncode == 2
-    assert "holds other files" in foreign.stderr
+    assert "not a paper's of this kind" in foreign.stderr
 
 
 def test_quick_and_full_do_not_mix(vipetsc, tmp_path):
@@ -168,12 +170,15 @@ class Browser:
             port = free.getsockname()[1]
         self.home, self.base = folder, f"http://127.0.0.1:{port}"
         log = (folder / "driver.log").open("w")
-        self.driver = subprocess.Popen(["chromedriver", f"--port={port}"], stdout=log, stderr=log)
+        self.driver = subprocess.Popen(
+            ["chromedriver", f"--port={port}"], stdout=log, stderr=log, start_new_session=True
+        )
+        self.sessions: list[str] = []
 
-    def call(self, path: str, body: dict | None = None, patience: float = 30) -> object:
+    def call(self, path: str, body: dict | None = None, method: str | None = None, patience: float = 30) -> object:
         """The ``value`` of the driver's answer; waits until the driver listens."""
         data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"})
+        request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"}, method=method)
         deadline = time.monotonic() + patience
         while True:
             try:
@@ -199,11 +204,33 @@ class Browser:
         }
         answer = self.call("/session", {"capabilities": {"alwaysMatch": wanted}})
         session = f"/session/{answer['sessionId']}"
+        self.sessions.append(session)
         self.call(f"{session}/url", {"url": page.as_uri()})
         return session
 
+    def processes(self) -> list[int]:
+        """Every process of the driver's session, and every browser with a profile in the folder."""
+        numbers = []
+        for path in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                zombie, session = (path / "stat").read_text().rpartition(")")[2].split()[0:4:3]
+                started_here = os.fsencode(self.home) in (path / "cmdline").read_bytes()
+                if zombie != "Z" and (int(session) == self.driver.pid or started_here):
+                    numbers.append(int(path.name))
+        return numbers
+
     def close(self) -> None:
+        """Quit the browsers and their driver; what does not go by itself within seconds is killed."""
+        for session in self.sessions:
+            with suppress(OSError):
+                self.call(session, method="DELETE", patience=0)
         self.driver.terminate()
+        deadline = time.monotonic() + 5
+        while self.processes() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        for number in self.processes():
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
         self.driver.wait()
 
 
@@ -212,6 +239,10 @@ def browser(tmp_path_factory):
     opened = Browser(tmp_path_factory.mktemp("browser"))
     yield opened
     opened.close()
+    deadline = time.monotonic() + 5
+    while opened.processes() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert opened.processes() == []
 
 
 MEASURE = """

@@ -40,15 +40,12 @@ def tiny_plan() -> Plan:
     """All steps of the quick plan in small, a few figures, and claims that are sums over the results."""
     plan = paper_plan(QUICK)
     steps = {step.name: step.changed(*CHANGES[step.name]) for step in plan.steps}
-    relation = replace(
-        plan.relation, sweep=steps["interband"], branches=tuple(steps[b.name] for b in plan.relation.branches)
-    )
-    return replace(plan, steps=tuple(steps.values()), relation=relation, claims=__spec__.name if __spec__ else __name__)
+    return replace(plan, steps=tuple(steps.values()), claims=__spec__.name if __spec__ else __name__)
 
 
 def drawing(plan: Plan) -> Plan:
     """The plan with the figures ``DRAWN`` alone."""
-    return replace(plan, plates=tuple(plate for plate in plan.plates if plate.id in DRAWN))
+    return replace(plan, figures=tuple(figure for figure in plan.figures if figure.id in DRAWN))
 
 
 @dataclass(frozen=True)

@@ -128,9 +128,13 @@ def draw(
     OSError, ValueError
         If a file cannot be read, or a picture not written.
     """
-    drawings = _DRAWINGS[source](folders, figure_names(source, names))
     with style.rc_style():
-        return draw_each(drawings, folders[0] / "figures", formats, itertools.count(*share))
+        return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, itertools.count(*share))
+
+
+def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[Drawing]:
+    """Stems and drawings of what the ``folders`` hold, as ``draw`` draws them; the first of them checks the names."""
+    yield from _DRAWINGS[source](folders, figure_names(source, names))
 
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:

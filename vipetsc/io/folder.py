@@ -116,7 +116,8 @@ def claim_folder(
         for old in [old for pattern in kind.replaced for old in path.glob(pattern)]:
             shutil.rmtree(old) if old.is_dir() else old.unlink()
     path.mkdir(parents=True, exist_ok=True)
-    write_text(marker, text)
+    if not marker.exists() or marker.read_text(encoding="utf-8") != text:
+        write_text(marker, text)
     return going_on
 
 

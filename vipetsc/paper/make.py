@@ -80,7 +80,8 @@ def make_paper(
     """
     root, stop, part = Path(root), stop or StopRequest(), plan.only(only)
     on_root(comm, lambda: _claim(plan, root))
-    made, drawn = _make_steps(part, root, comm, stop, tell), ()
+    made = _make_steps(part, root, comm, stop, tell)
+    drawn: tuple[Path, ...] = ()
     if not comm.allreduce(stop.requested, MPI.LOR):
         on_root(comm, lambda: _relate(plan, root))
         drawn = draw_paper(part, root, comm, stop, tell)
@@ -158,7 +159,9 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: 
     return tuple(drawn)
 
 
-def _listed(figures: Sequence[PaperFigure], folders: Mapping[str, Path], stems: dict[str, list[str]]) -> Iterator[Drawing]:
+def _listed(
+    figures: Sequence[PaperFigure], folders: Mapping[str, Path], stems: dict[str, list[str]]
+) -> Iterator[Drawing]:
     """All pictures of ``figures``; their stems are added to ``stems``."""
     for figure in figures:
         for stem, make in figure.offers(folders):

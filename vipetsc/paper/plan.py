@@ -113,7 +113,7 @@ def paper_plan(grid: str = FULL) -> Plan:
     """
     steps = []
     for name, (kind, cost) in STEPS.items():
-        changes = RUNS if kind is SWEEP else ()
+        changes: tuple[str, ...] = RUNS if kind is SWEEP else ()
         if name.endswith("-calibrated"):
             changes += ("lattice.reading=calibrated", OUT_OF_PHASE)
         changes += COARSER.get(name, ()) if grid == QUICK else ()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image
+from PIL import Image  # type: ignore[import-untyped]
 
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED

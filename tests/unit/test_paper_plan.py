@@ -1,0 +1,131 @@
+"""The paper's plan comes with the package; what is made from results is stale by content alone."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import vipetsc
+from vipetsc.io.folder import FolderError
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.paper import make
+from vipetsc.paper.make import inputs_of, read_record
+from vipetsc.paper.plan import CLAIMS, FULL, STEPS, TRANSFER, Plan, case_file, paper_plan
+from vipetsc.paper.steps import DONE, MISSING, RELATION, SEARCH, STALE, Step, fingerprint
+from vipetsc.studies.design import search_design
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = Path(vipetsc.__file__).parent
+
+
+def test_every_case_file_comes_with_the_package():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    shipped = {path for pattern in declared["vipetsc.paper"] for path in (PACKAGE / "paper").glob(pattern)}
+    needed = {case_file(name) for name in STEPS}
+    assert needed <= shipped
+    assert PACKAGE / "paper" / "report.html" in shipped
+    assert all(PACKAGE in path.parents and path.is_file() and not path.is_symlink() for path in needed)
+    assert {path for path in shipped if path.suffix == ".toml"} == needed
+
+
+def test_examples_of_the_same_name_are_the_same_files():
+    for path in {case_file(name) for name in STEPS}:
+        assert (ROOT / "runs" / path.name).resolve() == path
+
+
+def test_every_step_is_a_case_that_can_be_used():
+    for step in paper_plan(FULL).steps:
+        assert step.kind.case.from_toml(step.text).to_toml() == step.text
+
+
+SMALL = ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11")
+
+
+@pytest.fixture
+def searched(tmp_path) -> tuple[Plan, Path]:
+    """A plan of the search alone, done."""
+    step = Step("design", SEARCH, case_file("design"), SMALL)
+    search_design(step.case, tmp_path / "design")
+    plan = paper_plan(FULL)
+    return replace(plan, steps=(step,), figures=[f for f in plan.figures if f.id in ("figS3", "fig10")]), tmp_path
+
+
+def touch(root: Path) -> None:
+    for path in root.rglob("*"):
+        os.utime(path, ns=(2**61, 2**61))
+
+
+def test_times_of_files_make_nothing_stale(searched, monkeypatch):
+    plan, root = searched
+    before = inputs_of(plan, root)
+    touch(root)
+    assert plan.steps[0].state(root) == DONE
+    assert inputs_of(plan, root) == before
+    assert set(before) == {"figS3", "fig10", "claims"}
+
+
+def test_a_result_of_other_content_is_another_input(searched):
+    plan, root = searched
+    before = inputs_of(plan, root)
+    path = root / "design" / "design.h5"
+    path.write_bytes(path.read_bytes() + b"\0")
+    after = inputs_of(plan, root)
+    assert {key for key in before if before[key] != after[key]} == {"figS3", "claims"}
+
+
+def test_another_version_of_the_package_is_another_input(searched, monkeypatch):
+    plan, root = searched
+    before = inputs_of(plan, root)
+    monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
+    assert all(before[key] != value for key, value in inputs_of(plan, root).items())
+
+
+def test_another_case_is_another_input_and_a_stale_step(searched):
+    plan, root = searched
+    step = plan.steps[0].changed("design.eta.count=4")
+    assert step.state(root) == STALE
+    assert step.identity(root) != plan.steps[0].identity(root)
+    assert plan.steps[0].state(root / "none") == MISSING
+
+
+def test_a_relation_that_changes_is_another_input(tmp_path):
+    step = next(step for step in paper_plan(FULL).steps if step.name == TRANSFER)
+    (tmp_path / TRANSFER).mkdir()
+    before = step.identity(tmp_path)
+    (tmp_path / TRANSFER / RELATION).write_bytes(b"another")
+    assert step.identity(tmp_path) != before
+
+
+def test_stale_pictures_go_before_new_ones_are_drawn(searched):
+    plan, root = searched
+    (root / "figures").mkdir()
+    old, other = root / "figures" / "figS3-old.png", root / "figures" / "figS30-other.png"
+    old.touch()
+    other.touch()
+    make._drop_stale(plan, root)
+    assert not old.exists() and other.exists()
+    old.touch()  # drawn from the inputs of now
+    record = make._drop_stale(plan, root)
+    assert old.exists() and record == read_record(root)
+
+
+def test_fingerprints_tell_parts_apart():
+    assert fingerprint("ab", "c") != fingerprint("a", "bc") != fingerprint("abc")
+    assert fingerprint("ab") == fingerprint(b"ab")
+
+
+def test_the_plan_names_what_it_does_not_know():
+    with pytest.raises(FolderError, match=r"--only fig99 C18: figures are fig01"):
+        paper_plan(FULL).only(["fig99", "C18", "C1"])
+    assert paper_plan(FULL).only(["c1"]).figures and CLAIMS[-1] == "C17"
+
+
+def test_a_search_is_done_when_its_file_has_its_case(searched):
+    plan, root = searched
+    with open_netcdf(root / "design" / "design.h5", "search") as search:
+        assert tomllib.loads(search.attrs["case"]) == tomllib.loads(plan.steps[0].text)
+    assert plan.steps[0].results(root) == [root / "design" / "design.h5"]
