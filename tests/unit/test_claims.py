@@ -23,9 +23,9 @@ from vipetsc.paper.claims.claim import (
     verdict,
 )
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence
-from vipetsc.paper.claims.measure import CLAIMS, READINGS, measure_claim
+from vipetsc.paper.claims.measure import MEASURES, READINGS, measure_claim
 from vipetsc.paper.claims.scattering import BRANCHES
-from vipetsc.paper.claims.thresholds import LAWS, THRESHOLDS, criteria_of
+from vipetsc.paper.claims.thresholds import CLAIMS, LAWS
 from vipetsc.spectra import Parts, dispersion, part_energies, power_law
 from vipetsc.studies.ensemble import COMPLETE, Outcome, assemble
 
@@ -35,13 +35,8 @@ ONSET = 0.7  # N
 SPREAD_FIT = "share of configurations of spread sites with adjusted R^2 >= 0.95 over 4 points or more"
 
 
-def by_id(id):
-    (claim,) = (c for c in CLAIMS if c.id == id)
-    return claim
-
-
 def measure(id, root, reading="calibrated"):
-    return measure_claim(by_id(id), reading, Path(root))
+    return measure_claim(id, reading, Path(root))
 
 
 def put_sweep(folder, table, content, episodes, work=lambda case: case.drive.amplitude**2):
@@ -71,14 +66,14 @@ def put_sweep(folder, table, content, episodes, work=lambda case: case.drive.amp
 
 @given(st.floats(-1e6, 1e6), st.floats(0, 1e6), st.floats(-2e6, 2e6))
 def test_a_criterion_is_met_within_its_bounds_alone(low, width, value):
-    criterion = Criterion("C1", "x", "within", (low, low + width), "", "")
+    criterion = Criterion("x", "within", (low, low + width), "", "")
     assert criterion.met(value) == (low - 1e-9 <= value <= low + width + 1e-9)
     assert not criterion.met(float("nan"))
     assert f"{low:.4g} to {low + width:.4g}" in str(criterion)
 
 
 def test_shares_are_counted_out_of_their_number():
-    criterion = Criterion("C1", "share of curves", "of", (4, 6), "", "")
+    criterion = Criterion("share of curves", "of", (4, 6), "", "")
     assert criterion.met(4 / 6) and criterion.met(2 / 3) and not criterion.met(0.5)
     assert str(criterion) == "share of curves: at least 4 of 6"
 
@@ -97,7 +92,7 @@ def test_shares_are_counted_out_of_their_number():
     ],
 )
 def test_verdicts(value, expected):
-    criteria = (Criterion("C1", "a", "<=", 2, "", "", decisive=True), Criterion("C1", "b", "<=", 2, "", ""))
+    criteria = (Criterion("a", "<=", 2, "", "", decisive=True), Criterion("b", "<=", 2, "", ""))
     assert verdict(criteria, value)[0] == expected
 
 
@@ -179,6 +174,9 @@ C17 | IV: share of energy above the driven band* | <= | 0.01
 """
 
 
+CRITERIA = [(claim, criterion) for claim, spec in CLAIMS.items() for criterion in spec.criteria]
+
+
 def test_thresholds_are_those_specified():
     expected = set()
     for line in SPECIFIED.strip().splitlines():
@@ -187,10 +185,10 @@ def test_thresholds_are_those_specified():
         for law in LAWS if quantity.endswith("*") else ("",):
             name = quantity.replace("*", f", {law}")
             expected.add((claim, name, comparison, numbers[0] if len(numbers) == 1 else numbers))
-    assert {(c.claim, c.quantity, c.comparison, c.threshold) for c in THRESHOLDS} == expected
-    assert len(THRESHOLDS) == len(expected)
-    assert all(c.source for c in THRESHOLDS)
-    decisive = {(c.claim, c.threshold) for c in THRESHOLDS if c.decisive}
+    assert {(claim, c.quantity, c.comparison, c.threshold) for claim, c in CRITERIA} == expected
+    assert len(CRITERIA) == len(expected)
+    assert all(c.source for _, c in CRITERIA)
+    decisive = {(claim, c.threshold) for claim, c in CRITERIA if c.decisive}
     assert decisive == {("C2", 0), ("C3", 0.1), ("C3", 10), ("C13", 0.01)}
 
 
@@ -204,9 +202,9 @@ def test_constants_inside_of_quantities_are_those_specified():
     assert pytest.approx((1.5 - 1) / (2 * (1.5 + 1))) == thresholds.HERTZ_LIMIT
 
 
-@pytest.mark.parametrize("criterion", THRESHOLDS, ids=lambda c: f"{c.claim} {c.quantity}")
-def test_a_number_on_either_side_of_its_threshold_decides(criterion):
-    others = {c.quantity: met for c in criteria_of(criterion.claim) for met in [_meeting(c)]}
+@pytest.mark.parametrize("claim, criterion", CRITERIA, ids=[f"{claim} {c.quantity}" for claim, c in CRITERIA])
+def test_a_number_on_either_side_of_its_threshold_decides(claim, criterion):
+    others = {c.quantity: met for c in CLAIMS[claim].criteria for met in [_meeting(c)]}
     low, high = criterion.interval
     if criterion.comparison == "of":
         inside, outside = [low / high], [(low - 1) / high]
@@ -215,9 +213,9 @@ def test_a_number_on_either_side_of_its_threshold_decides(criterion):
         inside = [b for b in (low + size, high - size) if np.isfinite(b)]
         outside = [b for b in (low - size, high + size) if np.isfinite(b)]
     for value in inside:
-        assert verdict(criteria_of(criterion.claim), others | {criterion.quantity: value}) == (HOLDS, [])
+        assert verdict(CLAIMS[claim].criteria, others | {criterion.quantity: value}) == (HOLDS, [])
     for value in outside:
-        judgement, missed = verdict(criteria_of(criterion.claim), others | {criterion.quantity: value})
+        judgement, missed = verdict(CLAIMS[claim].criteria, others | {criterion.quantity: value})
         alone = len(others) == 1
         assert judgement == (FAILS if criterion.decisive or alone else IN_PART) and missed == [criterion.quantity]
 
@@ -233,9 +231,10 @@ def _meeting(criterion):
 def test_without_files_nothing_is_measured_and_thresholds_stand(tmp_path):
     claims = measure_claims(tmp_path)
     assert [(c.id, c.reading) for c in claims] == [(i, r) for i in IDS for r in READINGS]
+    assert list(CLAIMS) == list(MEASURES) == IDS
     for c in claims:
         assert c.verdict == UNMEASURED and "missing" in c.reason and not c.files and not c.value
-        for criterion in criteria_of(c.id):
+        for criterion in CLAIMS[c.id].criteria:
             bounds = [f"{b:.4g}" for b in criterion.interval if np.isfinite(b)]
             assert str(criterion) in c.threshold and all(b in str(criterion) for b in bounds)
         assert c.figure and "{" not in c.figure and c.claim.endswith(".")

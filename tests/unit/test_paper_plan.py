@@ -29,7 +29,8 @@ def test_every_case_file_comes_with_the_package():
     assert needed <= shipped
     assert PACKAGE / "paper" / "report.html" in shipped
     assert all(PACKAGE in path.parents and path.is_file() and not path.is_symlink() for path in needed)
-    assert {path for path in shipped if path.suffix == ".toml"} == needed
+    assert {path for path in shipped if path.parent.name == "cases"} == needed
+    assert set((PACKAGE / "paper").rglob("*.toml")) <= shipped
 
 
 def test_examples_of_the_same_name_are_the_same_files():

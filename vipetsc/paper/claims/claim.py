@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vipetsc.io.atomic import write_text
-
-if TYPE_CHECKING:
-    from vipetsc.paper.claims.evidence import Evidence
 
 HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
 DIGITS = 6  # significant ones of the numbers in claims.json
@@ -48,9 +44,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Criterion:
-    """A row of the table of thresholds: what decides on ``claim``.
-
-    ``comparison`` of the number called ``quantity`` with ``threshold``:
+    """What decides on a claim: the comparison of the number called ``quantity`` with ``threshold``.
 
     ========  =============  ========================================================
     "<="      bound          at most
@@ -63,7 +57,6 @@ class Criterion:
     hold.
     """
 
-    claim: str
     quantity: str
     comparison: str
     threshold: float | tuple[float, float]
@@ -109,16 +102,15 @@ class Measurement:
 
 @dataclass(frozen=True)
 class ClaimSpec:
-    """A claim before it is measured; its criteria are the rows of ``thresholds.THRESHOLDS`` with its ``id``.
+    """A claim before it is measured: a sentence, where the ``paper`` makes it, and what decides on it.
 
-    ``figure`` may hold ``{reading}``. ``measure`` (evidence, reading, measurement) fills the measurement, and raises
-    ``MissingEvidence`` when it cannot.
+    ``figure`` is the stem of the picture that shows it, and may hold ``{reading}``.
     """
 
-    id: str
     claim: str
+    paper: str
     figure: str
-    measure: Callable[[Evidence, str, Measurement], None]
+    criteria: tuple[Criterion, ...]
 
 
 def verdict(criteria: Sequence[Criterion], value: Mapping[str, float | None]) -> tuple[str, list[str]]:

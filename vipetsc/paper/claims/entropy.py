@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vipetsc.paper.claims.claim import ClaimSpec, Measurement, MissingEvidence
+from vipetsc.paper.claims.claim import Measurement, MissingEvidence
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence
 from vipetsc.paper.claims.thresholds import (
     ABRUPT,
@@ -218,25 +218,3 @@ def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
             f"{late} of {len(configurations)} configurations have their peak at {HIGH:g} N or above: nothing is behind"
             " it"
         )
-
-
-ENTROPY = (
-    ClaimSpec(
-        "C7",
-        "Entropy against amplitude has a floor, an abrupt rise, a peak and a power-law decay.",
-        "entropy-{reading}-5pi-9-energy_weighted",
-        power_law,
-    ),
-    ClaimSpec(
-        "C8",
-        "Rise, peak and power-law decay are the same for wavenumbers from 2π/9 to 7π/9.",
-        "entropy_all-{reading}-energy_weighted",
-        everywhere,
-    ),
-    ClaimSpec(
-        "C9",
-        "The spread of the entropy over the lattice grows at high amplitude.",
-        "entropy-{reading}-5pi-9-energy_weighted",
-        error_bars,
-    ),
-)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vipetsc.paper.claims.claim import ClaimSpec, Measurement, MissingEvidence
+from vipetsc.paper.claims.claim import Measurement, MissingEvidence
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MeasuredRun
-from vipetsc.paper.claims.thresholds import COUNTED, GRID, LAWS, LOW, PAPER_CELL, THRESHOLDS
+from vipetsc.paper.claims.thresholds import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
 
 STEP, AMPLITUDES, DESIGN = "interband", "interband-amplitudes", "design"
 
@@ -70,7 +70,7 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
         result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = maxima[-1] - float(beside)
         result.uncertainty[f"amplitudes, {law}"] = len(curve.amplitude)
     result.uncertainty["spread of the maxima between the laws"] = float(np.ptp(maxima))
-    lowest, _ = next(c.interval for c in THRESHOLDS if c.claim == "C11" and c.quantity.startswith("maximum"))
+    lowest = next(c.interval[0] for c in CLAIMS["C11"].criteria if c.quantity.startswith("maximum"))
     if max(maxima) < lowest and reading == "printed":
         result.reasons.append("the resonator's spring lambda k of the printed equations gives less transfer")
 
@@ -162,37 +162,3 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
             f"maximum with 15 cycles, {law}": float(short.value.max()),
         }
         result.uncertainty[f"amplitudes, {law}"] = len(shared)
-
-
-INTERBAND = (
-    ClaimSpec(
-        "C10",
-        "The four-band cell is best at (λ, η) = (.1, .5), where host and resonator move out of phase on band 2.",
-        "cost_maps",
-        optimum,
-    ),
-    ClaimSpec(
-        "C11",
-        "The transfer has a floor of about 1e-4, sets in suddenly, and reaches .30-.35 with five sites for both laws.",
-        "ibtet-{reading}",
-        onset,
-    ),
-    ClaimSpec(
-        "C12",
-        "Medium amplitude fills the upper bands most.",
-        "transfer_dispersions-{reading}-5-sites-30-cycles",
-        medium_most,
-    ),
-    ClaimSpec(
-        "C13",
-        "The energies of all bands and gaps sum to the total kinetic energy.",
-        "band_energies-hertz-{reading}-5-sites-30-cycles",
-        bands_sum,
-    ),
-    ClaimSpec(
-        "C14",
-        "One site transfers at most about a tenth; a burst of 15 cycles shows the same trend as one of 30.",
-        "ibtet-{reading}",
-        one_site,
-    ),
-)

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
-from vipetsc.paper.claims.claim import UNMEASURED, Claim, ClaimSpec, Measurement, MissingEvidence, rounded, verdict
-from vipetsc.paper.claims.entropy import ENTROPY
+from vipetsc.paper.claims import entropy, interband, modes, scattering
+from vipetsc.paper.claims.claim import UNMEASURED, Claim, Measurement, MissingEvidence, rounded, verdict
 from vipetsc.paper.claims.evidence import Evidence
-from vipetsc.paper.claims.interband import INTERBAND
-from vipetsc.paper.claims.modes import MODES
-from vipetsc.paper.claims.scattering import SCATTERING
-from vipetsc.paper.claims.thresholds import criteria_of
+from vipetsc.paper.claims.thresholds import CLAIMS
 
 READINGS = "printed", "calibrated"
-CLAIMS: tuple[ClaimSpec, ...] = (*SCATTERING, *ENTROPY, *INTERBAND, *MODES)
+# Each fills the measurement from the evidence in one reading, and raises MissingEvidence when it cannot.
+MEASURES: dict[str, Callable[[Evidence, str, Measurement], None]] = {
+    "C1": scattering.optical_ridge,
+    "C2": scattering.linear_content,
+    "C3": scattering.new_wavenumbers,
+    "C4": scattering.reflected,
+    "C5": scattering.native_bins,
+    "C6": scattering.reconstruction,
+    "C7": entropy.power_law,
+    "C8": entropy.everywhere,
+    "C9": entropy.error_bars,
+    "C10": interband.optimum,
+    "C11": interband.onset,
+    "C12": interband.medium_most,
+    "C13": interband.bands_sum,
+    "C14": interband.one_site,
+    "C15": modes.branches,
+    "C16": modes.follows_slope,
+    "C17": modes.portraits,
+}
 
 
 def measure_claims(root: str | Path) -> list[Claim]:
@@ -21,16 +38,16 @@ def measure_claims(root: str | Path) -> list[Claim]:
 
     What cannot be measured because its files are missing has the verdict "not measured" and says what is missing.
     """
-    return [measure_claim(claim, reading, Path(root)) for claim in CLAIMS for reading in READINGS]
+    return [measure_claim(claim, reading, Path(root)) for claim in MEASURES for reading in READINGS]
 
 
-def measure_claim(claim: ClaimSpec, reading: str, root: Path) -> Claim:
-    """One claim in one reading."""
-    result, criteria = Measurement(), criteria_of(claim.id)
+def measure_claim(claim: str, reading: str, root: Path) -> Claim:
+    """One claim, by its id, in one reading."""
+    result, spec = Measurement(), CLAIMS[claim]
     judgement, missed = UNMEASURED, list[str]()
     with Evidence(root) as evidence:
         try:
-            claim.measure(evidence, reading, result)
+            MEASURES[claim](evidence, reading, result)
         except MissingEvidence as missing:
             result.reasons.append(str(missing))
         except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
@@ -38,17 +55,17 @@ def measure_claim(claim: ClaimSpec, reading: str, root: Path) -> Claim:
             file = evidence.files[-1] if evidence.files else "a file"
             result.reasons.append(f"{file} cannot be used: {message}")
         else:
-            judgement, missed = verdict(criteria, result.value)
-    reasons = [f"not met: {' / '.join(missed)}"] if 0 < len(missed) < len(criteria) else []
+            judgement, missed = verdict(spec.criteria, result.value)
+    reasons = [f"not met: {' / '.join(missed)}"] if 0 < len(missed) < len(spec.criteria) else []
     return Claim(
-        claim.id,
+        claim,
         reading,
-        claim.claim,
+        spec.claim,
         rounded(result.value),
         rounded(result.uncertainty),
-        "; ".join(map(str, criteria)),
+        "; ".join(map(str, spec.criteria)),
         judgement,
         "; ".join([*reasons, *result.reasons]),
-        result.figure or claim.figure.format(reading=reading),
+        result.figure or spec.figure.format(reading=reading),
         tuple(evidence.files),
     )

@@ -14,7 +14,7 @@ from vipetsc.lattice import pass_bands
 from vipetsc.lattice.bloch import waves_at
 from vipetsc.modes.branch import KINDS
 from vipetsc.modes.system import System
-from vipetsc.paper.claims.claim import ClaimSpec, Measurement, MissingEvidence
+from vipetsc.paper.claims.claim import Measurement, MissingEvidence
 from vipetsc.paper.claims.evidence import Evidence, MeasuredRun
 from vipetsc.paper.claims.thresholds import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_EXPONENT, SAME_MOTION
 from vipetsc.studies.backbone import BRANCH, initiation_of
@@ -184,25 +184,3 @@ def _beyond_onset(run: MeasuredRun) -> str:
     except (OSError, ValueError):
         return f"{run.amplitude:g} N"
     return f"{run.amplitude:g} N, {100 * beyond:.2g} % above first contact,"
-
-
-MODES = (
-    ClaimSpec(
-        "C15",
-        "The branch is flat, folds at grazing with unstable orbits, then its slope falls as a power law to a limit.",
-        "branch-out-of-phase",
-        branches,
-    ),
-    ClaimSpec(
-        "C16",
-        "Against energy the transfer follows the slope of the branch, with a power law in region III.",
-        "ibtet_backbone-{reading}-5-sites-30-cycles",
-        follows_slope,
-    ),
-    ClaimSpec(
-        "C17",
-        "Phase portraits in the lattice pass through the branch's regimes: linear, grazing, non-smooth, in phase.",
-        "phase_regimes-hertz-{reading}-1-site-30-cycles",
-        portraits,
-    ),
-)
