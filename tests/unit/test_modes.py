@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,12 +19,13 @@ from vipetsc.lattice import Bilinear, Contact, Hertz, contact_stiffness, diatomi
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.changes import CROSSING, NONE, first_rise
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
-from vipetsc.modes.continuation import Continuation, StepControl
+from vipetsc.modes.continuation import Continuation, Guards, StepControl, half_trace_change, unit
 from vipetsc.modes.orbit import Dop853Flow
 from vipetsc.modes.point import half_traces, linear_start, multipliers
 from vipetsc.modes.regions import slope_laws, tell_regions
 from vipetsc.modes.samples import sample_orbit
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.special import Locator
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
 D = 10**-2.75
@@ -178,6 +181,22 @@ def test_regions_and_power_law_of_a_made_up_branch():
     assert law["points"] == np.sum(region == 4)
 
 
+def test_region_three_begins_where_the_exponent_settles():
+    """Of E^-1 + c E^-6, with the share a of the second: exponent -1 - 5 a, growth 25 a (1 - a) = 1/2 at a = 0.0204."""
+    energy = np.geomspace(1e-3, 1e6, 4000)
+    touched = energy > 1e-2
+    slope = np.where(touched, 1e3 / energy + 1e4 * (energy / 1e-2) ** -6.0, 0.0)
+    region = tell_regions(energy, slope, touched.astype(int), np.zeros(4000))
+    share = 1e4 * (energy / 1e-2) ** -6.0 / np.where(touched, slope, 1.0)
+    begin = np.nonzero(region == 3)[0][0]
+    assert share[begin] == pytest.approx((1 - np.sqrt(0.92)) / 2, rel=0.05)
+    laws = slope_laws(energy, slope, region)
+    assert set(laws) == {"II", "III"}
+    assert laws["II"]["exponent"] < -1.2
+    assert laws["III"]["exponent"] == pytest.approx(-1, abs=1e-3)
+    assert laws["II"]["points"] == begin - np.argmax(slope)
+
+
 def test_regions_without_contacts():
     energy = np.geomspace(1e-3, 1e3, 50)
     none, never = np.zeros(50, int), np.zeros(50)
@@ -264,6 +283,51 @@ def short_branch() -> Branch:
     points = [growing.point, *growing]
     orbit = sample_orbit(corrector.problem, points[-1], 40)
     return Branch("out-of-phase", "name = 'x'", 2, points, 0.1, True, "done", ["a", "b"], [(points[-1], orbit)])
+
+
+def test_steps_have_the_arclength_that_they_say(short_branch):
+    """t . (xi - xi0) = s in the chart of the point before, whose unknowns are of order one."""
+    for a, b in itertools.pairwise(short_branch.points):
+        chart = Relative(reduced(), a.x, a.period)
+        xi = chart.encode(a.x, a.period)
+        w, size = a.x[1] - a.x[0], np.abs(a.x).max()
+        assert xi == pytest.approx([a.x[0] / size, w / min(max(abs(w), D), size), 1.0], rel=1e-12)
+        tangent = np.linalg.solve(chart.derivative(xi), a.tangent)
+        chord = chart.encode(b.x, b.period) - xi
+        assert tangent @ chord / np.linalg.norm(tangent) == pytest.approx(b.step, rel=1e-6)
+
+
+def test_guards_are_what_the_points_obey(short_branch):
+    """No step strains a guard beyond its bound; some are held back by the half-trace, and the first by none."""
+    guards = Guards()
+    turns, changes = [], []
+    for a, b in itertools.pairwise(short_branch.points):
+        changes.append(half_trace_change(a, b))
+        assert abs(a.episodes - b.episodes) <= guards.contacts
+        chart = Relative(reduced(), a.x, a.period)
+        before, after = (np.linalg.solve(chart.derivative(chart.encode(a.x, a.period)), p.tangent) for p in (a, b))
+        turns.append(np.arccos(np.clip(unit(before) @ unit(after), -1, 1)))
+    assert 0.3 * guards.half_trace < max(changes) <= guards.half_trace
+    assert 0.3 * guards.turn < max(turns) <= guards.turn
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
+    """On the way up and on the way down again; the energy is stationary along the branch there."""
+    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
+    points = [replace(p, tangent=sign * p.tangent, energy_tangent=sign * p.energy_tangent) for p in short_branch.points]
+    points = points[::sign]
+    locator = Locator(corrector)
+    turning = [
+        (a, b) for a, b in itertools.pairwise(points) if a.energy_tangent * b.energy_tangent < 0 and a.episodes > 0
+    ]
+    assert len(turning) == 2
+    for a, b in turning:
+        (fold,) = (p for p in locator.between(a, b) if p.kind == "fold-energy")
+        assert abs(fold.energy_tangent) <= 1e-9 * abs(a.energy_tangent)
+        assert fold.half_traces[0] == pytest.approx(1, abs=1e-6)
+    kinds = {p.kind for a, b in itertools.pairwise(points[-20:]) for p in locator.between(a, b)}
+    assert "fold-energy" not in kinds
 
 
 def test_branch_file_round_trip(short_branch, tmp_path):

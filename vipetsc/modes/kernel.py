@@ -18,7 +18,6 @@ from vipetsc.modes.tableau import E3, E5, STAGES, A, B
 
 DONE, STUCK, FULL = range(3)
 """Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed."""
-
 SMALLEST_STEP = 1e-15
 """A step below this fraction of the interval means that the flow is stuck."""
 
@@ -40,7 +39,7 @@ class CompiledSystem(NamedTuple):
 class Tolerances(NamedTuple):
     """Errors allowed per step, relative to the size of the orbit and of each variation.
 
-    ``omega_ref`` in rad/s: velocities count as displacements over a radian of it, and a step is at most one radian.
+    Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian.
     """
 
     rtol: float
@@ -49,11 +48,7 @@ class Tolerances(NamedTuple):
 
 
 class Stepper(NamedTuple):
-    """What a step reads and writes.
-
-    The ``side`` (contacts,) of each contact (-1, 0, 1), stages, state and rates at the end (2n, 1 + m), (w, w', w'')
-    of each contact (contacts, 3) at the start and at the end.
-    """
+    """What a step reads and writes; ``side`` (contacts,) -1, 0 or 1; states (2n, 1 + m); motions (contacts, 3)."""
 
     system: CompiledSystem
     tolerances: Tolerances
@@ -125,10 +120,7 @@ def elongation(row: np.ndarray, u: np.ndarray) -> float:
 
 @njit
 def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarray) -> None:
-    """Time derivative ``dy`` of state and variations ``y`` (2n, 1 + m): displacements over velocities.
-
-    Column 0 is the orbit, the others are variations; ``side`` (contacts,) is frozen.
-    """
+    """Time derivative ``dy`` of the orbit, column 0, and variations of ``y`` (2n, 1 + m): displacements, velocities."""
     n, columns = y.shape[0] // 2, y.shape[1]
     for i in range(n):
         for j in range(columns):

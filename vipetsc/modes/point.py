@@ -16,7 +16,7 @@ def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
 
     The basic map is the half period (seen with the sign reversed) for the quarter-period map and the period for the
     others. With S = [[A, B], [C, D]] in mass-normalised coordinates and its mirror image after the end, it has the
-    diagonal block I + 2 B^T C (-I + 2 D^T A for a quarter period), whose eigenvalues are the half-traces. One of
+    diagonal block I + 2 B^T C (I - 2 D^T A for a quarter period), whose eigenvalues are the half-traces. One of
     them is trivial and its left eigenvector is known, so that it is removed exactly.
     """
     root = np.sqrt(problem.system.masses)
