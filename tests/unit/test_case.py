@@ -7,11 +7,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case, CaseError, DesignCase, case_id
+from vipetsc.case.resolve import _round_down
 
+PLAIN = {
+    "name": "plain",
+    "lattice": {
+        "cell": {
+            "masses": [1.0, 2.0],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 3.0, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 4.0},
+            ],
+            "contact": [1, 2],
+        },
+        "cells": 20,
+    },
+    "contacts": {"sites": [3], "clearance": 1e-3, "stiffness": 1e4},
+    "drive": {"frequency": 1.0},
+    "time": {"end": 10.0, "sample_interval": 0.125},
+}
 RUNS = Path(__file__).parents[2] / "runs"
 
 
@@ -56,6 +75,7 @@ def test_every_case_file_is_sound_and_survives_a_round_trip(path):
 def test_tolerances_scale_with_the_drive():
     weak, strong = (Case.builtin([f"drive.amplitude={a}"]).model() for a in (2.0**-10, 2.0**3))
     assert strong.atol[0] == weak.atol[0] * 2**13
+    assert strong.atol[0] == 0.1 * strong.rtol * strong.scale
     assert strong.atol[1] == strong.atol[0] * strong.drive.frequency
     assert Case.builtin(["time.atol=paper"]).model().atol == (24.33e-9, 24.33e-9)
 
@@ -65,6 +85,49 @@ def test_unknown_keys_name_the_nearest():
     assert "did you mean lattice.cells?" in found["lattice.cels"]
     assert "did you mean contacts?" in found["contcts"]
     assert "did you mean drive.amplitude?" in found["drive.amplitud"]
+
+
+def test_a_misspelt_choice_and_an_unknown_section_name_the_nearest():
+    found = problems({"contacts": {"law": "hertzz"}}, "desing.wavenumbers=5")
+    assert "did you mean 'hertz'?" in found["contacts.law"]
+    assert "did you mean design?" in found["desing"]
+
+
+def test_an_override_below_a_value_is_refused():
+    found = problems({"lattice": {"cells": 40}}, "lattice.cells.x=3")
+    assert "lattice.cells is a value, not a section" in found["--set lattice.cells.x"]
+
+
+def test_a_check_that_rests_on_an_invalid_key_is_left_out():
+    with pytest.raises(CaseError) as caught:
+        Case.from_table(PLAIN | {"contacts": PLAIN["contacts"] | {"clearance": -1.0}})
+    assert [p.key for p in caught.value.problems] == ["contacts.clearance"]
+    assert "greater than 0" in str(caught.value)
+
+
+def test_samples_are_counted_and_held_against_the_bands():
+    assert "too coarse" in problems({"time": {"samples": 20}})["time.samples"]
+    assert Case.from_table({"time": {"samples": 5000}}).model().samples == 5000
+
+
+def test_automatic_sample_intervals_are_round():
+    assert [_round_down(value) for value in (5.6e-4, 4.9e-4, 1.9e-3, 0.01)] == [5e-4, 2e-4, 1e-3, 0.01]
+
+
+def test_the_identity_of_a_case_stays_what_folders_on_disk_bear():
+    assert case_id(Case.from_table(PLAIN)) == "7b0b028bc7785b85"
+    assert case_id(Case.from_table(PLAIN, ["drive.amplitude=2.0"])) != case_id(Case.from_table(PLAIN))
+
+
+def test_a_result_names_its_case():
+    case = Case.from_table(PLAIN)
+    assert Case.of(xr.Dataset(attrs={"case": case.to_toml()})) == case
+
+
+def test_eta_stays_below_one():
+    eta = DesignCase.builtin().design.eta.values()
+    assert len(eta) == 36
+    assert eta.max() == 0.975
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,7 @@ def test_parts_name_bands_and_gaps():
     assert merged.bands == ((1, 2), (), (3,), ())
     assert merged.edges.tolist() == [0, 3, 5, 6, np.inf]
     assert Parts.of([Band(1, 4.0, 6.0)]).names == ("gap 1", "band 1", "above")
+    assert Parts.of([Band(1, 1e-9, 6.0)]).names == ("band 1", "above")  # a free lattice's zero, rounded
 
 
 def test_transfer_is_the_mean_share_after_arrival():
