@@ -17,21 +17,11 @@ import xarray as xr
 from scipy import fft
 
 import vipetsc
+from vipetsc import spectra
 from vipetsc.case import Case, Model
-from vipetsc.io.netcdf import Variables, variable
+from vipetsc.io.netcdf import variable
 from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
-from vipetsc.spectra import (
-    TAPER,
-    Parts,
-    dispersion,
-    front_arrival,
-    ibtet,
-    kinetic_energy,
-    part_energies,
-    wavenumber_content,
-)
-from vipetsc.studies.wavelets import entropy_variables, partition_variables
 
 FORMAT_VERSION = 2
 IN_MEMORY = 2**30  # bytes of velocity that are read at once; larger fields are read mass by mass
@@ -43,6 +33,45 @@ MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those w
 # What is measured of one run, and of every run of a sweep; "maps" are the space-time maps of the other measures.
 FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "maps")
 REDUCED = ("entropy", "bands")
+
+# Dimensions, units and description of every variable; dimensions of a group are named without it.
+LAYOUT = {
+    "time": ("time", "s", "time"),
+    "cell": ("cell", "1", "cell"),
+    "kinetic_energy": ("time cell", "J", "kinetic energy of a cell"),
+    "wavenumber": ("wavenumber", "rad/cell", "wavenumber"),
+    "wavenumber_content": ("time wavenumber", "J", "kinetic energy per wavenumber bin"),
+    "frequency": ("frequency", "rad/s", "angular frequency"),
+    "dispersion": ("wavenumber frequency", "J", "mean kinetic energy per bin"),
+    "dispersion_before": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells before the first site"),
+    "dispersion_after": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells after the first site"),
+    "ibtet": ("", "1", "inter-band energy transfer"),
+    "bands/edge": ("bands/edge", "1", "edge of a part"),
+    "bands/part": ("bands/part", "1", "part of the frequency axis"),
+    "bands/edges": ("bands/edge", "rad/s", "edges of the pass bands and gaps"),
+    "bands/energy": ("bands/part time", "J", "kinetic energy of a part"),
+    "bands/above": ("bands/part", "1", "1 for a pass band above the driven one"),
+    "bands/total": ("time", "J", "kinetic energy"),
+    "bands/share": ("bands/part", "1", "mean share of a part after the wave's arrival"),
+    "entropy/snapshot": ("entropy/snapshot", "s", "time of a snapshot"),
+    "entropy/history": ("entropy/snapshot", "bit", "energy-weighted mean entropy of a snapshot"),
+    "entropy/energy_weighted": ("", "bit", "mean over time of the energy-weighted entropy"),
+    "entropy/masked": ("", "bit", "mean entropy where the wave is louder than 1 % of its loudest"),
+    "entropy/joint": ("", "bit", "mean over time of the entropy over cells and wavenumbers together"),
+    "entropy/error": ("", "bit", "deviation over the cells of the masked time mean"),
+    "entropy/local": ("entropy/snapshot cell", "bit", "entropy over wavenumbers at a cell"),
+    "entropy/weight": ("entropy/snapshot cell", "m2/s2", "wavelet energy at a cell"),
+    "partition/snapshot": ("partition/snapshot", "s", "time of a snapshot"),
+    "partition/bin": ("partition/bin", "1", "wavenumber bin"),
+    "partition/bound": ("partition/bound", "1", "bound of a bin"),
+    "partition/bounds": ("partition/bound", "rad/cell", "bounds of the bins"),
+    "partition/energy": ("partition/bin partition/snapshot", "J", "kinetic energy of a bin"),
+    "partition/kinetic": ("partition/snapshot", "J", "kinetic energy"),
+    "partition/reconstructed": ("partition/snapshot", "J", "kinetic energy of the bins' sum"),
+    "partition/error": ("partition/snapshot", "1", "relative error of the reconstructed kinetic energy"),
+    "partition/cross_share": ("partition/snapshot", "1", "share of the energy between bins"),
+    "partition/kinetic_energy": ("partition/bin partition/snapshot cell", "J", "kinetic energy of a bin in a cell"),
+}
 
 
 def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | None = None) -> xr.Dataset:
@@ -68,38 +97,35 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
     about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}
     if "velocity" not in run:
         return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
-    analysis = _Analysis.of(run, frozenset(measures), arrival)
-    analysis.add_space_time()
-    nt, cells = analysis.velocity.shape[:2]
+    record = _Record.of(run)
+    nt, cells = record.velocity.shape[:2]
+    step = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
+    parts = [_space_time(record, measures)]
     if nt < 2:
-        analysis.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
+        record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
-        analysis.add_dispersions()
-        analysis.add_bands()
-        analysis.add_wavelets()
+        parts += [_dispersions(record)] if "dispersion" in measures else []
+        parts += [_bands(record)] if "bands" in measures else []
+        parts += [_wavelets(record, measures, arrival)] if cells > 1 else []
     if cells == 1:
-        analysis.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
-    about |= {"thinning": analysis.thin.step, "left_out": "; ".join(analysis.left_out)} | analysis.attributes
-    return xr.Dataset(analysis.variables, attrs=about)
-
-
-class _StoredField:
-    """A field (t, cell, dof) that stays in its file; what is sliced is read."""
-
-    def __init__(self, field: xr.DataArray) -> None:
-        self._field = field
-        self.shape = field.shape
-
-    def __getitem__(self, index: Any) -> np.ndarray:
-        return np.asarray(self._field[index].values)
+        record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
+    data = xr.Dataset(
+        {
+            name: variable(LAYOUT[name][0].split(), values, *LAYOUT[name][1:], **record.told.get(name, {}))
+            for part in parts
+            for name, values in part.items()
+        },
+        attrs=about | {"thinning": step, "left_out": "; ".join(record.left_out)} | record.told.get("", {}),
+    )
+    return data.isel(time=slice(None, None, step))
 
 
 @dataclass
-class _Analysis:
-    """A run on its way to an analysis: what the measures need of it, and what they have given so far.
+class _Record:
+    """What the measures need of a run, and what they tell besides their values.
 
     ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) as numbers from 1, ``site``
-    the cell of the leading site, None without sites; ``thin`` picks the samples of the space-time maps.
+    the cell of the leading site, None without sites. ``told`` are attributes of variables, and of groups under "".
     """
 
     model: Model
@@ -108,22 +134,15 @@ class _Analysis:
     interval: float
     cells: np.ndarray
     site: int | None
-    measures: frozenset[str]
-    arrival: float | None
-    thin: slice
-    variables: Variables = field(default_factory=dict)
-    attributes: dict[str, Any] = field(default_factory=dict)
+    told: dict[str, dict[str, Any]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, run: xr.Dataset, measures: frozenset[str], arrival: float | None) -> _Analysis:
-        recorded, leading = run["velocity"], leading_site(run)
-        velocity = _StoredField(recorded) if recorded.nbytes > IN_MEMORY else recorded.values
+    def of(cls, run: xr.Dataset) -> _Record:
+        field, leading = run["velocity"], leading_site(run)
+        velocity = _StoredField(field) if field.nbytes > IN_MEMORY else field.values
         site = None if leading is None else int(run["sites/cell"].values[leading])
-        nt, cells = velocity.shape[:2]
-        thin = slice(None, None, -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS))
-        model, interval = Case.of(run).model(), field_interval(run)
-        return cls(model, velocity, field_time(run), interval, run["cell"].values, site, measures, arrival, thin)
+        return cls(Case.of(run).model(), velocity, field_time(run), field_interval(run), run["cell"].values, site)
 
     @property
     def masses(self) -> np.ndarray:
@@ -133,112 +152,115 @@ class _Analysis:
     @cached_property
     def kinetic(self) -> np.ndarray:
         """Kinetic energy (t, cell) in J."""
-        return kinetic_energy(self.velocity, self.masses)
+        return spectra.kinetic_energy(self.velocity, self.masses)
 
-    def add_space_time(self) -> None:
-        """Kinetic energy of the cells, and by wavenumber, over time."""
-        self.variables["time"] = variable("time", self.time[self.thin], "s", "time")
-        self.variables["cell"] = variable("cell", self.cells, "1", "cell")
-        if "kinetic" in self.measures:
-            dims, long_name = ("time", "cell"), "kinetic energy of a cell"
-            self.variables["kinetic_energy"] = variable(dims, self.kinetic[self.thin], "J", long_name)
-        if "wavenumber" in self.measures and len(self.cells) > 1:
-            wavenumber, content = wavenumber_content(self.velocity, self.masses)
-            wavenumber = wavenumber / int(self.cells[1] - self.cells[0])
-            dims, long_name = ("time", "wavenumber"), "kinetic energy per wavenumber bin"
-            self.variables["wavenumber"] = variable("wavenumber", wavenumber, "rad/cell", "wavenumber")
-            self.variables["wavenumber_content"] = variable(dims, content[self.thin], "J", long_name)
 
-    def add_dispersions(self) -> None:
-        """Dispersion of all cells, of those before and of those after the first site."""
-        if "dispersion" not in self.measures:
-            return
-        nt, cells = self.velocity.shape[:2]
-        if cells < 2:
-            self.left_out.append("dispersion: a single cell was recorded")
-            return
-        windows = {"dispersion": slice(None)}
-        if self.site is None:
-            self.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
-        else:
-            low, high = map(int, np.searchsorted(self.cells, [self.site, self.site + 1]))
-            sides = slice(0, low), slice(high, cells)
-            before, after = sides if self.model.drive_cell < self.site else sides[::-1]
-            windows |= {"dispersion_before": before, "dispersion_after": after}
-        lengths = fft.next_fast_len(nt, real=True), cells
-        highest = HEADROOM * pass_bands(self.model.chain.cell)[-1].high
-        for name, window in windows.items():
-            if len(range(cells)[window]) < 2:
-                self.left_out.append(f"{name}: fewer than two of its cells were recorded")
-                continue
-            side = name.removeprefix("dispersion").strip("_")
-            # A wave that crosses the border of a window would smear over all wavenumbers.
-            tapers = TAPER, 0.5 if side else TAPER
-            field = self.velocity, self.masses, self.interval
-            spectrum = dispersion(*field, cells=window, tapers=tapers, lengths=lengths, highest=highest).folded()
-            long_name = "mean kinetic energy per bin" + (f", cells {side} the first site" if side else "")
-            self.variables["frequency"] = variable("frequency", spectrum.frequency, "rad/s", "angular frequency")
-            self.variables[name] = variable(("wavenumber", "frequency"), spectrum.energy, "J", long_name)
+class _StoredField:
+    """A field (t, cell, dof) that stays in its file; what is sliced is read."""
 
-    def add_bands(self) -> None:
-        """Energies of the pass bands and gaps, and the inter-band transfer."""
-        if "bands" not in self.measures:
-            return
-        parts = Parts.of(pass_bands(self.model.chain.cell))
-        energy = part_energies(self.velocity, self.masses, self.interval, parts.edges)
-        above = parts.above(self.model.drive.frequency)
-        first, reason = self._front()
-        total = energy[:, first:].sum(axis=0)
-        moving = total > 0
-        shares = (energy[:, first:][:, moving] / total[moving]).mean(axis=1)
-        edge, part = "bands/edge", "bands/part"
-        numbers, names = np.arange(1, len(parts.names) + 1), list(parts.names)
-        long_name = "kinetic energy of a part"
-        self.variables |= {
-            edge: variable(edge, np.arange(len(parts.edges)), "1", "edge of a part"),
-            part: variable(part, numbers, "1", "part of the frequency axis"),
-            "bands/edges": variable(edge, parts.edges, "rad/s", "edges of the pass bands and gaps"),
-            "bands/energy": variable((part, "time"), energy[:, self.thin], "J", long_name, parts=names),
-            "bands/above": variable(part, above.astype(np.int8), "1", "1 for a pass band above the driven one"),
-            "bands/total": variable("time", self.kinetic.sum(axis=1)[self.thin], "J", "kinetic energy"),
-            "bands/share": variable(part, shares, "1", "mean share of a part after the wave's arrival"),
-        }
-        transfer, told = ibtet(energy, above, first), {"start": self.time[first], "starts_when": reason}
-        self.variables["ibtet"] = variable((), transfer, "1", "inter-band energy transfer", **told)
+    def __init__(self, field: xr.DataArray) -> None:
+        self._field, self.shape = field, field.shape
 
-    def _front(self) -> tuple[int, str]:
-        """The sample at which the wave reaches the first site, and by what it is told."""
-        if self.site is None:
-            after = int(np.searchsorted(self.time, self.model.drive.duration))
-            return min(after, len(self.time) - 1), "the drive ends (the lattice has no sites)"
-        at = int(np.argmin(np.abs(self.cells - self.site)))
-        reason = f"the kinetic energy of cell {self.cells[at]} first exceeds 1 % of its largest value"
-        return front_arrival(self.kinetic[:, at]), reason
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return np.asarray(self._field[index].values)
 
-    def add_wavelets(self) -> None:
-        """Wavenumber entropy of the host velocity, and partition of the velocity."""
-        nt, cells = self.velocity.shape[:2]
-        if cells < 2 or not {"partition", "entropy"} & self.measures:
-            return
-        if cells > MOST_CELLS:
-            self.left_out.append(f"partition, entropy: more than {MOST_CELLS} cells were recorded")
-            return
-        stride = -(-nt // (SNAPSHOTS + 1))
-        time, maps = self.time[::stride], "maps" in self.measures
-        if "entropy" in self.measures:
-            arrival, reason = self._arrival()
-            # A record that ends before keeps its last snapshot.
-            start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
-            host = np.ascontiguousarray(self.velocity[::stride, :, self.model.chain.cell.host])
-            self.variables |= entropy_variables(host, time, start, maps)
-            self.attributes |= {"entropy/start": time[start], "entropy/starts_when": reason}
-        if "partition" in self.measures:
-            self.variables |= partition_variables(self.velocity[::stride], self.masses, time, maps)
 
-    def _arrival(self) -> tuple[float, str]:
-        """The paper's t_hat in s, and by what it is told."""
-        if self.arrival is not None:
-            return self.arrival, "the largest host velocity at the first site in the linear run"
-        distance = 0 if self.site is None else abs(self.site - 1 - self.model.drive_cell)
-        estimate = 0.5 * self.model.drive.duration + distance / self.model.speed
-        return estimate, "half the burst and the way to the first site at the group velocity"
+def _space_time(record: _Record, measures: Collection[str]) -> dict[str, Any]:
+    values = {"time": record.time, "cell": record.cells}
+    if "kinetic" in measures:
+        values["kinetic_energy"] = record.kinetic
+    if "wavenumber" in measures and len(record.cells) > 1:
+        wavenumber, content = spectra.wavenumber_content(record.velocity, record.masses)
+        spacing = int(record.cells[1] - record.cells[0])
+        values |= {"wavenumber": wavenumber / spacing, "wavenumber_content": content}
+    return values
+
+
+def _dispersions(record: _Record) -> dict[str, Any]:
+    """Dispersion of all cells, of those before and of those after the first site."""
+    nt, cells = record.velocity.shape[:2]
+    if cells < 2:
+        record.left_out.append("dispersion: a single cell was recorded")
+        return {}
+    values: dict[str, Any] = {}
+    windows = {"dispersion": slice(None)}
+    if record.site is None:
+        record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
+    else:
+        low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
+        sides = slice(0, low), slice(high, cells)
+        before, after = sides if record.model.drive_cell < record.site else sides[::-1]
+        windows |= {"dispersion_before": before, "dispersion_after": after}
+    lengths = fft.next_fast_len(nt, real=True), cells
+    highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
+    measured = record.velocity, record.masses, record.interval
+    for name, window in windows.items():
+        if len(range(cells)[window]) < 2:
+            record.left_out.append(f"{name}: fewer than two of its cells were recorded")
+            continue
+        # A wave that crosses the border of a window would smear over all wavenumbers.
+        tapers = spectra.TAPER, spectra.TAPER if name == "dispersion" else 0.5
+        spectrum = spectra.dispersion(*measured, cells=window, tapers=tapers, lengths=lengths, highest=highest).folded()
+        values |= {"frequency": spectrum.frequency, name: spectrum.energy}
+    return values
+
+
+def _bands(record: _Record) -> dict[str, Any]:
+    """Energies of the pass bands and gaps, and the inter-band transfer from the wave's arrival on."""
+    parts = spectra.Parts.of(pass_bands(record.model.chain.cell))
+    energy = spectra.part_energies(record.velocity, record.masses, record.interval, parts.edges)
+    above = parts.above(record.model.drive.frequency)
+    if record.site is None:
+        after = int(np.searchsorted(record.time, record.model.drive.duration))
+        first, reason = min(after, len(record.time) - 1), "the drive ends (the lattice has no sites)"
+    else:
+        at = int(np.argmin(np.abs(record.cells - record.site)))
+        first = spectra.front_arrival(record.kinetic[:, at])
+        reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
+    total = energy[:, first:].sum(axis=0)
+    moving = total > 0
+    record.told["bands/energy"] = {"parts": list(parts.names)}
+    record.told["ibtet"] = {"start": record.time[first], "starts_when": reason}
+    return {
+        "bands/edge": np.arange(len(parts.edges)),
+        "bands/part": np.arange(1, len(parts.names) + 1),
+        "bands/edges": parts.edges,
+        "bands/energy": energy,
+        "bands/above": above.astype(np.int8),
+        "bands/total": record.kinetic.sum(axis=1),
+        "bands/share": (energy[:, first:][:, moving] / total[moving]).mean(axis=1),
+        "ibtet": spectra.ibtet(energy, above, first),
+    }
+
+
+def _wavelets(record: _Record, measures: Collection[str], arrival: float | None) -> dict[str, Any]:
+    """Wavenumber entropy of the host velocity, and partition of the velocity, at snapshots."""
+    nt, cells = record.velocity.shape[:2]
+    values: dict[str, Any] = {}
+    if cells > MOST_CELLS and {"partition", "entropy"} & set(measures):
+        record.left_out.append(f"partition, entropy: more than {MOST_CELLS} cells were recorded")
+        return values
+    stride, maps, cell = -(-nt // (SNAPSHOTS + 1)), "maps" in measures, record.model.chain.cell
+    time = record.time[::stride]
+    if "entropy" in measures:
+        reason = "the largest host velocity at the first site in the linear run"
+        if arrival is None:
+            distance = 0 if record.site is None else abs(record.site - 1 - record.model.drive_cell)
+            arrival = 0.5 * record.model.drive.duration + distance / record.model.speed
+            reason = "half the burst and the way to the first site at the group velocity"
+        # A record that ends before keeps its last snapshot.
+        start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
+        entropy = spectra.entropy(np.ascontiguousarray(record.velocity[::stride, :, cell.host]), start)
+        names = "energy_weighted", "masked", "joint", "error", *(("local", "weight") if maps else ())
+        values |= {"entropy/snapshot": time, "entropy/history": entropy.snapshot}
+        values |= {f"entropy/{name}": getattr(entropy, name) for name in names}
+        record.told[""] = {"entropy/start": time[start], "entropy/starts_when": reason}
+    if "partition" in measures:
+        partition = spectra.partition(record.velocity[::stride], record.masses, fields=maps)
+        bins = len(partition.energy)
+        names = "energy", "kinetic", "reconstructed", "error", "cross_share"
+        values |= {"partition/snapshot": time, "partition/bin": np.arange(1, bins + 1)}
+        values |= {"partition/bound": np.arange(bins + 1), "partition/bounds": np.arange(bins + 1) * np.pi / bins}
+        values |= {f"partition/{name}": getattr(partition, name) for name in names}
+        values |= {"partition/kinetic_energy": partition.field} if maps else {}
+    return values

@@ -13,11 +13,11 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case import Case, Sweep, SweepMember
+from vipetsc.case import Sweep, SweepMember
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, claim_folder
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_root
-from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Outcome, assemble
+from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS, Outcome, assemble
 from vipetsc.studies.linear import LinearWave
 from vipetsc.studies.members import MemberStore, StoppedError
 
@@ -77,7 +77,7 @@ def run_sweep(
     folder, stop = Path(folder), stop or StopRequest()
     begin = time.perf_counter()
     members = plan.members()
-    on_root(comm, lambda: _prepare(plan, folder, force))
+    on_root(comm, lambda: claim_folder(folder, SWEEP, plan.to_toml(), force=force, resume=None))
     team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
     pool = TaskPool(comm, team, stop)
     store = MemberStore(folder, plan.options, team, stop)
@@ -90,8 +90,13 @@ def run_sweep(
     failures = pool.share(absent, lambda path: store.make_linear(linear[path]), None)
     ready = on_root(comm, lambda: [path for path in linear if (path / "wave.h5").exists()])
     waves = {path: LinearWave.read(path / "wave.h5") for path in ready}
-    feasible = [key for key in missing if source[key] in waves]
-    order = sorted(feasible, key=lambda key: -_cost(cases[key], waves[source[key]]))
+
+    def cost(key: str) -> float:
+        """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
+        reached = waves[source[key]].reached(cases[key])
+        return float(np.minimum(reached, 10.0).sum()) + 1e-3 * float(cases[key].time.end)
+
+    order = sorted((key for key in missing if source[key] in waves), key=cost, reverse=True)
     bar = Progress(comm, len(order), "runs", show=progress)
     made = pool.share(order, lambda key: store.make(cases[key], waves[source[key]]), bar)
     reasons = {key: failures.get(source[key], "") for key in missing} | made
@@ -163,17 +168,6 @@ class TaskPool:
         return ""
 
 
-def _prepare(plan: Sweep, folder: Path, force: bool) -> None:
-    """Claim ``folder``: a sweep of the same case goes on; raises FolderError."""
-    claim_folder(folder, SWEEP, plan.to_toml(), force=force, resume=None)
-    (folder / "linear").mkdir(exist_ok=True)
-
-
-def _cost(case: Case, wave: LinearWave) -> float:
-    """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
-    return float(np.minimum(wave.reached(case), 10.0).sum()) + 1e-3 * float(case.time.end)
-
-
 def _outcome(member: SweepMember, store: MemberStore, reasons: dict[str, str]) -> Outcome | None:
     """How ``member`` ended; None if it is still to be made."""
     if member.case is None:
@@ -193,8 +187,7 @@ def _write_index(plan: Sweep, members: list[SweepMember], outcomes: tuple[Outcom
     axes = [{"keys": axis.keys, "names": [names[k] for k in axis.keys], "values": axis.values} for axis in plan.axes]
     rows = []
     for member, outcome in zip(members, outcomes, strict=True):
-        row = {"place": member.index, "id": member.id}
-        row |= {"status": outcome.name, "reason": outcome.reason} if outcome else {"status": "missing", "reason": ""}
-        rows.append(row)
+        status, reason = (STATUS[outcome.status], outcome.reason) if outcome else ("missing", "")
+        rows.append({"place": member.index, "id": member.id, "status": status, "reason": reason})
     index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}
     write_text(folder / "index.json", json.dumps(index, indent=1) + "\n")
