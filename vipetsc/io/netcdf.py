@@ -11,7 +11,7 @@ The dataset is flat rather than a ``DataTree`` because there a group inherits th
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -28,6 +28,11 @@ Variables = dict[str, xr.Variable]
 def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
     """``values`` over the named dimensions, with ``units``, ``long_name`` and further attributes."""
     return xr.Variable(dims, np.asarray(values), {"units": units, "long_name": long_name, **attributes})
+
+
+def tabulated(layout: Mapping[str, tuple[str, str, str]], values: Mapping[str, Any]) -> Variables:
+    """``values`` by name as variables, whose dimensions (separated by blanks), units and texts ``layout`` gives."""
+    return {name: variable(layout[name][0].split(), value, *layout[name][1:]) for name, value in values.items()}
 
 
 def write_netcdf(path: str | Path, data: xr.Dataset) -> None:

@@ -19,7 +19,7 @@ from scipy import fft
 import vipetsc
 from vipetsc import spectra
 from vipetsc.case import Case, Model
-from vipetsc.io.netcdf import variable
+from vipetsc.io.netcdf import tabulated
 from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
 
@@ -100,32 +100,28 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
     record = _Record.of(run)
     nt, cells = record.velocity.shape[:2]
     step = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
-    parts = [_space_time(record, measures)]
+    values = _space_time(record, measures)
     if nt < 2:
         record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
-        parts += [_dispersions(record)] if "dispersion" in measures else []
-        parts += [_bands(record)] if "bands" in measures else []
-        parts += [_wavelets(record, measures, arrival)] if cells > 1 else []
+        values |= _dispersions(record) if "dispersion" in measures else {}
+        values |= _bands(record) if "bands" in measures else {}
+        values |= _wavelets(record, measures, arrival) if cells > 1 else {}
     if cells == 1:
         record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
-    data = xr.Dataset(
-        {
-            name: variable(LAYOUT[name][0].split(), values, *LAYOUT[name][1:], **record.told.get(name, {}))
-            for part in parts
-            for name, values in part.items()
-        },
-        attrs=about | {"thinning": step, "left_out": "; ".join(record.left_out)} | record.told.get("", {}),
-    )
+    about |= {"thinning": step, "left_out": "; ".join(record.left_out)} | record.attributes.pop("", {})
+    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    for name, attributes in record.attributes.items():
+        data[name].attrs.update(attributes)
     return data.isel(time=slice(None, None, step))
 
 
 @dataclass
 class _Record:
-    """What the measures need of a run, and what they tell besides their values.
+    """What the measures need of a run, and what they tell besides their values: attributes, and what is left out.
 
     ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) as numbers from 1, ``site``
-    the cell of the leading site, None without sites. ``told`` are attributes of variables, and of groups under "".
+    the cell of the leading site, None without sites. ``attributes`` are those of variables, of groups under "".
     """
 
     model: Model
@@ -134,7 +130,7 @@ class _Record:
     interval: float
     cells: np.ndarray
     site: int | None
-    told: dict[str, dict[str, Any]] = field(default_factory=dict)
+    attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
 
     @classmethod
@@ -219,8 +215,8 @@ def _bands(record: _Record) -> dict[str, Any]:
         reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
     total = energy[:, first:].sum(axis=0)
     moving = total > 0
-    record.told["bands/energy"] = {"parts": list(parts.names)}
-    record.told["ibtet"] = {"start": record.time[first], "starts_when": reason}
+    record.attributes["bands/energy"] = {"parts": list(parts.names)}
+    record.attributes["ibtet"] = {"start": record.time[first], "starts_when": reason}
     return {
         "bands/edge": np.arange(len(parts.edges)),
         "bands/part": np.arange(1, len(parts.names) + 1),
@@ -254,7 +250,7 @@ def _wavelets(record: _Record, measures: Collection[str], arrival: float | None)
         names = "energy_weighted", "masked", "joint", "error", *(("local", "weight") if maps else ())
         values |= {"entropy/snapshot": time, "entropy/history": entropy.snapshot}
         values |= {f"entropy/{name}": getattr(entropy, name) for name in names}
-        record.told[""] = {"entropy/start": time[start], "entropy/starts_when": reason}
+        record.attributes[""] = {"entropy/start": time[start], "entropy/starts_when": reason}
     if "partition" in measures:
         partition = spectra.partition(record.velocity[::stride], record.masses, fields=maps)
         bins = len(partition.energy)

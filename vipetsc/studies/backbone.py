@@ -17,15 +17,26 @@ from scipy.optimize import minimize_scalar
 import vipetsc
 from vipetsc.case import Case, case_id
 from vipetsc.io.folder import FolderError
-from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
+from vipetsc.io.netcdf import Variables, open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, open_run
 from vipetsc.spectra import PowerLaw, power_law
 from vipetsc.studies.linear import LinearWave, leading_cell, linear_case
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
-GRAZING, VIBRO_IMPACT = 2, 3  # numbers of the regions II and III
-FEWEST = 3
+VIBRO_IMPACT = 3  # number of the region III
+FEWEST = 3  # points of a power law
+
+# Dimensions, units and description of what the group of a curve holds.
+LAYOUT = {
+    "energy": ("energy", "J", "work of the drive, normalised to the branch"),
+    "ibtet": ("energy", "1", "inter-band energy transfer"),
+    "fitted": ("energy", "1", "1 in region III at or behind the peak"),
+    "point": ("point", "1", "regular point of the branch"),
+    "branch/energy": ("point", "J", "energy of the branch"),
+    "branch/slope": ("point", "Hz/J", "slope df/dE"),
+    "branch/region": ("point", "1", "region of the branch"),
+}
 
 
 @dataclass(frozen=True)
@@ -44,30 +55,17 @@ class Slope:
 
     @classmethod
     def read(cls, path: Path) -> Slope:
-        """The slope of the branch in ``path``.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be opened.
-        ValueError
-            If it holds no branch of ours, or one that does not reach a contact.
-        """
-        with open_netcdf(path, "branch", ("energy", "slope", "region", "contacts", "kind", "case")) as file:
-            names = "energy", "slope", "region", "contacts", "kind"
+        """The slope of the branch in ``path``; raises OSError, or ValueError if it does not reach a contact."""
+        names = "energy", "slope", "region", "contacts", "kind"
+        with open_netcdf(path, "branch", (*names, "case")) as file:
             energy, slope, region, contacts, kind = (file[name].values for name in names)
             table = tomllib.loads(file.attrs["case"])
-        touched = np.nonzero(contacts > 0)[0]
-        if not touched.size or touched[0] == 0:
+        touching = np.nonzero(contacts > 0)[0]
+        if not touching.size or touching[0] == 0:
             raise ValueError(f"{path}: the branch does not pass from region I to II; follow it to higher energy")
-        regular = kind == 0
         law, reading = table.get("contacts", {}).get("law", ""), table.get("lattice", {}).get("reading", "")
-        grazing = float(energy[touched[0] - 1])
+        regular, grazing = kind == 0, float(energy[touching[0] - 1])
         return cls(law, reading, energy[regular], slope[regular], region[regular], grazing)
-
-    def inside(self, region: int) -> np.ndarray:
-        """Which points (point) of ``region`` have a slope above zero."""
-        return (self.region == region) & np.isfinite(self.slope) & (self.slope > 0)
 
 
 @dataclass(frozen=True)
@@ -107,9 +105,9 @@ class Alignment:
     energy: np.ndarray
     ibtet: np.ndarray
     fitted: np.ndarray
-    divisor: float
-    law: PowerLaw | None
-    steepness: PowerLaw | None
+    divisor: float = np.nan
+    law: PowerLaw | None = None
+    steepness: PowerLaw | None = None
 
 
 def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, slope: Slope) -> Alignment:
@@ -128,13 +126,13 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
     order = np.argsort(work[valid], kind="stable")
     energy, ibtet = work[valid][order] * (slope.grazing / initiation), ibtet[valid][order]
-    region = slope.inside(VIBRO_IMPACT)
+    region = (slope.region == VIBRO_IMPACT) & np.isfinite(slope.slope) & (slope.slope > 0)
     if not region.any():
         raise ValueError("the branch has no region III; follow it to higher energy")
     known, steep = slope.energy[region], slope.slope[region]
     fitted = (energy >= known.min()) & (energy <= known.max()) & (np.arange(len(energy)) >= np.argmax(ibtet))
     if fitted.sum() < FEWEST:
-        return Alignment(energy, ibtet, fitted, np.nan, None, None)
+        return Alignment(energy, ibtet, fitted)
     order = np.argsort(known)
     at = np.interp(np.log(energy[fitted]), np.log(known[order]), np.log(steep[order]))
     measured = np.log(ibtet[fitted])
@@ -158,10 +156,9 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
         If the linear run is gone or cannot be read.
     """
     linear = folder / "linear" / case_id(linear_case(case))
-    wave = LinearWave.read(linear / "wave.h5")
+    wave, sites = LinearWave.read(linear / "wave.h5"), np.asarray(case.contacts.sites)
     with open_run(linear / "run.h5") as run:
         work = float(run["energy/work"][-1])
-    sites = np.asarray(case.contacts.sites)
     first = int(np.argmax(sites == leading_cell(case)))
     return Initiation.of(wave.envelope[sites - 1], np.asarray(case.contacts.clearance), first, work)
 
@@ -180,65 +177,50 @@ def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
     """
     if "ibtet" not in ensemble or bool(ensemble["ibtet"].isnull().all()):
         return None
-    slopes = [Slope.read(folder / BRANCH) for folder in branches]
-    folder, left_out = Path(ensemble.attrs["folder"]), []
+    slopes, folder = [Slope.read(branch / BRANCH) for branch in branches], Path(ensemble.attrs["folder"])
     variables: Variables = {}
     attributes: dict[str, Any] = {}
+    left_out = []
     for curve, member in curves(ensemble):
         case = Case.load(member / "case.toml")
-        if not case.contacts.sites:
-            continue
-        name = _name(case)
-        if f"{name}/case" in attributes:
-            left_out.append(f"{name}: another curve has the same law, reading, sites and cycles")
-            continue
-        result = _relate_curve(curve, case, slopes, folder)
-        if isinstance(result, str):
-            left_out.append(f"{name}: {result}")
-            continue
-        variables |= {f"{name}/{key}": _inside(name, item) for key, item in result[0].items()}
-        attributes |= {f"{name}/{key}": value for key, value in (result[1] | {"case": case.to_toml()}).items()}
-    about = {"format_version": FORMAT_VERSION, "case": ensemble.attrs["case"], "left_out": left_out}
-    about |= {"vipetsc_version": vipetsc.__version__, "sources": _sources(folder, branches)}
-    write_netcdf(folder / "backbone.h5", xr.Dataset(variables, attrs=about | attributes))
+        sites = len(np.asarray(case.contacts.sites))
+        name = f"{case.lattice.reading}-{case.contacts.law}-{sites}-sites-{case.drive.cycles:g}-cycles"
+        related: Any = "another curve has the same law, reading, sites and cycles"
+        if f"{name}/case" not in attributes:
+            related = _relate_curve(curve, case, slopes, folder) if sites else None
+        if isinstance(related, str):
+            left_out.append(f"{name}: {related}")
+        elif related:
+            layout = {f"{name}/{key}": (f"{name}/{dim}", unit, text) for key, (dim, unit, text) in LAYOUT.items()}
+            variables |= tabulated(layout, {f"{name}/{key}": values for key, values in related[0].items()})
+            attributes |= {f"{name}/{key}": value for key, value in related[1].items()}
+    version = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
+    sources = {"case": ensemble.attrs["case"], "left_out": left_out, "sources": _sources(folder, branches)}
+    write_netcdf(folder / "backbone.h5", xr.Dataset(variables, attrs=version | sources | attributes))
     return folder / "backbone.h5" if variables else None
-
-
-def _name(case: Case) -> str:
-    """The group of a curve: reading, law, number of sites and cycles."""
-    sites = len(np.asarray(case.contacts.sites))
-    return f"{case.lattice.reading}-{case.contacts.law}-{sites}-sites-{case.drive.cycles:g}-cycles"
 
 
 def _relate_curve(
     curve: xr.Dataset, case: Case, slopes: Sequence[Slope], folder: Path
-) -> tuple[Variables, dict[str, Any]] | str:
-    """Variables and attributes of one curve's group, or why there is none."""
-    reading, law = case.lattice.reading, case.contacts.law
-    of_law = [slope for slope in slopes if slope.law == law]
-    candidates = [slope for slope in of_law if slope.reading == reading] or of_law
-    work, ibtet = curve["work"].values, curve["ibtet"].values
-    untouched = ibtet[curve["contact_episodes"].values == 0]
-    if not candidates:
-        return f"no branch of the law {law}"
+) -> tuple[dict[str, np.ndarray], dict[str, Any]] | str:
+    """Values and attributes of one curve's group, or why there is none."""
+    of_law = [slope for slope in slopes if slope.law == case.contacts.law]
+    of_law.sort(key=lambda slope: slope.reading != case.lattice.reading)
+    untouched = curve["ibtet"].values[curve["contact_episodes"].values == 0]
+    if not of_law:
+        return f"no branch of the law {case.contacts.law}"
     if not untouched.size:
         return "no member without contact"
-    slope, initiation, floor = candidates[0], initiation_of(folder, case), float(untouched.mean())
-    aligned = align(work, ibtet, initiation.energy, floor, slope)
+    slope, initiation, floor = of_law[0], initiation_of(folder, case), float(untouched.mean())
+    aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
     if aligned.law is None or aligned.steepness is None:
         return f"{aligned.fitted.sum()} points in region III behind the peak"
-    fitted = aligned.fitted.astype(np.int8)
-    variables = {
-        "energy": variable("energy", aligned.energy, "J", "work of the drive, normalised to the branch"),
-        "ibtet": variable("energy", aligned.ibtet, "1", "inter-band energy transfer"),
-        "fitted": variable("energy", fitted, "1", "1 in region III at or behind the peak"),
-        "point": variable("point", np.arange(len(slope.energy)), "1", "regular point of the branch"),
-        "branch/energy": variable("point", slope.energy, "J", "energy of the branch"),
-        "branch/slope": variable("point", slope.slope, "Hz/J", "slope df/dE"),
-        "branch/region": variable("point", slope.region, "1", "region of the branch"),
-    }
+    values = {"energy": aligned.energy, "ibtet": aligned.ibtet, "fitted": aligned.fitted.astype(np.int8)}
+    values |= {"point": np.arange(len(slope.energy)), "branch/energy": slope.energy}
+    values |= {"branch/slope": slope.slope, "branch/region": slope.region}
     low, high = aligned.law.exponent_interval
-    return variables, {
+    return values, {
+        "case": case.to_toml(),
         "branch_reading": slope.reading,
         "grazing_energy": slope.grazing,
         "initiation_amplitude": initiation.amplitude,
@@ -253,11 +235,6 @@ def _relate_curve(
         "r2_adjusted": aligned.law.r2_adjusted,
         "slope_exponent": aligned.steepness.exponent,
     }
-
-
-def _inside(group: str, item: xr.Variable) -> xr.Variable:
-    """``item`` over the dimensions of ``group``."""
-    return xr.Variable([f"{group}/{dim}" for dim in item.dims], item.values, item.attrs)
 
 
 def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:

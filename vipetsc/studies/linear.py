@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+import vipetsc
 from vipetsc.case import Case
-from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
+from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import field_time
 
 
@@ -48,13 +49,14 @@ class LinearWave:
 
     def write(self, path: Path) -> None:
         """Leave the wave in ``path``, whole or not at all."""
-        cells = np.arange(1, len(self.envelope) + 1)
-        data = {
-            "cell": variable("cell", cells, "1", "cell, counted from 1"),
-            "envelope": variable("cell", self.envelope, "m", "largest relative displacement at 1 N"),
-            "arrival": variable("cell", self.arrival, "s", "time of the largest host velocity"),
+        layout = {
+            "cell": ("cell", "1", "cell, counted from 1"),
+            "envelope": ("cell", "m", "largest relative displacement at 1 N"),
+            "arrival": ("cell", "s", "time of the largest host velocity"),
         }
-        write_netcdf(path, xr.Dataset(data))
+        values = np.arange(1, len(self.envelope) + 1), self.envelope, self.arrival
+        data = tabulated(layout, dict(zip(layout, values, strict=True)))
+        write_netcdf(path, xr.Dataset(data, attrs={"vipetsc_version": vipetsc.__version__}))
 
     def reached(self, case: Case) -> np.ndarray:
         """Linear relative displacement over clearance (site) at the amplitude of ``case``."""

@@ -67,16 +67,24 @@ class MemberStore:
         path = self.linear_folder(case) / "wave.h5"
         return LinearWave.read(path) if path.exists() else None
 
+    def has_wave(self, case: Case) -> bool:
+        """Whether the linear wave of ``case`` has been made by this version of the package."""
+        path = self.linear_folder(case) / "wave.h5"
+        if not path.exists():
+            return False
+        with open_netcdf(path, "linear wave") as file:
+            return bool(file.attrs.get("vipetsc_version") == vipetsc.__version__)
+
     def make_linear(self, case: Case) -> None:
         """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if it does not come out."""
         linear, memory = linear_case(case), RunMemory(self.team)
         self._check(simulate(linear, memory, self.team, stop=self.stop))
 
         def measure() -> None:
-            folder = self.linear_folder(case)
-            folder.mkdir(parents=True, exist_ok=True)
-            run = memory.dataset
+            folder, run = self.linear_folder(case), memory.dataset
             assert run is not None
+            shutil.rmtree(folder, ignore_errors=True)  # what another version left
+            folder.mkdir(parents=True)
             write_netcdf(folder / "run.h5", _keeping(run, linear, "velocity"))
             LinearWave.of(run).write(folder / "wave.h5")
 
@@ -99,49 +107,32 @@ class MemberStore:
 
     def make(self, case: Case, wave: LinearWave) -> None:
         """Simulate the member of ``case``, or scale it; raises as ``make_linear``."""
-        folder = self.folder / case_id(case)
-        if self.options.fields:
-            self._make_whole(case, folder, wave)
-        elif np.all(wave.reached(case) < MARGIN):
+        folder, whole = self.folder / case_id(case), self.options.fields
+        if not whole and np.all(wave.reached(case) < MARGIN):
             on_root(self.team, lambda: self._scale(case, folder, wave))
-        else:
-            self._make_reduced(case, folder, wave)
-
-    def _make_whole(self, case: Case, folder: Path, wave: LinearWave) -> None:
-        """A run with its fields in ``folder``; one that was cut off goes on."""
+            return
 
         def is_begun() -> bool:
-            kept = folder / "case.toml"
-            if folder.is_dir() and not kept.exists():
-                shutil.rmtree(folder)  # killed before it had begun
-            return (folder / "parts").is_dir() and kept.read_text(encoding="utf-8") == case.to_toml()
+            """Whether a run with its fields was cut off; one killed before it had begun is dropped."""
+            marker = folder / "case.toml"
+            if whole and folder.is_dir() and not marker.exists():
+                shutil.rmtree(folder)
+            return whole and (folder / "parts").is_dir() and marker.read_text(encoding="utf-8") == case.to_toml()
 
-        begun = on_root(self.team, is_begun)
-        self._check(simulate(case, folder, self.team, force=not begun, resume=begun, stop=self.stop))
-
-        def measure() -> None:
-            with open_run(folder / "run.h5") as run:
-                write_netcdf(folder / "analysis.h5", analyse(run, self.measures, wave.arrival_at(case)))
-            self._finish(folder, case, self.summary(case))
-
-        on_root(self.team, measure)
-
-    def _make_reduced(self, case: Case, folder: Path, wave: LinearWave) -> None:
-        """A run of which the ledger, the impacts and the measures stay."""
-        memory = RunMemory(self.team)
-        measured = _gathered(case, "velocity")
-        result = simulate(measured, memory, self.team, stop=self.stop)
+        begun, memory = on_root(self.team, is_begun), RunMemory(self.team)
+        simulated, output = (case, folder) if whole else (_gathered(case, "velocity"), memory)
+        result = simulate(simulated, output, self.team, force=not begun, resume=begun, stop=self.stop)
         self._check(result)
-        summary = provenance(self.team) | {"status": result.sentence, "complete": True}
-        summary["statistics"] = result.statistics
 
         def measure() -> None:
             folder.mkdir(exist_ok=True)
-            run = memory.dataset
-            assert run is not None
-            write_netcdf(folder / "run.h5", _keeping(run, case))
-            write_netcdf(folder / "analysis.h5", analyse(run, self.measures, wave.arrival_at(case)))
-            self._finish(folder, case, summary)
+            summary = provenance(self.team) | {"status": result.sentence, "complete": True}
+            if memory.dataset is not None:
+                write_netcdf(folder / "run.h5", _keeping(memory.dataset, case))
+            with open_run(folder / "run.h5") if memory.dataset is None else memory.dataset as run:
+                write_netcdf(folder / "analysis.h5", analyse(run, self.measures, wave.arrival_at(case)))
+            summary["statistics"] = result.statistics
+            self._finish(folder, case, self.summary(case) if whole else summary)
 
         on_root(self.team, measure)
 

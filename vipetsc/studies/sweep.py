@@ -86,9 +86,9 @@ def run_sweep(
     missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_current(case)])
     source = {key: store.linear_folder(cases[key]) for key in missing}
     linear = {source[key]: cases[key] for key in missing}
-    absent = on_root(comm, lambda: [path for path in linear if not (path / "wave.h5").exists()])
+    absent = on_root(comm, lambda: [path for path, case in linear.items() if not store.has_wave(case)])
     failures = pool.share(absent, lambda path: store.make_linear(linear[path]), None)
-    ready = on_root(comm, lambda: [path for path in linear if (path / "wave.h5").exists()])
+    ready = on_root(comm, lambda: [path for path, case in linear.items() if store.has_wave(case)])
     waves = {path: LinearWave.read(path / "wave.h5") for path in ready}
 
     def cost(key: str) -> float:
