@@ -31,11 +31,6 @@ FLOORS = (
 )
 SERIAL = ("lattice", "spectra", "figures")
 FORBIDDEN = {"petsc4py", "mpi4py"}
-# Arrows that still point up, while the house is rebuilt.
-UPWARD = {
-    "io.ensemble_file -> case",
-    "io.run_file -> case",
-}
 
 
 def module_of(path):
@@ -79,7 +74,7 @@ def test_every_part_has_its_floor():
 
 def test_imports_point_down():
     upward = {f"{m} -> {other}" for m in MODULES for other in arrows(m) if floor(other) < floor(m)}
-    assert upward <= UPWARD
+    assert upward == set()
 
 
 def test_no_circle():
