@@ -11,7 +11,7 @@ from vipetsc.case import Case, Sweep, case_id
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.lattice import four_band
 from vipetsc.studies.ensemble import fit_curve
-from vipetsc.studies.linear import LinearWave, leading_cell
+from vipetsc.studies.linear import arrival_at, leading_cell, linear_wave, reached
 from vipetsc.studies.members import MemberStore
 from vipetsc.studies.sweep import conclude
 
@@ -94,10 +94,10 @@ def test_a_linear_wave_arrives_with_its_host():
     displacement[..., cell.resonator], displacement[..., cell.host] = 3e-3, -1e-3
     dims = "time", "cell", "dof"
     data = {"time": time, "displacement": (dims, displacement), "velocity": (dims, velocity)}
-    wave = LinearWave.of(xr.Dataset(data, attrs={"case": case.to_toml()}))
-    assert wave.arrival == pytest.approx(peak, abs=0.0026)
-    assert leading_cell(case) == 7 and wave.arrival_at(case) == wave.arrival[6]
+    wave = linear_wave(xr.Dataset(data, attrs={"case": case.to_toml()}))
+    assert wave["arrival"].values == pytest.approx(peak, abs=0.0026)
+    assert leading_cell(case) == 7 and arrival_at(wave, case) == wave["arrival"][6]
     rate = np.abs(velocity[..., cell.resonator] - velocity[..., cell.host]).max(axis=0)
-    assert wave.envelope == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
-    reached = case.drive.amplitude * wave.envelope[[19, 6, 2]] / np.asarray(case.contacts.clearance)
-    assert wave.reached(case) == pytest.approx(reached)
+    assert wave["envelope"].values == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
+    expected = case.drive.amplitude * wave["envelope"].values[[19, 6, 2]] / np.asarray(case.contacts.clearance)
+    assert reached(wave, case) == pytest.approx(expected)

@@ -7,6 +7,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, select
 from vipetsc.studies.ensemble import COMPLETE, SCALED
+from vipetsc.studies.linear import reached
 from vipetsc.studies.members import MemberStore
 from vipetsc.studies.sweep import run_sweep
 
@@ -26,7 +27,7 @@ def sweep(tmp_path_factory):
     case = Case.from_table(TABLE | {"drive": TABLE["drive"] | {"amplitude": 1.0}})
     store = MemberStore(folder / "wave")
     store.make_linear(case)
-    one = store.wave(case).reached(case).max()
+    one = reached(store.wave(case), case).max()
     shares = np.array([0.6, 0.85, 1.02, 1.1, 1.25, 3.0])
     table = TABLE | {"sweep": {"drive": {"amplitude": (shares / one).tolist()}}}
     result = run_sweep(Sweep.from_table(table), folder / "sweep")

@@ -20,7 +20,7 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import Variables, open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, open_run
 from vipetsc.spectra import PowerLaw, power_law
-from vipetsc.studies.linear import LinearWave, leading_cell, linear_case
+from vipetsc.studies.linear import leading_cell, linear_case
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
@@ -156,11 +156,11 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
         If the linear run is gone or cannot be read.
     """
     linear = folder / "linear" / case_id(linear_case(case))
-    wave, sites = LinearWave.read(linear / "wave.h5"), np.asarray(case.contacts.sites)
-    with open_run(linear / "run.h5") as run:
-        work = float(run["energy/work"][-1])
+    sites = np.asarray(case.contacts.sites)
+    with open_netcdf(linear / "wave.h5", "linear wave") as wave, open_run(linear / "run.h5") as run:
+        envelope, work = wave["envelope"].values[sites - 1], float(run["energy/work"][-1])
     first = int(np.argmax(sites == leading_cell(case)))
-    return Initiation.of(wave.envelope[sites - 1], np.asarray(case.contacts.clearance), first, work)
+    return Initiation.of(envelope, np.asarray(case.contacts.clearance), first, work)
 
 
 def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:

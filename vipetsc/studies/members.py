@@ -24,7 +24,7 @@ from vipetsc.io.read import open_run
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import FULL, REDUCED, analyse
-from vipetsc.studies.linear import LinearWave, leading_cell, linear_case, scaled, with_sites
+from vipetsc.studies.linear import arrival_at, leading_cell, linear_case, linear_wave, reached, scaled, with_sites
 
 # A member is scaled where its linear wave stays below this share of every clearance: the largest w between samples
 # exceeds the sampled envelope by less than the rest for any burst of a few cycles.
@@ -62,18 +62,18 @@ class MemberStore:
         """Where the linear run of ``case`` belongs."""
         return self.folder / "linear" / case_id(linear_case(case))
 
-    def wave(self, case: Case) -> LinearWave | None:
+    def wave(self, case: Case) -> xr.Dataset | None:
         """The linear wave of ``case``; None if it has not been made."""
         path = self.linear_folder(case) / "wave.h5"
-        return LinearWave.read(path) if path.exists() else None
+        if not path.exists():
+            return None
+        with open_netcdf(path, "linear wave", ("envelope", "arrival")) as file:
+            return file.load()
 
     def has_wave(self, case: Case) -> bool:
         """Whether the linear wave of ``case`` has been made by this version of the package."""
-        path = self.linear_folder(case) / "wave.h5"
-        if not path.exists():
-            return False
-        with open_netcdf(path, "linear wave") as file:
-            return bool(file.attrs.get("vipetsc_version") == vipetsc.__version__)
+        wave = self.wave(case)
+        return wave is not None and wave.attrs.get("vipetsc_version") == vipetsc.__version__
 
     def make_linear(self, case: Case) -> None:
         """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if it does not come out."""
@@ -86,7 +86,7 @@ class MemberStore:
             shutil.rmtree(folder, ignore_errors=True)  # what another version left
             folder.mkdir(parents=True)
             write_netcdf(folder / "run.h5", _keeping(run, linear, "velocity"))
-            LinearWave.of(run).write(folder / "wave.h5")
+            write_netcdf(folder / "wave.h5", linear_wave(run))
 
         on_root(self.team, measure)
 
@@ -105,10 +105,10 @@ class MemberStore:
         summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         return summary
 
-    def make(self, case: Case, wave: LinearWave) -> None:
+    def make(self, case: Case, wave: xr.Dataset) -> None:
         """Simulate the member of ``case``, or scale it; raises as ``make_linear``."""
         folder, whole = self.folder / case_id(case), self.options.fields
-        if not whole and np.all(wave.reached(case) < MARGIN):
+        if not whole and np.all(reached(wave, case) < MARGIN):
             on_root(self.team, lambda: self._scale(case, folder, wave))
             return
 
@@ -130,7 +130,7 @@ class MemberStore:
             if memory.dataset is not None:
                 write_netcdf(folder / "run.h5", _keeping(memory.dataset, case))
             with open_run(folder / "run.h5") if memory.dataset is None else memory.dataset as run:
-                write_netcdf(folder / "analysis.h5", analyse(run, self.measures, wave.arrival_at(case)))
+                write_netcdf(folder / "analysis.h5", analyse(run, self.measures, arrival_at(wave, case)))
             summary["statistics"] = result.statistics
             self._finish(folder, case, self.summary(case) if whole else summary)
 
@@ -143,7 +143,7 @@ class MemberStore:
         if not result.complete:
             raise RuntimeError(result.sentence)
 
-    def _scale(self, case: Case, folder: Path, wave: LinearWave) -> None:
+    def _scale(self, case: Case, folder: Path, wave: xr.Dataset) -> None:
         """The member from its linear run: fields go with the amplitude, energies with its square."""
         source, factor = self.linear_folder(case), case.drive.amplitude**2
         # All members with the same first site share these measures, whichever rank needs them first.
@@ -151,7 +151,7 @@ class MemberStore:
         with open_run(source / "run.h5") as linear:
             unit = with_sites(linear, case)
             if not shared.exists():
-                write_netcdf(shared, analyse(unit, self.measures, wave.arrival_at(case)))
+                write_netcdf(shared, analyse(unit, self.measures, arrival_at(wave, case)))
             run = scaled(unit.drop_vars("velocity"), factor).load()
         statistics = json.loads(run.attrs["statistics"]) | {"episodes": 0, "scaled_from": source.name}
         statistics |= {"work": float(run["energy/work"][-1]), "dissipated": 0.0}

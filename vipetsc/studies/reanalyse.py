@@ -13,6 +13,7 @@ from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.parallel import on_root
 from vipetsc.studies.analysis import analyse
+from vipetsc.studies.linear import arrival_at
 from vipetsc.studies.members import MemberStore
 from vipetsc.studies.sweep import conclude
 
@@ -50,7 +51,7 @@ def measure_run(folder: Path) -> Path:
     with open_run(folder / "run.h5") as run:
         case = Case.of(run)
         wave = MemberStore(folder.parent).wave(case)
-        write_netcdf(folder / "analysis.h5", analyse(run, arrival=wave.arrival_at(case) if wave else None))
+        write_netcdf(folder / "analysis.h5", analyse(run, arrival=None if wave is None else arrival_at(wave, case)))
     return folder / "analysis.h5"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -18,7 +18,7 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, claim_folder
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_root
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS, Outcome, assemble
-from vipetsc.studies.linear import LinearWave
+from vipetsc.studies.linear import reached
 from vipetsc.studies.members import MemberStore, StoppedError
 
 FORMAT_VERSION = 1
@@ -89,12 +89,12 @@ def run_sweep(
     absent = on_root(comm, lambda: [path for path, case in linear.items() if not store.has_wave(case)])
     failures = pool.share(absent, lambda path: store.make_linear(linear[path]), None)
     ready = on_root(comm, lambda: [path for path, case in linear.items() if store.has_wave(case)])
-    waves = {path: LinearWave.read(path / "wave.h5") for path in ready}
+    waves = {path: wave for path in ready if (wave := store.wave(linear[path])) is not None}
 
     def cost(key: str) -> float:
         """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
-        reached = waves[source[key]].reached(cases[key])
-        return float(np.minimum(reached, 10.0).sum()) + 1e-3 * float(cases[key].time.end)
+        touching = np.minimum(reached(waves[source[key]], cases[key]), 10.0)
+        return float(touching.sum()) + 1e-3 * float(cases[key].time.end)
 
     order = sorted((key for key in missing if source[key] in waves), key=cost, reverse=True)
     bar = Progress(comm, len(order), "runs", show=progress)
@@ -109,18 +109,32 @@ def run_sweep(
 
 
 def conclude(
-    plan: Sweep, members: list[SweepMember], store: MemberStore, reasons: dict[str, str]
+    plan: Sweep, members: Sequence[SweepMember], store: MemberStore, reasons: Mapping[str, str]
 ) -> tuple[Outcome | None, ...]:
     """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns how the members ended.
 
     ``reasons`` names the members (by id) that failed just now, and why.
     """
-    outcomes = tuple(_outcome(member, store, reasons) for member in members)
-    _write_index(plan, members, outcomes, store.folder)
+    outcomes, rows = [], []
+    for member in members:
+        outcome, reason = None, reasons.get(member.id) or member.problem
+        if reason:
+            outcome = Outcome(FAILED, reason)
+        elif member.case and store.is_complete(member.case):
+            summary = store.summary(member.case)
+            status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
+            outcome = Outcome(status, summary["status"], summary["statistics"])
+        outcomes.append(outcome)
+        told = (STATUS[outcome.status], outcome.reason) if outcome else ("missing", "")
+        rows.append({"place": member.index, "id": member.id, "status": told[0], "reason": told[1]})
+    names = plan.names()
+    axes = [{"keys": axis.keys, "names": [names[k] for k in axis.keys], "values": axis.values} for axis in plan.axes]
+    index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}
+    write_text(store.folder / "index.json", json.dumps(index, indent=1) + "\n")
     ended = [outcome for outcome in outcomes if outcome]
     if len(ended) == len(outcomes):
         assemble(plan, members, ended, store.folder)
-    return outcomes
+    return tuple(outcomes)
 
 
 class TaskPool:
@@ -166,28 +180,3 @@ class TaskPool:
         except FAILURES as error:
             return f"{type(error).__name__}: {error}" if not isinstance(error, RuntimeError) else str(error)
         return ""
-
-
-def _outcome(member: SweepMember, store: MemberStore, reasons: dict[str, str]) -> Outcome | None:
-    """How ``member`` ended; None if it is still to be made."""
-    if member.case is None:
-        return Outcome(FAILED, member.problem)
-    if reasons.get(member.id):
-        return Outcome(FAILED, reasons[member.id])
-    if not store.is_complete(member.case):
-        return None
-    summary = store.summary(member.case)
-    status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
-    return Outcome(status, summary["status"], summary["statistics"])
-
-
-def _write_index(plan: Sweep, members: list[SweepMember], outcomes: tuple[Outcome | None, ...], folder: Path) -> None:
-    """Write ``index.json``: the axes, and every member's place, folder and how it ended."""
-    names = plan.names()
-    axes = [{"keys": axis.keys, "names": [names[k] for k in axis.keys], "values": axis.values} for axis in plan.axes]
-    rows = []
-    for member, outcome in zip(members, outcomes, strict=True):
-        status, reason = (STATUS[outcome.status], outcome.reason) if outcome else ("missing", "")
-        rows.append({"place": member.index, "id": member.id, "status": status, "reason": reason})
-    index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}
-    write_text(folder / "index.json", json.dumps(index, indent=1) + "\n")
