@@ -10,16 +10,3 @@ from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.reading import CaseError, CaseFile, Problem
 from vipetsc.case.sweep import Sweep, SweepMember
-
-__all__ = [
-    "Case",
-    "CaseError",
-    "CaseFile",
-    "DesignCase",
-    "Model",
-    "NnmCase",
-    "Problem",
-    "Sweep",
-    "SweepMember",
-    "case_id",
-]

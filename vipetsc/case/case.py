@@ -3,8 +3,6 @@
 A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses and cells count from 1.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Checks between the keys of a case, each of which is valid by itself."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -39,8 +37,7 @@ def lattice_run_problems(sections: dict[str, Any], invalid: set[str]) -> list[Pr
         check_sites(checks, lattice, contacts)
         check_stiffness(checks, lattice, contacts)
     check_drive(checks, drive, lattice, cell)
-    check_time(checks, sections["time"], cell)
-    check_output(checks, sections["output"], lattice)
+    check_sampling(checks, sections["time"], sections["output"], cell, lattice.cells)
     return checks.problems
 
 
@@ -110,26 +107,20 @@ def check_drive(checks: Checks, drive: DriveTable, lattice: LatticeTable, cell: 
         checks.require(drive.mass <= cell.dofs, "drive.mass", drive.mass, f"the cell has {cell.dofs} masses")
 
 
-def check_time(checks: Checks, time: TimeTable, cell: UnitCell | None) -> None:
-    """Check the sampling against the bands and against the end."""
+def check_sampling(checks: Checks, time: TimeTable, output: OutputTable, cell: UnitCell | None, cells: int) -> None:
+    """Check the samples against the bands and the end, and the recorded window against the lattice."""
     interval = time.sample_interval
-    if not checks.valid("time.sample_interval"):
-        return
-    if cell and interval != "auto":
-        checks.problems += too_coarse(cell, interval, "time.sample_interval", interval)
-    if checks.valid("time.samples"):
-        both = time.samples is not None and interval != "auto"
-        checks.require(not both, "time.samples", time.samples, "give it or time.sample_interval, not both")
-    if checks.valid("time.end") and interval != "auto" and time.end != "traverse":
-        checks.require(time.end >= interval, "time.end", time.end, "shorter than one sample interval")
-
-
-def check_output(checks: Checks, output: OutputTable, lattice: LatticeTable) -> None:
-    """Check that the recorded window lies in the lattice."""
+    if checks.valid("time.sample_interval"):
+        if cell and interval != "auto":
+            checks.problems += too_coarse(cell, interval, "time.sample_interval", interval)
+        twice = checks.valid("time.samples") and time.samples is not None and interval != "auto"
+        checks.require(not twice, "time.samples", time.samples, "give it or time.sample_interval, not both")
+        if checks.valid("time.end") and interval != "auto" and time.end != "traverse":
+            checks.require(time.end >= interval, "time.end", time.end, "shorter than one sample interval")
     if output.window is not None and checks.valid("lattice.cells"):
         first, last = output.window
-        remedy = f"must be [first, last] within cells 1 to {lattice.cells}"
-        checks.require(1 <= first <= last <= lattice.cells, "output.window", output.window, remedy)
+        remedy = f"must be [first, last] within cells 1 to {cells}"
+        checks.require(1 <= first <= last <= cells, "output.window", output.window, remedy)
 
 
 def too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:

@@ -1,7 +1,5 @@
 """The case of the verb ``design``: which (lambda, eta) are searched, in which readings."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np

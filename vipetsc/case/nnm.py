@@ -3,8 +3,6 @@
 The system itself is built by ``vipetsc.modes.system.System.from_case``.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import Field

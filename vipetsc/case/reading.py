@@ -5,8 +5,6 @@ and, where there is one, the nearest valid key. ``CaseFile`` is the one way from
 case is a subclass that declares the sections it reads.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import difflib
@@ -26,8 +24,7 @@ if TYPE_CHECKING:
 SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "design")
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
-Table = dict[str, Any]
-"""A parsed TOML table."""
+Table = dict[str, Any]  # a parsed TOML table
 
 
 @dataclass(frozen=True)
@@ -49,10 +46,11 @@ class CaseError(ValueError):
     def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
         self.problems = list(problems)
         self.source = source
-        count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
-        super().__init__(f"{source}: {count}\n" + "\n".join(f"  {p}" for p in self.problems))
+        count = len(self.problems)
+        heading = f"{source}: {count} problem{'s' if count > 1 else ''}"
+        super().__init__("\n".join([heading, *(f"  {p}" for p in self.problems)]))
 
-    def __reduce__(self) -> tuple[type[CaseError], tuple[list[Problem], str]]:
+    def __reduce__(self) -> tuple[type[Self], tuple[list[Problem], str]]:
         return type(self), (self.problems, self.source)
 
 
@@ -79,9 +77,7 @@ class CaseFile(Section):
     @classmethod
     def load(cls, path: str | Path | None, overrides: Iterable[str] = ()) -> Self:
         """The case in file ``path``, or the built-in one, with ``a.b=value`` overrides; raises CaseError."""
-        if path is None:
-            return cls.builtin(overrides)
-        return cls.from_table(read_toml(path), overrides, str(path))
+        return cls.from_table(read_toml(path), overrides, str(path)) if path else cls.builtin(overrides)
 
     @classmethod
     def builtin(cls, overrides: Iterable[str] = ()) -> Self:
@@ -94,7 +90,7 @@ class CaseFile(Section):
         return cls.from_table(tomllib.loads(text))
 
     @classmethod
-    def of(cls, run: xr.DataTree | xr.Dataset) -> Self:
+    def of(cls, run: "xr.Dataset") -> Self:
         """The resolved case that a file of results carries in its attribute ``case``."""
         return cls.from_toml(run.attrs["case"])
 
@@ -164,10 +160,13 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
         if not equals or not all(path.split(".")):
             problems.append(Problem("--set", override, "write section.key=value"))
             continue
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = _bare(text)
+        value: Any = text  # a bare word
+        for read in (lambda text: tomllib.loads(f"value = {text}")["value"], float):
+            try:
+                value = read(text)
+                break
+            except ValueError:  # not TOML; not a number such as .5
+                continue
         problems += [dataclasses.replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
     return table, problems
 
@@ -182,14 +181,6 @@ def put(table: Table, path: str, value: Any) -> list[Problem]:
         return [Problem(path, value, f"{'.'.join(parents)} is a value, not a section")]
     section[key] = value
     return []
-
-
-def _bare(text: str) -> float | str:
-    """A value that TOML would not take: a number such as .5, or a word."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySection, list[Problem]]:

@@ -1,7 +1,5 @@
 """From the choices of a case file to plain numbers: sites, clearances, stiffness, frequency, times."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

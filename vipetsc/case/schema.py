@@ -1,7 +1,5 @@
 """The sections of a case of one lattice run: types, bounds and defaults; masses and cells count from 1."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """Many cases from one: the section ``[sweep]`` of a case file, and the members it stands for."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What the verb ``nnm`` prints: a live table while a branch grows, and how it went."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import TextIO

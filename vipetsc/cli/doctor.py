@@ -1,7 +1,5 @@
 """Versions and checks of an installation, and how to get what is missing."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 

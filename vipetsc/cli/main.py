@@ -1,7 +1,5 @@
 """Arguments and exit codes of the command line."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Pictures of what a folder holds, drawn again from its files over all ranks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,15 +16,8 @@ def draw_folders(
 ) -> list[Path]:
     """Draw runs, sweeps, branches or a search, whichever ``paths`` hold; ``names`` are figures of that kind.
 
-    Returns
-    -------
-    list of Path
-        The files written, on rank 0; an empty list on the others.
-
-    Raises
-    ------
-    FolderError
-        For folders that hold nothing to draw, cannot share a page, or a figure that does not exist.
+    Returns the files written, on rank 0. Raises FolderError for folders that hold nothing to draw or cannot share a
+    page, and for a figure that does not exist.
     """
     source, folders = on_root(comm, lambda: source_of(paths))
     return draw_source(source, folders, names, formats, comm)

@@ -1,7 +1,5 @@
 """What the verbs print: tables of a case, its bands, and how runs and sweeps ended."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -54,7 +52,7 @@ def bands_report(cell: UnitCell) -> str:
     return "\n".join(lines + [f" gap {gap['low']:9.2f} {gap['high']:9.2f}" for gap in bands["gaps"]])
 
 
-def sweep_table(result: SweepResult) -> str:
+def sweep_table(result: "SweepResult") -> str:
     """How a sweep ended: counts, time, what failed."""
     complete, scaled, failed = (result.count(status) for status in range(3))
     counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
@@ -129,7 +127,7 @@ def _duration(seconds: float) -> str:
     return f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
 
 
-def run_table(result: Result) -> str:
+def run_table(result: "Result") -> str:
     """How a run ended and its numbers."""
     s = result.statistics
     if s["engine"] == "propagator":

@@ -3,8 +3,6 @@
 What a verb alone needs is imported inside it: compiled kernels and matplotlib take seconds to load.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
