@@ -12,16 +12,7 @@ from hypothesis import strategies as st
 from vipetsc.case import Case, Sweep
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.paper.claims import measure_claims, thresholds, write_claims
-from vipetsc.paper.claims.claim import (
-    FAILS,
-    HOLDS,
-    IN_PART,
-    UNMEASURED,
-    Criterion,
-    MissingEvidence,
-    rounded,
-    verdict,
-)
+from vipetsc.paper.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED, Criterion, MissingEvidence, rounded, verdict
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence
 from vipetsc.paper.claims.measure import MEASURES, READINGS, measure_claim
 from vipetsc.paper.claims.scattering import BRANCHES

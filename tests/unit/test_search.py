@@ -30,12 +30,7 @@ def slow(reading, lam, eta):
     def modes(kappa):
         e = np.exp(-1j * kappa)
         stiffness = np.array(
-            [
-                [k + k2, -k2, 0, -k * e],
-                [-k2, 2 * k2 + k3, -k3, -k2],
-                [0, -k3, k3, 0],
-                [-k / e, -k2, 0, k + k2],
-            ]
+            [[k + k2, -k2, 0, -k * e], [-k2, 2 * k2 + k3, -k3, -k2], [0, -k3, k3, 0], [-k / e, -k2, 0, k + k2]]
         )
         squared, u = np.linalg.eig(stiffness / masses[:, None])
         order = np.argsort(squared.real)
@@ -134,12 +129,7 @@ def test_a_massless_host_or_resonator_is_refused(eta):
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    lam=st.floats(0.05, 2),
-    eta=st.floats(0.05, 0.95),
-    kappa=st.floats(0.01, 3.1),
-    reading=st.sampled_from(READINGS),
-)
+@given(lam=st.floats(0.05, 2), eta=st.floats(0.05, 0.95), kappa=st.floats(0.01, 3.1), reading=st.sampled_from(READINGS))
 def test_deflection_knows_neither_phase_nor_length_nor_direction(lam, eta, kappa, reading):
     """A wave to the left deflects as one to the right; a unit vector deflects by sqrt(2) at most."""
     cell = four_band(reading, lam, eta)

@@ -26,11 +26,7 @@ TABLE = {
     "contacts": {"sites": 1},
     "drive": {"band": 2, "at": "max-group-velocity", "cycles": 4},
     "time": {"rtol": 1e-7},
-    "sweep": {
-        "measures": ["transfer"],
-        "contacts": {"law": ["hertz", "bilinear"]},
-        "drive": {"amplitude": AMPLITUDES},
-    },
+    "sweep": {"measures": ["transfer"], "contacts": {"law": ["hertz", "bilinear"]}, "drive": {"amplitude": AMPLITUDES}},
 }
 
 

@@ -207,11 +207,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(folder, looks):
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    st.lists(st.floats(-1, 1), min_size=4, max_size=12),
-    st.floats(0.1, 1.0),
-    st.floats(0.05, 2.0),
-)
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=12), st.floats(0.1, 1.0), st.floats(0.05, 2.0))
 def test_no_onset_is_missed(coefficients, length, clearance):
     jet = np.array(coefficients)
     s = np.linspace(0, length, 4001)

@@ -243,10 +243,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
 
     # Springs so soft that they do nothing during one impact.
     soft = 1e-9
-    springs = [
-        {"start": 1, "end": 1, "stiffness": soft, "next_cell": True},
-        {"start": 1, "end": 2, "stiffness": soft},
-    ]
+    springs = [{"start": 1, "end": 1, "stiffness": soft, "next_cell": True}, {"start": 1, "end": 2, "stiffness": soft}]
     case = Case.from_table(
         {
             "lattice": {"cells": 2, "ends": "free",
@@ -283,11 +280,7 @@ def test_the_linear_ridge_lies_on_the_bloch_branch(folder):
     from vipetsc.spectra import fourier
 
     case = Case.from_table(
-        {
-            "lattice": {"preset": "diatomic", "reading": "printed"},
-            "contacts": {"sites": 0},
-            "drive": {"amplitude": 0.1},
-        }
+        {"lattice": {"preset": "diatomic", "reading": "printed"}, "contacts": {"sites": 0}, "drive": {"amplitude": 0.1}}
     )
     simulate(case, folder / "run")
     data = datasets(folder / "run" / "run.h5")

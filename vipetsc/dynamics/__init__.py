@@ -1,5 +1,3 @@
 """A lattice in motion, on PETSc."""
 
 from vipetsc.dynamics.run import Result, simulate
-
-__all__ = ["Result", "simulate"]

@@ -5,24 +5,3 @@ from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain, log_clearances, spread_sites
 from vipetsc.lattice.contact import Bilinear, Contact, ContactLaw, Hertz, contact_stiffness
 from vipetsc.lattice.drive import ToneBurst
-
-__all__ = [
-    "Band",
-    "Bilinear",
-    "BlochPoint",
-    "Chain",
-    "Contact",
-    "ContactLaw",
-    "Hertz",
-    "Spring",
-    "ToneBurst",
-    "UnitCell",
-    "bloch",
-    "contact_stiffness",
-    "diatomic",
-    "four_band",
-    "log_clearances",
-    "max_group_velocity",
-    "pass_bands",
-    "spread_sites",
-]

@@ -68,25 +68,3 @@ from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import Locator, switch
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.modes.tsrk import Tsrk
-
-__all__ = [
-    "MAPS",
-    "Branch",
-    "ContactPair",
-    "Continuation",
-    "ContinuationError",
-    "Corrector",
-    "Dop853Flow",
-    "Guards",
-    "Locator",
-    "Newmark",
-    "Point",
-    "Shooting",
-    "SmoothSpring",
-    "StepControl",
-    "System",
-    "Tsrk",
-    "follow_all",
-    "linear_start",
-    "switch",
-]

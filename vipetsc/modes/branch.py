@@ -17,15 +17,7 @@ from vipetsc.modes.point import Point
 from vipetsc.modes.regions import slope_laws, tell_regions
 from vipetsc.modes.samples import Comparison, OrbitSamples
 
-KINDS = (
-    "regular",
-    "fold-energy",
-    "fold-frequency",
-    "branch-point",
-    "symmetry-breaking",
-    "period-doubling",
-    "grazing",
-)
+KINDS = ("regular", "fold-energy", "fold-frequency", "branch-point", "symmetry-breaking", "period-doubling", "grazing")
 # Quantities of a point: name in the files, type, unit, description.
 QUANTITIES: dict[str, tuple[str, type, str, str]] = {
     "energy": ("energy", float, "J", "energy"),

@@ -75,13 +75,7 @@ class Flow:
         return np.hstack([np.asarray(start, float)[:, None], np.eye(len(start))])
 
     def finish(
-        self,
-        start: np.ndarray,
-        y: np.ndarray,
-        duration: float,
-        events: np.ndarray,
-        closed: float,
-        steps: int,
+        self, start: np.ndarray, y: np.ndarray, duration: float, events: np.ndarray, closed: float, steps: int
     ) -> Arc:
         """An arc from its start, state and variations ``y`` (2n, 1 + 2n) at its end, and what happened on the way."""
         n, system = self.system.dofs, self.system

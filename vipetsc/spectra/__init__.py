@@ -6,35 +6,3 @@ from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energ
 from vipetsc.spectra.partition import Partition, partition
 from vipetsc.spectra.power_law import PowerLaw, from_peak, normalised, power_law
 from vipetsc.spectra.wavelet import BINS, Bank, Nodes, filter_bank, inverse, padded_length, transform
-
-__all__ = [
-    "BINS",
-    "TAPER",
-    "Bank",
-    "Dispersion",
-    "Entropy",
-    "Nodes",
-    "Partition",
-    "Parts",
-    "PowerLaw",
-    "dispersion",
-    "entropy",
-    "filter_bank",
-    "from_peak",
-    "front_arrival",
-    "ibtet",
-    "inverse",
-    "kinetic_energy",
-    "local_entropy",
-    "normalised",
-    "padded_length",
-    "part_energies",
-    "part_kinetic_energy",
-    "partition",
-    "power_law",
-    "ridge",
-    "split",
-    "taper",
-    "transform",
-    "wavenumber_content",
-]

@@ -9,5 +9,3 @@ from vipetsc.dynamics.observers.guard import Guard
 from vipetsc.dynamics.observers.ledger import Ledger
 from vipetsc.dynamics.observers.progress import ProgressReport
 from vipetsc.dynamics.observers.recorder import Recorder
-
-__all__ = ["Guard", "Ledger", "Observer", "ProgressReport", "Recorder", "RunawayError", "Sample", "Setup"]

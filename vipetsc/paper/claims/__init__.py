@@ -2,5 +2,3 @@
 
 from vipetsc.paper.claims.claim import Claim, write_claims
 from vipetsc.paper.claims.measure import measure_claims
-
-__all__ = ["Claim", "measure_claims", "write_claims"]
