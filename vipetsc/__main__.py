@@ -1,7 +1,5 @@
 """Front door: ``python -m vipetsc VERB``, alone or under ``mpirun -n N``; PETSc options after ``--``."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

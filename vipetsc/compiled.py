@@ -5,8 +5,6 @@ constant of it, would go on with the old code. Here the folder of the cache bear
 and of the modules that they import: constants are frozen into compiled code.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Ranks that work, fail and end together; progress and messages from rank 0."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal
@@ -10,7 +8,7 @@ import time
 import traceback
 from collections.abc import Callable
 from types import FrameType
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -103,7 +101,7 @@ class StopRequest:
     def __init__(self) -> None:
         self.requested = False
 
-    def install(self) -> StopRequest:
+    def install(self) -> Self:
         """Listen from now on; returns itself."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._receive)

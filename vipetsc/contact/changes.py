@@ -8,8 +8,6 @@ of one of two switching functions of the site's mode, each affine in w or in w':
 - clipped: D - side w, and g.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The log of impacts: episodes of contact, and how often a limit of the contact law acted."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

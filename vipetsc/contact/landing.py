@@ -5,8 +5,6 @@ safeguarded Newton iteration on the switching function at the end of the repeate
 a bracket instead: it lands to the rounding of the time, where a residual no longer halves.)
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 The formulas stand in the package's docstring. ``vipetsc.lattice.Contact`` is the same law on arrays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Method and references: the package's docstring.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vipetsc.compiled import njit

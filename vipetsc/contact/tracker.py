@@ -1,7 +1,5 @@
 """Modes of sites over time: switching at located changes, and the log of episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, astuple
 

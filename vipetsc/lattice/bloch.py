@@ -1,7 +1,5 @@
 """Bloch bands of a unit cell: frequencies, eigenvectors, group velocities, pass bands and gaps."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The unit cell: masses, springs inside it and to the next cell, and the pair that may collide."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """A finite lattice: how many cells, how it ends, which cells carry contacts, and its linear response."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

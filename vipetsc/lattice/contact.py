@@ -4,8 +4,6 @@ With w = u_resonator - u_host and clearance D, the contact force is
 F = kc [(w - D)_+^n - (-w - D)_+^n] g, restoring: -F on the resonator, +F on the host.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -22,7 +20,7 @@ class ContactLaw:
     exponent: ClassVar[float]
 
     @classmethod
-    def named(cls, name: str) -> type[ContactLaw]:
+    def named(cls, name: str) -> "type[ContactLaw]":
         """The law called ``name``; raises KeyError for an unknown one."""
         return {law.name: law for law in cls.__subclasses__()}[name]
 

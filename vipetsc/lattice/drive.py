@@ -1,7 +1,5 @@
 """The drive: a windowed tone burst on one mass, Eq. (3) of the paper."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The paper's two lattices: cell, length, contacts, sites and drive, as plain case tables."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

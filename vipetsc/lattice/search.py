@@ -1,7 +1,5 @@
 """The search of the supplement for the four-band cell: which (lambda, eta) suit inter-band transfer best."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,10 +5,9 @@ record is continued by its mirror image (a cosine transform): it then has no jum
 start, which would leak about 1e-4 of the driven band's energy into all the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +31,7 @@ class Parts:
     bands: tuple[tuple[int, ...], ...]
 
     @classmethod
-    def of(cls, bands: Sequence[Band]) -> Parts:
+    def of(cls, bands: Sequence[Band]) -> Self:
         """The partition that ``bands``, lowest first, make of the frequency axis."""
         merged: list[tuple[float, float, tuple[int, ...]]] = []
         for band in sorted(bands, key=lambda b: (b.low, b.high)):

@@ -11,8 +11,6 @@ Averages are taken from the linear wave's arrival on. A plain mean over all poin
 count in it as much as the others.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple

@@ -4,8 +4,6 @@ A field is anything that can be indexed as ``velocity[..., dof]`` to give a (t, 
 or an HDF5 dataset, of which one mass at a time is then held in memory.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +25,7 @@ class Dispersion:
     frequency: NDArray[np.float64]
     energy: NDArray[np.float64]
 
-    def folded(self) -> Dispersion:
+    def folded(self) -> "Dispersion":
         """The same with kappa and -kappa added up, on [0, pi]."""
         length = len(self.wavenumber)
         half = length // 2 + 1

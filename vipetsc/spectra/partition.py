@@ -1,7 +1,5 @@
 """Kinetic energies of the twelve wavenumber partitions, and how much of the whole their sum leaves out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Both as in any textbook on regression; intervals are Student's with n - 2 degree
 the two parameters.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -5,11 +5,9 @@ exp(-(s - kc)^2 / 2), over the wavenumbers 0 < eta <= pi alone. A real signal is
 positive wavenumbers make; eta = pi belongs to both signs and counts half on either.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +30,7 @@ class Nodes:
     weight: float
 
     @classmethod
-    def log(cls, kc: float, voices: float = VOICES) -> Nodes:
+    def log(cls, kc: float, voices: float = VOICES) -> Self:
         """From pi/60 to pi (1 + 4/kc), both included, with ``voices`` nodes an octave or a few more.
 
         Raises ValueError below .65 kc voices, where the sum over the nodes would ripple.
