@@ -1,4 +1,3 @@
-# ruff: noqa: F401
 """What to simulate: strict TOML in, a typed, frozen and fully resolved case out.
 
 ``reading`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case);
