@@ -9,7 +9,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vipetsc.case.checks import lattice_run_problems, too_coarse
+from vipetsc.case.checks import (
+    Checks,
+    check_drive,
+    check_lattice,
+    check_sampling,
+    check_sites,
+    check_stiffness,
+    too_coarse,
+)
 from vipetsc.case.reading import CaseFile, Problem, Table
 from vipetsc.case.resolve import resolved, wave_speed, with_preset
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, TimeTable
@@ -76,7 +84,14 @@ class Case(CaseFile):
     @classmethod
     def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
         """What is wrong between keys."""
-        return lattice_run_problems(sections, invalid)
+        lattice, contacts, checks = sections["lattice"], sections["contacts"], Checks(invalid)
+        cell = check_lattice(checks, lattice)
+        if checks.valid("lattice.cells", "contacts.sites"):
+            check_sites(checks, lattice, contacts)
+            check_stiffness(checks, lattice, contacts)
+        check_drive(checks, sections["drive"], lattice, cell)
+        check_sampling(checks, sections["time"], sections["output"], cell, lattice.cells)
+        return checks.problems
 
     def unit_cell(self) -> UnitCell:
         """The unit cell, from the preset in its reading or from ``[lattice.cell]``."""

@@ -8,7 +8,7 @@ from vipetsc.case.reading import Problem
 from vipetsc.case.resolve import site_cells
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, Span, TimeTable
 from vipetsc.lattice.bloch import pass_bands
-from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.cell import UnitCell, cell_problems
 
 
 class Checks:
@@ -28,19 +28,6 @@ class Checks:
             self.problems.append(Problem(key, value, remedy))
 
 
-def lattice_run_problems(sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
-    """What is wrong between the keys of a lattice run's sections."""
-    lattice, contacts, drive = sections["lattice"], sections["contacts"], sections["drive"]
-    checks = Checks(invalid)
-    cell = check_lattice(checks, lattice)
-    if checks.valid("lattice.cells", "contacts.sites"):
-        check_sites(checks, lattice, contacts)
-        check_stiffness(checks, lattice, contacts)
-    check_drive(checks, drive, lattice, cell)
-    check_sampling(checks, sections["time"], sections["output"], cell, lattice.cells)
-    return checks.problems
-
-
 def check_lattice(checks: Checks, lattice: LatticeTable) -> UnitCell | None:
     """Check the unit cell; returns it if it is valid."""
     keys = ("lattice", "lattice.preset", "lattice.cell", "lattice.reading", "lattice.lambda", "lattice.eta")
@@ -51,7 +38,7 @@ def check_lattice(checks: Checks, lattice: LatticeTable) -> UnitCell | None:
     for key, value in (("lattice.lambda", lattice.lam), ("lattice.eta", lattice.eta)):
         fits = value is None or lattice.preset == "four-band"
         checks.require(fits, key, value, "only the four-band preset has it")
-    wrong = lattice.cell.problems() if lattice.cell else []
+    wrong = cell_problems(*lattice.cell.arguments()) if lattice.cell else []
     checks.problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
     return None if any(p.key.startswith("lattice.") for p in checks.problems) else lattice.unit_cell()
 

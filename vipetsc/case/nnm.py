@@ -110,7 +110,39 @@ class NnmCase(CaseFile):
     @classmethod
     def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
         """What is wrong between keys."""
-        return _problems(sections["lattice"], sections["contacts"], sections["nnm"]) if not invalid else []
+        if invalid:
+            return []
+        lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
+        checks = Checks(set())
+        remedy = 'a system of one\'s own needs "own" and [nnm.own]'
+        checks.require((nnm.system == "own") == (nnm.custom is not None), "nnm.system", nnm.system, remedy)
+        for key in ("energy", "frequency"):
+            low, high = getattr(nnm, key)
+            checks.require(low < high, f"nnm.{key}", [low, high], "must be [low, high]")
+        goes_down = nnm.direction != "up"
+        remedy = "going down needs a lowest energy above 0 (J)"
+        checks.require(not goes_down or nnm.energy[0] > 0, "nnm.energy", nnm.energy, remedy)
+        remedy = "must be below nnm.largest_step"
+        checks.require(nnm.smallest_step < nnm.largest_step, "nnm.smallest_step", nnm.smallest_step, remedy)
+        cell = None
+        if nnm.system == "own":
+            dofs = _check_custom(checks, nnm.custom) if nnm.custom else 0
+        else:
+            cell = check_lattice(checks, lattice)
+            dofs = cell.dofs * lattice.cells if cell and nnm.system == "chain" else 2
+        if nnm.system == "chain":
+            sites = site_cells(lattice, contacts)
+            checks.require(bool(sites), "contacts.sites", sites, f"name cells from 1 to {lattice.cells}")
+            check_sites(checks, lattice, contacts)
+        elif nnm.system == "reduced":
+            given = contacts.clearance
+            fits = not isinstance(given, list) or len(given) == 1
+            checks.require(fits, "contacts.clearance", given, "the reduced model has one contact")
+            missing = given is None and lattice.preset is None
+            checks.require(not missing, "contacts.clearance", None, "missing; give the clearance in m")
+        beyond = [mode for mode in nnm.modes if mode > dofs]
+        checks.require(not beyond or bool(checks.problems), "nnm.modes", beyond, f"the system has {dofs} modes")
+        return checks.problems
 
     def physics(self) -> tuple[Any, ...]:
         """What a branch that is resumed must keep: the system, the shooting map and the flow."""
@@ -137,39 +169,6 @@ class NnmCase(CaseFile):
         sites = tuple(c - 1 for c in site_cells(self.lattice, self.contacts))
         gaps = tuple(clearances(self.lattice, self.contacts, len(sites)))
         return Chain(self.lattice.unit_cell(), self.lattice.cells, self.lattice.ends, sites, gaps)
-
-
-def _problems(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable) -> list[Problem]:
-    checks = Checks(set())
-    remedy = 'a system of one\'s own needs "own" and [nnm.own]'
-    checks.require((nnm.system == "own") == (nnm.custom is not None), "nnm.system", nnm.system, remedy)
-    for key in ("energy", "frequency"):
-        low, high = getattr(nnm, key)
-        checks.require(low < high, f"nnm.{key}", [low, high], "must be [low, high]")
-    goes_down = nnm.direction != "up"
-    remedy = "going down needs a lowest energy above 0 (J)"
-    checks.require(not goes_down or nnm.energy[0] > 0, "nnm.energy", nnm.energy, remedy)
-    remedy = "must be below nnm.largest_step"
-    checks.require(nnm.smallest_step < nnm.largest_step, "nnm.smallest_step", nnm.smallest_step, remedy)
-    cell = None
-    if nnm.system == "own":
-        dofs = _check_custom(checks, nnm.custom) if nnm.custom else 0
-    else:
-        cell = check_lattice(checks, lattice)
-        dofs = cell.dofs * lattice.cells if cell and nnm.system == "chain" else 2
-    if nnm.system == "chain":
-        sites = site_cells(lattice, contacts)
-        checks.require(bool(sites), "contacts.sites", sites, f"name cells from 1 to {lattice.cells}")
-        check_sites(checks, lattice, contacts)
-    elif nnm.system == "reduced":
-        given = contacts.clearance
-        fits = not isinstance(given, list) or len(given) == 1
-        checks.require(fits, "contacts.clearance", given, "the reduced model has one contact")
-        missing = given is None and lattice.preset is None
-        checks.require(not missing, "contacts.clearance", None, "missing; give the clearance in m")
-    beyond = [mode for mode in nnm.modes if mode > dofs]
-    checks.require(not beyond or bool(checks.problems), "nnm.modes", beyond, f"the system has {dofs} modes")
-    return checks.problems
 
 
 def _check_custom(checks: Checks, system: SystemTable) -> int:

@@ -202,7 +202,9 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
 
 def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem:
     """The problem behind one of pydantic's errors in section ``name``."""
-    keys = [part for part in item["loc"] if not _is_union_branch(part)]
+    # Pydantic puts the branches of a union that it tried into the path: "float", "list[int]", "Span".
+    branch = re.compile(r"int|float|str|bool|Span|ClearanceSpan|.*\[.*|constrained.*")
+    keys = [part for part in item["loc"] if isinstance(part, int) or not branch.fullmatch(part)]
     path = name
     for part in keys:
         path += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
@@ -216,15 +218,6 @@ def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem
         near = difflib.get_close_matches(value, re.findall(r"'([^']+)'", choices), n=1, cutoff=0.4)
         message += f"; did you mean {near[0]!r}?" if near else ""
     return Problem(path, value, message)
-
-
-def _is_union_branch(part: int | str) -> bool:
-    """Whether pydantic put ``part`` into the path for the branch of a union it tried: "float", "list[int]", "Span"."""
-    return isinstance(part, str) and (
-        part in {"int", "float", "str", "bool", "Span", "ClearanceSpan"}
-        or "[" in part
-        or part.startswith("constrained")
-    )
 
 
 def _section_at(kind: type[Section], keys: list[int | str]) -> type[Section]:

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from vipetsc.case.reading import Section
-from vipetsc.lattice.cell import Spring, UnitCell, cell_problems
+from vipetsc.lattice.cell import Spring, UnitCell
 from vipetsc.lattice.presets import PRESETS
 
 Method = Literal["2a", "3bs", "5f", "5dp", "5bs", "6vr", "7vr", "8vr"]
@@ -49,15 +49,8 @@ class CellTable(Section):
     springs: list[SpringTable] = Field(min_length=1)
     contact: list[int] = Field(min_length=2, max_length=2)
 
-    def unit_cell(self) -> UnitCell:
-        """The cell with 0-based indices; raises ValueError if it is not a valid one."""
-        return UnitCell(*self._arguments())
-
-    def problems(self) -> list[tuple[str, str]]:
-        """What makes the cell invalid, as pairs of key and message."""
-        return cell_problems(*self._arguments())
-
-    def _arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int]:
+    def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int]:
+        """Those of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
         springs = tuple(Spring(s.start - 1, s.end - 1, s.stiffness, s.next_cell) for s in self.springs)
         return tuple(self.masses), springs, self.contact[0] - 1, self.contact[1] - 1
 
@@ -76,7 +69,7 @@ class LatticeTable(Section):
     def unit_cell(self) -> UnitCell:
         """The unit cell: ``cell``, or the preset's in its reading; raises ValueError for an invalid one."""
         if self.cell is not None:
-            return self.cell.unit_cell()
+            return UnitCell(*self.cell.arguments())
         options = {key: value for key, value in (("lam", self.lam), ("eta", self.eta)) if value is not None}
         return PRESETS[str(self.preset)].cell(self.reading, **options)
 
