@@ -1,0 +1,226 @@
+"""The propagator's parts alone: stencil, series and impulses against the matrix exponential; collocation; grouping."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+from scipy.linalg import expm
+
+from tests.conftest import small_case
+from vipetsc.contact.law import CLOSED, Contacts, ForceLaw, create_contacts
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.cluster import group_dofs
+from vipetsc.dynamics.propagator.collocation import EXIT, NODES, ONSET, PLAIN, collocation
+from vipetsc.dynamics.propagator.forces import _dof_tables
+from vipetsc.dynamics.propagator.free_motion import active_clusters, apply_impulses
+from vipetsc.dynamics.propagator.halo import HaloRegions
+from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.stencil import apply_propagator, create_stencil
+from vipetsc.dynamics.propagator.substep import (
+    HISTORY,
+    SUBSTEP_STATE,
+    ClusterMotion,
+    ClusterRecord,
+    Substep,
+    Trial,
+    accumulate_moments,
+    collocate,
+    error_ratio,
+    update_taylor,
+)
+from vipetsc.dynamics.propagator.taylor import evaluate, shift
+from vipetsc.dynamics.records import Burst
+
+ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+
+
+def exponential(chain, t: float) -> np.ndarray:
+    """The exact P(t), states ordered as (2 dof, cell)."""
+    n, d = chain.cells, chain.cell.dofs
+    order = np.arange(n * d).reshape(n, d).T.ravel()  # mass by mass
+    stiffness = chain.stiffness_matrix().toarray()[np.ix_(order, order)]
+    system = np.zeros((2 * n * d, 2 * n * d))
+    system[: n * d, n * d :] = np.eye(n * d)
+    system[n * d :, : n * d] = -stiffness / chain.masses()[order][:, None]
+    return expm(system * t)
+
+
+def parts(ends: str, interval: float, tolerance: float, sites=(5, 6, 12)):
+    """Model, layout, series, halo of a chain of 24 cells on one rank."""
+    model = small_case(lattice={"ends": ends}, contacts={"sites": list(sites)}).model()
+    layout = Layout.of(model, MPI.COMM_SELF)
+    return model, layout, StepSeries(model.chain, interval, tolerance), HaloRegions(layout)
+
+
+def fetch(layout: Layout, halo: HaloRegions, state: np.ndarray) -> None:
+    vector = layout.create_vector()
+    vector.array[: state.size] = state.ravel()
+    halo.fetch(vector, state)
+    vector.destroy()
+
+
+@ENDS
+@pytest.mark.parametrize(("interval", "tolerance"), [(1e-4, 1e-14), (2e-4, 1e-6), (5e-4, 1e-10)])
+def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, tolerance):
+    _, layout, series, halo = parts(ends, interval, tolerance)
+    stencil = create_stencil(series, layout, halo)
+    halo.bind_columns()
+    rows, n = 2 * layout.dofs, layout.cells
+    matrix = np.empty((rows * n, rows * n))
+    for column in range(rows * n):
+        state, out = np.zeros((rows, n)), np.empty((rows, n))
+        state.ravel()[column] = 1.0
+        fetch(layout, halo, state)
+        apply_propagator(stencil, state, halo.columns, out)
+        matrix[:, column] = out.ravel()
+    half = rows * n // 2
+    scale = np.where(np.arange(rows * n) < half, series.omega_max_h / interval, 1.0)  # a velocity counts as omega u
+    error = np.abs(matrix - exponential(series.chain, interval)) * scale[:, None] / scale
+    assert error.sum(axis=1).max() <= series.truncation + 2e-14
+    assert series.truncation < tolerance
+    if tolerance > 1e-12:  # the bound is one that is felt
+        assert error.sum(axis=1).max() > 1e-3 * series.truncation
+
+
+@ENDS
+def test_free_motion_and_impulses_are_the_exponential(ends):
+    model, layout, series, halo = parts(ends, 3e-4, 1e-15, sites=(1, 12, 24))
+    groups = group_dofs(model, series.reach)
+    tables = _dof_tables(model, groups, layout, series, halo)
+    halo.bind_columns()
+    d, n = layout.dofs, layout.cells
+    state = np.random.default_rng(5).normal(size=(2 * d, n)) * np.repeat([1e-4, 0.1], d)[:, None]
+    fetch(layout, halo, state)
+    dofs = [dof for group in groups for dof in group]
+    taylor = np.zeros((len(dofs), 2 * series.terms))
+    active_clusters(tables, halo.columns, taylor, np.zeros(len(groups), np.int64))
+    for s in (0.3, 1.0):
+        exact = (exponential(series.chain, s * series.interval) @ state.ravel()).reshape(2 * d, n)
+        for i, dof in enumerate(dofs):
+            w, rate = evaluate(taylor[i], s)
+            assert w == pytest.approx(np.dot(dof.form, exact[:d, dof.cell]), rel=1e-11, abs=1e-17)
+            assert rate / series.interval == pytest.approx(np.dot(dof.form, exact[d:, dof.cell]), rel=1e-11, abs=1e-13)
+    # An impulse on one DoF at s leaves what the exponential makes of it in the rest of the step.
+    s = 0.4
+    for i, dof in enumerate(dofs):
+        moments, out = np.zeros((1, 2 * series.terms)), np.zeros((2 * d, n))
+        moments[0] = (1 - s) ** np.arange(2 * series.terms)
+        apply_impulses(tables, i, moments, out)
+        impulse = np.zeros((2 * d, n))
+        impulse[d:, dof.cell] = np.array(dof.form) / model.chain.cell.masses
+        exact = exponential(series.chain, (1 - s) * series.interval) @ impulse.ravel()
+        np.testing.assert_allclose(out.ravel(), exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+def test_clusters_that_cannot_touch_are_left_alone():
+    model, layout, series, halo = parts("fixed", 1e-4, 1e-14, sites=(4, 12, 20))
+    groups = group_dofs(model, series.reach)
+    assert [[dof.site for dof in group] for group in groups] == [[-1], [0], [1], [2]]
+    tables = _dof_tables(model, groups, layout, series, halo)
+    halo.bind_columns()
+    taylor, active = np.zeros((4, 2 * series.terms)), np.zeros(4, np.int64)
+    state = np.zeros((2 * layout.dofs, layout.cells))
+    resonator, clearance = model.chain.cell.resonator, model.chain.clearances[1]
+    for reached, expected in ((0.9 * clearance, []), (1.001 * clearance, [2]), (np.nan, [2])):
+        state[resonator, 11] = reached
+        fetch(layout, halo, state)
+        count = active_clusters(tables, halo.columns, taylor, active)
+        assert active[:count].tolist() == expected
+
+
+def test_dofs_within_reach_are_grouped_across_a_periodic_end():
+    def sites(ends, reach):
+        model = small_case(lattice={"ends": ends}, contacts={"sites": [2, 12, 14, 23]}).model()
+        return [[dof.site for dof in group] for group in group_dofs(model, reach)]
+
+    assert sites("fixed", 1) == [[0, -1], [1], [2], [3]]
+    assert sites("fixed", 2) == [[0, -1], [1, 2], [3]]
+    assert sites("periodic", 1) == [[0, -1], [1], [2], [3]]
+    assert sites("periodic", 2) == [[0, 3, -1], [1, 2]]
+
+
+def test_a_shifted_series_is_the_same_function():
+    taylor = np.random.default_rng(2).normal(size=(3, 12))
+    moved = np.empty_like(taylor)
+    shift(taylor, 0.37, moved)
+    for series, other in zip(taylor, moved, strict=True):
+        np.testing.assert_allclose(evaluate(series, 0.8), evaluate(other, 0.43), rtol=1e-12)
+
+
+def test_nodes_have_the_order_of_gauss_and_follow_roots():
+    table = collocation(4)
+    share, weight = table.share, table.weight
+    assert weight[PLAIN] @ share[PLAIN] ** 15 == pytest.approx(1 / 16, rel=1e-14)
+    assert abs(weight[PLAIN] @ share[PLAIN] ** 16 - 1 / 17) > 1e-12
+    assert weight[ONSET] @ share[ONSET] ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
+    assert weight[EXIT] @ (1 - share[EXIT]) ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
+    assert abs(weight[PLAIN] @ share[PLAIN] ** 1.5 - 1 / 2.5) > 1e-8
+    # The last two coefficients of a polynomial of lower degree vanish; those of Legendre's own are found.
+    x = share[PLAIN]
+    assert np.abs(table.tail @ x ** (NODES - 3)).max() < 1e-14
+    legendre = np.polynomial.legendre.legval(2 * x - 1, np.eye(NODES)[NODES - 1])
+    np.testing.assert_allclose(table.tail @ legendre, [0, 1], atol=1e-13)
+
+
+def oscillator(damping: float = 0.0) -> tuple[ClusterRecord, ClusterMotion, float]:
+    """A mass on the stop x >= 0 (clearance 1, bilinear): x = v sin(rate t)/rate; the record, its motion, the rate."""
+    mass, h, speed, rate = 0.02, 1e-4, 0.5, 3e4
+    contact = small_case(contacts={"law": "bilinear"}).model().contact
+    law = ForceLaw(mass * rate**2, 1.0, damping, False, 0.0)
+    contacts = Contacts(law, create_contacts(contact, [1.0]).sites)
+    contacts.sites["mode"], contacts.sites["approach"] = CLOSED, speed
+    burst = Burst(0.0, 1.0, 1.0, 0.0)
+    response = np.full((1, 1, 1), h**2 / mass)
+    record = ClusterRecord(contacts, burst, response, collocation(2), h, 1.0, 1.0, 1e-10, 1e-12)
+    state = np.zeros(1, SUBSTEP_STATE)
+    taylor = np.array([[1.0, speed * h]])
+    motion = ClusterMotion(
+        taylor, np.zeros((1, 3)), np.zeros((1, 2)), np.zeros(1), np.zeros(1, HISTORY), state
+    )  # fmt: skip
+    return record, motion, rate
+
+
+def one_substep(record: ClusterRecord, motion: ClusterMotion, substep: Substep) -> Trial:
+    trial = Trial(np.array([0]), *np.zeros((3, 1, NODES)), np.zeros((1, 2)), np.zeros((1, 3)))
+    assert collocate(record, motion, trial, substep)
+    update_taylor(record, motion, trial, substep)
+    accumulate_moments(record, motion, trial, substep)
+    return trial
+
+
+@pytest.mark.parametrize("kind", [PLAIN, ONSET, EXIT])
+def test_a_linear_contact_is_an_oscillator(kind):
+    record, motion, rate = oscillator()
+    mass, speed, h = 0.02, 0.5, record.interval
+    trial = one_substep(record, motion, Substep(kind, 0.3))
+    phase = rate * 0.3 * h
+    assert trial.taylor[0, 0] - 1 == pytest.approx(speed / rate * np.sin(phase), rel=1e-9)
+    assert trial.taylor[0, 1] / h == pytest.approx(speed * np.cos(phase), rel=1e-10)
+    # The moments are those of the force about the end of the step; the first one is the momentum it took.
+    assert motion.moments[0, 0] == pytest.approx(mass * speed * (np.cos(phase) - 1), rel=1e-9)
+    t = np.linspace(0, 0.3 * h, 20001)
+    force = -mass * rate * speed * np.sin(rate * t)
+    assert motion.moments[0, 1] == pytest.approx(trapezoid(force * (1 - t / h), t), rel=1e-7)
+    assert motion.energy[0] == 0.0
+
+
+def test_damping_takes_the_energy_that_is_booked():
+    record, motion, rate = oscillator(damping=0.3)
+    mass, speed = 0.02, 0.5
+    trial = one_substep(record, motion, Substep(PLAIN, 0.3))
+    x, v = trial.taylor[0, 0] - 1, trial.taylor[0, 1] / record.interval
+    lost = 0.5 * mass * (speed**2 - v**2 - (rate * x) ** 2)
+    assert motion.energy[0] == pytest.approx(lost, rel=1e-9)
+    assert lost > 1e-2 * mass * speed**2
+
+
+def test_the_error_estimate_falls_as_the_order_says():
+    ratios = []
+    for length in (0.8, 0.4):
+        record, motion, _ = oscillator()
+        ratios.append(error_ratio(record, one_substep(record, motion, Substep(PLAIN, length)), length))
+    # The last two coefficients fall as h^6 and h^7, times the length.
+    assert 6 < np.log2(ratios[0] / ratios[1]) < 8.5
