@@ -15,7 +15,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.cluster import group_dofs
 from vipetsc.dynamics.propagator.collocation import EXIT, NODES, ONSET, PLAIN, collocation
 from vipetsc.dynamics.propagator.forces import _dof_tables
-from vipetsc.dynamics.propagator.free_motion import active_clusters, apply_impulses
+from vipetsc.dynamics.propagator.free_motion import active_clusters, apply_impulses, evaluate, shift
 from vipetsc.dynamics.propagator.halo import HaloRegions
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import apply_propagator, create_stencil
@@ -31,7 +31,6 @@ from vipetsc.dynamics.propagator.substep import (
     error_ratio,
     update_taylor,
 )
-from vipetsc.dynamics.propagator.taylor import evaluate, shift
 from vipetsc.dynamics.records import Burst
 
 ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
@@ -83,6 +82,13 @@ def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, toleran
     assert series.truncation < tolerance
     if tolerance > 1e-12:  # the bound is one that is felt
         assert error.sum(axis=1).max() > 1e-3 * series.truncation
+
+
+@pytest.mark.parametrize("interval", [1e-4, 3e-4])
+def test_the_bound_keeps_below_every_tolerance(interval):
+    chain = small_case().model().chain
+    for tolerance in np.geomspace(1e-14, 1e-3, 34):
+        assert StepSeries(chain, interval, tolerance).truncation < tolerance
 
 
 @ENDS

@@ -16,7 +16,7 @@ less than the tolerance. Both bounds and the entries dropped within the band mak
 no term exceeds the result by much, and the series is as good as rounding allows (Moler and Van Loan 2003). Cells at
 least r from an end share one stencil; the others have rows of their own.
 
-**2. Free motion of the contact DoFs** (``free_motion``, ``taylor``). A DoF x = c u is the relative displacement w of a
+**2. Free motion of the contact DoFs** (``free_motion``). A DoF x = c u is the relative displacement w of a
 site or the driven mass's displacement. Its rows c (-A)^m give its free motion x(s) = sum_k a_k s^k beforehand: a site
 with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k (k - 1) |a_k| bounds w by a parabola: on the side sigma
 one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and such steps

@@ -12,6 +12,7 @@ from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.landing import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
 from vipetsc.contact.law import CLOSED, FREE, contact_force
 from vipetsc.dynamics.propagator.collocation import EXIT, NODES, ONSET, PLAIN
+from vipetsc.dynamics.propagator.free_motion import ROUNDING, first_onset, shift
 from vipetsc.dynamics.propagator.substep import (
     ClusterMotion,
     ClusterRecord,
@@ -23,7 +24,6 @@ from vipetsc.dynamics.propagator.substep import (
     evaluate_site_motion,
     update_taylor,
 )
-from vipetsc.dynamics.propagator.taylor import ROUNDING, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, or without progress.
 DONE, CHANGED, FAILED = range(3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.propagator.advance import DONE, FAILED, ORDER, advance_cluster
 from vipetsc.dynamics.propagator.collocation import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.propagator.substep import HISTORY, SUBSTEP_STATE, ClusterMotion, ClusterRecord
+from vipetsc.dynamics.propagator.substep import ClusterMotion, ClusterRecord
 from vipetsc.dynamics.records import Burst
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
@@ -64,31 +64,19 @@ def group_dofs(model: Model, reach: int) -> list[list[ContactDof]]:
 class Cluster:
     """A group of DoFs on every rank that they reach, advanced through one linear step at a time.
 
-    All such ranks do the same sums on the same numbers; one of them, with ``logs``, keeps the log.
-
-    Parameters
-    ----------
-    model
-        The lattice, its contacts and its drive.
-    dofs
-        One group of ``group_dofs``.
-    series
-        The step's series.
-    response
-        (dof, dof, term): series of a DoF's motion after an impulse on another, times H.
-    taylor, moments, energy
-        As in ``ClusterMotion``; ``taylor`` is filled before each step.
+    All such ranks do the same sums on the same numbers; one of them, with ``logs``, keeps the log. ``response`` is that
+    of ``ClusterRecord``; ``motion.taylor`` is filled before each step, whose forces leave moments and energies there.
     """
 
     def __init__(
-        self, model: Model, dofs: list[ContactDof], series: StepSeries, response: np.ndarray, logs: bool,
-        taylor: np.ndarray, moments: np.ndarray, energy: np.ndarray,
+        self, model: Model, dofs: list[ContactDof], series: StepSeries, response: np.ndarray, motion: ClusterMotion,
+        logs: bool,
     ) -> None:  # fmt: skip
         cell, drive = model.chain.cell, model.drive
         self.sites = [dof.site for dof in dofs if dof.site >= 0]
         self.driven = len(self.sites) < len(dofs)
         self.logs = logs
-        self._energy = energy
+        self._motion = motion
         self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
         fastest = series.omega_max_h
         if self.driven:
@@ -97,7 +85,7 @@ class Cluster:
             contacts=create_contacts(model.contact, [model.chain.clearances[site] for site in self.sites]),
             burst=Burst(drive.window_amplitude, drive.frequency, float(drive.cycles), drive.duration),
             response=response,
-            nodes=collocation(taylor.shape[1]),
+            nodes=collocation(2 * series.terms),
             interval=series.interval,
             omega_max_h=series.omega_max_h,
             longest=(SEARCHED if self.sites else DRIVEN) / fastest,
@@ -106,45 +94,32 @@ class Cluster:
         )
         reduced_mass = 1 / (1 / cell.masses[cell.host] + 1 / cell.masses[cell.resonator])
         self.tracker = ImpactTracker(self._record.contacts, self.sites, reduced_mass)
-        self._motion = ClusterMotion(
-            taylor=taylor,
-            site_motion=self.tracker.start,
-            moments=moments,
-            energy=energy,
-            history=np.zeros(len(self.sites), HISTORY),
-            state=np.zeros(1, SUBSTEP_STATE),
-        )
-        self._motion.state["begin"], self._motion.state["length"] = np.nan, 1.0
+        self.tracker.start = motion.site_motion
 
     def is_busy(self, t: float) -> bool:
         """Whether a force acts on a DoF at time t in s."""
         return bool(self.tracker.open) or (self.driven and t < self._record.burst.duration)
 
     def advance(self, begin: float) -> None:
-        """Go through the step that begins at time ``begin`` in s; leaves the forces' moments and energies.
-
-        Raises StalledError where the contacts cannot be followed.
-        """
+        """Go through the step that begins at ``begin`` in s; raises StalledError if the contacts cannot be followed."""
+        now = begin
         for _ in range(MOST_CHANGES):
             outcome = advance_cluster(self._record, self._motion, begin)
             if outcome == DONE:
                 return
+            now = begin + float(self._motion.state["position"][0]) * self._record.interval
             if outcome == FAILED:
                 break
-            self._switch(self._time())
+            self._switch(now)
         sites = ", ".join(str(site + 1) for site in self.sites)
-        raise StalledError(f"the contacts of sites {sites} at {self._time():.9g} s")
-
-    def _time(self) -> float:
-        state = self._motion.state[0]
-        return float(state["begin"] + state["position"] * self._record.interval)
+        raise StalledError(f"the contacts of sites {sites} at {now:.9g} s")
 
     def _switch(self, now: float) -> None:
         """Switch the sites that have landed, and set the length of the next substep."""
         tracker, state = self.tracker, self._motion.state
         self._update_episodes()
         before = set(tracker.open)
-        state["switches"] += tracker.switch(now, self._energy)
+        state["switches"] += tracker.switch(now, self._motion.energy)
         for site in set(tracker.open) - before:
             duration = tracker.duration(abs(float(self._record.contacts.sites["approach"][site])))
             self._motion.history[site] = now, duration, 0.0, 0.0, 0.0
@@ -167,25 +142,4 @@ class Cluster:
     def unfinished(self) -> list[Episode]:
         """Copies of the open episodes; none where another rank logs them."""
         self._update_episodes()
-        return self.tracker.unfinished(self._energy) if self.logs else []
-
-    def counts(self) -> dict[str, int]:
-        """Substeps, landings, switches and limits of the contact law."""
-        state = self._motion.state[0]
-        counts = {name: int(state[name]) for name in ("substeps", "rejected", "landings", "switches")}
-        return counts | asdict(self.tracker.counts)
-
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """All that a resumed run needs."""
-        return self.tracker.checkpoint() | {
-            "energy": self._energy.copy(),
-            "history": self._motion.history.copy(),
-            "state": self._motion.state.copy(),
-        }
-
-    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
-        """Go back to a checkpoint."""
-        self.tracker.restore(checkpoint)
-        self._energy[:] = checkpoint["energy"]
-        self._motion.history[:] = checkpoint["history"]
-        self._motion.state[:] = checkpoint["state"]
+        return self.tracker.unfinished(self._motion.energy) if self.logs else []

@@ -1,9 +1,4 @@
-"""The second engine: exact linear steps by a banded propagator, contact forces collocated between them.
-
-Without contacts one step of length H takes the state to P(H) times it, whichever H: P is exact but for what its
-bandwidth leaves out. Forces, of contacts and of the drive, add what their moments over the step leave in the cells
-within P's reach. The sites' motion within a step is a known series, so a site that cannot touch is left alone.
-"""
+"""The engine of exact linear steps; the package's docstring has the method."""
 
 from __future__ import annotations
 
@@ -48,10 +43,8 @@ def step_series(model: Model) -> StepSeries | None:
         if cost >= least:
             break
         series = StepSeries(model.chain, model.sample_interval / parts, tolerance)
-        if (
-            max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
-            or model.chain.cells <= 2 * series.reach
-        ):
+        too_long = max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
+        if too_long or model.chain.cells <= 2 * series.reach:
             continue
         sizes = np.array([len(group) for group in group_dofs(model, series.reach)])
         cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
@@ -147,11 +140,11 @@ class Propagator(Engine):
 
     def take_episodes(self) -> list[Episode]:
         """Episodes closed since the last call that this rank logs."""
-        return self._forces.take_episodes()
+        return [episode for cluster in self._forces.clusters for episode in cluster.take_episodes()]
 
     def unfinished(self) -> list[Episode]:
         """Copies of the open episodes that this rank logs."""
-        return self._forces.unfinished()
+        return [episode for cluster in self._forces.clusters for episode in cluster.unfinished()]
 
     def statistics(self) -> dict[str, Any]:
         """Linear steps and what the clusters did, the step and its band."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import astuple, fields
 from itertools import pairwise
 from math import factorial
 from typing import Any
@@ -12,15 +12,17 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.episodes import Episode, ImpactCounts
+from vipetsc.contact.episodes import ImpactCounts
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.cluster import Cluster, ContactDof, group_dofs
 from vipetsc.dynamics.propagator.free_motion import DofTables, active_clusters, apply_impulses
 from vipetsc.dynamics.propagator.halo import HaloRegions
 from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.substep import HISTORY, SUBSTEP_STATE, ClusterMotion
 
-# What clusters count.
-COUNTS = ("substeps", "rejected", "landings", "switches", *(field.name for field in fields(ImpactCounts)))
+# What clusters and their trackers count.
+COUNTS = ("substeps", "rejected", "landings", "switches")
+LIMITS = tuple(field.name for field in fields(ImpactCounts))
 
 
 class Forces:
@@ -31,24 +33,31 @@ class Forces:
         groups = [group for group in group_dofs(model, series.reach)
                   if any((_owned_cells(dof.cell, series.reach, layout) >= 0).any() for dof in group)]  # fmt: skip
         self._dofs = _dof_tables(model, groups, layout, series, halo)
-        self._taylor = np.zeros((len(self._dofs.column), 2 * series.terms))
-        self._moments, self._energy = np.zeros_like(self._taylor), np.zeros(len(self._taylor))
+        count = len(self._dofs.column)
+        state = np.zeros(len(groups), SUBSTEP_STATE)
+        state["begin"], state["length"] = np.nan, 1.0
+        shape = (count, 2 * series.terms)
+        self._motion = ClusterMotion(
+            np.zeros(shape), np.zeros((count, 3)), np.zeros(shape), np.zeros(count), np.zeros(count, HISTORY), state
+        )
         self._active = np.zeros(len(groups), np.int64)
         self._of_cluster = [slice(a, b) for a, b in pairwise(self._dofs.first.tolist())]
         self.clusters = []
-        for group, own in zip(groups, self._of_cluster, strict=True):
-            logs = layout.start <= group[0].cell < layout.stop
+        for i, (group, own) in enumerate(zip(groups, self._of_cluster, strict=True)):
+            motion = ClusterMotion._make([*(array[own] for array in self._motion[:-1]), state[i : i + 1]])
             response = _responses(group, self._dofs, own, layout, series)
-            arrays = self._taylor[own], self._moments[own], self._energy[own]
-            self.clusters.append(Cluster(model, group, series, response, logs, *arrays))
+            logs = layout.start <= group[0].cell < layout.stop
+            self.clusters.append(Cluster(model, group, series, response, motion, logs))
         self._dofs.busy[:] = [cluster.is_busy(0.0) for cluster in self.clusters]
         numbers = {dof.site: i for i, dof in enumerate(dof for group in groups for dof in group)}
         self._ledger = [numbers[site] for site in ((-1,) if layout.owns_drive else ()) + layout.sites]
+        self._saved = {"energy": self._motion.energy, "history": self._motion.history, "clusters": state}
+        self._saved["busy"] = self._dofs.busy
 
     @property
     def ledger(self) -> np.ndarray:
         """The rank's work and dissipated energies in J, in the state's order."""
-        return self._energy[self._ledger]
+        return self._motion.energy[self._ledger]
 
     def act(self, begin: float, out: np.ndarray) -> None:
         """Add to the owned cells ``out`` (2 dof, cell) what forces do in the step that begins at ``begin`` in s.
@@ -56,40 +65,34 @@ class Forces:
         The halo holds the state then. Raises StalledError.
         """
         dofs = self._dofs
-        count = active_clusters(dofs, self._halo.columns, self._taylor, self._active)
+        count = active_clusters(dofs, self._halo.columns, self._motion.taylor, self._active)
         for i in self._active[:count].tolist():
             self.clusters[i].advance(begin)
-            apply_impulses(dofs, dofs.first[i], self._moments[self._of_cluster[i]], out)
+            apply_impulses(dofs, dofs.first[i], self._motion.moments[self._of_cluster[i]], out)
             dofs.busy[i] = self.clusters[i].is_busy(begin + self._interval)
-
-    def take_episodes(self) -> list[Episode]:
-        """Episodes closed since the last call that this rank logs."""
-        return [episode for cluster in self.clusters for episode in cluster.take_episodes()]
-
-    def unfinished(self) -> list[Episode]:
-        """Copies of the open episodes that this rank logs."""
-        return [episode for cluster in self.clusters for episode in cluster.unfinished()]
 
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
-        total = np.zeros(len(COUNTS), np.int64)
-        for cluster in self.clusters:
-            if cluster.logs:
-                total += [cluster.counts()[name] for name in COUNTS]
+        logs = [cluster.logs for cluster in self.clusters]
+        limits = [astuple(cluster.tracker.counts) for cluster in self.clusters if cluster.logs]
+        total = np.array([*(self._motion.state[name][logs].sum() for name in COUNTS),
+                          *np.array(limits, np.int64).reshape(-1, len(LIMITS)).sum(axis=0)])  # fmt: skip
         self._comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
-        return dict(zip(COUNTS, total.tolist(), strict=True))
+        return dict(zip((*COUNTS, *LIMITS), total.tolist(), strict=True))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs."""
-        clusters = {f"cluster-{i}-{k}": v for i, c in enumerate(self.clusters) for k, v in c.checkpoint().items()}
-        return clusters | {"busy": self._dofs.busy.copy()}
+        trackers = [cluster.tracker.checkpoint() for cluster in self.clusters]
+        logs = {f"cluster-{i}-{name}": array for i, arrays in enumerate(trackers) for name, array in arrays.items()}
+        return logs | {name: array.copy() for name, array in self._saved.items()}
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Go back to a checkpoint."""
-        self._dofs.busy[:] = checkpoint["busy"]
+        for name, array in self._saved.items():
+            array[:] = checkpoint[name]
         for i, cluster in enumerate(self.clusters):
             prefix = f"cluster-{i}-"
-            cluster.restore({k.removeprefix(prefix): v for k, v in checkpoint.items() if k.startswith(prefix)})
+            cluster.tracker.restore({k.removeprefix(prefix): v for k, v in checkpoint.items() if k.startswith(prefix)})
 
 
 def _unwrapped(cell: int, near: int, layout: Layout) -> int:

@@ -13,8 +13,8 @@ from scipy.special import binom
 from vipetsc.compiled import njit
 from vipetsc.contact.law import Contacts, contact_force
 from vipetsc.dynamics.propagator.collocation import NODES, Collocation
+from vipetsc.dynamics.propagator.free_motion import evaluate, shift
 from vipetsc.dynamics.propagator.series import MOST_TERMS
-from vipetsc.dynamics.propagator.taylor import evaluate, shift
 from vipetsc.dynamics.records import Burst, drive_force
 
 MOST_SWEEPS = 60
