@@ -3,7 +3,6 @@
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from vipetsc.case.reading import CaseFile, Problem, Section, Table
@@ -19,7 +18,7 @@ class GridTable(Section):
     last: Positive = 1.0
     count: Annotated[int, Field(ge=2)] = 37
 
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> np.ndarray:
         """The values (count,), free of the last digits' noise."""
         return np.round(np.linspace(self.first, self.last, self.count), 12)
 
@@ -30,7 +29,7 @@ class EtaTable(GridTable):
     first: Annotated[float, Field(gt=0, lt=1)] = 0.1
     last: Annotated[float, Field(gt=0, le=1)] = 1.0
 
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> np.ndarray:
         """The values below 1."""
         eta = super().values()
         return eta[eta < 1]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq, minimize_scalar
 
 from vipetsc.lattice.cell import UnitCell
@@ -20,10 +20,10 @@ class BlochPoint:
     (..., band) in cells/s. Of several cells, the axis of cells comes first.
     """
 
-    wavenumber: NDArray[np.float64]
-    frequency: NDArray[np.float64]
-    vectors: NDArray[np.complex128]
-    group_velocity: NDArray[np.float64]
+    wavenumber: np.ndarray
+    frequency: np.ndarray
+    vectors: np.ndarray
+    group_velocity: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -59,15 +59,15 @@ def bloch(cell: UnitCell | Sequence[UnitCell], kappa: ArrayLike) -> BlochPoint:
     return BlochPoint(kappa, frequency, vectors * root[..., :, None], group_velocity)
 
 
-Matrix = Callable[[UnitCell, NDArray[np.float64]], NDArray[np.complex128]]
+Matrix = Callable[[UnitCell, np.ndarray], np.ndarray]
 
 
-def _each(matrix: Matrix, cell: UnitCell | Sequence[UnitCell], kappa: NDArray[np.float64]) -> NDArray[np.complex128]:
+def _each(matrix: Matrix, cell: UnitCell | Sequence[UnitCell], kappa: np.ndarray) -> np.ndarray:
     """``matrix(cell, kappa)`` of one cell, or of several along a first axis."""
     return matrix(cell, kappa) if isinstance(cell, UnitCell) else np.stack([matrix(c, kappa) for c in cell])
 
 
-def _stiffness_slope(cell: UnitCell, kappa: NDArray[np.float64]) -> NDArray[np.complex128]:
+def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
     """dK/dkappa (..., dofs, dofs)."""
     k = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
     for mass, offset, other, stiffness in cell.couplings():
@@ -79,9 +79,7 @@ def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
     return sign * float(bloch(cell, kappa).frequency[band - 1])
 
 
-def _maximum(
-    function: Callable[[float], float], kappa: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[float, float]:
+def _maximum(function: Callable[[float], float], kappa: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """Where in [0, pi] ``function`` is largest, and its value there: the best grid point, refined."""
     best = int(np.argmax(values))
     bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, len(kappa) - 1)]

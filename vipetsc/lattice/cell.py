@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 Reading = Literal["printed", "calibrated"]
 
@@ -62,7 +62,7 @@ class UnitCell:
             ends.append((s.end, -offset, s.start, s.stiffness))
         return sorted(ends, key=lambda c: c[0])
 
-    def stiffness_matrix(self, kappa: ArrayLike) -> NDArray[np.complex128]:
+    def stiffness_matrix(self, kappa: ArrayLike) -> np.ndarray:
         """Bloch stiffness (..., dofs, dofs) in N/m at wavenumber ``kappa`` in rad per cell; Hermitian.
 
         The paper's printed matrix lacks the -1/2 in row 1, column 2 of Eq. (S1); this one follows from

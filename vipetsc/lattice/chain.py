@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
@@ -46,7 +45,7 @@ class Chain:
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         return coo_matrix(entries, shape=(n * d, n * d)).tocsc()
 
-    def masses(self) -> NDArray[np.float64]:
+    def masses(self) -> np.ndarray:
         """Masses (cells dofs,) in kg, ordered cell by cell."""
         return np.tile(np.asarray(self.cell.masses), self.cells)
 

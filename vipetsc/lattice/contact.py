@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 Adhesion = Literal["allow", "clip"]
 
@@ -66,7 +66,7 @@ class Contact:
         """3 (1 - r) / 2, the factor of w'/w'_minus in g (Hunt and Crossley 1975)."""
         return 1.5 * (1 - self.restitution)
 
-    def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> NDArray[np.float64]:
+    def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
         """g = 1 + 3 (1 - r)/2 w'/w'_minus for relative velocity and approach velocity in m/s.
 
         The paper prints a minus sign, which feeds energy in; Hunt and Crossley's law has a plus.
@@ -78,14 +78,14 @@ class Contact:
 
     def force(
         self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike = 0.0, approach: ArrayLike = np.inf
-    ) -> NDArray[np.float64]:
+    ) -> np.ndarray:
         """Restoring force F in N for relative displacement w in m; g = 1 unless an approach is given."""
         w = np.asarray(w, float)
         n = self.law.exponent
         elastic = np.maximum(w - clearance, 0) ** n - np.maximum(-w - clearance, 0) ** n
         return self.stiffness * elastic * self.dissipation_factor(rate, approach)
 
-    def potential(self, w: ArrayLike, clearance: ArrayLike) -> NDArray[np.float64]:
+    def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
         """Elastic energy kc x^(n+1)/(n+1) in J stored at relative displacement w in m."""
         x = np.maximum(np.abs(np.asarray(w, float)) - clearance, 0)
         return self.stiffness * x ** (self.law.exponent + 1) / (self.law.exponent + 1)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 Envelope = Literal["paper", "hann"]
 
@@ -32,7 +32,7 @@ class ToneBurst:
         """The factor in N before 1 - cos."""
         return self.amplitude if self.envelope == "paper" else self.amplitude / 2
 
-    def force(self, t: ArrayLike) -> NDArray[np.float64]:
+    def force(self, t: ArrayLike) -> np.ndarray:
         """Force in N at time t in s."""
         t = np.asarray(t, float)
         phase = self.frequency * t

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bloch import BlochPoint, bloch
 from vipetsc.lattice.cell import Reading, UnitCell, four_band
@@ -33,22 +33,22 @@ class Search:
     largest |group velocity| in cells/s.
     """
 
-    lam: NDArray[np.float64]
-    eta: NDArray[np.float64]
-    wavenumber: NDArray[np.float64]
-    frequency: NDArray[np.float64]
-    signed_deflection: NDArray[np.float64]
-    speed: NDArray[np.float64]
+    lam: np.ndarray
+    eta: np.ndarray
+    wavenumber: np.ndarray
+    frequency: np.ndarray
+    signed_deflection: np.ndarray
+    speed: np.ndarray
 
     @property
-    def out_of_phase(self) -> NDArray[np.bool_]:
+    def out_of_phase(self) -> np.ndarray:
         """Where (lambda, eta) host and resonator move against each other at every kappa of the second band.
 
         Wavenumbers at which either stands still (the zone's border, by symmetry) do not count.
         """
         return (self.signed_deflection >= 0).all(axis=-1) & (self.signed_deflection > 0).any(axis=-1)
 
-    def cost(self, name: str) -> NDArray[np.float64]:
+    def cost(self, name: str) -> np.ndarray:
         """One of ``COSTS`` over (lambda, eta); the larger the better.
 
         ``deflection``: largest signed deflection over kappa, 1. ``group_velocity``: the sum over bands 2 to 4
@@ -82,7 +82,7 @@ def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLi
     return Search(lams, etas, kappa, *(np.stack(part) for part in zip(*rows, strict=True)))
 
 
-def signed_deflection(cell: UnitCell, point: BlochPoint) -> NDArray[np.float64]:
+def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
     """|u3 - u2| sign(-u2 u3) (..., band) of the contact pair: positive where it moves out of phase.
 
     The paper leaves the length of the Bloch vectors open. They have unit norm here, which puts the optimum near the
@@ -95,6 +95,6 @@ def signed_deflection(cell: UnitCell, point: BlochPoint) -> NDArray[np.float64]:
     return np.abs(resonator - host) * side
 
 
-def unit_vectors(point: BlochPoint) -> NDArray[np.complex128]:
+def unit_vectors(point: BlochPoint) -> np.ndarray:
     """Bloch vectors (..., dof, band) scaled to sum_dof |u|^2 = 1."""
     return point.vectors / np.linalg.norm(point.vectors, axis=-2, keepdims=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 
 from vipetsc.lattice import Band
@@ -26,7 +26,7 @@ class Parts:
     above the top band; pass bands that overlap share a part.
     """
 
-    edges: NDArray[np.float64]
+    edges: np.ndarray
     names: tuple[str, ...]
     bands: tuple[tuple[int, ...], ...]
 
@@ -55,13 +55,13 @@ class Parts:
             inside.append(numbers)
         return cls(np.array([*edges, np.inf]), (*names, "above"), (*inside, ()))
 
-    def above(self, frequency: float) -> NDArray[np.bool_]:
+    def above(self, frequency: float) -> np.ndarray:
         """Which parts (part) are pass bands above the one driven at ``frequency`` (rad/s)."""
         driven = int(np.searchsorted(self.edges, frequency, side="right")) - 1
         return np.array([bool(b) and i > driven for i, b in enumerate(self.bands)])
 
 
-def split(signal: NDArray[np.float64], interval: float, edges: ArrayLike) -> Iterator[NDArray[np.float64]]:
+def split(signal: np.ndarray, interval: float, edges: ArrayLike) -> Iterator[np.ndarray]:
     """The parts of ``signal`` (t, ...) sampled every ``interval`` s, between consecutive ``edges`` (rad/s).
 
     Yields one array of the signal's shape a part. They add up to the signal, and their mean squares over
@@ -76,9 +76,7 @@ def split(signal: NDArray[np.float64], interval: float, edges: ArrayLike) -> Ite
         yield fft.idct(inside, type=1, axis=0, overwrite_x=True)
 
 
-def part_energies(
-    velocity: NDArray[np.float64], masses: ArrayLike, interval: float, edges: ArrayLike
-) -> NDArray[np.float64]:
+def part_energies(velocity: np.ndarray, masses: ArrayLike, interval: float, edges: ArrayLike) -> np.ndarray:
     """Kinetic energy (part, t) in J of every part, from ``velocity`` (t, cell, dof) in m/s.
 
     Summed over the cells, a block of them at a time.
@@ -95,8 +93,8 @@ def part_energies(
 
 
 def part_kinetic_energy(
-    velocity: NDArray[np.float64], masses: ArrayLike, interval: float, low: float, high: float
-) -> NDArray[np.float64]:
+    velocity: np.ndarray, masses: ArrayLike, interval: float, low: float, high: float
+) -> np.ndarray:
     """Kinetic energy (t, cell) in J of what moves between the frequencies ``low`` and ``high`` (rad/s)."""
     edges = [0.0, low, high, np.inf] if low > 0 else [0.0, high, np.inf]
     wanted = len(edges) - 3
@@ -108,12 +106,12 @@ def part_kinetic_energy(
     return energy
 
 
-def front_arrival(energy: NDArray[np.float64], fraction: float = 0.01) -> int:
+def front_arrival(energy: np.ndarray, fraction: float = 0.01) -> int:
     """First sample at which ``energy`` (t) of one cell exceeds ``fraction`` of its largest value."""
     return int(np.argmax(energy > fraction * energy.max()))
 
 
-def ibtet(energy: NDArray[np.float64], above: NDArray[np.bool_], start: int = 0) -> float:
+def ibtet(energy: np.ndarray, above: np.ndarray, start: int = 0) -> float:
     """Inter-band targeted energy transfer: share of the parts ``above`` (part), averaged from ``start`` on.
 
     ``energy`` (part, t) in J. The share is taken of the sum of all parts at every sample, as the paper's

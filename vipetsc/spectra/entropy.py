@@ -16,7 +16,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
 from vipetsc.compiled import njit
@@ -28,9 +27,6 @@ GROUP = 4  # nodes that are filtered together
 FLOOR = 0.01
 """Points below this fraction of the largest weight are masked, Eq. (d)."""
 
-Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
-
 
 @dataclass(frozen=True)
 class Entropy:
@@ -41,16 +37,16 @@ class Entropy:
     ``masked``, Eq. (d), with the standard deviation ``error`` over the cells of each one's masked time mean.
     """
 
-    local: Floats
-    weight: Floats
-    snapshot: Floats
+    local: np.ndarray
+    weight: np.ndarray
+    snapshot: np.ndarray
     energy_weighted: float
     masked: float
     joint: float
     error: float
 
 
-def entropy(velocity: Floats, start: int = 0, *, kc: float = 12.0, nodes: int = NODES) -> Entropy:
+def entropy(velocity: np.ndarray, start: int = 0, *, kc: float = 12.0, nodes: int = NODES) -> Entropy:
     """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the ``nodes`` wavenumbers i pi/nodes, i = 1, 2, ...
 
     ``velocity`` may be an HDF5 dataset: a few snapshots at a time are read. ``start`` is the sample of the linear
@@ -65,7 +61,7 @@ def entropy(velocity: Floats, start: int = 0, *, kc: float = 12.0, nodes: int = 
     return Entropy(local, weight, snapshot, float(snapshot[start:].mean()), masked, float(joint[start:].mean()), error)
 
 
-def local_entropy(velocity: Floats, *, kc: float = 12.0, nodes: int = NODES) -> tuple[Floats, Floats]:
+def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES) -> tuple[np.ndarray, np.ndarray]:
     """H (t, cell) in bits and W (t, cell) of ``velocity`` (t, cell), a few snapshots at a time.
 
     Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude.
@@ -96,7 +92,7 @@ class _Octave(NamedTuple):
     """Nodes that share a padded ``length``; for groups of them the band's first row and the filters from there on."""
 
     length: int
-    filters: list[tuple[int, Floats]]
+    filters: list[tuple[int, np.ndarray]]
 
 
 @lru_cache(maxsize=8)
@@ -120,7 +116,7 @@ def _octaves(cells: int, kc: float, nodes: int) -> tuple[_Octave, ...]:
 
 
 @njit("void(c16[:,::1], f8[:,::1], i8, c16[:,:,::1])")
-def _filter(spectrum: Complexes, filters: Floats, low: int, x: Complexes) -> None:
+def _filter(spectrum: np.ndarray, filters: np.ndarray, low: int, x: np.ndarray) -> None:
     """Spectra ``x`` (t, kappa, k) of the wavelet transforms; ``filters`` (kappa, band) start at row ``low``."""
     for t in range(x.shape[0]):
         for k in range(x.shape[1]):
@@ -131,7 +127,7 @@ def _filter(spectrum: Complexes, filters: Floats, low: int, x: Complexes) -> Non
 
 
 @njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", error_model="numpy", fastmath={"contract"})
-def _accumulate(x: Complexes, weight: Floats, s_log_s: Floats) -> None:
+def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
     """Add the sums of Eq. (a), S and S log2 S of the nodes of ``x`` (t, kappa, x), to arrays (t, cell).
 
     The logarithm is written out so that the loop is vectorised, four times as fast as calls of log2: S = 2^e m
@@ -163,7 +159,7 @@ def _accumulate(x: Complexes, weight: Floats, s_log_s: Floats) -> None:
 
 
 @njit("void(f8[:,::1], f8[:,::1], f8[:,::1])")
-def _entropies(weight: Floats, s_log_s: Floats, local: Floats) -> None:
+def _entropies(weight: np.ndarray, s_log_s: np.ndarray, local: np.ndarray) -> None:
     """Eq. (a) from its sums, kept from rounding below zero; W and H are 0 where S stands at its floor."""
     for t in range(weight.shape[0]):
         for c in range(weight.shape[1]):
@@ -174,7 +170,7 @@ def _entropies(weight: Floats, s_log_s: Floats, local: Floats) -> None:
                 weight[t, c] = local[t, c] = 0.0
 
 
-def _over_cells(local: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def _over_cells(local: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The energy-weighted mean (t) of Eq. (b) and the joint entropy (t) of Eq. (c)."""
     largest = weight.max(axis=1, keepdims=True)
     share = np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0)
@@ -184,7 +180,7 @@ def _over_cells(local: Floats, weight: Floats) -> tuple[Floats, Floats]:
     return mean, mean + position
 
 
-def _masked(local: Floats, weight: Floats) -> tuple[float, float]:
+def _masked(local: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     """The masked mean of Eq. (d), and the deviation over the cells of each one's mean over time."""
     above_threshold = weight > FLOOR * weight.max()
     if not above_threshold.any():

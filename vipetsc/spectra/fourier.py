@@ -7,7 +7,7 @@ or an HDF5 dataset, of which one mass at a time is then held in memory.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 
 TAPER = 0.1
@@ -21,9 +21,9 @@ class Dispersion:
     phase velocity omega/kappa > 0 has kappa > 0.
     """
 
-    wavenumber: NDArray[np.float64]
-    frequency: NDArray[np.float64]
-    energy: NDArray[np.float64]
+    wavenumber: np.ndarray
+    frequency: np.ndarray
+    energy: np.ndarray
 
     def folded(self) -> "Dispersion":
         """The same with kappa and -kappa added up, on [0, pi]."""
@@ -35,7 +35,7 @@ class Dispersion:
         return Dispersion(self.wavenumber[positive : positive + half], self.frequency, energy)
 
 
-def kinetic_energy(velocity: NDArray[np.float64], masses: ArrayLike) -> NDArray[np.float64]:
+def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
     """Kinetic energy (t, cell) in J of every cell, from ``velocity`` (t, cell, dof) in m/s, masses in kg."""
     energy = np.zeros(velocity.shape[:-1])
     for j, mass in enumerate(np.asarray(masses)):
@@ -43,9 +43,7 @@ def kinetic_energy(velocity: NDArray[np.float64], masses: ArrayLike) -> NDArray[
     return energy
 
 
-def wavenumber_content(
-    velocity: NDArray[np.float64], masses: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def wavenumber_content(velocity: np.ndarray, masses: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Kinetic energy per wavenumber over time: kappa (k) in [0, pi] rad per cell, content (t, k) in J.
 
     Both signs of kappa are added up; the content of a sample sums to its kinetic energy (Parseval).
@@ -59,7 +57,7 @@ def wavenumber_content(
     return 2 * np.pi * np.arange(cells // 2 + 1) / cells, content
 
 
-def taper(length: int, fraction: float) -> NDArray[np.float64]:
+def taper(length: int, fraction: float) -> np.ndarray:
     """Tukey window (length) with cosine flanks over ``fraction`` of it, scaled to mean square 1."""
     x = (np.arange(length) + 0.5) / length
     flank = np.minimum(x, 1 - x)
@@ -70,7 +68,7 @@ def taper(length: int, fraction: float) -> NDArray[np.float64]:
 
 
 def dispersion(
-    velocity: NDArray[np.float64],
+    velocity: np.ndarray,
     masses: ArrayLike,
     interval: float,
     *,
@@ -107,7 +105,7 @@ def dispersion(
     return Dispersion(wavenumber, frequency, energy.T[order])
 
 
-def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:
     """Ridge of a dispersion: energetic wavenumbers (k) and the frequency (k) in rad/s of each one's peak.
 
     A wavenumber counts when its peak exceeds ``floor`` times the largest; the peak is refined by the

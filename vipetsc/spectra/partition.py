@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 
 from vipetsc.spectra.wavelet import BINS, VOICES, Normalisation, filter_bank
@@ -19,28 +19,28 @@ class Partition:
     themselves, ``reconstructed`` (t): KE_rec = 1/2 sum m (sum_b v_b)^2.
     """
 
-    energy: NDArray[np.float64]
-    field: NDArray[np.float64] | None
-    kinetic: NDArray[np.float64]
-    reconstructed: NDArray[np.float64]
+    energy: np.ndarray
+    field: np.ndarray | None
+    kinetic: np.ndarray
+    reconstructed: np.ndarray
 
     @property
-    def error(self) -> NDArray[np.float64]:
+    def error(self) -> np.ndarray:
         """e (t) = |KE_rec - KE| / KE (the paper's Eq. (A8)), 0 at rest."""
         return _share(np.abs(self.reconstructed - self.kinetic), self.kinetic)
 
     @property
-    def cross_share(self) -> NDArray[np.float64]:
+    def cross_share(self) -> np.ndarray:
         """1 - sum_b KE_b / KE (t): the energy in products of different parts, 0 at rest."""
         return _share(self.kinetic - self.energy.sum(axis=0), self.kinetic)
 
 
-def _share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+def _share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
     return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0)
 
 
 def partition(
-    velocity: NDArray[np.float64],
+    velocity: np.ndarray,
     masses: ArrayLike,
     kc: float = 6.0,
     normalisation: Normalisation = "analytic",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
@@ -31,7 +31,7 @@ class PowerLaw:
     exponent_interval: tuple[float, float]
     points: int
 
-    def __call__(self, x: ArrayLike) -> NDArray[np.float64]:
+    def __call__(self, x: ArrayLike) -> np.ndarray:
         """The law at ``x``."""
         return np.asarray(self.factor * np.asarray(x, dtype=float) ** self.exponent)
 
@@ -91,13 +91,13 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     )
 
 
-def _nonlinear(u: NDArray[np.float64], w: NDArray[np.float64], slope: float, cx: float, cy: float) -> PowerLaw:
+def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float) -> PowerLaw:
     """Fit w = c exp(b u), c of order 1, and return it as y = a x^b with ln a = cy + ln c - b cx."""
 
-    def law(u: NDArray[np.float64], c: float, b: float) -> NDArray[np.float64]:
+    def law(u: np.ndarray, c: float, b: float) -> np.ndarray:
         return np.asarray(c * np.exp(b * u))
 
-    def gradient(u: NDArray[np.float64], c: float, b: float) -> NDArray[np.float64]:
+    def gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
         return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
     tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
@@ -131,7 +131,7 @@ def from_peak(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     return power_law(x[peak:], y[peak:], method)
 
 
-def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> NDArray[np.float64]:
+def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
     """A curve (n) scaled linearly so that it runs from ``low`` to ``high``; NaN stays, and a constant raises."""
     y = np.asarray(y, dtype=float)
     least, most = np.nanmin(y), np.nanmax(y)

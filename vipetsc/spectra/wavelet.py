@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 
 LOWEST = np.pi / 60
@@ -26,7 +26,7 @@ Normalisation = Literal["analytic", "dual"]
 class Nodes:
     """Wavenumbers ``kappa`` (node) in rad per cell on a log grid, and their common weight dkappa/kappa."""
 
-    kappa: NDArray[np.float64]
+    kappa: np.ndarray
     weight: float
 
     @classmethod
@@ -42,12 +42,12 @@ class Nodes:
         kappa = LOWEST * ratio ** (np.arange(steps + 1) / steps)
         return cls(kappa, float(np.log(ratio) / steps))
 
-    def bins(self, count: int = BINS) -> NDArray[np.int64]:
+    def bins(self, count: int = BINS) -> np.ndarray:
         """Bin (node) of every node, from 0: edges k pi/count, all nodes above pi in the last."""
         return np.minimum((self.kappa * count / np.pi).astype(int), count - 1)
 
 
-def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> NDArray[np.float64]:
+def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
     """Psi(kc eta/kappa) (kappa, eta), zero for eta <= 0.
 
     Raises ValueError for ``kc`` below 5: the uncorrected Morlet wavelet then has weight at eta = 0.
@@ -77,14 +77,12 @@ def padded_length(cells: int, kc: float, lowest: float = LOWEST) -> int:
     return fft.next_fast_len(cells + int(np.ceil(reach)), real=True)
 
 
-def wavenumbers(length: int) -> NDArray[np.float64]:
+def wavenumbers(length: int) -> np.ndarray:
     """Wavenumbers (k) in rad per cell of a real transform of ``length``."""
     return 2 * np.pi * np.arange(length // 2 + 1) / length
 
 
-def transform(
-    signal: NDArray[np.float64], kappa: ArrayLike, kc: float, length: int | None = None
-) -> NDArray[np.complex128]:
+def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | None = None) -> np.ndarray:
     """Complex wavelet transform X (..., kappa, x), Eq. (A5), of real signals (..., cell); X in the signal's unit.
 
     X = sqrt(kc/kappa) IFFT[FFT(signal) Psi(kc eta/kappa)] on the line padded to ``length``, by default
@@ -104,7 +102,7 @@ def transform(
     return fft.ifft(spectrum, overwrite_x=True)
 
 
-def inverse(x: NDArray[np.complex128], nodes: Nodes, kc: float, bins: int = BINS) -> NDArray[np.float64]:
+def inverse(x: np.ndarray, nodes: Nodes, kc: float, bins: int = BINS) -> np.ndarray:
     """Parts (bin, ..., x), Eq. (A7), of the signals whose transform at ``nodes`` is ``x`` (..., kappa, x), uncropped.
 
     u_b = 2 Re (1/C) sum over the nodes of bin b of (dkappa/kappa) sqrt(kappa/kc) IFFT[FFT(X) Psi(kc eta/kappa)].
@@ -132,11 +130,11 @@ class Bank:
     all but 1e-10 already, so the filters have no step.
     """
 
-    transfer: NDArray[np.float64]
+    transfer: np.ndarray
     cells: int
     length: int
 
-    def split(self, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    def split(self, signal: np.ndarray) -> np.ndarray:
         """Parts (bin, ..., cell) of real signals (..., cell), on the lattice alone."""
         spectrum = fft.rfft(signal, self.length)
         return np.stack([fft.irfft(t * spectrum, self.length)[..., : self.cells] for t in self.transfer])
