@@ -19,8 +19,7 @@ from vipetsc.figures.drawing import NOTE, draw_each
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.style import DPI, new_figure
 from vipetsc.paper.claims.measure import MEASURES
-from vipetsc.paper.figures import PAPER_FIGURES
-from vipetsc.paper.pictures import describe
+from vipetsc.paper.figures import PAPER_FIGURES, describe
 from vipetsc.paper.plan import CLAIMS
 from vipetsc.paper.report import numbers, sources
 

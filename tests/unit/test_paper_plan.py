@@ -13,9 +13,10 @@ import vipetsc
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import make
+from vipetsc.paper.figures import TRANSFER
 from vipetsc.paper.make import inputs_of, read_record
-from vipetsc.paper.plan import CLAIMS, FULL, STEPS, TRANSFER, Plan, case_file, paper_plan
-from vipetsc.paper.steps import DONE, MISSING, RELATION, SEARCH, STALE, Step, fingerprint
+from vipetsc.paper.plan import CLAIMS, FULL, Plan, paper_plan
+from vipetsc.paper.steps import DONE, MISSING, RELATION, STALE, fingerprint
 from vipetsc.studies.design import search_design
 
 ROOT = Path(__file__).parents[2]
@@ -25,7 +26,7 @@ PACKAGE = Path(vipetsc.__file__).parent
 def test_every_case_file_comes_with_the_package():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     shipped = {path for pattern in declared["vipetsc.paper"] for path in (PACKAGE / "paper").glob(pattern)}
-    needed = {case_file(name) for name in STEPS}
+    needed = {step.file for step in paper_plan(FULL).steps}
     assert needed <= shipped
     assert PACKAGE / "paper" / "report.html" in shipped
     assert all(PACKAGE in path.parents and path.is_file() and not path.is_symlink() for path in needed)
@@ -34,7 +35,7 @@ def test_every_case_file_comes_with_the_package():
 
 
 def test_examples_of_the_same_name_are_the_same_files():
-    for path in {case_file(name) for name in STEPS}:
+    for path in {step.file for step in paper_plan(FULL).steps}:
         assert (ROOT / "runs" / path.name).resolve() == path
 
 
@@ -49,7 +50,7 @@ SMALL = ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11")
 @pytest.fixture
 def searched(tmp_path) -> tuple[Plan, Path]:
     """A plan of the search alone, done."""
-    step = Step("design", SEARCH, case_file("design"), SMALL)
+    step = next(step for step in paper_plan(FULL).steps if step.name == "design").changed(*SMALL)
     search_design(step.case, tmp_path / "design")
     plan = paper_plan(FULL)
     return replace(plan, steps=(step,), figures=[f for f in plan.figures if f.id in ("figS3", "fig10")]), tmp_path

@@ -20,8 +20,8 @@ from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing, draw_each
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import PAPER, claim_folder, provenance
-from vipetsc.paper.pictures import PaperFigure
-from vipetsc.paper.plan import TRANSFER, Plan
+from vipetsc.paper.figures import TRANSFER, PaperFigure
+from vipetsc.paper.plan import Plan
 from vipetsc.paper.report import FigureEntry, Report, write_report
 from vipetsc.paper.steps import BRANCHES, DONE, STALE, fingerprint
 from vipetsc.parallel import SharedCounter, StopRequest, on_root

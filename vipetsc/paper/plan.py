@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
 from vipetsc.io.folder import FolderError
-from vipetsc.paper.figures import PAPER_FIGURES, RELATED, TRANSFER
-from vipetsc.paper.pictures import PaperFigure
-from vipetsc.paper.steps import BRANCHES, DONE, SEARCH, SWEEP, Step, StepKind
+from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
+from vipetsc.paper.steps import BRANCHES, DONE, SEARCH, SWEEP, Step
 
 FULL, QUICK = "full", "quick"
 CLAIMS = tuple(f"C{number}" for number in range(1, 18))
@@ -19,41 +19,9 @@ COARSE = "quick: coarse grid"
 # Steps that a claim is measured from besides those of the figures that show it.
 FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
 
-OUT_OF_PHASE = "nnm.modes=[2]"
-
-# Kind of each step and its CPU time in s: of a member of a sweep, else of the whole step. The cheap ones come first,
-# so that most figures are there early.
-STEPS: dict[str, tuple[StepKind, float]] = {
-    "scattering-amplitudes": (SWEEP, 4.0),
-    "interband-amplitudes": (SWEEP, 5.0),
-    "interband-one-site": (SWEEP, 4.0),
-    "design": (SEARCH, 15.0),
-    "nnm-hertz": (BRANCHES, 45.0),
-    "nnm-bilinear": (BRANCHES, 45.0),
-    "nnm-hertz-calibrated": (BRANCHES, 20.0),
-    "nnm-bilinear-calibrated": (BRANCHES, 20.0),
-    TRANSFER: (SWEEP, 1.2),
-    "scattering-neighbours": (SWEEP, 0.4),
-    "scattering": (SWEEP, 0.4),
-}
-
 RUNS = ("output.figures=false",)  # of all sweeps: the figures of the paper are drawn from all of them together
 
-COARSER = {
-    "scattering": (
-        'sweep.drive.wavenumber=["3pi/9", "5pi/9"]',
-        "sweep.drive.amplitude={ log = [0.1, 20.0], count = 9 }",
-        "sweep.contacts.sites=[2, 5, 20]",
-    ),
-    "scattering-neighbours": (
-        "sweep.drive.amplitude={ log = [0.1, 20.0], count = 9 }",
-        "sweep.contacts.sites.count=[2, 5, 20]",
-    ),
-    "interband": ("sweep.drive.amplitude={ log = [1.0, 1e4], count = 13 }",),
-    "design": ("design.lambda.count=10", "design.eta.count=10", "design.wavenumbers=51"),
-    "nnm-hertz": (OUT_OF_PHASE,),
-    "nnm-bilinear": (OUT_OF_PHASE,),
-}
+KINDS = {"sweep": SWEEP, "branches": BRANCHES, "search": SEARCH}
 
 
 @dataclass(frozen=True)
@@ -106,21 +74,15 @@ class Plan:
 
 
 def paper_plan(grid: str = FULL) -> Plan:
-    """The whole paper, from the case files of the package.
+    """The whole paper, from ``plan.toml`` and the case files of the package.
 
     The quick grid has fewer amplitudes, wavenumbers and sites and leaves out the in-phase branches; both laws and both
     readings stay.
     """
+    folder, coarse = files("vipetsc.paper"), grid == QUICK
     steps = []
-    for name, (kind, cost) in STEPS.items():
-        changes: tuple[str, ...] = RUNS if kind is SWEEP else ()
-        if name.endswith("-calibrated"):
-            changes += ("lattice.reading=calibrated", OUT_OF_PHASE)
-        changes += COARSER.get(name, ()) if grid == QUICK else ()
-        steps.append(Step(name, kind, case_file(name), changes, cost))
-    return Plan(grid, tuple(steps), note=COARSE if grid == QUICK else "")
-
-
-def case_file(step: str) -> Path:
-    """The case file of a step, shipped with the package; that of the printed reading serves both."""
-    return Path(str(files("vipetsc.paper") / "cases" / f"{step.removesuffix('-calibrated')}.toml"))
+    for name, row in tomllib.loads((folder / "plan.toml").read_text(encoding="utf-8")).items():
+        kind, file = KINDS[row["kind"]], folder / "cases" / f"{row.get('case', name)}.toml"
+        changes = [*(RUNS if kind is SWEEP else ()), *row.get("changes", ()), *(row.get("quick", ()) if coarse else ())]
+        steps.append(Step(name, kind, Path(str(file)), tuple(changes), row["cost"]))
+    return Plan(grid, tuple(steps), note=COARSE if coarse else "")

@@ -15,7 +15,7 @@ from PIL import Image  # type: ignore[import-untyped]
 
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED
-from vipetsc.paper.pictures import READINGS, PaperFigure, describe
+from vipetsc.paper.figures import READINGS, PaperFigure, describe
 
 WIDEST = 1500  # pixels of a picture in the page
 COLOURS = 200
