@@ -1,7 +1,5 @@
 """The figures of the paper and its supplement (``figures.toml``), and how they are drawn."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ What is made from results is made again when the hash of its inputs changed: the
 their results, the version of the package. ``made.json`` keeps the hashes.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,12 +1,11 @@
 """What the verb ``paper`` makes: steps, figures and claims, in full or on coarse grids."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Self
 
 from vipetsc.io.folder import FolderError
 from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
@@ -38,7 +37,7 @@ class Plan:
     note: str = ""
     claims: str = "vipetsc.paper.claims"
 
-    def only(self, ids: Iterable[str]) -> Plan:
+    def only(self, ids: Iterable[str]) -> Self:
         """The part of the plan that figures and claims need; all of it without ``ids``.
 
         Raises

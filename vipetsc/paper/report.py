@@ -1,7 +1,5 @@
 """The report on the paper: one page with everything in it, for a screen of any width and for print."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections import Counter

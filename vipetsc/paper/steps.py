@@ -1,7 +1,5 @@
 """Steps of a plan: a case file each, made in a folder of its own, and how far each has come."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import tomllib
@@ -9,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from mpi4py import MPI
 
@@ -61,7 +59,7 @@ class Step:
         """Where the step's files are."""
         return root / self.name
 
-    def changed(self, *changes: str) -> Step:
+    def changed(self, *changes: str) -> Self:
         """The same step with further changes to its case."""
         return replace(self, changes=(*self.changes, *changes))
 

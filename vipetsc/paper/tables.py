@@ -1,7 +1,5 @@
 """What the verb ``paper`` prints: how far a plan has come, and the verdicts on the claims."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

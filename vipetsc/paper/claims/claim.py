@@ -1,7 +1,5 @@
 """What a claim of the paper is: a sentence, criteria that were fixed beforehand, what was measured, a verdict."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field

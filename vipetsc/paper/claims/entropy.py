@@ -1,7 +1,5 @@
 """C7-C9: the wavenumber entropy of the diatomic lattice against amplitude (the paper's section II.C)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

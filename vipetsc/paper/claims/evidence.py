@@ -1,12 +1,10 @@
 """What claims are measured from: the steps of the paper in one folder, and which of their files were read."""
 
-from __future__ import annotations
-
 import tomllib
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
@@ -46,7 +44,7 @@ class AmplitudeCurve:
     episodes: np.ndarray
 
     @classmethod
-    def of(cls, members: xr.Dataset, name: str) -> AmplitudeCurve:
+    def of(cls, members: xr.Dataset, name: str) -> Self:
         """The measure ``name`` of ``Evidence.select``; raises MissingEvidence."""
         step = Path(members.attrs["folder"]).name
         if name not in members:
@@ -72,10 +70,10 @@ class AmplitudeCurve:
         return float(self.amplitude[self.peak])
 
     @property
-    def normalised(self) -> AmplitudeCurve:
+    def normalised(self) -> Self:
         """The same with values on [.01, 1], as the paper's; NaN if they are all equal."""
         value = normalised(self.value) if np.ptp(self.value) > 0 else np.full(len(self.value), np.nan)
-        return AmplitudeCurve(self.amplitude, value, self.episodes)
+        return replace(self, value=value)
 
     def growth_ratio(self, low: float, high: float) -> float:
         """Ratio of the amplitudes between which the values grow: from the last <= ``low`` to the first >= ``high``.
@@ -108,7 +106,7 @@ class Evidence:
         self._stack = ExitStack()
         self._ensembles: dict[str, xr.Dataset] = {}
 
-    def __enter__(self) -> Evidence:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

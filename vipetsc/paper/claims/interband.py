@@ -1,7 +1,5 @@
 """C10-C14: energy that passes to higher bands of the four-band lattice (the paper's section III and supplement)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vipetsc.paper.claims.claim import Measurement, MissingEvidence

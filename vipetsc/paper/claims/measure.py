@@ -1,7 +1,5 @@
 """All claims of the paper, measured from the files of its steps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

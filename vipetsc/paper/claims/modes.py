@@ -1,9 +1,8 @@
 """C15-C17: the reduced model's frequency-energy branches beside the lattice (the paper's section IV and supplement)."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -127,7 +126,7 @@ class PairMotion:
     above: float
 
     @classmethod
-    def of(cls, run: MeasuredRun, fields: xr.Dataset) -> PairMotion:
+    def of(cls, run: MeasuredRun, fields: xr.Dataset) -> Self:
         """The motion in ``fields``, an open ``run.h5``; raises MissingEvidence if the cell was not recorded."""
         model = run.case.model()
         cell, site = model.chain.cell, int(fields["sites/cell"].values[0])
@@ -144,7 +143,7 @@ class PairMotion:
         above = float(energy[frequency > edge].sum() / energy.sum())
         return cls(run, velocity, float(np.corrcoef(velocity.T)[0, 1]), above)
 
-    def correlation_with(self, other: PairMotion) -> float:
+    def correlation_with(self, other: Self) -> float:
         """Correlation of the resonator's velocity with that of ``other`` at the same times."""
         n = min(len(self.velocity), len(other.velocity))
         return float(np.corrcoef(self.velocity[:n, 1], other.velocity[:n, 1])[0, 1])

@@ -1,8 +1,7 @@
 """C1-C6: what the diatomic lattice does at low, medium and high amplitude (the paper's section II.B)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -38,7 +37,7 @@ class AmplitudeTriple:
     distance: int
 
     @classmethod
-    def of(cls, evidence: Evidence, reading: str, *needs: str) -> AmplitudeTriple:
+    def of(cls, evidence: Evidence, reading: str, *needs: str) -> Self:
         """The lowest, the middle and the highest amplitude; raises MissingEvidence."""
         runs = evidence.runs(STEP, reading, *needs)
         if len(runs) < 3:

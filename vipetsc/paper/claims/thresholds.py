@@ -3,8 +3,6 @@
 Sections (sec., App., Suppl.) are the paper's; SPEC is the specification that fixes what the paper leaves open.
 """
 
-from __future__ import annotations
-
 import tomllib
 from importlib.resources import files
 from typing import Any
