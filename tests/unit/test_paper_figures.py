@@ -18,7 +18,7 @@ from vipetsc.figures import rc_style, save
 from vipetsc.figures.drawing import NOTE, draw_each
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.style import DPI, new_figure
-from vipetsc.paper.claims.measure import MEASURES
+from vipetsc.paper.claims.thresholds import CLAIMS as SPECS
 from vipetsc.paper.figures import PAPER_FIGURES, describe
 from vipetsc.paper.plan import CLAIMS
 from vipetsc.paper.report import numbers, sources
@@ -82,7 +82,7 @@ def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
 
 def test_every_claim_has_a_figure_that_shows_it():
     shown = {claim for figure in PAPER_FIGURES for claim in figure.claims}
-    assert shown == set(CLAIMS) == set(MEASURES)
+    assert shown == set(CLAIMS) == set(SPECS)
     assert [figure.label for figure in PAPER_FIGURES] == [f"Fig. {i}" for i in range(1, 13)] + [
         *(f"Fig. A{i}" for i in range(1, 4)),
         *(f"Fig. S{i}" for i in range(1, 9)),

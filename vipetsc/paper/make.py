@@ -7,6 +7,7 @@ their results, the version of the package. ``made.json`` keeps the hashes.
 import importlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,9 @@ def _claim(plan: Plan, root: Path) -> None:
         _ = step.text
 
     def difference(text: str) -> str | None:
-        grid = json.loads(text)["grid"]
+        grid = "?"
+        with suppress(ValueError, KeyError):
+            grid = json.loads(text)["grid"]
         other = f"holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
         return other if grid != plan.grid else None
 
@@ -136,9 +139,8 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: 
     folders = on_root(comm, lambda: plan.folders(root))
     record = on_root(comm, lambda: _drop_stale(plan, root))
     if comm.rank == 0:
-        target.mkdir(exist_ok=True)
         tell("figures")
-    comm.Barrier()
+    on_root(comm, lambda: target.mkdir(exist_ok=True))
     counter = SharedCounter(comm)
 
     def turns() -> Iterator[int]:

@@ -102,12 +102,14 @@ class Measurement:
 class ClaimSpec:
     """A claim before it is measured: a sentence, where the ``paper`` makes it, and what decides on it.
 
-    ``figure`` is the stem of the picture that shows it, and may hold ``{reading}``.
+    ``figure`` is the stem of the picture that shows it, and may hold ``{reading}``. ``measure`` names a function
+    "module.name" (evidence, reading, measurement) that fills the measurement, or raises MissingEvidence.
     """
 
     claim: str
     paper: str
     figure: str
+    measure: str
     criteria: tuple[Criterion, ...]
 
 

@@ -12,21 +12,15 @@ from vipetsc.paper.claims.thresholds import ABRUPT, FEWEST, HIGH, PEAK, QUIET, S
 SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
 EXCITED = 5 * np.pi / 9  # rad/cell
 AVERAGES = "energy_weighted", "masked", "joint"
-FIT = {
-    "r2": "r2_log_log",
-    "r2_nonlinear": "r2_nonlinear",
-    "exponent": "exponent",
-    "low": "exponent_low",
-    "high": "exponent_high",
-}
+FIT = "r2_log_log", "r2_nonlinear", "exponent", "exponent_low", "exponent_high"
 
 
 @dataclass(frozen=True)
 class EntropyDecay:
     """The entropy of one configuration and wavenumber, its error bars, and the power laws of its fall.
 
-    ``r2``, ``r2_nonlinear`` are adjusted and NaN without a fit; ``exponent`` (log-log) has the interval ``low`` to
-    ``high``; ``points`` from the peak on.
+    Both ``r2`` are adjusted and NaN without a fit; ``exponent`` (log-log) has the interval from ``exponent_low`` to
+    ``exponent_high``; ``points`` from the peak on.
     """
 
     sites: int
@@ -36,8 +30,8 @@ class EntropyDecay:
     r2: float
     r2_nonlinear: float
     exponent: float
-    low: float
-    high: float
+    exponent_low: float
+    exponent_high: float
 
     @property
     def best(self) -> float:
@@ -71,10 +65,10 @@ def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: 
         members = evidence.select(step, reading, **wanted, sites=int(sites))
         curve = AmplitudeCurve.of(members, f"entropy/{average}")
         error = AmplitudeCurve.of(members, "entropy/error") if "entropy/error" in members else None
-        fit = {name: float(members[f"{prefix}/{key}"]) for name, key in FIT.items()}
+        fit = (float(members[f"{prefix}/{name}"]) for name in FIT)
         points = members[f"{prefix}/points"].item()
         points = int(points) if np.isfinite(points) else 0
-        configurations.append(EntropyDecay(int(sites), curve, error, points, **fit))
+        configurations.append(EntropyDecay(int(sites), curve, error, points, *fit))
     return configurations
 
 
@@ -123,7 +117,7 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], kind: st
         result.value[f"adjusted R^2 (log-log), {name}"] = c.r2
         result.value[f"exponent, {name}"] = c.exponent
         result.value[f"peak (N), {name}"] = c.curve.peak_amplitude
-        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = (c.high - c.low) / 2
+        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = (c.exponent_high - c.exponent_low) / 2
         result.uncertainty[f"points of the fit, {name}"] = c.points
 
 
