@@ -197,6 +197,16 @@ def test_region_three_begins_where_the_exponent_settles():
     assert laws["II"]["points"] == begin - np.argmax(slope)
 
 
+def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():
+    """E^-1 + c E^-3: the exponent -1 - 2 a stays at -3 first; from a(1 - a) = 1/8 on it has settled above -2."""
+    energy = np.geomspace(1e-3, 1e6, 4000)
+    touched = energy > 1e-2
+    slope = np.where(touched, 1 / energy + 1e8 * (energy / 1e-2) ** -3.0, 0.0)
+    region = tell_regions(energy, slope, touched.astype(int), np.zeros(4000))
+    share = 1e8 * (energy / 1e-2) ** -3.0 / np.where(touched, slope, 1.0)
+    assert share[region == 3].max() == pytest.approx((1 - np.sqrt(0.5)) / 2, rel=0.02)
+
+
 def test_regions_without_contacts():
     energy = np.geomspace(1e-3, 1e3, 50)
     none, never = np.zeros(50, int), np.zeros(50)

@@ -1,7 +1,5 @@
 """Is a branch one branch? Jumps between arcs, retracing and the return to the linear mode, detected."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 

@@ -1,12 +1,10 @@
 """A branch: its points in order, special ones among them, and the files that hold it."""
 
-from __future__ import annotations
-
 import csv
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
@@ -149,7 +147,7 @@ class Branch:
         return data
 
     @classmethod
-    def read(cls, path: Path) -> Branch:
+    def read(cls, path: Path) -> Self:
         """The branch in an HDF5 file, without its orbits; raises OSError or ValueError if it holds none."""
         with open_netcdf(path, "branch", ("point", "tangent", "half_trace", "next_step")) as file:
             data, about = file.load(), file.attrs

@@ -8,8 +8,6 @@ The roots are bisected in monomial form on the quarters of the step. Which of tw
 root decides, through the number of Newton steps of a later orbit, on the points of a branch.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,54 +1,23 @@
-"""Charts: the unknowns in which a branch is continued, and how they scale."""
+"""Charts: the unknowns xi (n + 1,) in which a branch is continued, in place of initial values x (n,) and the period.
 
-from __future__ import annotations
-
-from typing import ClassVar
+A chart is made around a point of the branch; xi is of order one there, so that arclength is dimensionless. Each
+encodes (x, period) as xi, decodes it, and gives d(x, period)/d xi (n + 1, n + 1).
+"""
 
 import numpy as np
 
 from vipetsc.modes.system import System, contact_directions
 
 
-class Chart:
-    """Unknowns xi (n + 1,) in place of the initial values x (n,) and the period, around a point of the branch.
-
-    A subclass gives its ``name`` and three methods; xi is of order one, so that arclength is dimensionless.
-    """
-
-    name: ClassVar[str]
-
-    def __init__(self, system: System, x: np.ndarray, period: float) -> None:
-        self.size, self.period = float(np.abs(x).max()), period
-
-    @classmethod
-    def named(cls, name: str) -> type[Chart]:
-        """The chart called ``name``; raises KeyError for an unknown one."""
-        return {chart.name: chart for chart in cls.__subclasses__()}[name]
-
-    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """Unknowns (n + 1,) of initial values ``x`` and ``period``."""
-        raise NotImplementedError
-
-    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values (n,) and period of unknowns ``xi``."""
-        raise NotImplementedError
-
-    def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi (n + 1, n + 1)."""
-        raise NotImplementedError
-
-
-class Relative(Chart):
+class Relative:
     """Initial values over the largest one, period over its value; gaps over their clearance.
 
     Where an arc starts at rest, the resonator's displacement gives way to w = u_resonator - u_host over
     max(|w|, D), or else a large common motion would hide the changes of w that make and break contacts.
     """
 
-    name = "relative"
-
     def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
-        super().__init__(system, x, period)
+        self.size, self.period = float(np.abs(x).max()), period
         self.weights = np.eye(len(x)) / self.size
         for row, pair in zip(contact_directions(system), system.contacts, strict=True):
             if rest:
@@ -57,63 +26,59 @@ class Relative(Chart):
         self.inverse = np.linalg.inv(self.weights)
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """See ``Chart.encode``."""
+        """The unknowns of initial values and period."""
         return np.append(self.weights @ x, period / self.period)
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """See ``Chart.decode``."""
+        """Initial values and period."""
         return self.inverse @ xi[:-1], float(xi[-1] * self.period)
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """See ``Chart.derivative``."""
+        """d(x, period)/d xi."""
         d = np.zeros((len(xi), len(xi)))
         d[:-1, :-1] = self.inverse
         d[-1, -1] = self.period
         return d
 
 
-class Logarithmic(Chart):
+class Logarithmic:
     """Logarithms of the largest initial value and of the period; the other values over the largest one."""
 
-    name = "logarithmic"
-
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:
-        super().__init__(system, x, period)
+        self.size, self.period = float(np.abs(x).max()), period
         self.lead = int(np.abs(x).argmax())
         self.sign = float(np.sign(x[self.lead]))
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """See ``Chart.encode``."""
+        """The unknowns of initial values and period."""
         xi = np.append(x / x[self.lead], np.log(period / self.period))
         xi[self.lead] = np.log(x[self.lead] / (self.sign * self.size))
         return xi
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """See ``Chart.decode``."""
+        """Initial values and period."""
         lead = self.sign * self.size * np.exp(xi[self.lead])
         x = xi[:-1] * lead
         x[self.lead] = lead
         return x, float(self.period * np.exp(xi[-1]))
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """See ``Chart.derivative``."""
+        """d(x, period)/d xi."""
         x, period = self.decode(xi)
         d = np.diag(np.append(np.full(len(x), x[self.lead]), period))
         d[:-1, self.lead] = x
         return d
 
 
-class Grazing(Chart):
-    """Relative, with sqrt(w - D) in place of the displacement of the contact nearest to its clearance.
+class Grazing:
+    """Relative, with y in place of the displacement of the contact nearest to its clearance: (|w| - D)/D = y |y|.
 
     An orbit that starts on its largest |w| depends on w - D through a square root (bilinear contact), so that
-    this unknown makes the branch smooth through grazing: q = (|w| - D)/D = y |y|.
+    this unknown makes the branch smooth through grazing.
     """
 
-    name = "grazing"
-
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:
-        super().__init__(system, x, period)
+        self.size, self.period = float(np.abs(x).max()), period
         w = contact_directions(system) @ x
         clearance = np.array([p.clearance for p in system.contacts])
         nearest = int(np.abs(np.abs(w) / clearance - 1).argmin())
@@ -122,23 +87,26 @@ class Grazing(Chart):
         self.sign = float(np.sign(w[nearest]))
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """See ``Chart.encode``."""
+        """The unknowns of initial values and period."""
         xi = np.append(x / self.size, period / self.period)
         q = self.sign * (self.row @ x) / self.clearance - 1
         xi[self.index] = np.sign(q) * np.sqrt(np.abs(q))
         return xi
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """See ``Chart.decode``."""
-        x = xi[:-1] * self.size
+        """Initial values and period."""
+        x, y = xi[:-1] * self.size, xi[self.index]
         x[self.index] = 0.0
-        y = xi[self.index]
         x[self.index] = self.sign * self.clearance * (1 + y * abs(y)) - self.row @ x
         return x, float(xi[-1] * self.period)
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """See ``Chart.derivative``."""
+        """d(x, period)/d xi."""
         d = np.diag(np.append(np.full(len(xi) - 1, self.size), self.period))
         d[self.index, :-1] = -self.row * self.size
         d[self.index, self.index] = self.sign * self.clearance * 2 * max(abs(xi[self.index]), 1e-9)
         return d
+
+
+Chart = Relative | Logarithmic | Grazing
+CHARTS: dict[str, type[Chart]] = {"relative": Relative, "logarithmic": Logarithmic, "grazing": Grazing}

@@ -1,14 +1,12 @@
 """Pseudo-arclength continuation as an iterator over points; the caller owns the loop."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from vipetsc.modes.chart import Chart, Grazing, Relative
+from vipetsc.modes.chart import CHARTS, Chart, Grazing, Relative
 from vipetsc.modes.point import Point
 from vipetsc.modes.shooting import Attempt, Corrector, Shooting
 
@@ -21,18 +19,9 @@ class ContinuationError(RuntimeError):
 class Guards:
     """Bounds on one step that keep a branch from jumping to another arc; infinity switches one off.
 
-    Residuals cannot tell a jump: both arcs satisfy the equations to rounding.
-
-    Parameters
-    ----------
-    half_trace
-        Change of asinh(c) of every Floquet half-trace c.
-    contacts
-        Change of the number of contact episodes of the arc.
-    corrector
-        Length of the correction over the step's length.
-    turn
-        Angle in rad between consecutive tangents.
+    Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc, length of the
+    correction over the step's length, angle in rad between consecutive tangents. Residuals cannot tell a jump: both
+    arcs satisfy the equations to rounding.
     """
 
     half_trace: float = 0.5
@@ -41,7 +30,7 @@ class Guards:
     turn: float = 0.2
 
     @classmethod
-    def off(cls) -> Guards:
+    def off(cls) -> Self:
         """Ordinary step control: Newton's convergence alone decides."""
         return cls(np.inf, np.inf, np.inf, np.inf)
 
@@ -90,11 +79,7 @@ class Continuation:
 
     Each point is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended, ``finished``
     whether it left its range. The whole state is the last point and the next step: a stored branch can be resumed.
-
-    Raises
-    ------
-    ContinuationError
-        While iterating, if the step falls below the smallest or the tangent is degenerate.
+    Raises ContinuationError if the step falls below the smallest or the tangent at the start is degenerate.
     """
 
     def __init__(
@@ -180,7 +165,7 @@ def chart_at(problem: Shooting, name: str, point: Point) -> Chart:
         clearances = np.array([p.clearance for p in problem.system.contacts])
         near = len(clearances) > 0 and np.abs(gaps / clearances).min() < 0.05
         return (Grazing if near else Relative)(problem.system, point.x, point.period)
-    return Chart.named(name)(problem.system, point.x, point.period)
+    return CHARTS[name](problem.system, point.x, point.period)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
@@ -220,10 +205,7 @@ def _squashed(c: np.ndarray) -> np.ndarray:
 def first_tangent(corrector: Corrector, start: Point, direction: int) -> np.ndarray:
     """Tangent d(x, period) at a corrected point, towards growing (+1) or falling (-1) energy.
 
-    Raises
-    ------
-    ContinuationError
-        If the point is a branch point, where the tangent is not unique.
+    Raises ContinuationError at a branch point, where the tangent is not unique.
     """
     problem = corrector.problem
     chart = Relative(problem.system, start.x, start.period)

@@ -1,7 +1,5 @@
 """Follow the branches of a case: one by one or shared over ranks, saved as they grow, resumed where they ended."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -52,12 +50,8 @@ def follow_all(
     """All branches of ``case``, written into ``folder``; rank r follows every size-th one, from r on.
 
     Each branch is computed on one rank, so that its bits do not depend on their number. A branch that fails is
-    written as far as it came, says why in its ``ending``, and the others go on.
-
-    Returns
-    -------
-    list of Branch
-        All branches on rank 0, in the order of ``nnm.modes``; an empty list on the others.
+    written as far as it came, says why in its ``ending``, and the others go on. Returns all branches on rank 0, in the
+    order of ``nnm.modes``; an empty list on the others.
     """
     mine = {}
     for job in range(comm.rank, len(case.nnm.modes), comm.size):
@@ -143,10 +137,7 @@ class Follower:
     ) -> None:
         """Continue ``branch`` from ``start`` until it ends; its special points are located on the way.
 
-        Raises
-        ------
-        ContinuationError, FlowError
-            If it cannot go on; the branch holds the points so far.
+        Raises ContinuationError or FlowError if it cannot go on; the branch holds the points so far.
         """
         control = replace(control, points=max(control.points - max(len(branch.regular()) - 1, 0), 0))
         points = Continuation(corrector, start, control, direction, branch.next_step or None)
@@ -159,7 +150,7 @@ class Follower:
         try:
             for point in points:
                 if self.options.locate:
-                    branch.points += [self._labelled(p, corrector.problem) for p in locator.between(last, point)]
+                    branch.points += [_labelled(p, corrector.problem) for p in locator.between(last, point)]
                 branch.points.append(point)
                 branch.next_step = points.step
                 if self.listener is not None:
@@ -184,10 +175,6 @@ class Follower:
         graze = self.system.grazing_energy(mode)
         energy = graze / 100 if math.isfinite(graze) else 1e-3
         return linear_start(self.corrector, mode, max(energy, self.options.energy[0] * 1.001))
-
-    def _labelled(self, point: Point, problem: Shooting) -> Point:
-        """Energy folds, where tongues begin and end, carry their resonance."""
-        return replace(point, resonance=resonance(problem, point)) if point.kind == "fold-energy" else point
 
     def _store_orbits(self, branch: Branch) -> None:
         """Orbits in the middle of every region, and at the energies asked for."""
@@ -236,3 +223,8 @@ def _jumps(branch: Branch, corrector: Corrector, control: StepControl) -> Iterat
 def _turned(point: Point) -> Point:
     """The same point on the branch followed the other way."""
     return replace(point, tangent=-point.direction, energy_tangent=-point.energy_tangent)
+
+
+def _labelled(point: Point, problem: Shooting) -> Point:
+    """Energy folds, where tongues begin and end, carry their resonance."""
+    return replace(point, resonance=resonance(problem, point)) if point.kind == "fold-energy" else point

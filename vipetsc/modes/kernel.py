@@ -5,8 +5,6 @@ contact is searched, and the step is repeated so that it ends on the first chang
 hence so are the variational equations' solutions (saltation is the identity, see the package's docstring).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

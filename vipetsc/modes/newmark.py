@@ -4,8 +4,6 @@ The sensitivities are the exact derivatives of the discrete flow (Peeters et al.
 Mech. Syst. Signal Process. 23, 2009, App. A). Contacts are met at the ends of steps only, which is this method's error.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vipetsc.compiled import njit

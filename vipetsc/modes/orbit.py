@@ -1,7 +1,5 @@
 """Arcs of orbits: state, sensitivities and contact changes after a given time, by the flow of one's choice."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -54,11 +52,6 @@ class Flow:
 
     def __init__(self, system: System) -> None:
         self.system = system
-
-    @classmethod
-    def named(cls, name: str) -> type[Flow]:
-        """The flow called ``name``; raises KeyError for an unknown one."""
-        return {flow.name: flow for flow in cls.__subclasses__()}[name]
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """The orbit from ``start`` (2n,) over ``duration`` seconds; ``period`` helps to choose steps.

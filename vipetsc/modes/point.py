@@ -1,8 +1,7 @@
 """One point of a branch: a periodic orbit with its energy, stability and contacts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -97,7 +96,7 @@ class Point:
         tangent: np.ndarray | None = None,
         index: int = 0,
         step: float = 0.0,
-    ) -> Point:
+    ) -> Self:
         """The point of a converged attempt."""
         x, period = chart.decode(attempt.xi)
         arc = attempt.arc
@@ -110,7 +109,7 @@ class Point:
             x=x,
             period=period,
             energy=problem.energy(x),
-            residual=float(np.abs(problem.residual(arc)).max()) / problem.residual_scale(np.abs(x).max(), period),
+            residual=float(np.abs(problem.residual(arc)).max()) / float(np.abs(x).max()),
             half_traces=traces,
             multiplier=float(np.abs(multipliers(traces, problem.map.quarter)).max(initial=1.0)),
             episodes=arc.episodes,
@@ -143,7 +142,6 @@ def linear_start(corrector: Corrector, mode: int, energy: float) -> Point:
     row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
     attempt = corrector.solve(chart, xi, row, row @ xi)
     if not attempt.converged:
-        raise ValueError(
-            f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J ({attempt}): lower nnm.start_energy"
-        )
+        why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy"
+        raise ValueError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
     return Point.of(problem, attempt, chart)

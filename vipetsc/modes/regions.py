@@ -1,7 +1,5 @@
 """Regions I-IV of a backbone, told from the branch itself, and the power laws of its slope."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vipetsc.spectra import power_law
@@ -29,14 +27,8 @@ def tell_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, cl
     until the local exponent d ln(df/dE)/d ln E changes by less than ``SETTLED`` per e-fold of energy and is above
     ``STEEP``. III: vibro-impact. IV: smooth limit, from where a contact is closed for 95 % of the time on. A
     branch on which the slope keeps changing sign (internal resonances) has its peak after its last energy fold.
-    Without an exponent that settles, II lasts.
-
-    Parameters
-    ----------
-    energy, slope
-        J and Hz/J.
-    episodes, closed
-        Contact episodes of the arc, and the fraction of the time with a contact closed.
+    Without an exponent that settles, II lasts. ``energy`` in J, ``slope`` in Hz/J, ``episodes`` contact episodes of the
+    arc, ``closed`` the fraction of the time with a contact closed.
     """
     region = np.ones(len(energy), np.int8)
     touched = np.nonzero(episodes > 0)[0]

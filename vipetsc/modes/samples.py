@@ -1,7 +1,5 @@
 """Orbits of a branch, seen closer: a whole period sampled, its internal resonance, the same orbit by another flow."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shooting: a periodic orbit as a boundary value problem over a part of its period, solved by PETSc's SNES."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -80,11 +78,6 @@ class Shooting:
         rate = np.append(arc.end[self.system.dofs :], arc.acceleration[1])[rows]
         return np.column_stack([arc.sensitivity[rows, columns], self.map.fraction * rate])
 
-    def residual_scale(self, size: float, period: float) -> float:
-        """Size of a residual that is as large as initial values of ``size``."""
-        to_rest = self.map.quarter and self.map.end == "rest"
-        return size * 2 * np.pi / period if to_rest else size
-
     def energy(self, x: np.ndarray) -> float:
         """Energy in J of the orbit with initial values ``x``."""
         zero = np.zeros_like(x)
@@ -110,9 +103,6 @@ class Attempt:
     xi: np.ndarray
     orbit: Arc | None = None
 
-    def __str__(self) -> str:
-        return f"{self.reason}; residuals {self.residuals}"
-
     @property
     def residuals(self) -> str:
         """The history as text."""
@@ -131,29 +121,18 @@ class Attempt:
 
 
 class Equation(NamedTuple):
-    """What is solved: shooting in a ``chart`` over ``scale``, and row . xi = value."""
+    """What is solved: shooting in a ``chart``, over its size, and row . xi = value."""
 
     chart: Chart
     row: np.ndarray
     value: float
-    scale: float
 
 
 class Corrector:
-    """Newton's method (PETSc SNES) for the shooting equations and one more linear row.
+    """Newton's method (PETSc SNES) for the shooting equations of ``problem`` and one more linear row.
 
-    Parameters
-    ----------
-    problem
-        The shooting problem.
-    tolerance
-        Scaled residual at which an orbit counts as found.
-    step_tolerance
-        Newton step (of unknowns of order one) below which rounding allows no more.
-    max_newton
-        Newton steps allowed.
-
-    PETSc options take the prefix ``nnm_``, for example ``-nnm_snes_monitor``.
+    It ends at a scaled residual of ``tolerance``, after a step (of unknowns of order one) below ``step_tolerance``,
+    where rounding allows no more, or after ``max_newton`` steps. PETSc options: ``-nnm_snes_monitor`` and the like.
     """
 
     def __init__(
@@ -183,8 +162,7 @@ class Corrector:
 
     def solve(self, chart: Chart, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Solve shooting(xi) = 0 and row . xi = value, starting from ``guess`` (n + 1,)."""
-        scale = self.problem.residual_scale(chart.size, chart.period)
-        self._equation, self._last, self._history = Equation(chart, row, value, scale), None, []
+        self._equation, self._last, self._history = Equation(chart, row, value), None, []
         self._xi.setArray(guess)
         try:
             self._snes.solve(None, self._xi)
@@ -196,8 +174,8 @@ class Corrector:
 
     def matrix(self, xi: np.ndarray) -> np.ndarray:
         """The scaled Jacobian (n, n + 1) of the shooting equations at ``xi``, in the chart of the last attempt."""
-        equation = self._current
-        return self.problem.jacobian(self._arc(xi)) @ equation.chart.derivative(xi) / equation.scale
+        chart = self._current.chart
+        return self.problem.jacobian(self._arc(xi)) @ chart.derivative(xi) / chart.size
 
     @property
     def _current(self) -> Equation:
@@ -213,7 +191,7 @@ class Corrector:
         equation, xi = self._current, x.getArray(readonly=True)
         if not np.all(np.isfinite(xi)) or equation.chart.decode(xi)[1] <= 0:
             raise FlowError("Newton left the domain: the period is not positive")
-        residual = self.problem.residual(self._arc(xi)) / equation.scale
+        residual = self.problem.residual(self._arc(xi)) / equation.chart.size
         f.setArray(np.append(residual, equation.row @ xi - equation.value))
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:

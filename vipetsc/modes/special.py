@@ -1,7 +1,5 @@
 """Special points between two points of a branch, located and not interpolated, and the branches that cross there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -47,16 +45,9 @@ def special_points(problem: Shooting) -> list[SpecialPoint]:
 
 
 class Locator:
-    """Locates the special points inside one step of a branch.
+    """Locates the special points inside one step of a branch; ``chart`` as in ``StepControl``.
 
-    Parameters
-    ----------
-    corrector
-        Solver and problem.
-    chart
-        Name of the chart, as in ``StepControl``.
-    grazing
-        Also locate every change of the number of contacts, by bisection (some 40 corrections each).
+    With ``grazing`` also every change of the number of contacts, by bisection (some 40 corrections each).
     """
 
     def __init__(self, corrector: Corrector, chart: str = "relative", grazing: bool = False) -> None:
@@ -128,18 +119,8 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
     centre, whichever map has a second null direction at ``point``; over the doubled period at a period doubling.
-
-    Parameters
-    ----------
-    amplitude
-        First step along the new direction, relative to the orbit's size.
-    sign
-        Which side of a pitchfork, 1 or -1.
-
-    Raises
-    ------
-    ContinuationError
-        If no map has a second null direction, or the corrector falls back or fails.
+    ``amplitude`` is the first step along the new direction, relative to the orbit's size; ``sign`` (1 or -1) the side
+    of a pitchfork. Raises ContinuationError if no map has a second null direction, or the corrector fails.
     """
     singular, old = [], corrector.problem
     for name in ("quarter", "half", "half-centre") if old.map.quarter else (old.map.name,):
@@ -147,11 +128,10 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
         x, period = _re_expressed(old, point, problem)
         chart = Relative(problem.system, x, period, rest=problem.map.start == "rest")
         xi = chart.encode(x, period)
-        scale = problem.residual_scale(chart.size, chart.period)
         arc = problem.arc(x, period)
-        if np.abs(problem.residual(arc)).max() > 1e-6 * scale:
+        if np.abs(problem.residual(arc)).max() > 1e-6 * chart.size:
             continue  # not an orbit of this map: the doubled period's quarter
-        matrix = problem.jacobian(arc) @ chart.derivative(xi) / scale
+        matrix = problem.jacobian(arc) @ chart.derivative(xi) / chart.size
         values, directions = np.linalg.svd(matrix)[1:]
         singular.append(f"{name} {values[-1] / values[0]:.1e}")
         if values[-1] > 1e-5 * values[0]:
@@ -166,8 +146,8 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
         fresh = Corrector(problem, corrector.tolerance, corrector.step_tolerance)
         attempt = fresh.solve(chart, xi + amplitude * row, row, row @ xi + amplitude)
         if not attempt.converged:
-            where = f"at E = {point.energy:.9g} J ({attempt}): lower nnm.switch_amplitude"
-            raise ContinuationError(f"no convergence on the crossing branch {where}")
+            why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.switch_amplitude"
+            raise ContinuationError(f"no convergence on the crossing branch at E = {point.energy:.9g} J {why}")
         tangent = chart.derivative(attempt.xi) @ tangent_at(fresh, attempt.xi, row)
         return fresh, Point.of(problem, attempt, chart, tangent)
     where = f"at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz"

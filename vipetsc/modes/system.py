@@ -1,9 +1,8 @@
 """A conservative system of masses, springs and contact pairs, with any number of degrees of freedom."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.linalg import eigh
@@ -42,20 +41,9 @@ class SmoothSpring:
 class System:
     """M u'' + K u + contact forces + smooth spring forces = 0.
 
-    Parameters
-    ----------
-    masses
-        (n,) in kg.
-    stiffness
-        (n, n) in N/m, symmetric.
-    contacts, springs
-        Contact pairs and smooth nonlinear springs.
-
-    Raises
-    ------
-    ValueError
-        If a mass is not positive, the stiffness is not symmetric, an index lies outside the system, a
-        clearance is not positive, or a contact dissipates: normal modes exist in conservative systems.
+    ``masses`` (n,) in kg, ``stiffness`` (n, n) in N/m, symmetric. Raises ValueError if a mass is not positive, the
+    stiffness is not symmetric, an index lies outside the system, a clearance is not positive, or a contact dissipates:
+    normal modes exist in conservative systems.
     """
 
     masses: np.ndarray
@@ -88,7 +76,7 @@ class System:
         springs: Iterable[tuple[int | None, int, float]],
         contacts: Iterable[ContactPair] = (),
         smooth: Iterable[SmoothSpring] = (),
-    ) -> System:
+    ) -> Self:
         """A system from linear springs (start, end, stiffness in N/m); start None is the ground."""
         masses = np.asarray(list(masses), float)
         stiffness = np.zeros((len(masses), len(masses)))
@@ -98,7 +86,7 @@ class System:
         return cls(masses, stiffness, tuple(contacts), tuple(smooth))
 
     @classmethod
-    def from_case(cls, case: NnmCase) -> System:
+    def from_case(cls, case: NnmCase) -> Self:
         """The system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
         law = case.contact()
         if case.nnm.custom is not None:
@@ -108,7 +96,7 @@ class System:
         return cls.from_chain(case.chain(), law)
 
     @classmethod
-    def _from_table(cls, table: SystemTable, law: Contact) -> System:
+    def _from_table(cls, table: SystemTable, law: Contact) -> Self:
         """The system of ``[nnm.own]``, whose masses count from 1 and whose ground is 0."""
 
         def mass(number: int) -> int | None:
@@ -122,7 +110,7 @@ class System:
         )
 
     @classmethod
-    def from_chain(cls, chain: Chain, law: Contact) -> System:
+    def from_chain(cls, chain: Chain, law: Contact) -> Self:
         """The finite lattice ``chain`` with its contact sites, as one system (small chains: dense)."""
         d, cell = chain.cell.dofs, chain.cell
         pairs = (
@@ -132,7 +120,7 @@ class System:
         return cls(chain.masses(), chain.stiffness_matrix().toarray(), tuple(pairs))
 
     @classmethod
-    def reduced(cls, cell: UnitCell, clearance: float, law: Contact) -> System:
+    def reduced(cls, cell: UnitCell, clearance: float, law: Contact) -> Self:
         """The paper's 2-DoF model of a cell's contact pair (Sec. IV); masses are (host, resonator).
 
         Each of the host's springs to other masses is shared between its two masses: held at its middle it

@@ -4,8 +4,6 @@ TSEvent is not used: it loses short contacts and error control. Steps are taken 
 contacts frozen; a change found on a step's interpolant is landed on from a copy of the state.
 """
 
-from __future__ import annotations
-
 from petsc4py import PETSc
 
 import numpy as np
