@@ -4,8 +4,6 @@ Each cell's energy is a whole number of a unit and a rest in multiples of unit/2
 that neither the order nor the partition shows in the result.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vipetsc.compiled import njit

@@ -6,10 +6,9 @@ dissipated energy of each owned site). Behind them lie the ghosts: displacements
 the left, then on the right. Mass by mass keeps every inner loop contiguous.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Self
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -35,7 +34,7 @@ class Layout:
     offsets: tuple[int, ...]
 
     @classmethod
-    def of(cls, model: Model, comm: MPI.Comm) -> Layout:
+    def of(cls, model: Model, comm: MPI.Comm) -> Self:
         """Cells in equal blocks, the first ranks one more where they do not divide; a rank may be empty."""
         cells, dofs = model.chain.cells, model.chain.cell.dofs
         cuts = [r * (cells // comm.size) + min(r, cells % comm.size) for r in range(comm.size + 1)]

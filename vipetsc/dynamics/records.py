@@ -3,8 +3,6 @@
 A rank's part of the state is ordered as ``layout`` says.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 

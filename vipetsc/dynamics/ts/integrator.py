@@ -3,8 +3,6 @@
 The method stands in the package's docstring.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, astuple, dataclass
 from typing import Any
 

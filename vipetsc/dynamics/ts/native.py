@@ -1,7 +1,5 @@
 """The right-hand side as a C function pointer that PETSc calls without entering Python."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable
 from typing import Any, get_type_hints

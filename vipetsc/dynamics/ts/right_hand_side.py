@@ -4,8 +4,6 @@ A cell's sums run over its springs in the cell's order, whichever rank owns it a
 result does not depend on the partition, to the last bit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vipetsc.compiled import njit
