@@ -9,8 +9,8 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.contact.law import CLOSED
+from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.meter import EnergyMeter
 from vipetsc.dynamics.ts.integrator import Integrator
 
 CELLS, DRIVEN, SITES = 7, 3, (3, 7)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
+from vipetsc.dynamics import recorder as recording
 from vipetsc.dynamics import simulate
-from vipetsc.dynamics.meter import Energies
+from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample
-from vipetsc.dynamics.observers import recorder as recording
 
 
 def sample(work: float, total: float, dissipated: float = 0.0) -> Sample:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.dynamics import recorder as recording
 from vipetsc.dynamics import simulate
-from vipetsc.dynamics.observers import recorder as recording
 from vipetsc.io import store
 from vipetsc.io.chunks import ChunkList, load_arrays, save_arrays
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
@@ -75,6 +75,7 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
 def test_episodes_stand_in_the_order_of_their_onsets():
     """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
     chunks = ChunkList()
+    chunks.begin()
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
         chunk = {f"impact_{name}": np.arange(len(sites)) * 1.0 for name in IMPACTS}
         chunk |= {"impact_site": np.array(sites), "impact_onset": np.array(onsets)}

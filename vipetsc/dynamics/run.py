@@ -13,13 +13,12 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case, Model
+from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import StalledError, select_engine
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.meter import EnergyMeter
-from vipetsc.dynamics.observers import Observer, Recorder, RunawayError, Sample, Setup
-from vipetsc.dynamics.observers.guard import fastest_place
-from vipetsc.dynamics.observers.recorder import recorded_cells
+from vipetsc.dynamics.observers import Observer, RunawayError, Sample, Setup
 from vipetsc.dynamics.propagator.engine import Propagator
+from vipetsc.dynamics.recorder import Recorder, recorded_cells
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import provenance
 from vipetsc.io.store import RunDescription, RunFolder, RunOutput
@@ -29,6 +28,7 @@ from vipetsc.parallel import StopRequest
 ENGINES = (Propagator, Integrator)
 # The guard first: a sample that it refuses is not recorded.
 OBSERVERS = ("guard", "ledger", "recorder")
+COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
 
 
 @dataclass(frozen=True)
@@ -86,21 +86,34 @@ def simulate(
     OSError
         If a file cannot be written, on all ranks.
     """
-    clock = Clock()
+    begin = time.perf_counter(), time.process_time()
     output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
-    names = [*OBSERVERS, *(["progress"] if progress else []), *observers]
-    model = case.model()
-    output.begin(describe(case, model), force, resume)
-    run = Run(case, model, output, native, stop, [Observer.registry[name]() for name in names])
+    comm, model = output.comm, case.model()
+    output.begin(_description(case, model), force, resume)
+    layout = Layout.of(model, comm)
+    kind, refusal = select_engine(case.time.engine, model, ENGINES)
+    setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
+    run = Run(setup, [*OBSERVERS, *(["progress"] if progress else []), *observers])
     state = output.chunks.last_state() if resume else None
     if state is not None:
         run.restore(state)
-    ending = run.advance()
-    return run.finish(ending, clock)
+    ending, sentence = run.advance()
+    if ending == STOPPED:
+        run.checkpoint()
+        sentence += "; --resume goes on from there"
+    statistics = run.finish(ending == STOPPED) | ({"engine_note": refusal} if refusal else {})
+    cpu = comm.allreduce(time.process_time() - begin[1])
+    statistics |= {"wall_seconds": round(time.perf_counter() - begin[0], 3), "cpu_seconds": round(cpu, 3)}
+    statistics = comm.bcast(statistics)
+    if ending != STOPPED:
+        attributes = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
+        attributes = comm.bcast(provenance(comm) | attributes)
+        output.finish(attributes, run.recorder.columns, {"case": case.model_dump(by_alias=True)})
+    setup.engine.destroy()
+    return Result(ending == COMPLETE, ending == STOPPED, sentence, statistics, output.folder)
 
 
-def describe(case: Case, model: Model) -> RunDescription:
-    """What the run's file tells of ``case``."""
+def _description(case: Case, model: Model) -> RunDescription:
     return RunDescription(
         case=case.to_toml(),
         cells=recorded_cells(case) + 1,
@@ -111,48 +124,17 @@ def describe(case: Case, model: Model) -> RunDescription:
     )
 
 
-class Clock:
-    """Wall and processor time since it was made."""
-
-    def __init__(self) -> None:
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
-
-    def read(self, comm: MPI.Comm) -> dict[str, float]:
-        """Seconds since then, those of the processors summed over the ranks; all must call it."""
-        cpu = comm.allreduce(time.process_time() - self._cpu)
-        return {"wall_seconds": round(time.perf_counter() - self._wall, 3), "cpu_seconds": round(cpu, 3)}
-
-
-@dataclass(frozen=True)
-class Ending:
-    """How the loop ended: all samples are there, or it was stopped on request, or it failed; why, in a sentence."""
-
-    sentence: str
-    complete: bool = False
-    stopped: bool = False
-
-
 class Run:
-    """One simulation: an engine that advances, and observers that watch its samples."""
+    """The samples of one run: its engine goes from one to the next, its observers look at each."""
 
-    def __init__(
-        self,
-        case: Case,
-        model: Model,
-        output: RunOutput,
-        native: bool,
-        stop: StopRequest | None,
-        observers: Sequence[Observer],
-    ) -> None:
-        self.comm, self.observers = output.comm, observers
-        layout = Layout.of(model, self.comm)
-        kind, self._refusal = select_engine(case.time.engine, model, ENGINES)
-        engine = kind(model, layout, native, stop)
-        self.setup = Setup(case, model, layout, EnergyMeter(model, layout), engine, output)
+    def __init__(self, setup: Setup, observers: Sequence[str]) -> None:
+        self.setup = setup
+        self.recorder = Recorder()
+        self.observers = [self.recorder if name == "recorder" else Observer.registry[name]() for name in observers]
         self.samples = 0
-        self.last: float | None = None
-        for observer in observers:
-            observer.begin(self.setup)
+        self.last: float | None = None  # time of the last good sample
+        for observer in self.observers:
+            observer.begin(setup)
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on after a checkpoint."""
@@ -162,34 +144,29 @@ class Run:
             prefix = f"{observer.name}/"
             observer.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
-    def advance(self) -> Ending:
-        """Simulate to the end, or to where it stops or fails."""
+    def advance(self) -> tuple[str, str]:
+        """Go to the end, or to where the run stops or fails: how it ended, and a sentence about it."""
         engine, model = self.setup.engine, self.setup.model
         while self.samples < model.samples:
             t = self.samples * model.sample_interval
             try:
                 if not engine.advance(t):
-                    return Ending(f"stopped on request at t = {engine.time:.6g} s", stopped=True)
-                self._observe(Sample(self.samples, t, engine.state, self.setup.meter.measure(engine.state)))
-            except StalledError as error:
-                return self._failure(f"stalled: {error}")
-            except RunawayError as error:
-                return self._failure(str(error))
+                    return STOPPED, f"stopped on request at t = {engine.time:.6g} s"
+                sample = Sample(self.samples, t, engine.state, self.setup.meter.measure(engine.state))
+                for observer in self.observers:
+                    observer.observe(sample)
+            except (StalledError, RunawayError) as error:
+                reason = f"stalled: {error}" if isinstance(error, StalledError) else str(error)
+                good = "none" if self.last is None else f"t = {self.last:.6g} s"
+                place = fastest_place(self.setup)
+                return FAILED, f"{reason}, at t = {engine.time:.6g} s ({place}); last good sample: {good}"
             self.samples, self.last = self.samples + 1, t
             if any(observer.due for observer in self.observers):
-                self._checkpoint()
-        return Ending(f"complete: {model.samples} samples to t = {self.last:.6g} s", complete=True)
+                self.checkpoint()
+        return COMPLETE, f"complete: {model.samples} samples to t = {self.last:.6g} s"
 
-    def _observe(self, sample: Sample) -> None:
-        for observer in self.observers:
-            observer.observe(sample)
-
-    def _failure(self, reason: str) -> Ending:
-        good = "none" if self.last is None else f"t = {self.last:.6g} s"
-        place = fastest_place(self.setup)
-        return Ending(f"{reason}, at t = {self.setup.engine.time:.6g} s ({place}); last good sample: {good}")
-
-    def _checkpoint(self) -> None:
+    def checkpoint(self) -> None:
+        """Write what a resumed run needs."""
         for observer in self.observers:
             observer.flush()
         state = self.setup.engine.checkpoint() | {"samples": np.array(self.samples)}
@@ -197,29 +174,28 @@ class Run:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
         self.setup.output.chunks.save_state(state)
 
-    def finish(self, ending: Ending, clock: Clock) -> Result:
-        """Write what is still in memory; unless the run was stopped on request, the final files too."""
-        output, sentence = self.setup.output, ending.sentence
-        if ending.stopped:
-            self._checkpoint()
-            sentence += "; --resume goes on from there"
-        for observer in self.observers:
-            observer.finish(ending.stopped)
-        statistics = self._statistics(clock)
-        if not ending.stopped:
-            attributes = {"status": sentence, "complete": ending.complete, "statistics": statistics}
-            attributes = self.comm.bcast(provenance(self.comm) | attributes)
-            recorder = next(observer for observer in self.observers if isinstance(observer, Recorder))
-            summary = {"case": self.setup.case.model_dump(by_alias=True)}
-            output.finish(attributes, recorder.columns, summary)
-        self.setup.engine.destroy()
-        return Result(ending.complete, ending.stopped, sentence, statistics, output.folder)
-
-    def _statistics(self, clock: Clock) -> dict[str, Any]:
+    def finish(self, stopped: bool) -> dict[str, Any]:
+        """End all observers; statistics of theirs and of the engine."""
         engine = self.setup.engine
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
-        if self._refusal:
-            statistics["engine_note"] = self._refusal
         for observer in self.observers:
+            observer.finish(stopped)
             statistics |= observer.statistics()
-        return self.comm.bcast(statistics | clock.read(self.comm))
+        return statistics
+
+
+def fastest_place(setup: Setup) -> str:
+    """The cell that moves fastest, or is not finite, and the site nearest to it; all ranks must call it."""
+    layout = setup.layout
+    half = layout.dofs * layout.owned
+    y = setup.engine.state.array_r
+    finite = np.isfinite(y[:half]) & np.isfinite(y[half : 2 * half])
+    speed = np.where(finite, np.abs(y[half : 2 * half]), np.inf).reshape(layout.dofs, layout.owned)
+    local = (-1.0, layout.start)
+    if layout.owned:
+        local = float(speed.max()), layout.start + int(speed.max(axis=0).argmax())
+    _, fastest = max(layout.comm.allgather(local))
+    sites = setup.model.chain.sites
+    nearest = min(range(len(sites)), key=lambda i: abs(sites[i] - fastest), default=None)
+    near = "" if nearest is None else f", nearest site {nearest + 1} in cell {sites[nearest] + 1}"
+    return f"cell {fastest + 1}{near}"

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -23,56 +25,85 @@ from vipetsc.parallel import on_every_rank, on_root
 Arrays = Mapping[str, np.ndarray]
 
 
-class ChunkFiles:
-    """Chunks and checkpoints in ``folder``, shared by all ranks of ``comm``; ``count`` chunks are written."""
+class Chunks(ABC):
+    """Chunks and checkpoints of one run; ``count`` chunks are there."""
 
-    def __init__(self, folder: Path, comm: MPI.Comm) -> None:
-        self.folder, self.comm = folder, comm
-        self.count = 0
+    count: int = 0
 
+    @abstractmethod
+    def begin(self) -> None:
+        """Make ready (rank 0 only)."""
+
+    @abstractmethod
     def append(self, chunk: Arrays | None) -> None:
-        """Write this rank's share of the next chunk, None for no share; all ranks must call it.
+        """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
 
         Raises OSError on all ranks if one cannot write.
         """
+
+    @abstractmethod
+    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
+        """The arrays ``wanted`` of chunk ``number`` as ``rank`` gave it."""
+
+    @abstractmethod
+    def remove(self) -> None:
+        """Drop all of them (rank 0 only)."""
+
+    def save_state(self, state: Arrays) -> None:
+        """Keep this rank's checkpoint after the last chunk; as ``append``. None is kept by default."""
+        return
+
+    def last_state(self) -> Arrays | None:
+        """Go back to the last checkpoint that all ranks wrote, if there is one: ``count``, and this rank's share.
+
+        All ranks must call it; raises FolderError if it was written by another number of ranks.
+        """
+        return None
+
+
+class ChunkFiles(Chunks):
+    """Chunks and the last two checkpoints in ``folder``, shared by all ranks of ``comm``."""
+
+    def __init__(self, folder: Path, comm: MPI.Comm) -> None:
+        self.folder, self.comm = folder, comm
+
+    def begin(self) -> None:
+        """See ``Chunks``."""
+        self.folder.mkdir(exist_ok=True)
+
+    def append(self, chunk: Arrays | None) -> None:
+        """See ``Chunks``."""
         path = self._chunk(self.count, self.comm.rank)
         on_every_rank(self.comm, lambda: None if chunk is None else save_arrays(path, chunk))
         self.count += 1
 
+    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
+        """See ``Chunks``."""
+        return load_arrays(self._chunk(number, rank), wanted)
+
+    def remove(self) -> None:
+        """See ``Chunks``."""
+        shutil.rmtree(self.folder)
+
     def save_state(self, state: Arrays) -> None:
-        """Write this rank's checkpoint after the last chunk, and drop the one before the last; see ``append``."""
+        """See ``Chunks``."""
         number = self.count - 1
         on_every_rank(self.comm, lambda: save_arrays(self._state(number), state))
         self._state(number - 2).unlink(missing_ok=True)
 
     def last_state(self) -> Arrays | None:
-        """Read this rank's share of the last checkpoint that all ranks wrote, None if there is none; sets ``count``.
-
-        All ranks must call it; raises FolderError if it was written by another number of ranks.
-        """
+        """See ``Chunks``."""
         number = on_root(self.comm, self._last_complete)
         self.count = number + 1
         return load_arrays(self._state(number)) if number >= 0 else None
 
-    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """The arrays ``wanted`` of chunk ``number`` as ``rank`` wrote it."""
-        return load_arrays(self._chunk(number, rank), wanted)
-
-    def remove(self) -> None:
-        """Drop all of them (rank 0 only)."""
-        shutil.rmtree(self.folder)
-
     def _last_complete(self) -> int:
-        counts: dict[int, int] = {}
-        sizes = set()
-        for path in self.folder.glob("state-*.npy"):
-            _, number, _, size = path.stem.split("-")
-            counts[int(number)] = counts.get(int(number), 0) + 1
-            sizes.add(int(size))
+        names = [path.stem.split("-") for path in self.folder.glob("state-*.npy")]
+        sizes = {int(size) for *_, size in names}
         if sizes - {self.comm.size}:
-            raise FolderError(
-                f"{self.folder.parent}: was begun on {max(sizes)} ranks; resume with mpirun -n {max(sizes)}"
-            )
+            message = f"was begun on {max(sizes)} ranks; resume with mpirun -n {max(sizes)}"
+            raise FolderError(f"{self.folder.parent}: {message}")
+        counts = Counter(int(number) for _, number, *_ in names)
         return max((number for number, count in counts.items() if count == self.comm.size), default=-1)
 
     def _chunk(self, number: int, rank: int) -> Path:
@@ -82,34 +113,23 @@ class ChunkFiles:
         return self.folder / f"state-{number:06d}-{self.comm.rank}-{self.comm.size}.npy"
 
 
-class ChunkList:
-    """Chunks kept in memory, without checkpoints."""
+class ChunkList(Chunks):
+    """Chunks kept in memory by the rank that reads them, without checkpoints."""
 
-    def __init__(self) -> None:
+    def begin(self) -> None:
+        """See ``Chunks``."""
         self._chunks: list[Arrays | None] = []
 
-    @property
-    def count(self) -> int:
-        """Number of chunks."""
-        return len(self._chunks)
-
     def append(self, chunk: Arrays | None) -> None:
-        """Keep the next chunk."""
+        """See ``Chunks``."""
         self._chunks.append(chunk)
-
-    def save_state(self, state: Arrays) -> None:
-        """Nothing is kept: a run in memory cannot be gone on with."""
-
-    def last_state(self) -> None:
-        """No checkpoint."""
+        self.count = len(self._chunks)
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """Chunk ``number``, whole, on the rank that keeps it."""
+        """See ``Chunks``."""
         return self._chunks[number] or {}
 
-    def remove(self) -> None:
-        """Forget all of them."""
-        self._chunks.clear()
+    remove = begin
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
 from typing import Any
 
 from mpi4py import MPI
@@ -11,9 +11,9 @@ import numpy as np
 
 from vipetsc.case import Case
 from vipetsc.contact.episodes import Episode
+from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.meter import Energies
-from vipetsc.dynamics.observers.base import Observer, Sample, Setup
+from vipetsc.dynamics.observers import Observer, Sample, Setup
 from vipetsc.io.store import GATHER_LIMIT, IMPACTS, LEDGER
 
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
@@ -32,22 +32,18 @@ class Recorder(Observer):
     def begin(self, setup: Setup) -> None:
         """See ``Observer``."""
         super().begin(setup)
-        layout, output = setup.layout, setup.case.output
-        self.comm = layout.comm
+        layout, output, comm = setup.layout, setup.case.output, setup.layout.comm
         recorded = recorded_cells(setup.case)
-        begin, stop = (int(i) for i in np.searchsorted(recorded, [layout.start, layout.stop]))
-        local = recorded[begin:stop] - layout.start
+        first, stop = (int(i) for i in np.searchsorted(recorded, [layout.start, layout.stop]))
+        local = recorded[first:stop] - layout.start
         self._cells = slice(int(local[0]), int(local[-1]) + 1, output.every) if local.size else slice(0)
-        self._fields = tuple(output.fields)
-        sample_bytes = len(self._fields) * layout.dofs * 8
-        samples = -(-setup.model.samples // output.stride)
-        large = sample_bytes * len(recorded) * samples > GATHER_LIMIT
+        sample_bytes = len(output.fields) * layout.dofs * 8
+        large = sample_bytes * len(recorded) * -(-setup.model.samples // output.stride) > GATHER_LIMIT
         parallel = output.writer == "parallel" or (output.writer == "auto" and large)
-        shared = self.comm.size > 1 and setup.output.shared and parallel
-        self.columns = slice(begin, stop) if shared else None
-        most = self.comm.allreduce(local.size, MPI.MAX) if shared else len(recorded)
+        self.columns = slice(first, stop) if comm.size > 1 and setup.output.shared and parallel else None
+        most = comm.allreduce(local.size, MPI.MAX) if self.columns else len(recorded)
         self._length = int(np.clip(CHUNK_BYTES // max(sample_bytes * most, 1), 1, CHUNK_SAMPLES))
-        self._buffer = np.empty((self._length, len(self._fields), layout.dofs, local.size))
+        self._buffer = np.empty((self._length, len(output.fields), layout.dofs, local.size))
         self._dissipated = np.empty((self._length, len(layout.sites)))
         self._samples: list[tuple[float, Energies]] = []
         self._field_times: list[float] = []
@@ -55,17 +51,15 @@ class Recorder(Observer):
 
     def observe(self, sample: Sample) -> None:
         """See ``Observer``."""
-        layout = self.setup.layout
+        layout, output = self.setup.layout, self.setup.case.output
         y = sample.state.array_r
         self._dissipated[len(self._samples)] = y[layout.dissipated :]
         self._samples.append((sample.time, sample.energies))
-        if sample.number % self.setup.case.output.stride:
-            return
-        half = layout.dofs * layout.owned
-        for i, name in enumerate(self._fields):
-            block = y[:half] if name == "displacement" else y[half : 2 * half]
-            self._buffer[len(self._field_times), i] = block.reshape(layout.dofs, layout.owned)[:, self._cells]
-        self._field_times.append(sample.time)
+        if sample.number % output.stride == 0:
+            both = y[: 2 * layout.dofs * layout.owned].reshape(2, layout.dofs, layout.owned)
+            for i, name in enumerate(output.fields):
+                self._buffer[len(self._field_times), i] = both[int(name == "velocity")][:, self._cells]
+            self._field_times.append(sample.time)
 
     @property
     def due(self) -> bool:
@@ -85,7 +79,7 @@ class Recorder(Observer):
         """See ``Observer``."""
         return {"episodes": np.array(self._episodes)}
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """See ``Observer``."""
         self._episodes = int(state["episodes"])
 
@@ -99,21 +93,18 @@ class Recorder(Observer):
         Rank 0's chunk holds times, energies and all ranks' episodes; the fields are those of a rank's own cells, or on
         rank 0 of all.
         """
-        comm = self.comm
-        count, fields = len(self._samples), len(self._field_times)
-        local = np.moveaxis(self._buffer[:fields], 2, 3)  # (samples, field, cell, dof)
+        comm, count = self.setup.layout.comm, len(self._samples)
+        local = np.moveaxis(self._buffer[: len(self._field_times)], 2, 3)  # (samples, field, cell, dof)
         block = gather_cells(comm, local) if self.columns is None else local
         by_site = gather_sites(self.setup.layout, self._dissipated[:count])
         logs = comm.gather(episodes)
         chunk: dict[str, np.ndarray] = {}
         if logs is not None and by_site is not None:
-            chunk["time"] = np.array([time for time, _ in self._samples])
-            chunk["field_time"] = np.array(self._field_times)
+            chunk |= {"time": np.array([t for t, _ in self._samples]), "field_time": np.array(self._field_times)}
             chunk |= {name: np.array([getattr(energies, name) for _, energies in self._samples]) for name in LEDGER}
-            chunk["dissipated_by_site"] = by_site
-            chunk |= impact_table([episode for log in logs for episode in log])
+            chunk |= {"dissipated_by_site": by_site} | impact_table([episode for log in logs for episode in log])
         if block is not None:
-            chunk |= {name: block[:, i] for i, name in enumerate(self._fields)}
+            chunk |= {name: block[:, i] for i, name in enumerate(self.setup.case.output.fields)}
         self.setup.output.chunks.append(chunk or None)
         self._episodes += comm.allreduce(len(episodes))
         self._samples.clear()
@@ -146,18 +137,16 @@ def gather_cells(comm: MPI.Comm, block: np.ndarray) -> np.ndarray | None:
 
 def gather_sites(layout: Layout, values: np.ndarray) -> np.ndarray | None:
     """All ranks' ``values`` (samples, site) in the order of the sites, on rank 0; all ranks must call it."""
-    gathered = layout.comm.gather((layout.sites, values.copy()))
+    gathered = layout.comm.gather((np.asarray(layout.sites, np.int64), values))
     if gathered is None:
         return None
-    sites = np.concatenate([np.asarray(sites, np.int64) for sites, _ in gathered])
-    table = np.concatenate([columns for _, columns in gathered], axis=1)
-    return table[:, np.argsort(sites)]
+    sites, tables = zip(*gathered, strict=True)
+    return np.concatenate(tables, axis=1)[:, np.argsort(np.concatenate(sites))]
 
 
 def impact_table(episodes: list[Episode]) -> dict[str, np.ndarray]:
     """The log as columns ``impact_<name>``; sites counted from 1."""
-    rows = [asdict(episode) for episode in episodes]
-    integers = ("site", "side")
-    table = {f"impact_{n}": np.array([row[n] for row in rows], np.int64 if n in integers else float) for n in IMPACTS}
+    kinds = dict.fromkeys(("site", "side"), np.int64)
+    table = {f"impact_{n}": np.array([getattr(e, n) for e in episodes], kinds.get(n, float)) for n in IMPACTS}
     table["impact_site"] += 1
     return table

@@ -1,0 +1,179 @@
+"""What watches a run, sample by sample, without changing it: the contract, and the small observers.
+
+``guard`` ends a run whose state is no solution any more, ``ledger`` keeps the error of the energy balance, ``progress``
+tells how far it is; ``recorder`` keeps what is written and has a module of its own. A further observer is a subclass of
+``Observer`` with a name, which ``simulate`` is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from vipetsc.case import Case, Model
+from vipetsc.dynamics.energies import Energies, EnergyMeter
+from vipetsc.dynamics.engine import Engine
+from vipetsc.dynamics.layout import Layout
+from vipetsc.io.store import RunOutput
+from vipetsc.parallel import Progress
+
+# A ledger that misses by this share of the largest work is no longer a solution but an instability.
+RUNAWAY = 0.1
+
+
+class RunawayError(RuntimeError):
+    """The state is no solution any more; says why."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a run is made of: the case, its model in the lattice's own terms, and who does what on which cells."""
+
+    case: Case
+    model: Model
+    layout: Layout
+    meter: EnergyMeter
+    engine: Engine
+    output: RunOutput
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The lattice at one of the uniform times: ``number`` from 0, ``time`` in s.
+
+    ``state`` is ordered as ``Layout`` says, ghosts up to date; it changes with the next sample.
+    """
+
+    number: int
+    time: float
+    state: PETSc.Vec
+    energies: Energies
+
+
+class Observer:
+    """Watches a run.
+
+    Calls come on all ranks in the same order: ``begin``, perhaps ``restore``, then ``observe`` for every sample;
+    whenever some observer is ``due``, and when the run is stopped on request, ``flush`` of all and then ``checkpoint``
+    of all; at the end ``finish`` and ``statistics``.
+
+    A subclass has a ``name``, by which ``simulate`` finds it. It must not change the state, and what it raises it must
+    raise on all ranks.
+    """
+
+    name: ClassVar[str]
+    registry: ClassVar[dict[str, type[Observer]]] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        Observer.registry[cls.name] = cls
+
+    def begin(self, setup: Setup) -> None:
+        """Make ready for a run from t = 0 on."""
+        self.setup = setup
+
+    def observe(self, sample: Sample) -> None:
+        """Look at the next sample; raises RunawayError to end the run before it."""
+
+    @property
+    def due(self) -> bool:
+        """Whether a checkpoint should be made now."""
+        return False
+
+    def flush(self) -> None:
+        """Hand what was kept since the last checkpoint to the run's output."""
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """What a resumed run needs to go on with the same bits, this rank's share."""
+        return {}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on from what ``checkpoint`` gave; the engine is there already."""
+
+    def finish(self, stopped: bool) -> None:
+        """Come to an end; ``stopped`` on request, to be gone on with from the checkpoint just made."""
+
+    def statistics(self) -> dict[str, Any]:
+        """Numbers for ``summary.json`` and the attributes of ``run.h5``; those of rank 0 count."""
+        return {}
+
+
+class Guard(Observer):
+    """Raises RunawayError for a state that is not finite, or holds energy that nothing has put in."""
+
+    name = "guard"
+    most_work = 0.0
+
+    def observe(self, sample: Sample) -> None:
+        """See ``Observer``."""
+        energies, largest = sample.energies, self.setup.meter.largest
+        if not (np.isfinite(energies.work) and energies.total < largest):
+            raise RunawayError("the state is not finite")
+        self.most_work = max(self.most_work, abs(energies.work))
+        if abs(energies.residual) > RUNAWAY * self.most_work and energies.total > 1e-12 * largest:
+            raise RunawayError(
+                f"the energy runs away: {energies.total:.4g} J in the lattice, {energies.work:.4g} J of work done"
+            )
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """See ``Observer``."""
+        return {"most_work": np.array(self.most_work)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """See ``Observer``."""
+        self.most_work = float(state["most_work"])
+
+
+class Ledger(Observer):
+    """Keeps the largest residual of the energy balance, work - dissipated - (kinetic + spring + contact), in J."""
+
+    name = "ledger"
+    worst = most_work = 0.0
+    work = dissipated = float("nan")
+
+    def observe(self, sample: Sample) -> None:
+        """See ``Observer``."""
+        self.work, self.dissipated = sample.energies.work, sample.energies.dissipated
+        self.worst = max(self.worst, abs(sample.energies.residual))
+        self.most_work = max(self.most_work, abs(self.work))
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """See ``Observer``."""
+        return {"sums": np.array([self.worst, self.most_work, self.work, self.dissipated])}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """See ``Observer``."""
+        self.worst, self.most_work, self.work, self.dissipated = state["sums"].tolist()
+
+    def statistics(self) -> dict[str, Any]:
+        """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end."""
+        error = {"ledger_error": self.worst / self.most_work if self.most_work else 0.0}
+        return error if np.isnan(self.work) else error | {"work": self.work, "dissipated": self.dissipated}
+
+
+class ProgressReport(Observer):
+    """Tells on stderr of rank 0 how far the lattice's time is."""
+
+    name = "progress"
+
+    def begin(self, setup: Setup) -> None:
+        """See ``Observer``."""
+        super().begin(setup)
+        self._progress = Progress(setup.layout.comm, setup.model.end, "s")
+
+    def observe(self, sample: Sample) -> None:
+        """See ``Observer``."""
+        self._progress.update(sample.time)
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """See ``Observer``."""
+        self._progress.start_at(self.setup.engine.time)
+
+    def finish(self, stopped: bool) -> None:
+        """See ``Observer``."""
+        self._progress.close()
