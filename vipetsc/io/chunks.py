@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -25,74 +24,44 @@ from vipetsc.parallel import on_every_rank, on_root
 Arrays = Mapping[str, np.ndarray]
 
 
-class Chunks(ABC):
-    """Chunks and checkpoints of one run; ``count`` chunks are there."""
+class ChunkFiles:
+    """Chunks, ``count`` of them, and the last two checkpoints in ``folder``, shared by all ranks of ``comm``."""
 
-    count: int = 0
+    def __init__(self, folder: Path, comm: MPI.Comm) -> None:
+        self.folder, self.comm, self.count = folder, comm, 0
 
-    @abstractmethod
     def begin(self) -> None:
         """Make ready (rank 0 only)."""
+        self.folder.mkdir(exist_ok=True)
 
-    @abstractmethod
     def append(self, chunk: Arrays | None) -> None:
-        """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
+        """Write this rank's share of the next chunk, None for no share; all ranks must call it.
 
         Raises OSError on all ranks if one cannot write.
         """
+        path = self._chunk(self.count, self.comm.rank)
+        on_every_rank(self.comm, lambda: None if chunk is None else save_arrays(path, chunk))
+        self.count += 1
 
-    @abstractmethod
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """The arrays ``wanted`` of chunk ``number`` as ``rank`` gave it."""
+        """The arrays ``wanted`` of chunk ``number`` as ``rank`` wrote it."""
+        return load_arrays(self._chunk(number, rank), wanted)
 
-    @abstractmethod
     def remove(self) -> None:
         """Drop all of them (rank 0 only)."""
+        shutil.rmtree(self.folder)
 
     def save_state(self, state: Arrays) -> None:
-        """Keep this rank's checkpoint after the last chunk; as ``append``. None is kept by default."""
-        return
+        """Write this rank's checkpoint after the last chunk; see ``append``."""
+        number = self.count - 1
+        on_every_rank(self.comm, lambda: save_arrays(self._state(number), state))
+        self._state(number - 2).unlink(missing_ok=True)
 
     def last_state(self) -> Arrays | None:
         """Go back to the last checkpoint that all ranks wrote, if there is one: ``count``, and this rank's share.
 
         All ranks must call it; raises FolderError if it was written by another number of ranks.
         """
-        return None
-
-
-class ChunkFiles(Chunks):
-    """Chunks and the last two checkpoints in ``folder``, shared by all ranks of ``comm``."""
-
-    def __init__(self, folder: Path, comm: MPI.Comm) -> None:
-        self.folder, self.comm = folder, comm
-
-    def begin(self) -> None:
-        """See ``Chunks``."""
-        self.folder.mkdir(exist_ok=True)
-
-    def append(self, chunk: Arrays | None) -> None:
-        """See ``Chunks``."""
-        path = self._chunk(self.count, self.comm.rank)
-        on_every_rank(self.comm, lambda: None if chunk is None else save_arrays(path, chunk))
-        self.count += 1
-
-    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """See ``Chunks``."""
-        return load_arrays(self._chunk(number, rank), wanted)
-
-    def remove(self) -> None:
-        """See ``Chunks``."""
-        shutil.rmtree(self.folder)
-
-    def save_state(self, state: Arrays) -> None:
-        """See ``Chunks``."""
-        number = self.count - 1
-        on_every_rank(self.comm, lambda: save_arrays(self._state(number), state))
-        self._state(number - 2).unlink(missing_ok=True)
-
-    def last_state(self) -> Arrays | None:
-        """See ``Chunks``."""
         number = on_root(self.comm, self._last_complete)
         self.count = number + 1
         return load_arrays(self._state(number)) if number >= 0 else None
@@ -113,23 +82,36 @@ class ChunkFiles(Chunks):
         return self.folder / f"state-{number:06d}-{self.comm.rank}-{self.comm.size}.npy"
 
 
-class ChunkList(Chunks):
-    """Chunks kept in memory by the rank that reads them, without checkpoints."""
+class ChunkList:
+    """Chunks kept in memory by the rank that reads them, without checkpoints; as ``ChunkFiles``."""
 
-    def begin(self) -> None:
-        """See ``Chunks``."""
+    def __init__(self) -> None:
         self._chunks: list[Arrays | None] = []
 
-    def append(self, chunk: Arrays | None) -> None:
-        """See ``Chunks``."""
-        self._chunks.append(chunk)
-        self.count = len(self._chunks)
+    @property
+    def count(self) -> int:
+        """Number of chunks."""
+        return len(self._chunks)
 
-    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """See ``Chunks``."""
-        return self._chunks[number] or {}
+    def begin(self) -> None:
+        """Forget all chunks."""
+        self._chunks = []
 
     remove = begin
+
+    def append(self, chunk: Arrays | None) -> None:
+        """Keep the next chunk."""
+        self._chunks.append(chunk)
+
+    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
+        """Chunk ``number``, which has what is ``wanted``."""
+        return self._chunks[number] or {}
+
+    def save_state(self, state: Arrays) -> None:
+        """Nothing: a run in memory cannot be gone on with."""
+
+    def last_state(self) -> None:
+        """No checkpoint."""
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:

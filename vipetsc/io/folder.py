@@ -30,18 +30,9 @@ class FolderError(ValueError):
 class FolderKind:
     """What a folder of results holds; patterns as of ``Path.glob``.
 
-    Attributes
-    ----------
-    noun
-        One of them, for messages.
-    results
-        What shows that a folder holds results of this kind.
-    unfinished
-        What is there while results can be gone on with, and its name in messages.
-    replaced
-        What goes when ``force`` begins anew; other results stay until new ones replace them.
-    marker
-        The file that names what the results are of.
+    ``noun``: one of them; ``results``: what shows that a folder holds some; ``unfinished``: what is there while they
+    can be gone on with, and their name; ``replaced``: what goes when ``force`` begins anew (other results stay until
+    new ones replace them); ``marker``: the file that names what the results are of.
     """
 
     noun: str

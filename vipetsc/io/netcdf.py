@@ -11,7 +11,8 @@ The dataset is flat rather than a ``DataTree`` because there a group inherits th
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -104,10 +105,12 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
         groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
     except OSError as error:
         raise OSError(f"{path} cannot be opened as a {kind}: {error}") from error
-    data = _flat(groups)
-    data.set_close(_closing(groups))
-    present = {parent for name in data.variables for parent in _parents(str(name))} | set(data.attrs)
-    missing = [name for name in needs if name not in present]
+    data, closing = _flat(groups), ExitStack()
+    for group in groups.values():
+        closing.callback(group.close)
+    data.set_close(closing.close)
+    present = {str(part) for name in data.variables for part in (name, *PurePosixPath(str(name)).parents)}
+    missing = [name for name in needs if name not in present and name not in data.attrs]
     if missing:
         data.close()
         raise ValueError(f"{path} is not a {kind} of vipetsc: it has no {', '.join(missing)}")
@@ -134,16 +137,3 @@ def _dimension(groups: dict[str, xr.Dataset], group: PurePosixPath, name: str) -
         if around is not None and name in around.variables and around.variables[name].dims == (name,):
             return str(place / name).strip("/")
     return str(group / name).strip("/")
-
-
-def _parents(name: str) -> list[str]:
-    path = PurePosixPath(name)
-    return [name, *(str(parent) for parent in path.parents)]
-
-
-def _closing(groups: dict[str, xr.Dataset]) -> Callable[[], None]:
-    def close() -> None:
-        for group in groups.values():
-            group.close()
-
-    return close

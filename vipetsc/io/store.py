@@ -1,8 +1,8 @@
 """Where a run goes: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
 
 While a run goes on, its samples are kept as chunks (``io.chunks``); when it has ended they become one dataset in the
-layout of ``io.netcdf``. Fields (t, cell, dof) are too large to be held whole: a writer is a context manager that gives a
-mapping by which ``fields[name][samples, cells] = values`` puts them where they belong, in a file of one rank, in one
+layout of ``io.netcdf``. Fields (t, cell, dof) are too large to be held whole: a writer is a context manager that gives
+a mapping by which ``fields[name][samples, cells] = values`` puts them where they belong, in a file of one rank, in one
 that all ranks share, or in memory; the writers differ in open and close only.
 """
 
@@ -24,11 +24,12 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.io.atomic import write_text
-from vipetsc.io.chunks import ChunkFiles, ChunkList, Chunks
+from vipetsc.io.chunks import ChunkFiles, ChunkList
 from vipetsc.io.folder import RUN, claim_folder
 from vipetsc.io.netcdf import add_variable, put_dataset, variable
 from vipetsc.parallel import on_every_rank, on_root
 
+Chunks = ChunkFiles | ChunkList
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
 FIELDS = {"displacement": "m", "velocity": "m/s"}
 LEDGER = {
