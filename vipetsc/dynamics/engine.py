@@ -1,7 +1,5 @@
 """What every engine offers to a simulation, and which one a case gets."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 

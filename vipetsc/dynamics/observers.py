@@ -5,8 +5,6 @@ tells how far it is; ``recorder`` keeps what is written and has a module of its 
 ``Observer`` with a name, which ``simulate`` is given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -67,7 +65,7 @@ class Observer:
     """
 
     name: ClassVar[str]
-    registry: ClassVar[dict[str, type[Observer]]] = {}
+    registry: ClassVar[dict[str, "type[Observer]"]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -1,7 +1,5 @@
 """Samples on their way to a file: buffered on each rank, sent in chunks to whoever writes them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

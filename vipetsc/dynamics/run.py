@@ -1,7 +1,5 @@
 """A case in, a result out: the loop over a run's samples."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Files that are whole or not there: written under a temporary name, renamed when complete."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Chunk k holds the samples between the checkpoints k - 1 and k. A chunk and a che
 its share of each into a file of its own, so nothing is sent while a run goes on.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections import Counter

@@ -1,7 +1,5 @@
 """Output folders: the one way to claim one, and the provenance that every output carries."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import sys

@@ -8,8 +8,6 @@ The dataset is flat rather than a ``DataTree`` because there a group inherits th
 ``tree["sites/cell"]`` would be the coordinate ``/cell``, not the variable of the group ``sites``.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import ExitStack

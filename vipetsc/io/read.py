@@ -5,8 +5,6 @@ measures over one dimension a swept axis; ``select`` picks members by the values
 from 1, units stand in the attributes.
 """
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterator

@@ -6,8 +6,6 @@ a mapping by which ``fields[name][samples, cells] = values`` puts them where the
 that all ranks share, or in memory; the writers differ in open and close only.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from abc import ABC, abstractmethod
