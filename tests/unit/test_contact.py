@@ -206,3 +206,11 @@ def test_the_contact_time_is_that_of_a_simulated_impact(law):
         (0, 1), [0.0, speed], rtol=1e-10, atol=1e-13, events=lambda t, z: z[1],
     )  # fmt: skip
     assert 2 * rest.t_events[0][0] == pytest.approx(ImpactTracker(contacts, (0,), mass).duration(speed), rel=1e-6)
+
+
+def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
+    tracker = ImpactTracker(create_contacts(Contact(Hertz, KC), [D]), (0,), 0.003)
+    tracker.start[0] = 1.01 * D, -0.1, 0.0
+    assert tracker.switch(0.0, np.zeros(1)) == 1
+    assert tracker.contacts.sites["mode"].tolist() == [CLOSED]
+    assert tracker.counts.grazes == 0
