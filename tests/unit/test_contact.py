@@ -175,6 +175,7 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
 
     tracker.end[1] = -1.5 * D, 0.0, 0.0
     tracker.accept_step(1e-3)
+    assert tracker.start[1, 0] == -1.5 * D
     tracker.end[1] = -D, 0.2, 0.0  # g = 1 + .45 (-.2/.05) < 0: the contact pulls
     tracker.accept_step(1e-3)
     (episode,) = tracker.unfinished(np.array([0.0, 0.5]))
