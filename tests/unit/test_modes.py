@@ -6,7 +6,7 @@ import csv
 import io
 import itertools
 import tomllib
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -113,6 +113,13 @@ def test_charts_encode_decode_and_differentiate(x, period, kind):
         assert column == pytest.approx(difference, rel=1e-5, abs=1e-5 * np.abs(column).max())
 
 
+@pytest.mark.parametrize(("gap", "scale"), [(0.1, 1.0), (-2.0, 2.0), (6.0, 5.0)])
+def test_the_relative_chart_weighs_gaps_by_the_larger_of_gap_and_clearance(gap, scale):
+    x = D * np.array([5.0 - gap, 5.0]) if gap > 0 else D * np.array([5.0, 5.0 + gap])
+    xi = Relative(reduced(), x, 0.01).encode(x, 0.01)
+    assert xi == pytest.approx([x[0] / (5 * D), gap / scale, 1.0], rel=1e-12)
+
+
 @given(
     c=st.tuples(*[st.floats(-1, 1)] * 6),
     size=st.tuples(*[st.floats(-3, 0)] * 6),
@@ -195,6 +202,17 @@ def test_region_three_begins_where_the_exponent_settles():
     assert laws["II"]["exponent"] < -1.2
     assert laws["III"]["exponent"] == pytest.approx(-1, abs=1e-3)
     assert laws["II"]["points"] == begin - np.argmax(slope)
+
+
+def test_the_law_of_region_two_is_that_of_its_falling_part():
+    """Behind the last point where the branch goes backwards, and behind the peak."""
+    energy = np.geomspace(1, 100, 60)
+    slope = np.concatenate([np.full(5, 9.0), [-1.0], energy[6:20] ** 3, energy[20:] ** -2.5 * energy[20] ** 5.5])
+    laws = slope_laws(energy, slope, np.full(60, 2))
+    assert laws["II"]["exponent"] == pytest.approx(-2.5, abs=1e-12)
+    assert laws["II"]["points"] == 40
+    assert slope_laws(energy[:3], slope[:3], np.full(3, 3)) == {}
+    assert slope_laws(energy, np.full(60, np.nan), np.full(60, 3)) == {}
 
 
 def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():
@@ -343,6 +361,10 @@ def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
 def test_branch_file_round_trip(short_branch, tmp_path):
     short_branch.write(tmp_path, {"ranks": 1})
     again = Branch.read(tmp_path / "branch-out-of-phase.h5")
+    for read, written in zip(again.points, short_branch.points, strict=True):
+        for name in (f.name for f in fields(written)):
+            assert np.array_equal(getattr(read, name), getattr(written, name), equal_nan=name != "kind"), name
+    assert again.next_step == short_branch.next_step
     assert again.to_csv() == short_branch.to_csv()
     assert (again.ending, again.complete, again.findings) == ("done", True, ["a", "b"])
     rows = list(csv.DictReader(io.StringIO((tmp_path / "branch-out-of-phase.csv").read_text())))

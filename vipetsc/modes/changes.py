@@ -15,14 +15,12 @@ import numpy as np
 from vipetsc.compiled import njit
 from vipetsc.contact.search import first_upcrossing_after_start
 
+# Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
 NONE, CROSSING, EXTREMUM = 0, 1, 2
-"""Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell."""
-
+# Attempts at an extremum, and of one landing in all.
 EXTREMUM_ATTEMPTS, MOST_ATTEMPTS = 40, 120
-"""Attempts at an extremum, and of one landing in all."""
-
+# A slope at the start below this share of the curvature is the rounding of an extremum.
 ROUNDING = 1e-8
-"""A slope at the start below this share of the curvature is the rounding of an extremum."""
 
 
 class Landing(NamedTuple):

@@ -23,12 +23,10 @@ from vipetsc.modes.special import Locator, switch
 from vipetsc.modes.system import System
 from vipetsc.modes.tsrk import Tsrk
 
+# The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
-"""The flows by their names in case files."""
-
+# Points between two writings of a growing branch.
 SAVE_EVERY = 500
-"""Points between two writings of a growing branch."""
-
 FAILURES = (ContinuationError, FlowError, ValueError)
 
 Listener = Callable[[Branch, Point], None]

@@ -14,11 +14,10 @@ from vipetsc.contact.law import ForceLaw, elastic_force_and_slope
 from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Landing, correct, first_rise, hermite
 from vipetsc.modes.tableau import E3, E5, STAGES, A, B
 
+# Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed.
 DONE, STUCK, FULL = range(3)
-"""Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed."""
+# A step below this fraction of the interval means that the flow is stuck.
 SMALLEST_STEP = 1e-15
-"""A step below this fraction of the interval means that the flow is stuck."""
-
 CONTACT = np.dtype([("clearance", np.float64), ("stiffness", np.float64), ("exponent", np.float64)])
 SPRING = np.dtype([("quadratic", np.float64), ("cubic", np.float64)])
 

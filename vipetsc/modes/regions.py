@@ -4,20 +4,16 @@ import numpy as np
 
 from vipetsc.spectra import power_law
 
+# Fraction of the time in contact from which the clearance counts as negligible (region IV).
 SMOOTH_LIMIT = 0.95
-"""Fraction of the time in contact from which the clearance counts as negligible (region IV)."""
-
+# Change of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III).
 SETTLED = 0.5
-"""Change of the slope's local exponent per e-fold of energy below which the grazing peak is over (region III)."""
-
+# Local exponents below this still belong to the fall from the grazing peak; no limit law is so steep.
 STEEP = -2.0
-"""Local exponents below this still belong to the fall from the grazing peak; no limit law is so steep."""
-
+# Points that a local exponent needs.
 FEWEST = 5
-"""Points that a local exponent needs."""
-
+# Factors of power laws stay below this and above its inverse.
 MOST = float(np.exp(500.0))
-"""Factors of power laws stay below this and above its inverse."""
 
 
 def tell_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:
