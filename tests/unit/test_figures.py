@@ -7,8 +7,8 @@ from matplotlib.image import imread
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Case
-from vipetsc.figures import draw, draw_bands, figure_names
 from vipetsc.figures.lattice import draw_lattice, draw_unit_cell
+from vipetsc.figures.registry import draw, draw_bands, figure_names
 from vipetsc.figures.style import new_figure, rc_style
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.spectra import kinetic_energy

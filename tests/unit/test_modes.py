@@ -383,7 +383,7 @@ def test_xarray_opens_the_branch(short_branch, tmp_path):
 
 
 def test_picture_from_the_file(short_branch, tmp_path):
-    from vipetsc.figures import draw
+    from vipetsc.figures.registry import draw
 
     short_branch.write(tmp_path, {})
     (path,) = draw("branches", [tmp_path])

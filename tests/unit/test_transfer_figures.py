@@ -9,10 +9,11 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import FIGURES, draw, rc_style
-from vipetsc.figures.band_energies import closing_error
-from vipetsc.figures.regimes import ContactMotion
+from vipetsc.figures.portraits import ContactMotion
+from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.study import Study
+from vipetsc.figures.style import rc_style
+from vipetsc.figures.transfer import closing_error
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
 from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders

@@ -1,20 +1,6 @@
-"""Pictures, from files only; matplotlib is loaded when the first of these names is used."""
+"""Pictures, from files only, never from a running simulation; its modules load matplotlib.
 
-from importlib import import_module
-
-_HOMES = {
-    "FIGURES": "vipetsc.figures.registry",
-    "draw": "vipetsc.figures.registry",
-    "draw_bands": "vipetsc.figures.registry",
-    "figure_names": "vipetsc.figures.registry",
-    "rc_style": "vipetsc.figures.style",
-    "save": "vipetsc.figures.drawing",
-}
-
-__all__ = ["FIGURES", "draw", "draw_bands", "figure_names", "rc_style", "save"]
-
-
-def __getattr__(name: str) -> object:
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+``registry`` has every figure by name and draws what folders hold; ``drawing`` is the loop over pictures that ranks
+share, ``style`` sizes and colours, ``panels`` what figures share, ``study`` what pictures of sweeps are drawn from.
+The other modules are families of figures; their docstrings name the paper's.
+"""

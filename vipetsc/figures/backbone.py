@@ -1,7 +1,5 @@
 """Frequency-energy plots of branches, with grazing inset, slope and phase portraits (paper, Fig. 11)."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The (lambda, eta) search: Bloch deflections, cost maps with optima, dispersion against the parameters (Fig. S3)."""
 
-from __future__ import annotations
-
 import matplotlib as mpl
 import numpy as np
 import xarray as xr

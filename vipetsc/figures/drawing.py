@@ -1,7 +1,5 @@
 """The drawing loop: which rank draws which picture, and how a picture becomes a file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 

@@ -1,10 +1,8 @@
 """Mean wavenumber entropy against amplitude, with the power laws fitted from the peak on (paper, Figs. 5 and S2)."""
 
-from __future__ import annotations
-
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -15,7 +13,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.panels import annotate_empty, panel_title
+from vipetsc.figures.panels import annotate_empty, label_outer, panel_title
 from vipetsc.figures.study import AMPLITUDE, Study, counted, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.read import axes as axes_of
 
@@ -40,7 +38,7 @@ class EntropyCurve(NamedTuple):
     fit: dict[str, float]
 
     @classmethod
-    def of(cls, row: xr.Dataset, average: str) -> EntropyCurve | None:
+    def of(cls, row: xr.Dataset, average: str) -> Self | None:
         """The curve of an average; None where fewer than two members came out, or all alike."""
         value, error = row[f"entropy/{average}"].values, row["entropy/error"].values
         valid = np.isfinite(value)
@@ -110,10 +108,24 @@ def entropy(study: Study) -> Iterator[Drawing]:
     """Entropy against amplitude for each reading, wavenumber and average: linear above, log-log with fits below."""
     for ensemble, named in with_entropies(study):
         for rows in facets(ensemble):
-            for average in AVERAGES:
-                if any(EntropyCurve.of(row, average) for row in rows):
-                    name = suffix(rows[0], ensemble, named, FACETS)
-                    yield f"{name}-{average}", partial(_entropy, ensemble, rows, average)
+            yield from _by_average(_entropy, ensemble, rows, suffix(rows[0], ensemble, named, FACETS))
+
+
+def entropy_all(study: Study) -> Iterator[Drawing]:
+    """Every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
+    for ensemble, named in with_entropies(study):
+        for rows in facets(ensemble, ("reading",)):
+            if len({driven_wavenumber(row, ensemble) for row in rows}) > 1:
+                yield from _by_average(_entropy_all, ensemble, rows, suffix(rows[0], ensemble, named, ("reading",)))
+
+
+def _by_average(
+    page: Callable[..., Figure], ensemble: xr.Dataset, rows: Sequence[xr.Dataset], stem: str
+) -> Iterator[Drawing]:
+    """A page for every average of which some of the ``rows`` has a curve."""
+    for average in AVERAGES:
+        if any(EntropyCurve.of(row, average) for row in rows):
+            yield f"{stem}-{average}", partial(page, ensemble, rows, average)
 
 
 def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
@@ -127,26 +139,37 @@ def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> 
             annotate_empty(lower, "")
             continue
         for name, label in AVERAGES.items():
-            other = EntropyCurve.of(row, name) if name != average else None
-            if other:
-                upper.plot(other.amplitude, other.value, color=COLOURS[name], lw=0.6, alpha=0.5, label=label)
-        for axes in (upper, lower):
-            _points(axes, curve, average)
-        for other_row in _other_readings(row, ensemble):
-            other = EntropyCurve.of(other_row, average)
-            if other:
-                label = f"{other_row['reading'].item()} reading"
-                lower.plot(other.amplitude, other.value, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)), label=label)
-        _power_law(lower, curve, 6.0)
+            if name != average:
+                _faint(upper, row, name, label, color=COLOURS[name], lw=0.6, alpha=0.5)
+        _points(upper, curve, average, 2.2)
+        for other in _other_readings(row, ensemble):
+            label = f"{other['reading'].item()} reading"
+            _faint(lower, other, average, label, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)))
+        _log_panel(lower, curve, average, 2.2, 6.0)
         upper.set(xlim=(0, 1.04 * curve.amplitude[-1]), ylim=(-0.05, 1.45))
-        _logarithmic(lower, curve)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("Normalised entropy")
-    for axes in grid[1]:
-        axes.set_xlabel("A (N)")
+    label_outer(grid, "A (N)", "Normalised entropy")
     pairs = [pair for axes in grid.flat for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in pairs}
     figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=_legend_columns(len(rows)))
+    return figure
+
+
+def _entropy_all(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
+    by_wavenumber = grouped(rows, partial(driven_wavenumber, ensemble=ensemble))
+    heading = f"{facet_title(rows[0], ensemble, False)}, {AVERAGES[average]} mean entropy"
+    figure, grid = _panels(len(by_wavenumber), len(rows) // len(by_wavenumber), 1.15, heading)
+    label_outer(grid, "A (N)", "")
+    for line, (wavenumber, of_wavenumber) in zip(grid, by_wavenumber.items(), strict=True):
+        line[0].set_ylabel(wavenumber)
+        for axes, row in zip(line, of_wavenumber, strict=True):
+            curve = EntropyCurve.of(row, average)
+            if axes in grid[0]:
+                panel_title(axes, row_title(row, ensemble))
+            if curve is None:
+                annotate_empty(axes, _why_no_curve(row, average))
+                continue
+            _log_panel(axes, curve, average, 1.6, 5.5)
+            axes.tick_params(labelbottom=axes in grid[-1])
     return figure
 
 
@@ -185,7 +208,14 @@ def _panels(
     return figure, grid
 
 
-def _points(axes: Axes, curve: EntropyCurve, average: str, size: float = 2.2) -> None:
+def _faint(axes: Axes, row: xr.Dataset, average: str, label: str, **line: Any) -> None:
+    """A curve to compare with, if the row has one."""
+    curve = EntropyCurve.of(row, average)
+    if curve:
+        axes.plot(curve.amplitude, curve.value, label=label, **line)
+
+
+def _points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
     pale = tuple(0.5 + 0.5 * np.array(to_rgb(COLOURS[average])))
     axes.errorbar(
         curve.amplitude, curve.value, curve.error, fmt="o-", color=COLOURS[average], ecolor=pale, ms=size, mew=0,
@@ -193,53 +223,15 @@ def _points(axes: Axes, curve: EntropyCurve, average: str, size: float = 2.2) ->
     )  # fmt: skip
 
 
-def _power_law(axes: Axes, curve: EntropyCurve, fontsize: float) -> None:
-    """The power law as a thick black line, and both adjusted R^2."""
+def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float, fontsize: float) -> None:
+    """The curve in logarithms, the power law as a thick black line with both adjusted R^2."""
+    _points(axes, curve, average, size)
     x, y = curve.power_law()
-    if not len(x):
+    if len(x):
+        axes.plot(x, y, color=style.BLACK, lw=2.0, zorder=4, label="power law, adjusted R² (of nonlinear fit)")
+        fit = curve.fit
+        text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
+        axes.text(0.04, 0.97, text, transform=axes.transAxes, ha="left", va="top", fontsize=fontsize)
+    else:
         axes.text(0.04, 0.04, "no power law", transform=axes.transAxes, fontsize=fontsize, color=style.GREY)
-        return
-    axes.plot(x, y, color=style.BLACK, lw=2.0, zorder=4, label="power law, adjusted R² (of nonlinear fit)")
-    fit = curve.fit
-    text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
-    axes.text(0.04, 0.97, text, transform=axes.transAxes, ha="left", va="top", fontsize=fontsize)
-
-
-def _logarithmic(axes: Axes, curve: EntropyCurve) -> None:
     axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * curve.amplitude[0], 1.25 * curve.amplitude[-1]))
-
-
-def entropy_all(study: Study) -> Iterator[Drawing]:
-    """Every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
-    for ensemble, named in with_entropies(study):
-        for of_reading in facets(ensemble, ("reading",)):
-            rows = grouped(of_reading, partial(driven_wavenumber, ensemble=ensemble))
-            if len(rows) < 2:
-                continue
-            for average in AVERAGES:
-                if any(EntropyCurve.of(row, average) for row in of_reading):
-                    name = suffix(of_reading[0], ensemble, named, ("reading",))
-                    yield f"{name}-{average}", partial(_entropy_all, ensemble, rows, average)
-
-
-def _entropy_all(ensemble: xr.Dataset, by_wavenumber: dict[str, list[xr.Dataset]], average: str) -> Figure:
-    wavenumbers, rows = list(by_wavenumber), list(by_wavenumber.values())
-    heading = f"{facet_title(rows[0][0], ensemble, False)}, {AVERAGES[average]} mean entropy"
-    figure, grid = _panels(len(rows), len(rows[0]), 1.15, heading)
-    for (r, c), axes in np.ndenumerate(grid):
-        row = rows[r][c]
-        curve = EntropyCurve.of(row, average)
-        if r == 0:
-            panel_title(axes, row_title(row, ensemble))
-        if curve is None:
-            annotate_empty(axes, _why_no_curve(row, average))
-            continue
-        _points(axes, curve, average, 1.6)
-        _power_law(axes, curve, 5.5)
-        _logarithmic(axes, curve)
-        axes.tick_params(labelbottom=r == len(rows) - 1)
-    for axes, wavenumber in zip(grid[:, 0], wavenumbers, strict=True):
-        axes.set_ylabel(wavenumber)
-    for axes in grid[-1]:
-        axes.set_xlabel("A (N)")
-    return figure

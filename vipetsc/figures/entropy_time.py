@@ -1,7 +1,5 @@
 """Wavenumber entropy in time: over the cells at three amplitudes, and over all amplitudes (paper, Fig. A2)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 
@@ -15,9 +13,8 @@ from matplotlib.figure import Figure
 from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.entropy import FACETS, facet_title, facets, row_title, with_entropies
-from vipetsc.figures.panels import mark_sites, panel_title, space_time_map
-from vipetsc.figures.series import AmplitudeSeries, series_of
-from vipetsc.figures.study import AMPLITUDE, MeasuredRun, Study, suffix
+from vipetsc.figures.panels import label_outer, mark_sites, panel_title, space_time_map
+from vipetsc.figures.study import AMPLITUDE, AmplitudeSeries, MeasuredRun, Study, from_series, suffix
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import member_folder
 
@@ -26,13 +23,9 @@ COLOURS = "viridis"
 LEAST_WEIGHT = 1e-5  # of the largest: cells with less energy are left blank
 
 
-def entropy_maps(study: Study) -> Iterator[Drawing]:
+@from_series("entropy/local")
+def entropy_maps(series: AmplitudeSeries) -> Figure:
     """H(x, t) at three amplitudes to one scale, with the energy-weighted H(t) over each; quiet cells are blank."""
-    for series in series_of(study, "entropy/local"):
-        yield series.suffix, partial(_maps, series)
-
-
-def _maps(series: AmplitudeSeries) -> Figure:
     figure = style.new_figure(style.PAGE, 2.7, series.title)
     panels = figure.subplots(1, 3, sharey=True)
     local = [_above_threshold(member) for member in series.runs]
@@ -96,10 +89,7 @@ def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figu
         panel_title(axes, row_title(row, ensemble))
     for axes in grid.flat[len(configurations) :]:
         axes.set_axis_off()
-    for axes in grid[-1]:
-        axes.set_xlabel("Time (s)")
-    for axes in grid[:, 0]:
-        axes.set_ylabel("Amplitude A (N)")
+    label_outer(grid, "Time (s)", "Amplitude A (N)")
     figure.colorbar(image, ax=list(grid.flat), label="H(t) (bit)", pad=0.01, extend="both")
     return figure
 

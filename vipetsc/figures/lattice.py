@@ -1,7 +1,5 @@
 """The unit cell drawn as masses and springs with its clearance; the lattice as a strip with its sites."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,6 +9,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order
 
 from vipetsc.case import Case
 from vipetsc.figures import style
@@ -94,47 +94,35 @@ def _layout(cell: UnitCell) -> _Layout:
 
 def _centres(cell: UnitCell, nested: bool) -> dict[int, Point]:
     """Position of every mass: the shortest way through the cell on one line, the others below it."""
-    neighbours: dict[int, list[int]] = {i: [] for i in range(cell.dofs)}
-    for s in cell.springs:
-        if not s.next_cell:
-            neighbours[s.start].append(s.end)
-            neighbours[s.end].append(s.start)
+    joined = np.zeros((cell.dofs, cell.dofs), bool)
+    for spring in cell.springs:
+        if not spring.next_cell:
+            joined[spring.start, spring.end] = joined[spring.end, spring.start] = True
+    through = next(s for s in cell.springs if s.next_cell)
+    _, before = breadth_first_order(csr_array(joined), through.end)
+    line = [through.start] if through.start == through.end or before[through.start] >= 0 else [through.end]
+    while line[0] != through.end:
+        line.insert(0, int(before[line[0]]))
     centre: dict[int, Point] = {}
     x = 0.0
-    for i in _through(cell, neighbours):
+    for i in line:
         extra = (WIDE - HALF) * (nested and i == cell.host)
         centre[i] = (x + extra, 0.0)
         x += PITCH + 2 * extra
     if nested:
-        centre.setdefault(cell.host, (x, 0.0))
-        centre[cell.resonator] = centre[cell.host]
+        centre[cell.resonator] = centre.setdefault(cell.host, (x, 0.0))
     while len(centre) < cell.dofs:
         # A mass off the line hangs below one that has its position, or stands at the end of the line.
         missing = [i for i in range(cell.dofs) if i not in centre]
-        hanging = next((i for i in missing if set(neighbours[i]) & centre.keys()), None)
-        if hanging is None:
+        hanging = [(i, j) for i in missing for j in centre if joined[i, j]]
+        if not hanging:
             centre[missing[0]] = (max(p for p, _ in centre.values()) + PITCH, 0.0)
             continue
-        x, y = centre[next(j for j in neighbours[hanging] if j in centre)]
-        y -= 0.75 * PITCH
-        while (x, y) in centre.values():
+        x, y = centre[hanging[0][1]]
+        while (x, y - 0.75 * PITCH) in centre.values():
             x += 0.5 * PITCH
-        centre[hanging] = (x, y)
+        centre[hanging[0][0]] = (x, y - 0.75 * PITCH)
     return centre
-
-
-def _through(cell: UnitCell, neighbours: dict[int, list[int]]) -> list[int]:
-    """The masses on the shortest way from one border of the cell to the other, breadth first."""
-    through = next(s for s in cell.springs if s.next_cell)
-    paths, reached = [[through.end]], {through.end}
-    while paths:
-        path = paths.pop(0)
-        if path[-1] == through.start:
-            return path
-        fresh = [i for i in neighbours[path[-1]] if i not in reached]
-        reached.update(fresh)
-        paths += [[*path, i] for i in fresh]
-    return [through.end]
 
 
 def _inner_spring(axes: Axes, layout: _Layout, spring: Spring, level: float, host: int) -> float:
@@ -145,15 +133,15 @@ def _inner_spring(axes: Axes, layout: _Layout, spring: Spring, level: float, hos
     if abs(xa - xb) < 0.1:
         top, bottom = (a, b) if ya > yb else (b, a)
         drop = TALL if layout.nested and top == host else HALF
-        draw_spring(axes, (xa, layout.centre[top][1] - drop), (xb, layout.centre[bottom][1] + HALF), text)
+        draw_spring(axes, [(xa, layout.centre[top][1] - drop), (xb, layout.centre[bottom][1] + HALF)], text)
     elif abs(ya - yb) >= 0.1:
         short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
-        draw_spring(axes, (xa + short[0], ya + short[1]), (xb - short[0], yb - short[1]), text)
+        draw_spring(axes, [(xa + short[0], ya + short[1]), (xb - short[0], yb - short[1])], text)
     elif layout.blocked(xa, xb, ya):
-        _route(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
+        draw_spring(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
         return level
     else:
-        draw_spring(axes, (xa + layout.half[a], ya), (xb - layout.half[b], yb), text)
+        draw_spring(axes, [(xa + layout.half[a], ya), (xb - layout.half[b], yb)], text)
     return 0.0
 
 
@@ -163,12 +151,12 @@ def _outer_spring(axes: Axes, layout: _Layout, spring: Spring, level: float, hos
     for mass, wall, side in ((spring.start, layout.right, 1), (spring.end, layout.left, -1)):
         x, y = layout.centre[mass]
         if layout.blocked(min(x, side * np.inf), max(x, side * np.inf), y):
-            _route(axes, [(x, y + HALF), (x, level), (wall, level)], text)
+            draw_spring(axes, [(x, y + HALF), (x, level), (wall, level)], text)
             used = level
             continue
         start = x + side * layout.half[mass]
         if side > 0:
-            draw_spring(axes, (start, y), (wall, y), text)
+            draw_spring(axes, [(start, y), (wall, y)], text)
         else:
             axes.plot([start, wall], [y, y], color=style.BLACK, lw=0.7, zorder=2)
         axes.plot([wall, wall + 0.4 * side], [y, y], color=style.BLACK, lw=0.7, ls=(0, (1, 1.5)), zorder=2)
@@ -200,7 +188,7 @@ def _host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None:
     for left, bottom in itertools.product((x - reach - GAP - 0.1, x + reach + GAP), (y - 0.52, y + 0.2)):
         box(left, bottom, 0.1, 0.32, style.SKY, 4)
     stiffness = sum(s.stiffness for s in cell.springs if cell.resonator in (s.start, s.end))
-    draw_spring(axes, (x - WIDE + 0.1, y), (x - reach, y), "", turns=3, height=0.09)
+    draw_spring(axes, [(x - WIDE + 0.1, y), (x - reach, y)], "", turns=3, height=0.09)
     box(x - reach, y - reach, 2 * reach, 2 * reach, style.ORANGE, 5)
     axes.text(x, y, f"$m_{{{cell.resonator + 1}}}$", ha="center", va="center", zorder=6)
     line = {"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
@@ -221,31 +209,23 @@ def _contact_link(axes: Axes, host: Point, resonator: Point) -> None:
                   fontsize=6.5, color=style.VERMILION)  # fmt: skip
 
 
-def draw_spring(axes: Axes, start: Point, end: Point, text: str, turns: int = 5, height: float = 0.13) -> None:
-    """A zigzag from ``start`` to ``end`` with straight leads, its stiffness beside it."""
-    origin, along = np.array(start), np.subtract(end, start)
+def draw_spring(axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, height: float = 0.13) -> None:
+    """A line through ``corners``, a zigzag with straight leads on its longest leg, its stiffness beside it."""
+    legs = np.stack([corners[:-1], corners[1:]], axis=1)
+    longest = int(np.argmax(np.hypot(*(legs[:, 1] - legs[:, 0]).T)))
+    for leg in np.delete(legs, longest, axis=0):
+        axes.plot(*leg.T, color=style.BLACK, lw=0.7, zorder=2)
+    start, along = legs[longest, 0], legs[longest, 1] - legs[longest, 0]
     across = np.array([-along[1], along[0]]) / np.hypot(*along)
     s = np.concatenate([[0, 0.2], 0.2 + 0.6 * (np.arange(2 * turns) + 0.5) / (2 * turns), [0.8, 1]])
     swing = np.zeros(len(s))
     swing[2:-2] = height * (-1.0) ** np.arange(2 * turns)
-    points = origin + s[:, None] * along + swing[:, None] * across
+    points = start + s[:, None] * along + swing[:, None] * across
     axes.plot(*points.T, color=style.BLACK, lw=0.7, zorder=2 if height > 0.1 else 6, solid_joinstyle="round")
-    if text:
-        x, y = origin + along / 2
-        upright = abs(along[1]) > abs(along[0])
-        axes.text(x + (0.2 if upright else 0), y + (0 if upright else 0.2), text, fontsize=6.5,
-                  ha="left" if upright else "center", va="center" if upright else "bottom")  # fmt: skip
-
-
-def _route(axes: Axes, corners: Sequence[Point], text: str) -> None:
-    """A spring that goes round the masses in its way: a line through ``corners``, zigzag on the longest leg."""
-    legs = list(itertools.pairwise(corners))
-    longest = int(np.argmax([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in legs]))
-    for i, (a, b) in enumerate(legs):
-        if i == longest:
-            draw_spring(axes, a, b, text)
-        else:
-            axes.plot([a[0], b[0]], [a[1], b[1]], color=style.BLACK, lw=0.7, zorder=2)
+    if abs(along[1]) > abs(along[0]):
+        axes.text(*(start + along / 2 + (0.2, 0)), text, fontsize=6.5, ha="left", va="center")
+    else:
+        axes.text(*(start + along / 2 + (0, 0.2)), text, fontsize=6.5, ha="center", va="bottom")
 
 
 def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = False) -> None:
@@ -284,7 +264,5 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = Fa
 
 def with_prefix(value: float, unit: str) -> str:
     """A value with the prefix that keeps it readable: 20 kN/m, 2.5 g."""
-    for factor, prefix in ((1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m")):
-        if abs(value) >= factor:
-            return f"{value / factor:.4g} {prefix}{unit}"
-    return f"{value:.3g} {unit}"
+    factor, prefix = style.si_prefix(value)
+    return f"{value / factor:.4g} {prefix}{unit}"

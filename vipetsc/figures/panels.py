@@ -1,7 +1,5 @@
 """Panels that figures share: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -129,6 +127,14 @@ def shade_bands(axes: Axes, spans: Iterable[tuple[float, float]], along: str = "
     """Shade ``spans`` of frequency (rad/s) on the axis ``along``, which shows krad/s."""
     for low, high in spans:
         (axes.axhspan if along == "y" else axes.axvspan)(low / 1e3, high / 1e3, color=style.PALE, alpha=0.7, lw=0)
+
+
+def label_outer(grid: np.ndarray, xlabel: str, ylabel: str) -> None:
+    """Label the x axes of the lowest row and the y axes of the first column of a ``grid`` of panels."""
+    for axes in grid[-1]:
+        axes.set_xlabel(xlabel)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(ylabel)
 
 
 def colours(count: int) -> list[str]:

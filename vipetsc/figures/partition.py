@@ -1,9 +1,7 @@
-"""The wave's energy in twelve wavenumber bins, in space-time and reconstructed (paper, Figs. 4 and A1)."""
+"""The wave's energy in twelve wavenumber bins: in space-time, reconstructed, and how the bins are made."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
-from functools import partial
+import itertools
+from collections.abc import Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -11,16 +9,18 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import ConnectionPatch
 from scipy.ndimage import gaussian_filter
 
-from vipetsc.figures import style
-from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.panels import ROMAN, colour_bar, log_norm, mark_sites, panel_title, space_time_map
-from vipetsc.figures.series import AmplitudeSeries, series_of
-from vipetsc.figures.study import MeasuredRun, Study
+from vipetsc.figures import panels, style
+from vipetsc.figures.panels import ROMAN, panel_title
+from vipetsc.figures.study import AmplitudeSeries, MeasuredRun, from_series
+from vipetsc.io.read import field_time
 from vipetsc.lattice import bloch
+from vipetsc.spectra import Nodes, inverse, transform
 
-SHOWN = 7
+KC = 6.0  # the partition's wavelet
+SHOWN, EXPLAINED = 7, 4  # bins whose maps are drawn
 DECADES = 4
 LEVEL = 0.003  # of the largest energy of any bin: where the contours lie
 FIELD = "partition/kinetic_energy"  # (bin, snapshot, cell)
@@ -48,14 +48,9 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
     return sorted(bins)
 
 
-def partition(study: Study) -> Iterator[Drawing]:
-    """Energy of seven bins in space-time at the medium amplitude; contours of all bins; the band in their colours."""
-    for series in series_of(study, FIELD):
-        if series.drives_a_wave:
-            yield series.suffix, partial(_partition, series)
-
-
-def _partition(series: AmplitudeSeries) -> Figure:
+@from_series(FIELD, wave=True)
+def partition(series: AmplitudeSeries) -> Figure:
+    """Energy of seven bins in space-time at the medium amplitude, contours of all, the driven band (paper, Fig. 4)."""
     medium = series.runs[1]
     heading = f"{series.title}; maps: medium amplitude, {medium.amplitude:g} N"
     figure = style.new_figure(style.PAGE, 6.6, heading)
@@ -64,31 +59,31 @@ def _partition(series: AmplitudeSeries) -> Figure:
     colours = bin_colours(len(field))
     *maps, band = upper.subplots(2, 4).flat
     _maps(maps, medium.run, field, shown_bins(series.wave.wavenumber, len(field)))
-    colour_bar(upper, maps[0].images[0], [*maps, band], "Energy of a bin in a cell (J)", aspect=40)
+    panels.colour_bar(upper, maps[0].images[0], [*maps, band], "Energy of a bin in a cell (J)", aspect=40)
     _coloured_band(band, series, medium.analysis["partition/bounds"].values, colours)
-    panels = lower.subplots(1, 3, sharey=True)
+    contours = lower.subplots(1, 3, sharey=True)
     for column, member, heading in series.headings():
-        _contours(panels[column], member, colours)
-        panel_title(panels[column], f"(b.{ROMAN[column]}) {heading}")
-        panels[column].set_xlabel("Time (s)")
-    panels[0].set_ylabel("Cell")
+        _contours(contours[column], member, colours)
+        panel_title(contours[column], f"(b.{ROMAN[column]}) {heading}")
+        contours[column].set_xlabel("Time (s)")
+    contours[0].set_ylabel("Cell")
     edges = np.arange(len(colours) + 1) + 0.5
     keys = mpl.cm.ScalarMappable(BoundaryNorm(edges, len(colours)), ListedColormap(colours))
-    bar = lower.colorbar(keys, ax=panels, label="Bin", pad=0.01, ticks=np.arange(1, len(colours) + 1))
+    bar = lower.colorbar(keys, ax=contours, label="Bin", pad=0.01, ticks=np.arange(1, len(colours) + 1))
     bar.ax.tick_params(length=0, labelsize=6)
     bar.minorticks_off()
     return figure
 
 
-def _maps(panels: Sequence[Axes], run: xr.Dataset, field: xr.DataArray, bins: Sequence[int]) -> None:
+def _maps(grid: Sequence[Axes], run: xr.Dataset, field: xr.DataArray, bins: Sequence[int]) -> None:
     """Energy of the ``bins`` in space-time to one scale; panels without a bin are left empty."""
-    norm = log_norm(float(field[list(bins)].max()), DECADES)
-    for i, axes in enumerate(panels):
+    norm = panels.log_norm(float(field[list(bins)].max()), DECADES)
+    for i, axes in enumerate(grid):
         if i >= len(bins):
             axes.set_axis_off()
             continue
-        space_time_map(axes, field[bins[i]], norm)
-        mark_sites(axes, run)
+        panels.space_time_map(axes, field[bins[i]], norm)
+        panels.mark_sites(axes, run)
         panel_title(axes, f"(a.{ROMAN[i]}) $K_{{{bins[i] + 1}}}$")
         axes.set_ylabel("" if i % 4 else "Cell")
         axes.tick_params(labelleft=i % 4 == 0)
@@ -107,7 +102,7 @@ def _contours(axes: Axes, member: MeasuredRun, colours: np.ndarray) -> None:
         if smooth[b].max() > level > 0:
             axes.contourf(time, cells[::step], smooth[b].T, [level, np.inf], colors=[colours[b]], alpha=0.35)
             axes.contour(time, cells[::step], smooth[b].T, [level], colors=[colours[b]], linewidths=0.6)
-    mark_sites(axes, member.run, style.GREY)
+    panels.mark_sites(axes, member.run, style.GREY)
     axes.set(xlim=time[[0, -1]], ylim=cells[[0, -1]])
 
 
@@ -123,13 +118,9 @@ def _coloured_band(axes: Axes, series: AmplitudeSeries, bounds: np.ndarray, colo
     panel_title(axes, f"(c) Band {band} by bin")
 
 
-def reconstruction(study: Study) -> Iterator[Drawing]:
-    """Kinetic energy and that of the bins' sum over time, their relative error, and the share between bins."""
-    for series in series_of(study, "partition/reconstructed"):
-        yield series.suffix, partial(_reconstruction, series)
-
-
-def _reconstruction(series: AmplitudeSeries) -> Figure:
+@from_series("partition/reconstructed")
+def reconstruction(series: AmplitudeSeries) -> Figure:
+    """Kinetic energy and that of the bins' sum over time, relative error, the share between bins (paper, Fig. A1)."""
     figure = style.new_figure(style.PAGE, 5.0, series.title)
     grid = figure.subplots(3, 3, sharex="col", sharey="row")
     for column, member, heading in series.headings():
@@ -157,3 +148,72 @@ def _reconstruction(series: AmplitudeSeries) -> Figure:
                         ha="right", va="top", color=style.VERMILION)  # fmt: skip
     grid[2, 0].set(ylabel="Share of KE between bins")
     return figure
+
+
+@from_series(FIELD, wave=True, sites=True)
+def partition_explained(series: AmplitudeSeries) -> Figure:
+    """A snapshot, its wavelet transform cut into bins, the inverse of some, their energy in space-time (Fig. S1)."""
+    member = series.runs[1]
+    field, cells = member.analysis[FIELD].load(), member.analysis["cell"].values
+    snapshots, bounds = (member.analysis[f"partition/{name}"].values for name in ("snapshot", "bounds"))
+    time = float(snapshots[np.argmin(np.abs(snapshots - series.snapshot_times()[2]))])
+    sample = int(np.argmin(np.abs(field_time(member.run) - time)))
+    signal = member.run["velocity"][sample, :, member.model.chain.cell.host].values
+    nodes = Nodes.log(KC)
+    wavelets = transform(signal, nodes.kappa, KC)
+    parts = inverse(wavelets, nodes, KC, len(field))[:, : len(cells)]
+    bins = shown_bins(series.wave.wavenumber, len(field), EXPLAINED)
+    colours = bin_colours(len(field))
+
+    figure = style.new_figure(style.PAGE, 4.6, f"{series.title}; medium amplitude, {member.amplitude:g} N")
+    # The empty column leaves room for the arrows.
+    grid = figure.add_gridspec(EXPLAINED, 4, width_ratios=(1.15, 0.25, 1, 1.05))
+    half = EXPLAINED // 2
+    above, below = figure.add_subplot(grid[:half, 0]), figure.add_subplot(grid[half:, 0])
+    above.plot(cells, signal, color=style.BLACK, lw=0.4)
+    above.set(ylabel="Host velocity (m/s)", xlim=cells[[0, -1]])
+    above.tick_params(labelbottom=False)
+    panel_title(above, f"(a) Snapshot at t = {time:.3g} s")
+    _domain(below, cells, wavelets[:, : len(cells)], nodes, bounds, colours)
+    largest = 1.1 * np.abs(parts[bins]).max()
+    norm = panels.log_norm(float(field[bins].max()), DECADES)
+    # Bins rise upwards, as in the wavelet domain.
+    traces, maps = ([figure.add_subplot(grid[row, column]) for row in range(EXPLAINED)] for column in (2, 3))
+    for row, (b, trace, energy) in enumerate(zip(reversed(bins), traces, maps, strict=True)):
+        trace.plot(cells, parts[b], color=colours[b], lw=0.5)
+        trace.set(xlim=cells[[0, -1]], ylim=(-largest, largest))
+        trace.yaxis.tick_right()
+        image = panels.space_time_map(energy, field[b], norm)
+        panels.mark_sites(energy, member.run)
+        energy.axvline(time, color="white", lw=0.6)
+        for axes, tag, what in ((trace, "c", "Velocity (m/s)"), (energy, "d", "Energy")):
+            panel_title(axes, f"({tag}.{ROMAN[row]}) {what} of $K_{{{b + 1}}}$")
+            axes.tick_params(labelbottom=row == EXPLAINED - 1)
+            axes.set_xlabel("")
+        middle = float(np.clip(0.5 * (bounds[b] + bounds[b + 1]), nodes.kappa[0], np.pi)) / np.pi
+        ends = (1.0, middle), (0.0, 0.5), below.get_yaxis_transform(), trace.transAxes
+        figure.add_artist(ConnectionPatch(*ends, arrowstyle="-|>", color=colours[b], lw=0.7, mutation_scale=6))
+    traces[-1].set_xlabel("Cell")
+    maps[-1].set_xlabel("Time (s)")
+    panels.colour_bar(figure, image, maps, "Energy of a bin in a cell (J)", 0.02, 40)
+    return figure
+
+
+def _domain(
+    axes: Axes, cells: np.ndarray, x: np.ndarray, nodes: Nodes, bounds: np.ndarray, colours: np.ndarray
+) -> None:
+    """|X| over cells and wavenumber with the bounds of the bins, each named on the right edge."""
+    inside = nodes.kappa <= np.pi
+    magnitude = np.abs(x[inside])
+    kappa = np.linspace(0, np.pi, 301)[1:]
+    nearest = np.abs(nodes.kappa[inside][None, :] - kappa[:, None]).argmin(axis=1)
+    panels.draw_map(
+        axes, cells, kappa / np.pi, magnitude[nearest], panels.log_norm(float(magnitude.max()), 2), "magma_r"
+    )
+    for bound in bounds[1:-1]:
+        axes.axhline(bound / np.pi, color=style.GREY, lw=0.4)
+    for b, (low, high) in enumerate(itertools.pairwise(bounds)):
+        axes.text(0.985, 0.5 * (low + high) / np.pi, f"{b + 1}", transform=axes.get_yaxis_transform(), ha="right",
+                  va="center", fontsize=5.5, fontweight="bold", color=colours[b])  # fmt: skip
+    axes.set(xlabel="Cell", ylabel="κ (π rad/cell)", ylim=(0, 1))
+    panel_title(axes, "(b) Wavelets |X| and bins")

@@ -1,7 +1,5 @@
 """Every picture by name: what it is drawn from and by which function; the check of names; the drawing of folders."""
 
-from __future__ import annotations
-
 import difflib
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,28 +8,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vipetsc.figures import design, style
+from vipetsc.figures import design, runs, style
 from vipetsc.figures.backbone import backbone
-from vipetsc.figures.band_energies import band_energies
-from vipetsc.figures.bands import bands
-from vipetsc.figures.dispersion import dispersion
 from vipetsc.figures.drawing import Drawing, draw_each, save
 from vipetsc.figures.entropy import entropy, entropy_all
 from vipetsc.figures.entropy_time import entropy_history, entropy_maps
-from vipetsc.figures.explained import partition_explained
-from vipetsc.figures.impacts import impacts
 from vipetsc.figures.lattice import unit_cell
-from vipetsc.figures.ledger import ledger
-from vipetsc.figures.partition import partition, reconstruction
-from vipetsc.figures.phase import phase
-from vipetsc.figures.regimes import phase_regimes
+from vipetsc.figures.partition import partition, partition_explained, reconstruction
+from vipetsc.figures.portraits import phase, phase_regimes
 from vipetsc.figures.scattering import amplitudes, wavelets
-from vipetsc.figures.spacetime import spacetime
+from vipetsc.figures.schematics import bands
 from vipetsc.figures.study import Study
-from vipetsc.figures.transfer import transfer
-from vipetsc.figures.transfer_backbone import ibtet_backbone
-from vipetsc.figures.transfer_curves import ibtet
-from vipetsc.figures.transfer_dispersions import transfer_dispersions
+from vipetsc.figures.transfer import band_energies, transfer, transfer_dispersions
+from vipetsc.figures.transfer_curves import ibtet, ibtet_backbone
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.lattice import UnitCell
@@ -65,7 +54,7 @@ def _specs(source: str, functions: Iterable[Callable[..., Any]], measure: str = 
 
 # The dearest of a run first, so that ranks which share the work finish together.
 FIGURES: dict[str, FigureSpec] = {
-    **_specs(RUN, (spacetime, dispersion, phase, unit_cell, impacts, ledger)),
+    **_specs(RUN, (runs.spacetime, runs.dispersion, phase, unit_cell, runs.impacts, runs.ledger)),
     **_specs(
         SWEEP,
         (amplitudes, wavelets, partition, partition_explained, reconstruction,
@@ -132,11 +121,6 @@ def draw(
         return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, itertools.count(*share))
 
 
-def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[Drawing]:
-    """Stems and drawings of what the ``folders`` hold, as ``draw`` draws them; the first of them checks the names."""
-    yield from _DRAWINGS[source](folders, figure_names(source, names))
-
-
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
     """Draw the dispersion diagram of ``cell`` into ``path``; ``frequency`` in rad/s marks a drive."""
     with style.rc_style():
@@ -151,30 +135,27 @@ def study_drawings(study: Study, names: Iterable[str]) -> Iterator[Drawing]:
             yield f"{name}-{suffix}" if suffix else name, make
 
 
-def _of_run(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
-    with ExitStack() as stack:
-        run = stack.enter_context(open_run(folders[0] / "run.h5"))
-        path = folders[0] / "analysis.h5"
-        analysis = stack.enter_context(open_netcdf(path, "analysis")) if path.exists() else None
-        for name in names:
-            yield name, partial(FIGURES[name].function, run, analysis)
+def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[Drawing]:
+    """Stems and drawings of what the ``folders`` hold, as ``draw`` draws them; the first of them checks the names.
 
-
-def _of_sweep(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
-    yield from study_drawings(Study.read(folders), names)
-
-
-def _of_branches(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
-    for name, path in itertools.product(names, sorted(folders[0].glob("branch-*.h5"))):
-        paths = [folder / path.name for folder in folders if (folder / path.name).exists()]
-        stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
-        yield stem, partial(FIGURES[name].function, paths)
-
-
-def _of_design(folders: Sequence[Path], names: Sequence[str]) -> Iterator[Drawing]:
-    with open_netcdf(folders[0] / "design.h5", "search", ("cost", "frequency")) as search:
-        for name in names:
-            yield name, partial(FIGURES[name].function, search)
-
-
-_DRAWINGS = {RUN: _of_run, SWEEP: _of_sweep, BRANCHES: _of_branches, DESIGN: _of_design}
+    Files stay open until the last drawing was asked for.
+    """
+    names = figure_names(source, names)
+    folder = folders[0]
+    if source == SWEEP:
+        yield from study_drawings(Study.read(folders), names)
+    elif source == BRANCHES:
+        for name, path in itertools.product(names, sorted(folder.glob("branch-*.h5"))):
+            paths = [other / path.name for other in folders if (other / path.name).exists()]
+            stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
+            yield stem, partial(FIGURES[name].function, paths)
+    else:
+        with ExitStack() as stack:
+            if source == RUN:
+                data: tuple[Any, ...] = (stack.enter_context(open_run(folder / "run.h5")), None)
+                if (folder / "analysis.h5").exists():
+                    data = data[0], stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
+            else:
+                data = (stack.enter_context(open_netcdf(folder / "design.h5", "search", ("cost", "frequency"))),)
+            for name in names:
+                yield name, partial(FIGURES[name].function, *data)

@@ -1,14 +1,15 @@
-"""Schematics: a lattice with its cell and bands (paper, Figs. 1, 6), the reduced model of a contact cell (Fig. 10)."""
+"""A cell's bands; a lattice with its cell and bands (paper, Figs. 1 and 6); the reduced model (Fig. 10)."""
 
-from __future__ import annotations
-
+import numpy as np
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.lattice import draw_lattice, draw_mass, draw_spring, draw_unit_cell, draw_wall, with_prefix
-from vipetsc.figures.panels import band_diagram, panel_title
+from vipetsc.figures.panels import band_diagram, colours, panel_title, shade_bands
 from vipetsc.figures.study import counted
+from vipetsc.lattice import UnitCell, bloch, pass_bands
+from vipetsc.lattice.bloch import gaps
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
 SIDE = 0.5  # half the side of a mass of the reduced model
@@ -41,9 +42,9 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
     draw_wall(axes, (-0.35, -0.8), 0.35, 1.9)
     axes.plot([0, 0], [-0.8, 1.1], color=style.BLACK, lw=1.0)
     host, resonator = 2.6, 6.6
-    draw_spring(axes, (0, 0), (host - SIDE, 0), rf"$k_1$ = {with_prefix(springs[0], 'N/m')}")
+    draw_spring(axes, [(0, 0), (host - SIDE, 0)], rf"$k_1$ = {with_prefix(springs[0], 'N/m')}")
     start, end = host + SIDE, resonator - SIDE
-    draw_spring(axes, (start, 0.26), (end, 0.26), rf"$k_2$ = {with_prefix(springs[1], 'N/m')}")
+    draw_spring(axes, [(start, 0.26), (end, 0.26)], rf"$k_2$ = {with_prefix(springs[1], 'N/m')}")
     middle, gap = (start + end) / 2, 0.16
     for edge, stop in ((start, middle - gap), (end, middle + gap)):
         axes.plot([edge, stop], [-0.3, -0.3], color=style.VERMILION, lw=1.0)
@@ -59,4 +60,26 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
         axes.text(x + 0.95, 0.85, f"$u_{i + 1}$", va="center", fontsize=7, color=style.BLUE)
     axes.set(xlim=(-0.5, 8.0), ylim=(-0.95, 1.2), aspect="equal")
     axes.set_axis_off()
+    return figure
+
+
+def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
+    """Frequency against wavenumber and against group velocity; gaps shaded, a drive ``frequency`` (rad/s) marked."""
+    point, passing = bloch(cell, np.linspace(0, np.pi, 361)), pass_bands(cell)
+    figure = style.new_figure(style.PAGE * 0.72, 3.0)
+    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": (1.3, 1)})
+    band_diagram(left, cell, frequency)
+    for band, colour, speed, branch in zip(
+        passing, colours(len(passing)), point.group_velocity.T, point.frequency.T, strict=True
+    ):
+        right.plot(speed, branch / 1e3, color=colour)
+        left.annotate(f"{band.number}", (1.0, (band.low + band.high) / 2e3), (3, 0), textcoords="offset points",
+                      ha="left", va="center", color=colour)  # fmt: skip
+    shade_bands(right, gaps(passing))
+    if frequency is not None:
+        right.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
+    right.set(xlabel="Group velocity dω/dκ (cells/s)")
+    right.axvline(0, color=style.GREY, lw=0.5)
+    panel_title(left, "(a) Bands; gaps shaded")
+    panel_title(right, "(b) Group velocity")
     return figure

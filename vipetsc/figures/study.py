@@ -1,44 +1,48 @@
-"""What the pictures of sweeps are drawn from: ensembles, their members with fields, branches; and their names."""
-
-from __future__ import annotations
+"""What the pictures of sweeps are drawn from: ensembles, members with their fields, and how they are named."""
 
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, partial, wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import xarray as xr
+from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model
+from vipetsc.figures.drawing import Drawing
+from vipetsc.figures.panels import recorded_sites
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import axes, curves, open_ensemble, open_run, whole_members
+from vipetsc.io.read import axes, curves, field_time, open_ensemble, open_run, whole_members
+from vipetsc.lattice.bloch import waves_at
 
 AMPLITUDE = "amplitude"
+LEVELS = ("Low", "Medium", "High")
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Study:
-    """Ensembles of finished sweeps (`vipetsc.io.read.open_ensemble`), and folders of frequency-energy branches."""
+    """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`."""
 
     ensembles: tuple[xr.Dataset, ...]
-    branches: tuple[Path, ...] = ()
 
     @classmethod
-    def read(cls, folders: Iterable[Path]) -> Study:
-        """The sweeps and branches in ``folders``; raises OSError or ValueError."""
-        folders = list(folders)
-        sweeps = tuple(open_ensemble(folder) for folder in folders if (folder / "ensemble.h5").exists())
-        return cls(sweeps, tuple(folder for folder in folders if any(folder.glob("branch-*.h5"))))
+    def read(cls, folders: Iterable[Path]) -> Self:
+        """The sweeps among ``folders``; raises OSError or ValueError."""
+        return cls(tuple(open_ensemble(folder) for folder in folders if (folder / "ensemble.h5").exists()))
 
-    def measuring(self, measure: str) -> Study:
+    def measuring(self, measure: str) -> "Study":
         """The same without the sweeps that do not take the ``measure``."""
-        return replace(self, ensembles=tuple(e for e in self.ensembles if measure in table(e)["sweep"]["measures"]))
+        return Study(tuple(e for e in self.ensembles if measure in table(e)["sweep"]["measures"]))
+
+
+StudyFigure = Callable[[Study], Iterator[Drawing]]
+"""Offers the drawings that the data of a study allow, each with a suffix for its file's name."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class MeasuredRun:
 
     @classmethod
     @contextmanager
-    def open(cls, folder: Path) -> Iterator[MeasuredRun]:
+    def open(cls, folder: Path) -> Iterator[Self]:
         """The member in ``folder``, its files open for the time of the block; raises OSError or ValueError."""
         with open_run(folder / "run.h5") as run, open_netcdf(folder / "analysis.h5", "analysis") as analysis:
             yield cls(folder, Case.of(run), run, analysis)
@@ -76,6 +80,111 @@ def transfer_members(study: Study) -> Iterator[MeasuredRun]:
                 # The transfer of a lattice without a higher band is not a number.
                 if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
                     yield member
+
+
+class Wave(NamedTuple):
+    """The linear wave at the drive's frequency: its ``band`` (1-based), wavenumber (rad/cell) and speed (cells/s)."""
+
+    band: int
+    wavenumber: float
+    speed: float
+
+    @classmethod
+    def of(cls, case: Case) -> Self:
+        """The wave that ``case`` drives, its wavenumber NaN in a gap."""
+        model = case.model()
+        waves = waves_at(model.chain.cell, model.drive.frequency)
+        return cls(waves[0][0], float(waves[0][1]), abs(float(waves[0][2]))) if waves else cls(0, np.nan, np.nan)
+
+
+@dataclass(frozen=True)
+class AmplitudeSeries:
+    """One configuration at a low, a medium and a high amplitude.
+
+    ``suffix`` tells it from the others of a study; ``varied`` are the values of what else the sweep varies.
+    """
+
+    suffix: str
+    runs: tuple[MeasuredRun, ...]
+    varied: tuple[str, ...] = ()
+
+    @cached_property
+    def wave(self) -> Wave:
+        """The linear wave at the drive's frequency."""
+        return Wave.of(self.runs[0].case)
+
+    @property
+    def title(self) -> str:
+        """Reading, sites and wavenumber, and what else the sweep varies."""
+        case = self.runs[0].case
+        parts = [f"{case.lattice.reading.capitalize()} reading", *self.varied, counted(len(sites_of(case)), "site")]
+        return ", ".join(parts + ([f"κ* = {in_pi(self.wave.wavenumber)}"] if self.wave.band else []))
+
+    def headings(self) -> Iterator[tuple[int, MeasuredRun, str]]:
+        """Column, run and the column's title."""
+        for column, (level, member) in enumerate(zip(LEVELS, self.runs, strict=True)):
+            yield column, member, f"{level} amplitude, {member.amplitude:g} N"
+
+    def snapshot_times(self) -> np.ndarray:
+        """Four times in s, from the linear wave: half way to the first site, at it, past the last, near the end.
+
+        The packet's middle leaves the driven cell when half the burst is over.
+        """
+        member = self.runs[0]
+        delay = np.abs(recorded_sites(member.run) - 1 - member.model.drive_cell) / self.wave.speed
+        burst, end = member.model.drive.duration, field_time(member.run)[-1]
+        near, far = delay.min(), delay.max()
+        return np.minimum(np.array([0.5 * burst + 0.5 * near, 0.5 * burst + near, burst + far, 0.95 * end]), end)
+
+
+def from_series(
+    *needs: str, wave: bool = False, sites: bool = False
+) -> Callable[[Callable[[AmplitudeSeries], Figure]], StudyFigure]:
+    """Decorator of a figure of an `AmplitudeSeries`: offers one picture a series whose analyses hold ``needs``.
+
+    Of those only series that drive a ``wave`` of a pass band, or that recorded contact ``sites`` and cells beside them.
+    """
+
+    def decorate(page: Callable[[AmplitudeSeries], Figure]) -> StudyFigure:
+        @wraps(page)
+        def offer(study: Study) -> Iterator[Drawing]:
+            for series in series_of(study, *needs):
+                run = series.runs[0].run
+                has_sites = len(recorded_sites(run)) > 0 and run.sizes["cell"] > 1
+                if (series.wave.band or not wave) and (has_sites or not sites):
+                    yield series.suffix, partial(page, series)
+
+        return offer
+
+    return decorate
+
+
+def series_of(study: Study, *needs: str) -> Iterator[AmplitudeSeries]:
+    """Every configuration of the sweeps with full fields at its lowest, middle and highest amplitude.
+
+    ``needs`` names what their analyses must hold. Files are open until the next one is asked for.
+    """
+    measured = [(ensemble, triples) for ensemble in study.ensembles if (triples := _triples(ensemble))]
+    for ensemble, triples in measured:
+        for triple in triples:
+            with ExitStack() as stack:
+                runs = tuple(stack.enter_context(MeasuredRun.open(folder)) for _, folder in triple)
+                if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
+                    first = triple[0][0]
+                    names = set(axes(ensemble)) - {AMPLITUDE, "reading", "wavenumber", "sites"}
+                    values = [(name, first[name].item()) for name in axes(ensemble) if name in names]
+                    varied = tuple(value if isinstance(value, str) else f"{name} {value:g}" for name, value in values)
+                    yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), runs, varied)
+
+
+def _triples(ensemble: xr.Dataset) -> list[list[tuple[xr.Dataset, Path]]]:
+    """Members and folders at the lowest, middle and highest amplitude of every configuration that has three."""
+    if AMPLITUDE not in axes(ensemble):
+        return []
+    others = [name for name in axes(ensemble) if name != AMPLITUDE]
+    rows = grouped(whole_members(ensemble), lambda pair: repr([pair[0][name].item() for name in others]))
+    ordered = [sorted(row, key=lambda pair: pair[0][AMPLITUDE].item()) for row in rows.values()]
+    return [[row[0], row[len(row) // 2], row[-1]] for row in ordered if len(row) >= len(LEVELS)]
 
 
 def table(ensemble: xr.Dataset) -> dict[str, Any]:
@@ -107,15 +216,11 @@ def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collecti
     for name in axes(ensemble):
         tells = name in ("reading", "wavenumber") or ensemble.sizes[name] > 1
         if name != AMPLITUDE and tells and (dims is None or name in dims):
-            parts.append(_in_a_file_name(name, member[name].item()))
+            value = member[name].item()
+            text = value if isinstance(value, str) else f"{name}-{value:g}"
+            text = in_pi(value).replace("π", "pi").replace("/", "-") if name == "wavenumber" else text
+            parts.append("".join(c if c.isalnum() or c in "-." else "-" for c in text))
     return "-".join(parts)
-
-
-def _in_a_file_name(name: str, value: Any) -> str:
-    if name == "wavenumber":
-        return in_pi(value).replace("π", "pi").replace("/", "-")
-    text = value if isinstance(value, str) else f"{name}-{value:g}"
-    return "".join(c if c.isalnum() or c in "-." else "-" for c in text)
 
 
 def in_pi(wavenumber: float) -> str:
@@ -133,11 +238,6 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def law_name(case: Case) -> str:
-    """The contact law with a capital."""
-    return case.contacts.law.capitalize()
-
-
 def sites_of(case: Case) -> list[int]:
     """Cells of the contact sites, from 1."""
     sites = case.contacts.sites
@@ -145,26 +245,22 @@ def sites_of(case: Case) -> list[int]:
     return sites
 
 
-def configuration(case: Case) -> str:
-    """Number of sites and cycles, such as "5 sites, 30 cycles"."""
-    return f"{counted(len(sites_of(case)), 'site')}, {case.drive.cycles:g} cycles"
+class Labels(NamedTuple):
+    """How a case is named on pages and, as a ``stem``, in their files' names."""
 
+    law: str  # Hertz
+    configuration: str  # 5 sites, 30 cycles
+    page: str  # Calibrated, 5 sites, 30 cycles
+    page_stem: str
+    member: str  # Hertz, calibrated, 5 sites, 30 cycles, 24.33 N
+    member_stem: str
 
-def configuration_heading(case: Case) -> str:
-    """Reading and configuration at the head of a page: "Calibrated, 5 sites, 30 cycles"."""
-    return f"{case.lattice.reading.capitalize()}, {configuration(case)}"
-
-
-def configuration_stem(case: Case) -> str:
-    """Reading and configuration in a file's name, such as "calibrated-5-sites-30-cycles"."""
-    return f"{case.lattice.reading}-{configuration(case)}".replace(",", "").replace(" ", "-")
-
-
-def member_heading(case: Case) -> str:
-    """Law, reading, configuration and amplitude: what every picture of one member says."""
-    return f"{law_name(case)}, {case.lattice.reading}, {configuration(case)}, {case.drive.amplitude:.4g} N"
-
-
-def member_stem(case: Case) -> str:
-    """A member in a file's name: law, reading, configuration, amplitude."""
-    return f"{case.contacts.law}-{configuration_stem(case)}-{case.drive.amplitude:.4g}N"
+    @classmethod
+    def of(cls, case: Case) -> Self:
+        """The names of ``case``."""
+        law, reading, amplitude = case.contacts.law, case.lattice.reading, f"{case.drive.amplitude:.4g}"
+        configuration = f"{counted(len(sites_of(case)), 'site')}, {case.drive.cycles:g} cycles"
+        stem = f"{reading}-{configuration}".replace(",", "").replace(" ", "-")
+        member = f"{law.capitalize()}, {reading}, {configuration}, {amplitude} N"
+        page = f"{reading.capitalize()}, {configuration}"
+        return cls(law.capitalize(), configuration, page, stem, member, f"{law}-{stem}-{amplitude}N")

@@ -1,7 +1,5 @@
 """Sizes, type and colours of all pictures; an empty figure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -57,6 +55,12 @@ def rc_style() -> Iterator[None]:
     """The house style, for making and for saving figures; leaves matplotlib's settings as they were."""
     with mpl.rc_context(_RC):
         yield
+
+
+def si_prefix(value: float) -> tuple[float, str]:
+    """Factor and symbol of the prefix that brings ``value`` to between 1 and 1000 units."""
+    prefixes = ((1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
+    return next((pair for pair in prefixes if abs(value) >= pair[0]), (1.0, ""))
 
 
 def new_figure(width: float, height: float, heading: str = "", *, fitted: bool = True, left: bool = False) -> Figure:

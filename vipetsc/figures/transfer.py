@@ -1,30 +1,21 @@
-"""Inter-band transfer in one run: nine panels, from space-time to spectra (paper, Figs. 7 and S6)."""
+"""Inter-band transfer: nine panels of a run (paper, Figs. 7, S6), dispersions (Fig. 8), energies of bands (A3)."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import cycle
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from vipetsc.figures import style
+from vipetsc.case import Case
+from vipetsc.figures import panels, style
 from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.panels import (
-    DECADES,
-    KAPPA,
-    below_cutoff,
-    colour_bar,
-    colours,
-    dispersion_map,
-    draw_map,
-    log_norm,
-    panel_title,
-    shade_bands,
-    space_time_map,
-)
-from vipetsc.figures.study import MeasuredRun, Study, member_heading, member_stem, transfer_members
+from vipetsc.figures.panels import KAPPA, panel_title
+from vipetsc.figures.study import Labels, MeasuredRun, Study, grouped, transfer_members
+from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import TAPER, Parts, part_kinetic_energy, taper
@@ -32,20 +23,24 @@ from vipetsc.spectra import TAPER, Parts, part_kinetic_energy, taper
 INPUT_CELL = 5  # the paper's cell before the sites; the one behind them is the middle of the lattice, its cell 150
 SEGMENTS = {"dispersion_before": ("Input segment", style.SKY), "dispersion_after": ("Output segment", style.YELLOW)}
 ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
+GAPS = (style.DASHED, (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))
+SHARE_DECADES = 6
+LARGEST_ERROR = 0.01
+LEAST_SHARE = 1e-3  # of the largest total: the error is not judged below
 
 
 def transfer(study: Study) -> Iterator[Drawing]:
     """For every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for member in transfer_members(study):
         if "velocity" in member.run and all(name in member.analysis for name in ("kinetic_energy", *SEGMENTS)):
-            yield member_stem(member.case), partial(nine_panels, member)
+            yield Labels.of(member.case).member_stem, partial(nine_panels, member)
 
 
 def nine_panels(member: MeasuredRun) -> Figure:
     """(a) All energy, (b-e) that of every pass band, (f, g) both segments, (h, i) spectra of two cells."""
     run = member.run
     velocity = run["velocity"].values
-    figure = style.new_figure(style.PAGE, 7.6, member_heading(member.case), left=True)
+    figure = style.new_figure(style.PAGE, 7.6, Labels.of(member.case).member, left=True)
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
     letters = iter("abcdefghijklmnopqrstuvwxyz")
     _space_time(upper, member, velocity, letters)
@@ -67,22 +62,22 @@ def _space_time(page: SubFigure, member: MeasuredRun, velocity: np.ndarray, lett
     grid = page.add_gridspec(2, 1 + columns, width_ratios=(1.35, *[1.0] * columns))
     whole = page.add_subplot(grid[:, 0])
     energy = member.analysis["kinetic_energy"]
-    norm = log_norm(float(energy.max()))
-    image = space_time_map(whole, energy, norm)
+    norm = panels.log_norm(float(energy.max()))
+    image = panels.space_time_map(whole, energy, norm)
     panel_title(whole, f"({next(letters)}) Kinetic energy")
     _mark_segments(whole, member)
-    panels, cells, time = [whole], run["cell"].values, field_time(run)
+    maps, cells, time = [whole], run["cell"].values, field_time(run)
     for i, p in enumerate(bands):
         axes = page.add_subplot(grid[i // columns, 1 + i % columns], sharex=whole, sharey=whole)
         part = part_kinetic_energy(velocity, cell.masses, field_interval(run), *parts.edges[p : p + 2])
-        draw_map(axes, time, cells, part.T, norm)
+        panels.draw_map(axes, time, cells, part.T, norm)
         panel_title(axes, f"({next(letters)}) {parts.names[p].capitalize()}")
         axes.tick_params(labelleft=False, labelbottom=i // columns == 1)
         if i // columns == 1:
             axes.set_xlabel("Time (s)")
-        panels.append(axes)
+        maps.append(axes)
     whole.set(ylim=(cells[0] - 0.5, cells[-1] + 0.5), xlim=time[[0, -1]])
-    colour_bar(page, image, panels, "Kinetic energy of a cell (J)", aspect=35)
+    panels.colour_bar(page, image, maps, "Kinetic energy of a cell (J)", aspect=35)
 
 
 def _mark_segments(axes: Axes, member: MeasuredRun) -> None:
@@ -101,16 +96,16 @@ def _mark_segments(axes: Axes, member: MeasuredRun) -> None:
 
 def _dispersions(page: SubFigure, member: MeasuredRun, letters: Iterator[str]) -> None:
     cell = member.model.chain.cell
-    spectra = below_cutoff(member.analysis, cell, list(SEGMENTS))
-    norm = log_norm(max(float(s.max()) for s in spectra.values()))
-    panels = page.subplots(1, 2, sharey=True)
-    for axes, (name, (label, colour)) in zip(panels, SEGMENTS.items(), strict=True):
-        image = dispersion_map(axes, spectra[name], norm, cell)
+    spectra = panels.below_cutoff(member.analysis, cell, list(SEGMENTS))
+    norm = panels.log_norm(max(float(s.max()) for s in spectra.values()))
+    maps = page.subplots(1, 2, sharey=True)
+    for axes, (name, (label, colour)) in zip(maps, SEGMENTS.items(), strict=True):
+        image = panels.dispersion_map(axes, spectra[name], norm, cell)
         axes.set_xlabel(KAPPA)
         panel_title(axes, f"({next(letters)}) {label}")
         axes.plot([0.03, 0.03], [0.03, 0.97], color=colour, lw=2.2, transform=axes.transAxes)
-    panels[0].set_ylabel("Frequency ω (krad/s)")
-    colour_bar(page, image, panels, "Energy per bin (J)")
+    maps[0].set_ylabel("Frequency ω (krad/s)")
+    panels.colour_bar(page, image, maps, "Energy per bin (J)")
 
 
 def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
@@ -120,19 +115,19 @@ def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
     frequency = 2e-3 * np.pi * np.fft.rfftfreq(len(velocity), step)
     spectrum = np.abs(np.fft.rfft(velocity * taper(len(velocity), TAPER)[:, None], axis=0)) * step
     shown = frequency <= 1.1e-3 * bands[-1].high
-    shade_bands(axes, ((band.low, band.high) for band in bands), "x")
+    panels.shade_bands(axes, ((band.low, band.high) for band in bands), "x")
     for band in bands:
         axes.annotate(str(band.number), (0.5e-3 * (band.low + band.high), 0), (0, 2), ha="center", color=style.GREY,
                       xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=6.5)  # fmt: skip
     inset = axes.inset_axes([0.42, 0.70, 0.56, 0.28])
     roles = {cell.host: " (host)", cell.resonator: " (resonator)"}
-    for j, colour in enumerate(colours(cell.dofs)):
+    for j, colour in enumerate(panels.colours(cell.dofs)):
         line = {"color": colour, "lw": 0.5, "alpha": 0.85, "rasterized": True}
         label = f"mass {j + 1}{roles.get(j, '')}"
         axes.plot(frequency[shown], np.maximum(spectrum[shown, j], 1e-300), label=label, **line)
         inset.plot(time, velocity[:, j], **line)
     peak = spectrum.max() or 1.0
-    low = min(10.0**-DECADES * peak, axes.get_ylim()[1])
+    low = min(10.0**-panels.DECADES * peak, axes.get_ylim()[1])
     axes.set(yscale="log", xlim=(0, frequency[shown][-1]), ylim=(low, ROOM * peak))
     axes.set(xlabel="Frequency ω (krad/s)", ylabel="Velocity spectrum (m)")
     axes.legend(loc="upper left", fontsize=5.5, handlelength=1.0, labelspacing=0.2)
@@ -140,3 +135,115 @@ def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
     inset.tick_params(labelsize=5, pad=1)
     inset.set_ylabel("m/s", fontsize=5.5, labelpad=0)
     inset.set_xlabel("s", fontsize=5.5, labelpad=-4, loc="right")
+
+
+def transfer_dispersions(study: Study) -> Iterator[Drawing]:
+    """Every reading and configuration: laws in rows, amplitudes in columns."""
+    members = ((m.case, m.folder) for m in transfer_members(study) if "dispersion" in m.analysis)
+    for name, group in grouped(members, lambda pair: Labels.of(pair[0]).page_stem).items():
+        yield name, partial(_dispersion_table, group)
+
+
+def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
+    """One panel a member; colours run over five decades below each panel's own largest value."""
+    runs = {(case.contacts.law, case.drive.amplitude): folder for case, folder in members}
+    laws, amplitudes = sorted({law for law, _ in runs}, reverse=True), sorted({amplitude for _, amplitude in runs})
+    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * len(laws), Labels.of(members[0][0]).page, left=True)
+    grid = figure.subplots(len(laws), len(amplitudes), sharex=True, sharey=True, squeeze=False)
+    for (i, j), axes in np.ndenumerate(grid):
+        if (laws[i], amplitudes[j]) not in runs:
+            panels.annotate_empty(axes, "no such run")
+            continue
+        with MeasuredRun.open(runs[laws[i], amplitudes[j]]) as member:
+            cell = member.model.chain.cell
+            energy = panels.below_cutoff(member.analysis, cell, ["dispersion"])["dispersion"]
+            energy = energy / (float(energy.max()) or 1.0)
+            image = panels.dispersion_map(axes, energy, panels.log_norm(1.0), cell)
+            transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
+        panel_title(axes, f"({'abcdef'[i]}.{j + 1}) {laws[i].capitalize()}, {amplitudes[j]:.4g} N")
+        axes.text(0.03, 0.41, transferred, color="white", fontsize=6.5, transform=axes.transAxes)
+    panels.label_outer(grid, KAPPA, "Frequency ω (krad/s)")
+    panels.colour_bar(figure, image, grid.flat, "Energy per bin over its largest", aspect=35)
+    return figure
+
+
+def band_energies(study: Study) -> Iterator[Drawing]:
+    """Energies of all parts and their sum over time for every whole member; mean shares for every sweep."""
+    for member in transfer_members(study):
+        if member.analysis.sizes["bands/part"] and member.analysis.sizes["time"] > 1:
+            yield Labels.of(member.case).member_stem, partial(energies_over_time, member)
+    with_shares = (curve for curve in transfer_curves(study) if "bands/share" in curve.data)
+    for name, curves in grouped(with_shares, lambda curve: Labels.of(curve.case).page_stem).items():
+        yield f"shares-{name}", partial(shares, curves)
+
+
+def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndarray:
+    """|sum of ``parts`` (part, t) - ``total`` (t)| over the total, each a running mean over ``samples`` (t').
+
+    Energies beat twice a period, and so do the cross terms that a sum of parts lacks: a mean over a period of the
+    drive is what an energy of a part means. NaN where the total is below 1e-3 of its largest.
+    """
+    samples = max(min(samples, len(total)), 1)
+    window = np.full(samples, 1.0 / samples)
+    whole = np.convolve(total, window, "valid")
+    error = np.abs(np.convolve(parts.sum(axis=0), window, "valid") - whole)
+    above_threshold = whole > LEAST_SHARE * whole.max()
+    return np.divide(error, whole, out=np.full_like(whole, np.nan), where=above_threshold)
+
+
+def energies_over_time(member: MeasuredRun) -> Figure:
+    """The parts and their sum against the total (mean over a period of the drive), and how far they miss it."""
+    analysis = member.analysis
+    time, parts, total = (analysis[name].values for name in ("time", "bands/energy", "bands/total"))
+    names = list(np.atleast_1d(analysis["bands/energy"].attrs["parts"]))
+    samples = max(round(2 * np.pi / member.model.drive.frequency / (time[1] - time[0])), 1)
+    time, mean_total, mean_sum, *mean_parts = (
+        np.convolve(values, np.full(samples, 1.0 / samples), "valid")
+        for values in (time, total, parts.sum(axis=0), *parts)
+    )
+    figure = style.new_figure(style.PAGE * 0.8, 4.2, Labels.of(member.case).member, left=True)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1))
+    for line, name, part in zip(_lines(names), names, mean_parts, strict=True):
+        upper.plot(time, part, label=name, **line)
+    upper.plot(time, mean_total, color=style.BLACK, lw=1.6, label="total")
+    upper.plot(time, mean_sum, color=style.YELLOW, lw=0.8, ls="--", label="sum of parts")
+    top = total.max() or 1.0
+    upper.set(yscale="log", ylim=(top * 10.0**-SHARE_DECADES, 3 * top), ylabel="Kinetic energy (J)")
+    upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
+    panel_title(upper, "(a) Parts of the frequency axis, mean over a period of the drive")
+
+    error = closing_error(parts, total, samples)
+    lower.plot(time, 100 * np.maximum(error, 1e-12), color=style.BLUE, lw=0.7)
+    lower.axhline(100 * LARGEST_ERROR, color=style.VERMILION, lw=0.7, ls="--")
+    whole = abs(parts.sum() / (total.sum() or 1.0) - 1)
+    below = np.mean(error[np.isfinite(error)] <= LARGEST_ERROR)
+    text = f"whole record: {100 * whole:.2g} %; at most 1 % for {100 * below:.3g} % of the time"
+    lower.text(0.5, 0.93, text, ha="center", va="top", fontsize=6.5, transform=lower.transAxes)
+    lower.set(yscale="log", ylim=(1e-4, 1e3), xlim=analysis["time"][[0, -1]], xlabel="Time (s)", ylabel="Error (%)")
+    panel_title(lower, "(b) Sum of the parts against the total")
+    return figure
+
+
+def shares(curves: Sequence[TransferCurve]) -> Figure:
+    """Mean share of every part after the wave's arrival against the amplitude; a column a law."""
+    figure = columns_of_laws(curves, 4.6, 2.7, "Mean share of the energy (1)", _shares)
+    figure.axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
+    return figure
+
+
+def _shares(axes: Axes, curve: TransferCurve) -> str:
+    share = curve.data["bands/share"]
+    names = list(np.atleast_1d(share.attrs["parts"]))
+    for line, name, part in zip(_lines(names), names, share.values.T, strict=True):
+        axes.plot(curve.amplitude, np.maximum(part, 1e-300), label=name, **line)
+    axes.plot(curve.amplitude, share.values.sum(axis=1), color=style.BLACK, lw=0.6, ls=":", label="sum")
+    axes.set(xscale="log", yscale="log", ylim=(10.0**-SHARE_DECADES, 2), xlabel="Amplitude of the drive (N)")
+    return Labels.of(curve.case).law
+
+
+def _lines(names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """A colour for each pass band, grey dashes for each gap and for what lies above."""
+    bands, gaps = cycle(style.SERIES), cycle(GAPS)
+    for name in names:
+        is_band = name.startswith("band")
+        yield {"color": next(bands), "lw": 1.0} if is_band else {"color": style.GREY, "lw": 0.7, "ls": next(gaps)}

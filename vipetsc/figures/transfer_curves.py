@@ -1,10 +1,9 @@
-"""Inter-band transfer against the amplitude of the drive, from a sweep (paper, Fig. 9)."""
+"""Inter-band transfer against the amplitude (paper, Fig. 9) and against the slope of a branch (Figs. 12, S7, S8)."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -14,49 +13,69 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.panels import panel_title
-from vipetsc.figures.study import AMPLITUDE, Study, configuration, grouped, sites_of
+from vipetsc.figures.panels import label_outer, panel_title, shade_regions
+from vipetsc.figures.study import AMPLITUDE, Labels, Study, grouped, sites_of
+from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves
 
 LINES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.PURPLE, "D"), (style.ORANGE, "v"))
 FEWEST = 6  # amplitudes that make a curve
+RED = "#CC0000"
 
 
 class TransferCurve(NamedTuple):
-    """The measures of one law, reading and configuration over rising amplitude; ``case`` stands for them."""
+    """The measures of one law, reading and configuration over rising amplitude; ``case`` stands for them.
+
+    ``amplitude`` of the drive in N; ``ibtet`` is NaN where a member failed; ``peak`` is the index of its largest;
+    ``floor`` the transfer without any contact, NaN if every member touches.
+    """
 
     case: Case
     data: xr.Dataset
-
-    @property
-    def amplitude(self) -> np.ndarray:
-        """Amplitudes (amplitude) of the drive in N."""
-        return self.data[AMPLITUDE].values
-
-    @property
-    def ibtet(self) -> np.ndarray:
-        """Inter-band transfer (amplitude), NaN where a member failed."""
-        return self.data["ibtet"].values
-
-    @property
-    def floor(self) -> float:
-        """The transfer without any contact, NaN if every member touches."""
-        untouched = self.ibtet[self.data["contact_episodes"].values == 0]
-        return float(untouched.mean()) if untouched.size else np.nan
-
-    @property
-    def peak(self) -> int:
-        """Index of the largest transfer."""
-        return int(np.nanargmax(self.ibtet))
+    amplitude: np.ndarray
+    ibtet: np.ndarray
+    peak: int
+    floor: float
 
 
-def transfer_curves(study: Study, fewest: int = FEWEST) -> Iterator[TransferCurve]:
-    """The curves of all sweeps with at least ``fewest`` amplitudes whose transfer is known."""
+class AlignedCurve(NamedTuple):
+    """A transfer curve in the energies of a branch: a group of ``backbone.h5``, its values and attributes by name."""
+
+    case: Case
+    values: dict[str, Any]
+
+
+Curve = TypeVar("Curve", TransferCurve, AlignedCurve)
+
+
+def transfer_curves(study: Study) -> Iterator[TransferCurve]:
+    """The curves of all sweeps with at least ``FEWEST`` amplitudes whose transfer is known."""
     for ensemble in study.ensembles:
-        for data, folder in curves(ensemble, AMPLITUDE) if "ibtet" in ensemble else ():
-            curve = TransferCurve(Case.load(folder / "case.toml"), data.sortby(AMPLITUDE))
-            if sites_of(curve.case) and np.isfinite(curve.ibtet).sum() >= fewest:
-                yield curve
+        for row, folder in curves(ensemble, AMPLITUDE) if "ibtet" in ensemble else ():
+            case, data = Case.load(folder / "case.toml"), row.sortby(AMPLITUDE)
+            transfer = data["ibtet"].values
+            if sites_of(case) and np.isfinite(transfer).sum() >= FEWEST:
+                untouched = transfer[data["contact_episodes"].values == 0]
+                floor = float(untouched.mean()) if untouched.size else np.nan
+                peak = int(np.nanargmax(transfer))
+                yield TransferCurve(case, data, data[AMPLITUDE].values, transfer, peak, floor)
+
+
+def columns_of_laws(
+    shown: Sequence[Curve], narrow: float, height: float, ylabel: str, panel: Callable[[Axes, Curve], str]
+) -> Figure:
+    """A page of one configuration: a column a law, drawn by ``panel``, which returns the column's title.
+
+    A single column is ``narrow`` inches wide.
+    """
+    shown = sorted(shown, key=lambda curve: curve.case.contacts.law, reverse=True)
+    width = style.PAGE if len(shown) > 1 else narrow
+    figure = style.new_figure(width, height, Labels.of(shown[0].case).page, left=True)
+    grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for tag, axes, curve in zip("abcdef", grid, shown, strict=False):
+        panel_title(axes, f"({tag}) {panel(axes, curve)}")
+    grid[0].set_ylabel(ylabel)
+    return figure
 
 
 def ibtet(study: Study) -> Iterator[Drawing]:
@@ -67,7 +86,7 @@ def ibtet(study: Study) -> Iterator[Drawing]:
 
 def _page(reading: str, of_reading: Sequence[TransferCurve]) -> Figure:
     laws = sorted({c.case.contacts.law for c in of_reading}, reverse=True)
-    kinds = dict(zip(dict.fromkeys(configuration(c.case) for c in of_reading), LINES * 5, strict=False))
+    kinds = dict(zip(dict.fromkeys(Labels.of(c.case).configuration for c in of_reading), LINES * 5, strict=False))
     figure = style.new_figure(style.PAGE if len(laws) > 1 else style.COLUMN, 4.6)
     grid = figure.subplots(2, len(laws), sharey="row", squeeze=False)
     for column, law in enumerate(laws):
@@ -75,14 +94,13 @@ def _page(reading: str, of_reading: Sequence[TransferCurve]) -> Figure:
         linear, logarithmic = grid[:, column]
         for row, axes in enumerate((linear, logarithmic)):
             _draw(axes, of_law, kinds)
-            axes.set_xlabel("Amplitude of the drive (N)")
             panel_title(axes, f"({'ab'[column % 2]}.{row + 1}) {law.capitalize()}, {reading}")
         _inset(linear, of_law, kinds)
         linear.set(xlim=(0, None), ylim=(0, None))
         logarithmic.set(xscale="log", yscale="log", ylim=(None, 6.0))
         logarithmic.legend(loc="upper right", fontsize=6)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("Inter-band transfer (1)")
+    for row in grid:
+        label_outer(row[None], "Amplitude of the drive (N)", "Inter-band transfer (1)")
     return figure
 
 
@@ -95,7 +113,7 @@ def _inset(axes: Axes, of_law: Sequence[TransferCurve], kinds: dict[str, tuple[s
     inset.set_ylim(0, 1.18 * max(c.ibtet[c.peak] for c in of_law))
     inset.tick_params(labelsize=6, pad=1.5)
     for line, curve in enumerate(of_law):
-        colour, _ = kinds[configuration(curve.case)]
+        colour, _ = kinds[Labels.of(curve.case).configuration]
         amplitude, largest = curve.amplitude[curve.peak], curve.ibtet[curve.peak]
         inset.plot(amplitude, largest, "o", mfc="none", mec=colour, ms=6, mew=0.7)
         inset.text(0.97, 0.95 - 0.11 * line, f"largest: {largest:.3f} at {amplitude:.3g} N", ha="right", va="top",
@@ -105,8 +123,55 @@ def _inset(axes: Axes, of_law: Sequence[TransferCurve], kinds: dict[str, tuple[s
 def _draw(axes: Axes, shown: Sequence[TransferCurve], kinds: dict[str, tuple[str, str]], size: float = 2.2) -> None:
     """The curves, each with its floor dashed; ``kinds`` has colour and mark by configuration."""
     for curve in shown:
-        kind = configuration(curve.case)
+        kind = Labels.of(curve.case).configuration
         colour, mark = kinds[kind]
         axes.plot(curve.amplitude, curve.ibtet, color=colour, marker=mark, ms=size, lw=0.7, label=kind)
         if np.isfinite(curve.floor):
             axes.axhline(curve.floor, color=colour, lw=0.6, ls=(0, (4, 3)), zorder=1)
+
+
+def ibtet_backbone(study: Study) -> Iterator[Drawing]:
+    """Every reading and configuration of ``backbone.h5``, laws in columns; one made of another sweep is passed over."""
+    for ensemble in study.ensembles:
+        path = Path(ensemble.attrs["folder"]) / "backbone.h5"
+        aligned = _aligned_curves(path, ensemble.attrs["case"]) if path.exists() else []
+        ylabel = "Inter-band transfer, normalised slope (1)"
+        for name, columns in grouped(aligned, lambda curve: Labels.of(curve.case).page_stem).items():
+            yield name, partial(columns_of_laws, columns, 4.0, 3.0, ylabel, _superposition)
+
+
+def _aligned_curves(path: Path, sweep: str) -> list[AlignedCurve]:
+    """The curves in ``path``; none if it was made of another sweep than that of the case file's text ``sweep``."""
+    with open_netcdf(path, "backbone", ("case",)) as file:
+        if file.attrs["case"] != sweep:
+            return []
+        groups: dict[str, dict[str, Any]] = {}
+        for name, value in [*file.attrs.items(), *((n, v.values) for n, v in file.variables.items())]:
+            group, _, rest = str(name).partition("/")
+            if rest:
+                groups.setdefault(group, {})[rest] = value
+    return [AlignedCurve(Case.from_toml(values["case"]), values) for values in groups.values()]
+
+
+def _superposition(axes: Axes, aligned: AlignedCurve) -> str:
+    """Points of the lattice, red where fitted; slope over the divisor dashed, with the floor grey; the law green."""
+    curve = aligned.values
+    energy, transfer, fitted = curve["energy"], curve["ibtet"], curve["fitted"].astype(bool)
+    branch, slope, region = (curve[f"branch/{name}"] for name in ("energy", "slope", "region"))
+    grazing, floor = curve["grazing_energy"], curve["floor"]
+    scaled = np.where(region == 1, 0.0, np.abs(slope)) / curve["divisor"]
+    left, right = 0.5 * min(energy.min(), 0.1 * grazing), 2 * energy.max()
+    # Region I goes on to the left: below the first point of the branch its slope is zero as well.
+    with_floor = np.append(left, branch), floor + np.append(0.0, scaled)
+    axes.plot(*with_floor, color=style.GREY, lw=2.2, alpha=0.55, label="slope + floor")
+    label = f"slope, $E^{{{curve['slope_exponent']:.2f}}}$ there"
+    axes.plot(branch, np.where(scaled > 0, scaled, np.nan), color=style.BLACK, lw=0.8, ls=style.DASHED, label=label)
+    axes.plot(energy, transfer, "-o", color=style.BLUE, ms=2.6, mfc="white", mew=0.6, lw=0.6, label="lattice")
+    axes.plot(energy[fitted], transfer[fitted], "o", color=RED, ms=2.8, label="in region III")
+    label = f"$E^{{{curve['exponent']:.2f}}}$, adj. $R^2$ {curve['r2_adjusted']:.3f}"
+    law = curve["factor"] * energy[fitted] ** curve["exponent"]
+    axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4, label=label)
+    shade_regions(axes, np.minimum(np.where(region == 1, grazing, branch), right), region, left, at_top=False)
+    axes.set(xscale="log", yscale="log", xlabel="Normalised energy (J)", xlim=(left, right), ylim=(0.25 * floor, 4.0))
+    axes.legend(loc="upper right", fontsize=6)
+    return f"{Labels.of(aligned.case).law}; branch of the {curve['branch_reading']} reading"
