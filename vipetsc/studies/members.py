@@ -56,6 +56,7 @@ class MemberStore:
         self.team, self.stop = team, stop or StopRequest()
         asked = [MEASURES[name] for name in self.options.measures]
         self.measures = FULL if self.options.fields else tuple(m for m in REDUCED if m in asked)
+        self._linear: dict[Path, tuple[xr.Dataset, xr.Dataset]] = {}  # ledgers and measures that scaled members share
         self._requested = {"measures": sorted(self.options.measures), "fields": self.options.fields}
 
     def linear_folder(self, case: Case) -> Path:
@@ -148,20 +149,22 @@ class MemberStore:
         source, factor = self.linear_folder(case), case.drive.amplitude**2
         # All members with the same first site share these measures, whichever rank needs them first.
         shared = source / f"analysis-{leading_cell(case)}-{'-'.join(sorted(self.options.measures))}.h5"
-        with open_run(source / "run.h5") as linear:
-            unit = with_sites(linear, case)
-            if not shared.exists():
-                write_netcdf(shared, analyse(unit, self.measures, arrival_at(wave, case)))
-            run = scaled(unit.drop_vars("velocity"), factor).load()
+        if shared not in self._linear:
+            with open_run(source / "run.h5") as run:
+                if not shared.exists():
+                    write_netcdf(shared, analyse(with_sites(run, case), self.measures, arrival_at(wave, case)))
+                with open_netcdf(shared, "analysis") as analysis:
+                    self._linear[shared] = run.drop_vars("velocity").load(), analysis.load()
+        linear, measured = self._linear[shared]
+        run = scaled(with_sites(linear, case), factor)
         statistics = json.loads(run.attrs["statistics"]) | {"episodes": 0, "scaled_from": source.name}
         statistics |= {"work": float(run["energy/work"][-1]), "dissipated": 0.0}
-        summary = provenance(self.team) | {"status": "complete: scaled from the linear run", "complete": True}
-        summary["statistics"] = statistics
+        about = {"status": "complete: scaled from the linear run", "complete": True, "statistics": statistics}
+        summary = provenance(self.team) | about
         folder.mkdir(exist_ok=True)
         write_netcdf(folder / "run.h5", _keeping(run.assign_attrs(summary), case))
-        with open_netcdf(shared, "analysis") as analysis:
-            about = {"case": case.to_toml(), "status": summary["status"]}
-            write_netcdf(folder / "analysis.h5", scaled(analysis, factor).assign_attrs(about))
+        about = {"case": case.to_toml(), "status": summary["status"]}
+        write_netcdf(folder / "analysis.h5", scaled(measured, factor).assign_attrs(about))
         self._finish(folder, case, summary)
 
     def _finish(self, folder: Path, case: Case, summary: dict[str, Any]) -> None:
