@@ -56,7 +56,12 @@ def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
             for name in names:
                 np.testing.assert_allclose(large[name], factor * small[name], rtol=1e-13)
             assert Case.of(large).drive.amplitude == amplitude[1]
-            if file == "analysis":
+            if file == "run":
+                assert large["sites/cell"].values.tolist() == TABLE["contacts"]["sites"]
+                assert large["sites/clearance"].values.tolist() == TABLE["contacts"]["clearance"]
+                assert large["energy/dissipated_by_site"].shape == (large.sizes["time"], 2)
+                assert not large["energy/dissipated_by_site"].values.any()
+            else:
                 assert large["ibtet"].item() == small["ibtet"].item()
                 assert large["bands/edges"].values.tolist() == small["bands/edges"].values.tolist()
     assert select(ensemble, amplitude=amplitude[0])["work"].item() > 0
