@@ -11,8 +11,7 @@ from vipetsc.case import Case, Sweep, case_id
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.lattice import four_band
 from vipetsc.studies.ensemble import fit_curve
-from vipetsc.studies.linear import arrival_at, leading_cell, linear_wave, reached
-from vipetsc.studies.members import MemberStore
+from vipetsc.studies.members import MemberStore, arrival_at, leading_cell, linear_wave, reached
 from vipetsc.studies.sweep import conclude
 
 SWEEP = {

@@ -7,8 +7,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, select
 from vipetsc.studies.ensemble import COMPLETE, SCALED
-from vipetsc.studies.linear import reached
-from vipetsc.studies.members import MemberStore
+from vipetsc.studies.members import MemberStore, reached
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = {

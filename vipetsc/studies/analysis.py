@@ -5,12 +5,10 @@ after the first site), wavenumber partition and entropy (wavelets over the cells
 gaps, and the inter-band targeted energy transfer. The measures themselves stand in ``vipetsc.spectra``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
@@ -134,7 +132,7 @@ class _Record:
     left_out: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, run: xr.Dataset) -> _Record:
+    def of(cls, run: xr.Dataset) -> Self:
         field, leading = run["velocity"], leading_site(run)
         velocity = _StoredField(field) if field.nbytes > IN_MEMORY else field.values
         site = None if leading is None else int(run["sites/cell"].values[leading])

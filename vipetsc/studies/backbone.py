@@ -1,14 +1,12 @@
 """Inter-band transfer beside the slope of frequency-energy branches: ``backbone.h5`` (paper, section IV.C)."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
@@ -20,7 +18,7 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import Variables, open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, open_run
 from vipetsc.spectra import PowerLaw, power_law
-from vipetsc.studies.linear import leading_cell, linear_case
+from vipetsc.studies.members import leading_cell, linear_case
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
@@ -54,7 +52,7 @@ class Slope:
     grazing: float
 
     @classmethod
-    def read(cls, path: Path) -> Slope:
+    def read(cls, path: Path) -> Self:
         """The slope of the branch in ``path``; raises OSError, or ValueError if it does not reach a contact."""
         names = "energy", "slope", "region", "contacts", "kind"
         with open_netcdf(path, "branch", (*names, "case")) as file:
@@ -80,7 +78,7 @@ class Initiation:
     onset: float
 
     @classmethod
-    def of(cls, envelope: np.ndarray, clearance: np.ndarray, first: int, work: float) -> Initiation:
+    def of(cls, envelope: np.ndarray, clearance: np.ndarray, first: int, work: float) -> Self:
         """From the linear run at 1 N: largest w (site) in m, and the drive's work in J; ``first`` is a site.
 
         Until the first contact the lattice is linear, so w grows with the amplitude and the work with its
@@ -116,12 +114,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     The paper's three steps: the lattice's energy is scaled so that the ``initiation`` energy (J) falls on the
     transition from region I to II; the slope is divided by a scalar s; the linear transfer ``floor`` is added.
     s makes the sum over the fitted points of [ln(slope/s + floor) - ln(ibtet)]^2 least, the slope interpolated
-    between the branch's points of region III in logarithms.
-
-    Raises
-    ------
-    ValueError
-        If the branch has no region III.
+    between the branch's points of region III in logarithms. Raises ValueError for a branch without region III.
     """
     valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
     order = np.argsort(work[valid], kind="stable")
@@ -148,13 +141,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
 
 
 def initiation_of(folder: Path, case: Case) -> Initiation:
-    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run.
-
-    Raises
-    ------
-    OSError, ValueError
-        If the linear run is gone or cannot be read.
-    """
+    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run; raises OSError."""
     linear = folder / "linear" / case_id(linear_case(case))
     sites = np.asarray(case.contacts.sites)
     with open_netcdf(linear / "wave.h5", "linear wave") as wave, open_run(linear / "run.h5") as run:
@@ -168,12 +155,7 @@ def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
 
     A curve over the amplitude is laid over the branch of its law and reading, or of its law alone if there is
     none of its reading. ``branches`` are folders with ``branch-out-of-phase.h5``. What could not be related is
-    named in the attribute ``left_out``.
-
-    Raises
-    ------
-    OSError, ValueError
-        If a branch or a linear run cannot be read, or a branch has no region III.
+    named in the attribute ``left_out``. Raises OSError or ValueError for a branch or a linear run that cannot be used.
     """
     if "ibtet" not in ensemble or bool(ensemble["ibtet"].isnull().all()):
         return None
@@ -255,10 +237,7 @@ def is_related(folder: Path, branches: Sequence[Path]) -> bool:
 def relate_folders(folders: Sequence[Path]) -> list[Path]:
     """``relate`` every finished sweep among ``folders`` to the branches in the others; the files written.
 
-    Raises
-    ------
-    FolderError
-        If one of the others holds no out-of-phase branch, or a file cannot be used.
+    Raises FolderError if one of the others holds no out-of-phase branch, or a file cannot be used.
     """
     sweeps = [f for f in folders if (f / "ensemble.h5").exists()]
     branches = [f for f in folders if f not in sweeps]

@@ -1,7 +1,5 @@
 """The (lambda, eta) search of the supplement: a case in, ``design.h5`` out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -50,19 +48,10 @@ Searches = Mapping[Reading, Search]
 
 
 def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> str:
-    """Search the grid of ``case`` in each of its readings and write ``design.h5`` and ``case.toml``.
+    """Search the grid of ``case`` in each of its readings; writes ``design.h5``, returns a table of the optima.
 
-    Call it on one rank. ``force`` replaces an earlier search in ``folder``.
-
-    Returns
-    -------
-    str
-        A table of the optima.
-
-    Raises
-    ------
-    FolderError
-        If ``folder`` holds anything else, or a search and ``force`` is off.
+    Call it on one rank. ``force`` replaces an earlier search in ``folder``; raises FolderError if it holds anything
+    else, or a search and ``force`` is off.
     """
     folder, options = Path(folder), case.design
     claim_folder(folder, SEARCH, case.to_toml(), force=force)

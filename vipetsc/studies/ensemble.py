@@ -1,7 +1,5 @@
 """``ensemble.h5``: what was measured of every member of a sweep, over the swept keys, with power-law fits."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

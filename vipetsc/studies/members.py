@@ -1,6 +1,9 @@
-"""The runs of a sweep, each in a folder of its own: simulated and measured, or scaled from a linear run."""
+"""The runs of a sweep, each in a folder of its own: simulated and measured, or scaled from a linear run.
 
-from __future__ import annotations
+Until the first contact a lattice is linear, so displacements go with the drive's amplitude and energies with its
+square. All members that differ in contacts and amplitude alone share one linear run under 1 N, which tells which of
+them nothing touches; those are that run, scaled.
+"""
 
 import json
 import shutil
@@ -19,12 +22,11 @@ from vipetsc.dynamics import simulate
 from vipetsc.dynamics.run import Result
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
-from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.read import open_run
+from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
+from vipetsc.io.read import field_time, open_run
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import FULL, REDUCED, analyse
-from vipetsc.studies.linear import arrival_at, leading_cell, linear_case, linear_wave, reached, scaled, with_sites
 
 # A member is scaled where its linear wave stays below this share of every clearance: the largest w between samples
 # exceeds the sampled envelope by less than the rest for any burst of a few cycles.
@@ -32,6 +34,13 @@ MARGIN = 0.9
 
 MEASURES = {"entropy": "entropy", "transfer": "bands"}
 """What ``analyse`` calls the measures of ``[sweep] measures``."""
+
+
+LAYOUT = {
+    "cell": ("cell", "1", "cell, counted from 1"),
+    "envelope": ("cell", "m", "largest relative displacement at 1 N"),
+    "arrival": ("cell", "s", "time of the largest host velocity"),
+}
 
 
 class StoppedError(Exception):
@@ -184,3 +193,69 @@ def _keeping(run: xr.Dataset, case: Case, *fields: str) -> xr.Dataset:
     """``run`` of ``case`` with these of its fields alone."""
     dropped = [name for name in ("displacement", "velocity") if name in run and name not in fields]
     return run.drop_vars(dropped).assign_attrs(case=_gathered(case, *fields).to_toml())
+
+
+def linear_wave(run: xr.Dataset) -> xr.Dataset:
+    """Measure a linear run with both fields of all cells.
+
+    ``envelope`` (cell): largest sqrt(w^2 + (w'/Om)^2) in m of the contact pair's relative displacement w, Om the
+    drive's angular frequency. ``arrival`` (cell): time in s of the largest host velocity, the paper's t_hat when taken
+    at the first site.
+    """
+    model = Case.of(run).model()
+    host, resonator = model.chain.cell.host, model.chain.cell.resonator
+    displacement, velocity = run["displacement"].values, run["velocity"].values
+    w = displacement[..., resonator] - displacement[..., host]
+    rate = velocity[..., resonator] - velocity[..., host]
+    envelope = np.sqrt(np.max(w**2 + (rate / model.drive.frequency) ** 2, axis=0))
+    arrival = field_time(run)[np.argmax(np.abs(velocity[..., host]), axis=0)]
+    values = {"cell": np.arange(1, len(envelope) + 1), "envelope": envelope, "arrival": arrival}
+    return xr.Dataset(tabulated(LAYOUT, values), attrs={"vipetsc_version": vipetsc.__version__})
+
+
+def reached(wave: xr.Dataset, case: Case) -> np.ndarray:
+    """Linear relative displacement over clearance (site) at the amplitude of ``case``."""
+    envelope = wave["envelope"].values[np.asarray(case.contacts.sites, int) - 1]
+    return np.asarray(abs(case.drive.amplitude) * envelope / np.asarray(case.contacts.clearance or [], float))
+
+
+def arrival_at(wave: xr.Dataset, case: Case) -> float | None:
+    """The paper's t_hat in s, when the wave is largest at the first site of ``case``; None without sites."""
+    cell = leading_cell(case)
+    return float(wave["arrival"][cell - 1]) if cell else None
+
+
+def leading_cell(case: Case) -> int:
+    """Cell (1-based) of the site nearest to the drive; 0 without sites."""
+    cells = np.asarray(case.contacts.sites, np.int64)
+    return int(cells[np.argmin(np.abs(cells - case.drive.cell))]) if cells.size else 0
+
+
+def linear_case(case: Case) -> Case:
+    """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone share it."""
+    table = case.model_dump(by_alias=True, exclude_none=True)
+    table["contacts"] = {"sites": 0}
+    table["drive"]["amplitude"] = 1.0
+    table["output"] = {"stride": case.output.stride}
+    return Case.from_table(table | {"name": "linear"})
+
+
+def with_sites(linear: xr.Dataset, case: Case) -> xr.Dataset:
+    """The ``linear`` run as a run of ``case`` under 1 N whose sites nothing touches."""
+    sites = np.asarray(case.contacts.sites, np.int64)
+    values = {
+        "site": ("site", np.arange(1, len(sites) + 1)),
+        "sites/cell": ("site", sites),
+        "sites/clearance": ("site", np.asarray(case.contacts.clearance or [], float)),
+        "energy/dissipated_by_site": (("time", "site"), np.zeros((linear.sizes["time"], len(sites)))),
+    }
+    variables = {name: (*item, linear[name].attrs) for name, item in values.items()}
+    unit = Case.from_table(case.model_dump(by_alias=True, exclude_none=True), ["drive.amplitude=1.0"])
+    return linear.drop_dims("site").assign(variables).assign_attrs(case=unit.to_toml())
+
+
+def scaled(data: xr.Dataset, factor: float) -> xr.Dataset:
+    """``data`` with all energies (in J) times ``factor``."""
+    energies = [name for name in data.data_vars if data[name].attrs.get("units") == "J"]
+    with xr.set_options(keep_attrs=True):
+        return data.assign({name: data[name] * factor for name in energies})

@@ -1,7 +1,5 @@
 """The measures of runs already made, once more: one run, or all of a sweep whose fields were kept."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mpi4py import MPI
@@ -13,8 +11,7 @@ from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.parallel import on_root
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.linear import arrival_at
-from vipetsc.studies.members import MemberStore
+from vipetsc.studies.members import MemberStore, arrival_at
 from vipetsc.studies.sweep import conclude
 
 
@@ -24,10 +21,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     The runs are shared over the ranks of ``comm``. Members of a sweep that kept no fields stay as they are; the
     sweep's ensemble is put together anew.
 
-    Raises
-    ------
-    FolderError
-        If a path holds neither runs nor a sweep; nothing is written then.
+    Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
     """
     runs = on_root(comm, lambda: [folder for path in paths for folder in _run_folders(path)])
     measured = []
@@ -41,13 +35,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
 
 
 def measure_run(folder: Path) -> Path:
-    """Write ``folder/analysis.h5``; a run of a sweep has its wave's arrival from the sweep. Returns the path.
-
-    Raises
-    ------
-    OSError, ValueError
-        If ``run.h5`` cannot be read or is not one of ours.
-    """
+    """Write ``folder/analysis.h5`` and return its path; a sweep knows when the wave arrives. Raises as ``open_run``."""
     with open_run(folder / "run.h5") as run:
         case = Case.of(run)
         wave = MemberStore(folder.parent).wave(case)

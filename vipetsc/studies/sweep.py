@@ -1,7 +1,5 @@
 """Every member of a sweep, over all ranks: linear runs first, then the longest; resumes, and goes on past failures."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -18,8 +16,7 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, claim_folder
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_root
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS, Outcome, assemble
-from vipetsc.studies.linear import reached
-from vipetsc.studies.members import MemberStore, StoppedError
+from vipetsc.studies.members import MemberStore, StoppedError, reached
 
 FORMAT_VERSION = 1
 # What a member may raise and leave the others to go on: the machine's limits, a solver's or a file's refusal.
@@ -67,12 +64,7 @@ def run_sweep(
     it was; ``force`` begins anew. A member that fails is recorded with its reason and the others go on. All ranks of
     ``comm`` make members; ``[sweep] ranks`` of them share each.
 
-    Raises
-    ------
-    CaseError
-        If no member is a valid case.
-    FolderError
-        If the folder holds anything but this sweep.
+    Raises CaseError if no member is a valid case, FolderError if the folder holds anything but this sweep.
     """
     folder, stop = Path(folder), stop or StopRequest()
     begin = time.perf_counter()
