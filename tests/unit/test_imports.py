@@ -105,3 +105,19 @@ def test_figures_wait_with_matplotlib():
     code = "import sys, vipetsc.figures; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT.parent)
     assert done.stdout.strip() == "False"
+
+
+def test_no_function_hides_a_module():
+    """What a package hands out has no name of one of its modules: importing the module would replace it."""
+    code = f"""
+import importlib, inspect, petsc4py
+petsc4py.init([])
+modules = [f"vipetsc.{{m}}" for m in {sorted(m for m in MODULES if not m.startswith("__"))!r}]
+for module in modules:
+    importlib.import_module(module)
+for module in modules:
+    parent, _, name = module.rpartition(".")
+    found = vars(importlib.import_module(parent))[name]
+    assert inspect.ismodule(found), (module, found)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT.parent)

@@ -18,12 +18,13 @@ from vipetsc.lattice import (
     contact_stiffness,
     diatomic,
     four_band,
+    gaps,
     log_clearances,
     max_group_velocity,
     pass_bands,
     spread_sites,
+    waves_at,
 )
-from vipetsc.lattice.bloch import gaps, waves_at
 from vipetsc.lattice.cell import cell_problems
 
 KAPPA = np.linspace(0, np.pi, 41)

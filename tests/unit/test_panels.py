@@ -6,8 +6,7 @@ import xarray as xr
 from matplotlib.colors import to_rgba
 
 from vipetsc.figures import panels, style
-from vipetsc.lattice import bloch, diatomic, four_band, pass_bands
-from vipetsc.lattice.bloch import gaps
+from vipetsc.lattice import bloch, diatomic, four_band, gaps, pass_bands
 
 TIME, CELLS = np.linspace(0.0, 0.3, 4), np.arange(5, 12)
 

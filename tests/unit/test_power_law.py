@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from vipetsc.spectra import from_peak, normalised, power_law
-from vipetsc.spectra.power_law import r2_adjusted
+from vipetsc.spectra.fits import r2_adjusted
 
 METHODS = ("log-log", "nonlinear")
 X = np.geomspace(0.1, 20, 12)

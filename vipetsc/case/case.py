@@ -21,7 +21,7 @@ from vipetsc.case.checks import (
 from vipetsc.case.reading import CaseFile, Problem, Table
 from vipetsc.case.resolve import resolved, wave_speed, with_preset
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, TimeTable
-from vipetsc.lattice.bloch import waves_at
+from vipetsc.lattice import waves_at
 from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.contact import Contact, ContactLaw

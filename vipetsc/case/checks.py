@@ -7,7 +7,7 @@ import numpy as np
 from vipetsc.case.reading import Problem
 from vipetsc.case.resolve import site_cells
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, Span, TimeTable
-from vipetsc.lattice.bloch import pass_bands
+from vipetsc.lattice import pass_bands
 from vipetsc.lattice.cell import UnitCell, cell_problems
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from vipetsc.case.reading import Table
 from vipetsc.case.schema import ClearanceSpan, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
-from vipetsc.lattice.bloch import bloch, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.chain import log_clearances, spread_sites
 from vipetsc.lattice.contact import contact_stiffness

@@ -8,8 +8,7 @@ import numpy as np
 
 from vipetsc.case import Case, Model
 from vipetsc.io.store import GATHER_LIMIT
-from vipetsc.lattice import UnitCell, max_group_velocity, pass_bands
-from vipetsc.lattice.bloch import gaps, waves_at
+from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result

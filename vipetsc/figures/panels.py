@@ -11,8 +11,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.image import AxesImage
 
 from vipetsc.figures import style
-from vipetsc.lattice import UnitCell, bloch, pass_bands
-from vipetsc.lattice.bloch import gaps
+from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
 DECADES = 5  # of energy that a map shows
 PIXELS = 600  # most rows and columns of a map: a printed page shows no more

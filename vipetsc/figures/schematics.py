@@ -8,8 +8,7 @@ from vipetsc.figures import style
 from vipetsc.figures.lattice import draw_lattice, draw_mass, draw_spring, draw_unit_cell, draw_wall, with_prefix
 from vipetsc.figures.panels import band_diagram, colours, panel_title, shade_bands
 from vipetsc.figures.study import counted
-from vipetsc.lattice import UnitCell, bloch, pass_bands
-from vipetsc.lattice.bloch import gaps
+from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
 SIDE = 0.5  # half the side of a mass of the reduced model

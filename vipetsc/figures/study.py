@@ -18,7 +18,7 @@ from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.panels import recorded_sites
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_ensemble, open_run, whole_members
-from vipetsc.lattice.bloch import waves_at
+from vipetsc.lattice import waves_at
 
 AMPLITUDE = "amplitude"
 LEVELS = ("Low", "Medium", "High")

@@ -1,6 +1,6 @@
 """The physics of a contact lattice in plain numpy: cells, contacts, drives, Bloch bands, finite chains."""
 
-from vipetsc.lattice.bloch import Band, BlochPoint, bloch, max_group_velocity, pass_bands
+from vipetsc.lattice.bands import Band, BlochPoint, bloch, gaps, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain, log_clearances, spread_sites
 from vipetsc.lattice.contact import Bilinear, Contact, ContactLaw, Hertz, contact_stiffness

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.lattice.bloch import BlochPoint, bloch
+from vipetsc.lattice.bands import BlochPoint, bloch
 from vipetsc.lattice.cell import Reading, UnitCell, four_band
 
 COSTS = ("deflection", "group_velocity", "weighted")

@@ -12,7 +12,7 @@ import xarray as xr
 from vipetsc.case.design import DesignCase
 from vipetsc.io.folder import SEARCH, claim_folder, provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
-from vipetsc.lattice.bloch import bloch
+from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band
 from vipetsc.lattice.search import COSTS, Search, search, signed_deflection, unit_vectors
 

@@ -9,8 +9,7 @@ import xarray as xr
 
 from vipetsc.case import NnmCase
 from vipetsc.io.read import field_interval, nearest_cell, open_run
-from vipetsc.lattice import pass_bands
-from vipetsc.lattice.bloch import waves_at
+from vipetsc.lattice import pass_bands, waves_at
 from vipetsc.modes.branch import KINDS
 from vipetsc.modes.system import System
 from vipetsc.paper.claims.claim import Measurement, MissingEvidence

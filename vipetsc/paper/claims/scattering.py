@@ -5,8 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from vipetsc.lattice import bloch, max_group_velocity, pass_bands
-from vipetsc.lattice.bloch import waves_at
+from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.paper.claims.claim import Measurement, MissingEvidence
 from vipetsc.paper.claims.evidence import Evidence, MeasuredRun
 from vipetsc.paper.claims.thresholds import BESIDE, NATIVE
