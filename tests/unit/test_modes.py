@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import DOP853
 
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Bilinear, Contact, Hertz, contact_stiffness, diatomic, four_band
+from vipetsc.modes import tableau
 from vipetsc.modes.branch import Branch
-from vipetsc.modes.changes import CROSSING, NONE, first_rise
+from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.continuation import Continuation, Guards, StepControl, half_trace_change, unit
 from vipetsc.modes.orbit import Dop853Flow
@@ -156,6 +158,41 @@ def test_a_hump_beside_a_dip_in_one_quarter_of_a_step_is_found():
     share, outcome = first_rise(c)
     assert outcome == CROSSING
     assert 0 < share < 0.02
+
+
+def test_the_second_hump_of_a_gap_is_found():
+    """Slope -(x - .1)(x - .45)(x - .9): the first largest value is 2e-3 below zero, the second 2.3e-3 above."""
+    slope = -np.polynomial.Polynomial.fromroots([0.1, 0.45, 0.9])
+    c = np.append(slope.integ().coef, 0.0)
+    c[0] = -2e-3 - slope.integ()(0.1)
+    share, outcome = first_rise(c)
+    assert outcome == CROSSING
+    assert 0.45 < share < 0.9
+    assert np.polynomial.Polynomial(c)(share) == pytest.approx(0, abs=1e-15)
+
+
+@pytest.mark.parametrize(("margins", "expected"), [(0.5, EXTREMUM), (-0.5, EXTREMUM), (-2, NONE), (2, CROSSING)])
+def test_a_gap_that_nearly_closes_is_left_to_the_flow(margins, expected):
+    """Largest value at .4, within the interpolant's error of zero or beyond it."""
+    c = np.array([0.0, 0.8, -1.0, 0.0, 0.0, -0.02])
+    turn = np.polynomial.Polynomial(c).deriv().roots()
+    top = turn[(turn.imag == 0) & (turn.real > 0) & (turn.real < 1)].real[0]
+    c[0] = margins * 0.01 * 0.02 - np.polynomial.Polynomial(c)(top)
+    share, outcome = first_rise(c)
+    assert outcome == expected
+    if outcome == EXTREMUM:
+        assert share == pytest.approx(top, abs=1e-8)
+
+
+@pytest.mark.parametrize("rounding", [1e-17, 0.0, -1e-17])
+def test_a_step_that_starts_on_a_near_miss_leaves_it(rounding):
+    assert first_rise(np.array([-1e-4, rounding, -1.0, 0.0, 0.5, 0.3])) == (1.0, NONE)
+
+
+def test_the_tableau_is_the_one_of_dop853():
+    for name in ("A", "B", "E3", "E5"):
+        ours, reference = getattr(tableau, name), getattr(DOP853, name)
+        assert np.array_equal(ours, reference[tuple(slice(n) for n in ours.shape)]), name
 
 
 @pytest.mark.parametrize("name", ["quarter", "half", "whole"])

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -64,16 +64,6 @@ GUARDED = {
 }
 
 
-class _Predictor(NamedTuple):
-    """A step from point ``last`` at ``xi`` along the unit ``tangent`` of the chart."""
-
-    last: Point
-    chart: Chart
-    xi: np.ndarray
-    tangent: np.ndarray
-    step: float
-
-
 class Continuation:
     """Iterates over the points of a branch, from ``start`` in the direction of growing or falling energy.
 
@@ -122,8 +112,7 @@ class Continuation:
                 why, knob = f"no convergence ({attempt.reason})", "nnm.max_newton or nnm.tolerance"
                 self.step *= 0.4
                 continue
-            predictor = _Predictor(last, chart, xi, tangent, self.step)
-            point, strain, guard = self._judge(predictor, attempt)
+            point, strain, guard = self._judge(chart, xi, tangent, attempt)
             if strain <= 1.0:
                 effort = max(strain / 0.7, attempt.newton / 5, 1 / self.control.growth)
                 self.step = min(self.step / effort, self.control.largest)
@@ -137,10 +126,9 @@ class Continuation:
             f"residuals of the last attempt: {residuals}; turn nnm.smallest_step or {knob}"
         )
 
-    def _judge(self, predictor: _Predictor, attempt: Attempt) -> tuple[Point, float, str]:
+    def _judge(self, chart: Chart, xi: np.ndarray, tangent: np.ndarray, attempt: Attempt) -> tuple[Point, float, str]:
         """The corrected point, how far it strains the guards (1 is the bound), and which guard most."""
-        last, chart, xi, tangent, step = predictor
-        guards = self.control.guards
+        last, step, guards = self.point, self.step, self.control.guards
         direction = tangent_at(self.corrector, attempt.xi, tangent)
         point = Point.of(
             self.problem, attempt, chart, chart.derivative(attempt.xi) @ direction, index=last.index + 1, step=step
