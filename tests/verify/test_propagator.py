@@ -160,6 +160,8 @@ def test_agrees_over_the_whole_builtin_run(folder):
     assert statistics["episodes"] == 181
     assert statistics["steps"] == statistics["samples"] - 1
     assert statistics["bandwidth"] == 2
+    # 6064: without nodes of their own for onset and separation the error needs more.
+    assert statistics["substeps"] < 6200
 
 
 def test_tolerance_keeps_its_promise(folder):

@@ -74,12 +74,11 @@ class Cluster:
     ) -> None:  # fmt: skip
         cell, drive = model.chain.cell, model.drive
         self.sites = [dof.site for dof in dofs if dof.site >= 0]
-        self.driven = len(self.sites) < len(dofs)
         self.logs = logs
         self._motion = motion
         self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
         fastest = series.omega_max_h
-        if self.driven:
+        if len(self.sites) < len(dofs):
             fastest += drive.frequency * (1 + 1 / drive.cycles) * series.interval
         self._record = ClusterRecord(
             contacts=create_contacts(model.contact, [model.chain.clearances[site] for site in self.sites]),
@@ -95,10 +94,6 @@ class Cluster:
         reduced_mass = 1 / (1 / cell.masses[cell.host] + 1 / cell.masses[cell.resonator])
         self.tracker = ImpactTracker(self._record.contacts, self.sites, reduced_mass)
         self.tracker.start = motion.site_motion
-
-    def is_busy(self, t: float) -> bool:
-        """Whether a force acts on a DoF at time t in s."""
-        return bool(self.tracker.open) or (self.driven and t < self._record.burst.duration)
 
     def advance(self, begin: float) -> None:
         """Go through the step that begins at ``begin`` in s; raises StalledError if the contacts cannot be followed."""

@@ -29,7 +29,7 @@ class Forces:
     """Clusters of contact sites and the drive; adds to ``halo`` the cells whose motion they need."""
 
     def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
-        self._comm, self._interval, self._halo = layout.comm, series.interval, halo
+        self._comm, self._halo = layout.comm, halo
         groups = [group for group in group_dofs(model, series.reach)
                   if any((_owned_cells(dof.cell, series.reach, layout) >= 0).any() for dof in group)]  # fmt: skip
         self._dofs = _dof_tables(model, groups, layout, series, halo)
@@ -48,11 +48,11 @@ class Forces:
             response = _responses(group, self._dofs, own, layout, series)
             logs = layout.start <= group[0].cell < layout.stop
             self.clusters.append(Cluster(model, group, series, response, motion, logs))
-        self._dofs.busy[:] = [cluster.is_busy(0.0) for cluster in self.clusters]
         numbers = {dof.site: i for i, dof in enumerate(dof for group in groups for dof in group)}
         self._ledger = [numbers[site] for site in ((-1,) if layout.owns_drive else ()) + layout.sites]
+        self._drive_end = model.drive.duration
+        self._driven = slice(numbers.get(-1, count), numbers.get(-1, count) + 1)
         self._saved = {"energy": self._motion.energy, "history": self._motion.history, "clusters": state}
-        self._saved["busy"] = self._dofs.busy
 
     @property
     def ledger(self) -> np.ndarray:
@@ -65,11 +65,12 @@ class Forces:
         The halo holds the state then. Raises StalledError.
         """
         dofs = self._dofs
+        # A site in contact reaches its clearance anyway; the drive must be asked for.
+        dofs.clearance[self._driven] = -np.inf if begin < self._drive_end else np.inf
         count = active_clusters(dofs, self._halo.columns, self._motion.taylor, self._active)
         for i in self._active[:count].tolist():
             self.clusters[i].advance(begin)
             apply_impulses(dofs, dofs.first[i], self._motion.moments[self._of_cluster[i]], out)
-            dofs.busy[i] = self.clusters[i].is_busy(begin + self._interval)
 
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
@@ -134,7 +135,6 @@ def _dof_tables(
         inverse_masses=1 / np.asarray(chain.cell.masses),
         clearance=np.array(clearances) * (1 - 1e-9),  # an onset within rounding of the clearance is one
         first=np.cumsum([0, *map(len, groups)]),
-        busy=np.zeros(len(groups), bool),
     )
 
 

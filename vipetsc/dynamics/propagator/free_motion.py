@@ -22,8 +22,8 @@ class DofTables(NamedTuple):
     ``column`` (dof,) is the first column in the halo of the cells that a DoF reaches, ``owned`` (dof, cell) which of
     the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
     mass, cell, term); ``factors`` (2 term,) are H^(k mod 2)/k!; ``inverse_masses`` (mass,) are in 1/kg. ``clearance``
-    (dof,) in m is infinite for the driven mass. The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``; it is
-    ``busy`` (cluster,) when a force acts on it as the step begins.
+    (dof,) in m is that of a site; of the driven mass -inf while the drive lasts, inf later. The DoFs of cluster c are
+    ``first[c]`` to ``first[c + 1]``.
     """
 
     column: np.ndarray
@@ -34,7 +34,6 @@ class DofTables(NamedTuple):
     inverse_masses: np.ndarray
     clearance: np.ndarray
     first: np.ndarray
-    busy: np.ndarray
 
 
 @njit(error_model="numpy")
@@ -63,13 +62,13 @@ def taylor_coefficients(dofs: DofTables, dof: int, columns: np.ndarray, taylor: 
 
 @njit(error_model="numpy")
 def active_clusters(dofs: DofTables, columns: np.ndarray, taylor: np.ndarray, active: np.ndarray) -> int:
-    """Find the clusters that are busy or have a site whose free motion may reach its clearance; returns how many.
+    """Find the clusters with a DoF whose free motion may reach its clearance; returns how many.
 
     Fills ``taylor`` (dof, 2 term) of all DoFs and puts the clusters' numbers into ``active`` (cluster,).
     """
     count = 0
-    for cluster in range(dofs.busy.size):
-        is_active = dofs.busy[cluster]
+    for cluster in range(active.size):
+        is_active = False
         for dof in range(dofs.first[cluster], dofs.first[cluster + 1]):
             is_active |= not taylor_coefficients(dofs, dof, columns, taylor[dof]) < dofs.clearance[dof]
         if is_active:
