@@ -6,7 +6,7 @@ their results, the version of the package. ``made.json`` keeps the hashes.
 
 import importlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +19,9 @@ from vipetsc.figures import style
 from vipetsc.figures.drawing import Drawing, draw_each
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import PAPER, claim_folder, provenance
-from vipetsc.paper.figures import TRANSFER, PaperFigure
+from vipetsc.paper.figures import TRANSFER
 from vipetsc.paper.plan import Plan
-from vipetsc.paper.report import FigureEntry, Report, write_report
+from vipetsc.paper.report import write_report
 from vipetsc.paper.steps import BRANCHES, DONE, STALE, fingerprint
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
@@ -148,25 +148,21 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: 
             yield counter.draw()
 
     stems: dict[str, list[str]] = {figure.id: [] for figure in plan.figures}
+
+    def offered() -> Iterator[Drawing]:
+        for figure in plan.figures:
+            for stem, make in figure.offers(folders):
+                stems[figure.id].append(stem)
+                yield stem, make
+
     with style.rc_style():
-        drawings = _listed(plan.figures, folders, stems)
-        mine = draw_each(drawings, target, FORMATS, turns(), plan.note, keep=Path.exists)
+        mine = draw_each(offered(), target, FORMATS, turns(), plan.note, keep=Path.exists)
     drawn = sorted(path for paths in comm.allgather(mine) for path in paths)
     counter.free()
     for figure, pictures in stems.items():
         record["figures"][figure]["pictures"] = pictures
     on_root(comm, lambda: _write_record(root, record))
     return tuple(drawn)
-
-
-def _listed(
-    figures: Sequence[PaperFigure], folders: Mapping[str, Path], stems: dict[str, list[str]]
-) -> Iterator[Drawing]:
-    """All pictures of ``figures``; their stems are added to ``stems``."""
-    for figure in figures:
-        for stem, make in figure.offers(folders):
-            stems[figure.id].append(stem)
-            yield stem, make
 
 
 def inputs_of(plan: Plan, root: Path) -> dict[str, str]:
@@ -215,10 +211,10 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[
     if not report.exists() or record.get("report") != inputs:
         tell("report")
         stems = {key: entry["pictures"] for key, entry in record["figures"].items()}
-        paths = {f: [root / "figures" / f"{stem}.png" for stem in stems.get(f.id, ())] for f in plan.figures}
-        entries = [FigureEntry(figure, [path for path in paths[figure] if path.exists()]) for figure in plan.figures]
+        paths = [[root / "figures" / f"{stem}.png" for stem in stems.get(f.id, ())] for f in plan.figures]
+        pictures = [(f, [path for path in ps if path.exists()]) for f, ps in zip(plan.figures, paths, strict=True)]
         statistics = {step.name: step.statistics(root) for step in plan.steps if step.state(root) == DONE}
-        write_report(Report(plan.note, json.loads(text), entries, statistics, versions), report)
+        write_report(report, plan.note, json.loads(text), pictures, statistics, versions)
         record["report"] = inputs
     _write_record(root, record)
     return tuple(json.loads(text))

@@ -4,7 +4,6 @@ import base64
 import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +19,19 @@ COLOURS = 200
 VERDICTS = HOLDS, IN_PART, FAILS, UNMEASURED
 
 
-@dataclass(frozen=True)
-class FigureEntry:
-    """A figure of the paper and its pictures (PNG) that were drawn."""
+def write_report(
+    path: Path,
+    note: str,
+    claims: Sequence[Mapping[str, Any]],
+    pictures: Sequence[tuple[PaperFigure, Sequence[Path]]],
+    statistics: Mapping[str, Mapping[str, Any]],
+    versions: Mapping[str, Any],
+) -> None:
+    """Write the page to ``path``, whole or not at all.
 
-    figure: PaperFigure
-    pictures: Sequence[Path]
-
-
-@dataclass(frozen=True)
-class Report:
-    """What the page tells: rows of ``claims.json``, figures, statistics by step, versions; ``note`` if coarse."""
-
-    note: str
-    claims: Sequence[Mapping[str, Any]]
-    figures: Sequence[FigureEntry]
-    statistics: Mapping[str, Mapping[str, Any]]
-    versions: Mapping[str, Any]
-
-
-def write_report(report: Report, path: Path) -> None:
-    """Write the page to ``path``, whole or not at all."""
+    From the rows of ``claims.json``, the pictures (PNG) of every figure, numbers about the steps by name, and versions;
+    ``note`` is not empty for coarse grids.
+    """
     environment = Environment(
         loader=PackageLoader("vipetsc.paper", "."),
         autoescape=True,
@@ -50,18 +41,20 @@ def write_report(report: Report, path: Path) -> None:
     )
     environment.filters |= {"numbers": numbers, "sources": sources, "picture": picture, "describe": describe}
     rows: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for claim in report.claims:
+    for claim in claims:
         rows.setdefault(claim["id"], {})[claim["reading"]] = claim
     readings = [r for r in READINGS if any(r in row for row in rows.values())]
     verdicts = {r: Counter(row[r]["verdict"] for row in rows.values() if r in row) for r in readings}
     page = environment.get_template("report.html").render(
-        report=report,
+        note=note,
+        pictures=pictures,
+        versions=versions,
         rows=rows,
         readings=readings,
         counts={r: [(v, verdicts[r][v]) for v in VERDICTS if verdicts[r][v]] for r in readings},
-        figure_of={claim: entry.figure for entry in reversed(report.figures) for claim in entry.figure.claims},
-        sweeps={name: numbers for name, numbers in report.statistics.items() if "members" in numbers},
-        branches={name: numbers for name, numbers in report.statistics.items() if "points" in numbers},
+        figure_of={claim: figure for figure, _ in reversed(pictures) for claim in figure.claims},
+        sweeps={name: row for name, row in statistics.items() if "members" in row},
+        branches={name: row for name, row in statistics.items() if "points" in row},
     )
     write_text(path, page)
 

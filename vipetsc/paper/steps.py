@@ -135,18 +135,10 @@ def fingerprint(*parts: str | bytes) -> str:
     return hashlib.sha256(" ".join(digests).encode()).hexdigest()
 
 
-def _make_sweep(case: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-    run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True)
-
-
 def _make_branches(case: NnmCase, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
     resume = not afresh and on_root(comm, (folder / "case.toml").exists)
     on_root(comm, lambda: prepare_folder(case, folder, afresh, resume))
     follow_all(case, folder, comm, resume)
-
-
-def _make_search(case: DesignCase, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-    on_root(comm, lambda: search_design(case, folder, afresh or (folder / "case.toml").exists()))
 
 
 def _branch_files(case: NnmCase) -> list[str]:
@@ -185,6 +177,18 @@ def _cpu_times(folder: Path) -> list[float]:
     return [0.0 if "scaled_from" in s else float(s.get("cpu_seconds", 0.0)) for s in statistics]
 
 
-SWEEP = StepKind(Sweep, lambda case: ("ensemble.h5",), _make_sweep, _sweep_statistics)
+SWEEP = StepKind(
+    Sweep,
+    lambda case: ("ensemble.h5",),
+    lambda case, folder, comm, stop, afresh: run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True),
+    _sweep_statistics,
+)
 BRANCHES = StepKind(NnmCase, _branch_files, _make_branches, _branch_statistics)
-SEARCH = StepKind(DesignCase, lambda case: ("design.h5",), _make_search, lambda paths: {})
+SEARCH = StepKind(
+    DesignCase,
+    lambda case: ("design.h5",),
+    lambda case, folder, comm, stop, afresh: on_root(
+        comm, lambda: search_design(case, folder, afresh or (folder / "case.toml").exists())
+    ),
+    lambda paths: {},
+)
