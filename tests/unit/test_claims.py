@@ -618,6 +618,13 @@ def test_bands_sum_where_the_split_is_right_alone(tmp_path, velocity, change, ex
     assert missed in sums.reason and sums.figure.endswith("calibrated-5-sites-30-cycles-24N")
 
 
+def test_a_beat_across_an_edge_shows_over_a_period_and_not_over_the_record(tmp_path):
+    put_bands(tmp_path, on_an_edge, as_it_is)
+    value = measure("C13", tmp_path).value
+    assert value["mean error over a period of the drive, largest of the runs"] > 0.5
+    assert value["largest error of the mean over the record"] < 0.01
+
+
 def test_energy_ends_in_its_own_band(tmp_path):
     case = Case.from_table({"lattice": {"preset": "four-band", "cells": 30}})
     time, parts = np.arange(1500) * 2.5e-4, Parts.of(pass_bands(case.unit_cell()))

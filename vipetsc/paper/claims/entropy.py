@@ -99,8 +99,8 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     _list_fits(result, spread, "spread")
     try:
         masked = decays(evidence, NEIGHBOURS, reading, "masked")
-    except MissingEvidence as missing:
-        result.reasons.append(str(missing))
+    except (MissingEvidence, OSError, ValueError) as missing:
+        result.reasons.append(str(missing).replace(f"{evidence.root}/", ""))
     else:
         shares = _share(c.reaches(c.r2, STRAIGHT) for c in masked)
         result.value[f"share of configurations of neighbouring sites with {fit}"] = shares

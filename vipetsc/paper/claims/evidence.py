@@ -96,8 +96,8 @@ class AmplitudeCurve:
 class Evidence:
     """The steps in ``root``, opened as they are asked for. Use it as a context manager.
 
-    ``files`` are those asked for so far, relative to ``root``, in order. Every method raises ``MissingEvidence`` for
-    what is not there.
+    ``files`` are those asked for so far, relative to ``root``, in order. Every method raises MissingEvidence for what
+    is not there, OSError or ValueError for a file that cannot be used.
     """
 
     def __init__(self, root: str | Path) -> None:
@@ -123,20 +123,13 @@ class Evidence:
 
     def open(self, *parts: str, needs: tuple[str, ...] = ()) -> xr.Dataset:
         """An HDF5 file below ``root`` with the variables and groups ``needs``."""
-        path = self.path(*parts)
-        try:
-            return self._stack.enter_context(open_netcdf(path, "file of results", needs))
-        except (OSError, ValueError) as error:
-            raise MissingEvidence(str(error).replace(f"{self.root}/", "")) from None
+        return self._stack.enter_context(open_netcdf(self.path(*parts), "file of results", needs))
 
     def ensemble(self, step: str) -> xr.Dataset:
         """The finished sweep of a step."""
         self.path(step, "ensemble.h5")
         if step not in self._ensembles:
-            try:
-                self._ensembles[step] = open_ensemble(self.root / step)
-            except (OSError, ValueError) as error:
-                raise MissingEvidence(f"{step}: {error}".replace(f"{self.root}/", "")) from None
+            self._ensembles[step] = open_ensemble(self.root / step)
         return self._ensembles[step]
 
     def select(self, step: str, reading: str, **wanted: Any) -> xr.Dataset:
