@@ -92,12 +92,11 @@ class Initiation:
 
 @dataclass(frozen=True)
 class Alignment:
-    """A transfer curve in the energies of a branch.
+    """A transfer curve in the energies of a branch; ``divisor`` NaN, both laws None for too few points.
 
     ``energy`` (point): work of the drive times grazing energy over initiation energy, J, rising. ``fitted``: which
     points lie in region III at or behind the largest transfer. ``divisor``: what the slope is divided by, Hz/J.
-    ``law``: the transfer's power law over the fitted points, ``steepness`` that of the slope at their energies;
-    both None, and ``divisor`` NaN, for too few points.
+    ``law``: the transfer's power law over the fitted points, ``steepness`` that of the slope at their energies.
     """
 
     energy: np.ndarray
@@ -200,23 +199,12 @@ def _relate_curve(
     values = {"energy": aligned.energy, "ibtet": aligned.ibtet, "fitted": aligned.fitted.astype(np.int8)}
     values |= {"point": np.arange(len(slope.energy)), "branch/energy": slope.energy}
     values |= {"branch/slope": slope.slope, "branch/region": slope.region}
-    low, high = aligned.law.exponent_interval
-    return values, {
-        "case": case.to_toml(),
-        "branch_reading": slope.reading,
-        "grazing_energy": slope.grazing,
-        "initiation_amplitude": initiation.amplitude,
-        "initiation_energy": initiation.energy,
-        "onset_amplitude": initiation.onset,
-        "floor": floor,
-        "divisor": aligned.divisor,
-        "exponent": aligned.law.exponent,
-        "exponent_low": low,
-        "exponent_high": high,
-        "factor": aligned.law.factor,
-        "r2_adjusted": aligned.law.r2_adjusted,
-        "slope_exponent": aligned.steepness.exponent,
-    }
+    law, (low, high) = aligned.law, aligned.law.exponent_interval
+    about = {"case": case.to_toml(), "branch_reading": slope.reading, "grazing_energy": slope.grazing, "floor": floor}
+    about |= {"initiation_amplitude": initiation.amplitude, "initiation_energy": initiation.energy}
+    about |= {"onset_amplitude": initiation.onset, "divisor": aligned.divisor, "factor": law.factor}
+    about |= {"exponent": law.exponent, "exponent_low": low, "exponent_high": high, "r2_adjusted": law.r2_adjusted}
+    return values, about | {"slope_exponent": aligned.steepness.exponent}
 
 
 def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:

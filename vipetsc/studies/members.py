@@ -100,14 +100,11 @@ class MemberStore:
 
         on_root(self.team, measure)
 
-    def is_complete(self, case: Case) -> bool:
-        """Whether the member of ``case`` is there with all that the sweep asks for."""
+    def is_complete(self, case: Case, current: bool = False) -> bool:
+        """Whether the member of ``case`` has all that the sweep asks for; if ``current``, made by this version."""
         summary = self.summary(case)
-        return bool(summary.get("complete")) and all(summary.get(k) == v for k, v in self._requested.items())
-
-    def is_current(self, case: Case) -> bool:
-        """Whether the member of ``case`` is complete and was made by this version of the package."""
-        return self.is_complete(case) and self.summary(case).get("vipetsc_version") == vipetsc.__version__
+        current = not current or summary.get("vipetsc_version") == vipetsc.__version__
+        return current and bool(summary.get("complete")) and self._requested.items() <= summary.items()
 
     def summary(self, case: Case) -> dict[str, Any]:
         """``summary.json`` of the member of ``case``; empty if there is none."""

@@ -9,7 +9,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
-from vipetsc.parallel import on_root
+from vipetsc.parallel import on_every_rank, on_root
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.members import MemberStore, arrival_at
 from vipetsc.studies.sweep import conclude
@@ -24,13 +24,14 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
     """
     runs = on_root(comm, lambda: [folder for path in paths for folder in _run_folders(path)])
-    measured = []
-    for folder in runs[comm.rank :: comm.size]:
+
+    def has_fields(folder: Path) -> bool:
         with open_run(folder / "run.h5") as run:
-            has_fields = "velocity" in run
-        if has_fields or not (folder.parent / "index.json").exists():
-            measured.append(measure_run(folder))
-    written = sorted(path for share in comm.allgather(measured) for path in share)
+            return "velocity" in run or not (folder.parent / "index.json").exists()
+
+    share = runs[comm.rank :: comm.size]
+    measured = on_every_rank(comm, lambda: [measure_run(folder) for folder in share if has_fields(folder)])
+    written = sorted(path for paths in comm.allgather(measured) for path in paths)
     return written + on_root(comm, lambda: [_reassemble(path) for path in paths if (path / "index.json").exists()])
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from vipetsc.case import Sweep, SweepMember
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, claim_folder
-from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_root
+from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_every_rank, on_root
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS, Outcome, assemble
 from vipetsc.studies.members import MemberStore, StoppedError, reached
 
@@ -75,13 +75,13 @@ def run_sweep(
     store = MemberStore(folder, plan.options, team, stop)
 
     cases = {m.id: m.case for m in members if m.case}
-    missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_current(case)])
+    missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_complete(case, current=True)])
     source = {key: store.linear_folder(cases[key]) for key in missing}
     linear = {source[key]: cases[key] for key in missing}
     absent = on_root(comm, lambda: [path for path, case in linear.items() if not store.has_wave(case)])
     failures = pool.share(absent, lambda path: store.make_linear(linear[path]), None)
     ready = on_root(comm, lambda: [path for path, case in linear.items() if store.has_wave(case)])
-    waves = {path: wave for path in ready if (wave := store.wave(linear[path])) is not None}
+    waves = on_every_rank(comm, lambda: {p: wave for p in ready if (wave := store.wave(linear[p])) is not None})
 
     def cost(key: str) -> float:
         """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
