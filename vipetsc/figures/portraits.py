@@ -121,14 +121,14 @@ def phase_regimes(study: Study) -> Iterator[Drawing]:
         run = member.run
         if len(recorded_sites(run)) == run.sizes["site"] == 1 and "displacement" in run and "velocity" in run:
             members.append((member.case, member.folder))
-    for name, group in grouped(members, lambda pair: _settings(pair[0])).items():
+
+    def settings(case: Case) -> str:
+        return f"{case.contacts.law}-{Labels.of(case).page_stem}"
+
+    for name, group in grouped(members, lambda pair: settings(pair[0])).items():
         sites = sites_of(group[0][0])
-        matching = [c for c in curves if _settings(c.case) == name and sites_of(c.case) == sites]
+        matching = [c for c in curves if settings(c.case) == name and sites_of(c.case) == sites]
         yield name, partial(_page, [folder for _, folder in group], matching[0] if matching else None)
-
-
-def _settings(case: Case) -> str:
-    return f"{case.contacts.law}-{Labels.of(case).page_stem}"
 
 
 def _page(folders: Sequence[Path], curve: TransferCurve | None) -> Figure:

@@ -29,18 +29,10 @@ RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
 
 
 class FigureSpec(NamedTuple):
-    """How a picture is made: ``function`` of what a folder of this ``source`` holds.
+    """A figure of what folders of a ``source`` hold; one of sweeps is drawn from those that take the ``measure``.
 
-    ========  ====================================================  ================================
-    source    function                                              files
-    ========  ====================================================  ================================
-    run       (run, analysis or None) -> Figure                     ``run.h5``, ``analysis.h5``
-    sweep     (Study) -> iterator of (suffix, () -> Figure)         ``ensemble.h5``, branches
-    branches  (paths) -> Figure                                     ``branch-<name>.h5``
-    design    (search) -> Figure                                    ``design.h5``
-    ========  ====================================================  ================================
-
-    A figure of sweeps is drawn from those that have the ``measure``.
+    ``function`` is (run, analysis or None) -> Figure for a run, (search) -> Figure for a design, (paths) -> Figure
+    for branches; of sweeps it offers drawings: (Study) -> iterator of (suffix, () -> Figure).
     """
 
     function: Callable[..., Any]
@@ -48,26 +40,21 @@ class FigureSpec(NamedTuple):
     measure: str = ""
 
 
-def _specs(source: str, functions: Iterable[Callable[..., Any]], measure: str = "") -> dict[str, FigureSpec]:
+def _specs(source: str, *functions: Callable[..., Any], measure: str = "") -> dict[str, FigureSpec]:
     return {f.__name__: FigureSpec(f, source, measure) for f in functions}
 
 
 # The dearest of a run first, so that ranks which share the work finish together.
 FIGURES: dict[str, FigureSpec] = {
-    **_specs(RUN, (runs.spacetime, runs.dispersion, phase, unit_cell, runs.impacts, runs.ledger)),
-    **_specs(
-        SWEEP,
-        (amplitudes, wavelets, partition, partition_explained, reconstruction,
-         entropy, entropy_all, entropy_maps, entropy_history),
-        "entropy",
-    ),
-    **_specs(SWEEP, (transfer, transfer_dispersions, band_energies, ibtet, ibtet_backbone, phase_regimes), "transfer"),
+    **_specs(RUN, runs.spacetime, runs.dispersion, phase, unit_cell, runs.impacts, runs.ledger),
+    **_specs(SWEEP, amplitudes, wavelets, partition, partition_explained, reconstruction, measure="entropy"),
+    **_specs(SWEEP, entropy, entropy_all, entropy_maps, entropy_history, measure="entropy"),
+    **_specs(SWEEP, transfer, transfer_dispersions, band_energies, ibtet, ibtet_backbone, measure="transfer"),
+    **_specs(SWEEP, phase_regimes, measure="transfer"),
     "branch": FigureSpec(backbone, BRANCHES),
-    **_specs(
-        DESIGN,
-        (design.deflections, design.cost_maps, design.dispersion_against_lambda, design.dispersion_against_eta),
-    ),
-}  # fmt: skip
+    **_specs(DESIGN, design.deflections, design.cost_maps),
+    **_specs(DESIGN, design.dispersion_against_lambda, design.dispersion_against_eta),
+}
 
 
 def figure_names(source: str, names: Sequence[str] | None = None) -> list[str]:

@@ -17,6 +17,14 @@ GREY, PALE = "#777777", "#DDDDDD"
 SERIES = BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY  # of bands, masses, curves in their order
 DASHED, DOTTED = (0, (4, 2)), (0, (1, 2))
 
+_TICKS = {
+    "labelsize": 7,
+    "direction": "out",
+    "major.width": 0.6,
+    "minor.width": 0.4,
+    "major.size": 2.5,
+    "minor.size": 1.5,
+}
 _RC = {
     "font.family": "DejaVu Sans",
     "mathtext.fontset": "dejavusans",
@@ -26,18 +34,7 @@ _RC = {
     "axes.linewidth": 0.6,
     "axes.titlelocation": "left",
     "axes.labelpad": 2.5,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "xtick.direction": "out",
-    "ytick.direction": "out",
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.minor.width": 0.4,
-    "ytick.minor.width": 0.4,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "xtick.minor.size": 1.5,
-    "ytick.minor.size": 1.5,
+    **{f"{axis}tick.{key}": value for axis in "xy" for key, value in _TICKS.items()},
     "lines.linewidth": 1.0,
     "legend.fontsize": 7,
     "legend.frameon": False,
