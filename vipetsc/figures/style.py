@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,39 +19,28 @@ SERIES = BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY  # of bands, masses, curves
 DASHED, DOTTED = (0, (4, 2)), (0, (1, 2))
 
 _TICKS = {
-    "labelsize": 7,
-    "direction": "out",
-    "major.width": 0.6,
-    "minor.width": 0.4,
-    "major.size": 2.5,
-    "minor.size": 1.5,
+    "labelsize": 7, "direction": "out", "major.width": 0.6, "minor.width": 0.4, "major.size": 2.5, "minor.size": 1.5,
+}  # fmt: skip
+_GROUPS: dict[str, dict[str, Any]] = {
+    "font": {"family": "DejaVu Sans", "size": 8},
+    "mathtext": {"fontset": "dejavusans"},
+    "axes": {"titlesize": 8, "labelsize": 8, "linewidth": 0.6, "titlelocation": "left", "labelpad": 2.5},
+    "xtick": _TICKS,
+    "ytick": _TICKS,
+    "lines": {"linewidth": 1.0},
+    "legend": {"fontsize": 7, "frameon": False, "handlelength": 1.4, "borderaxespad": 0.2},
+    "image": {"cmap": "viridis"},
+    "figure": {"dpi": 100},
+    "savefig": {"dpi": DPI},
+    "pdf": {"fonttype": 42},
 }
-_RC = {
-    "font.family": "DejaVu Sans",
-    "mathtext.fontset": "dejavusans",
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.labelsize": 8,
-    "axes.linewidth": 0.6,
-    "axes.titlelocation": "left",
-    "axes.labelpad": 2.5,
-    **{f"{axis}tick.{key}": value for axis in "xy" for key, value in _TICKS.items()},
-    "lines.linewidth": 1.0,
-    "legend.fontsize": 7,
-    "legend.frameon": False,
-    "legend.handlelength": 1.4,
-    "legend.borderaxespad": 0.2,
-    "image.cmap": "viridis",
-    "figure.dpi": 100,
-    "savefig.dpi": DPI,
-    "pdf.fonttype": 42,
-}
+RC = {f"{group}.{key}": value for group, settings in _GROUPS.items() for key, value in settings.items()}
 
 
 @contextmanager
 def rc_style() -> Iterator[None]:
     """The house style, for making and for saving figures; leaves matplotlib's settings as they were."""
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(RC):
         yield
 
 
