@@ -62,9 +62,9 @@ def collocation(powers: int) -> Collocation:
 
 def _lagrange(x: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Lagrange polynomials (node, ...) of the nodes ``x`` at the points ``at``."""
-    found = np.ones((x.size, *at.shape))
+    values = np.ones((x.size, *at.shape))
     for k in range(x.size):
         for i in range(x.size):
             if i != k:
-                found[k] *= (at - x[i]) / (x[k] - x[i])
-    return found
+                values[k] *= (at - x[i]) / (x[k] - x[i])
+    return values

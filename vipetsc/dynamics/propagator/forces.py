@@ -43,9 +43,9 @@ class Forces:
         self._active = np.zeros(len(groups), np.int64)
         self._of_cluster = [slice(a, b) for a, b in pairwise(self._dofs.first.tolist())]
         self.clusters = []
-        for i, (group, own) in enumerate(zip(groups, self._of_cluster, strict=True)):
-            motion = ClusterMotion._make([*(array[own] for array in self._motion[:-1]), state[i : i + 1]])
-            response = _responses(group, self._dofs, own, layout, series)
+        for i, (group, span) in enumerate(zip(groups, self._of_cluster, strict=True)):
+            motion = ClusterMotion._make([*(array[span] for array in self._motion[:-1]), state[i : i + 1]])
+            response = _responses(group, self._dofs, span, layout, series)
             logs = layout.start <= group[0].cell < layout.stop
             self.clusters.append(Cluster(model, group, series, response, motion, logs))
         numbers = {dof.site: i for i, dof in enumerate(dof for group in groups for dof in group)}
@@ -138,11 +138,11 @@ def _dof_tables(
     )
 
 
-def _responses(group: list[ContactDof], dofs: DofTables, own: slice, layout: Layout, series: StepSeries) -> np.ndarray:
+def _responses(group: list[ContactDof], dofs: DofTables, span: slice, layout: Layout, series: StepSeries) -> np.ndarray:
     """Motion (dof, dof, term) of each DoF of a ``group`` after an impulse on each, times H, in powers 2 m + 1 of s."""
     factors = dofs.factors[1::2] * series.interval
     response = np.zeros((len(group), len(group), series.terms))
-    for i, rows in enumerate(dofs.rows[dofs.table[own]]):
+    for i, rows in enumerate(dofs.rows[dofs.table[span]]):
         for j, source in enumerate(group):
             offset = _unwrapped(source.cell, group[i].cell, layout) - group[i].cell
             if abs(offset) <= series.reach:
