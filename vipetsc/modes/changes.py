@@ -56,8 +56,7 @@ def correct(landing: Landing, motion: np.ndarray, floor: float) -> tuple[Landing
     newton = -value / rate if rate > 0.0 else high
     attempts += 1
     # rounding of w' may keep Newton's method from the extremum for ever
-    unknown = abs(newton) > floor and (attempts < EXTREMUM_ATTEMPTS if extremum else high - low > floor)
-    if unknown:
+    if abs(newton) > floor and (attempts < EXTREMUM_ATTEMPTS if extremum else high - low > floor):
         target = length + newton
         if not low < target < high:
             target = 0.5 * (low + high)

@@ -34,19 +34,12 @@ class Arc:
 
     def blocks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The (n, n) blocks du/du0, du/dv0, dv/du0, dv/dv0 of the sensitivity."""
-        n = len(self.start) // 2
-        s = self.sensitivity
+        n, s = len(self.start) // 2, self.sensitivity
         return s[:n, :n], s[:n, n:], s[n:, :n], s[n:, n:]
 
 
 class Flow:
-    """What every flow offers; a subclass gives its ``name`` and ``arc``.
-
-    Parameters
-    ----------
-    system
-        The system in motion.
-    """
+    """What every flow of a system offers; a subclass gives its ``name`` and ``arc``."""
 
     name: ClassVar[str]
 
@@ -56,10 +49,7 @@ class Flow:
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """The orbit from ``start`` (2n,) over ``duration`` seconds; ``period`` helps to choose steps.
 
-        Raises
-        ------
-        FlowError
-            If the time cannot be covered.
+        Raises FlowError if the time cannot be covered.
         """
         raise NotImplementedError
 
@@ -96,8 +86,7 @@ class Dop853Flow(Flow):
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """See ``Flow.arc``."""
-        y = self.with_variations(start)
-        events = np.empty((self.capacity, 4))
+        y, events = self.with_variations(start), np.empty((self.capacity, 4))
         tolerances = kernel.Tolerances(self.rtol, self.rtol_sensitivity, max(self._omega, 2 * np.pi / period))
         outcome, count, closed, steps = kernel.flow(self._compiled, tolerances, y, duration, events)
         if outcome != kernel.DONE:
@@ -139,9 +128,7 @@ class FiniteDifferences(Flow):
         rate = 2 * np.pi / period
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / rate)
         columns = []
-        for i in range(2 * n):
-            move = np.zeros(2 * n)
-            move[i] = self.step * size * (1.0 if i < n else rate)
-            ends = [self.flow.arc(start + s * move, duration, period).end for s in (1, -1)]
-            columns.append((ends[0] - ends[1]) / (2 * move[i]))
+        for move in np.diag(self.step * size * np.repeat([1.0, rate], n)):
+            later, earlier = (self.flow.arc(start + s * move, duration, period).end for s in (1, -1))
+            columns.append((later - earlier) / (2 * move.max()))
         return replace(centre, sensitivity=np.column_stack(columns))
