@@ -14,6 +14,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, member_folder, open_ensemble, select
 from vipetsc.paper.claims.claim import MissingEvidence
 from vipetsc.spectra import normalised
+from vipetsc.studies.backbone import initiation_of
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,14 @@ class MeasuredRun:
     def amplitude(self) -> float:
         """Amplitude of the drive in N."""
         return self.case.drive.amplitude
+
+    @property
+    def onset(self) -> float:
+        """Amplitude in N of the first contact of runs like this one; NaN if their linear run is gone."""
+        try:
+            return initiation_of(self.folder.parent, self.case).onset
+        except (OSError, ValueError):
+            return float("nan")
 
     def arrays(self, *names: str) -> tuple[np.ndarray, ...]:
         """Variables of the analysis by name."""

@@ -15,7 +15,7 @@ from vipetsc.modes.system import System
 from vipetsc.paper.claims.claim import Measurement, MissingEvidence
 from vipetsc.paper.claims.evidence import Evidence, MeasuredRun
 from vipetsc.paper.claims.thresholds import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_EXPONENT, SAME_MOTION
-from vipetsc.studies.backbone import BRANCH, initiation_of
+from vipetsc.studies.backbone import BRANCH
 
 INTERBAND, ONE_SITE = "interband", "interband-one-site"
 MAIN = "5-sites-30-cycles"
@@ -171,14 +171,8 @@ def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
         result.value |= {f"correlation at {m.run.amplitude:g} N, {law}": m.correlation for m in touching[:-1]}
         result.uncertainty[f"amplitudes, {law}"] = len(motions)
         if grazing < SAME_MOTION:
-            result.reasons.append(f"{law}: at {_beyond_onset(first.run)} the resonator's motion has already left the"
-                                  " linear one")  # fmt: skip
-
-
-def _beyond_onset(run: MeasuredRun) -> str:
-    """The run's amplitude, and how far it lies above that of first contact where this is known."""
-    try:
-        beyond = run.amplitude / initiation_of(run.folder.parent, run.case).onset - 1
-    except (OSError, ValueError):
-        return f"{run.amplitude:g} N"
-    return f"{run.amplitude:g} N, {100 * beyond:.2g} % above first contact,"
+            run = first.run
+            beyond = 100 * (run.amplitude / run.onset - 1)
+            above = f", {beyond:.2g} % above first contact," if np.isfinite(beyond) else ""
+            text = f"{law}: at {run.amplitude:g} N{above} the resonator's motion has already left the linear one"
+            result.reasons.append(text)

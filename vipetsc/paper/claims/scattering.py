@@ -10,7 +10,6 @@ from vipetsc.paper.claims.claim import Measurement, MissingEvidence
 from vipetsc.paper.claims.evidence import Evidence, MeasuredRun
 from vipetsc.paper.claims.thresholds import BESIDE, NATIVE
 from vipetsc.spectra import Dispersion, ridge
-from vipetsc.studies.backbone import initiation_of
 
 EXCITED = 5 * np.pi / 9  # rad/cell, of the paper's section II
 BRANCHES = f"share within {100 * BESIDE:g} % of the top edge from the Bloch branches"
@@ -73,10 +72,7 @@ class AmplitudeTriple:
         if self.medium.episodes:
             return
         text = f"{self.medium.amplitude:g} N makes no contact"
-        try:
-            onset = initiation_of(self.medium.folder.parent, self.medium.case).onset
-        except (OSError, ValueError):
-            onset = np.nan
+        onset = self.medium.onset
         if np.isfinite(onset):
             result.value["first contact (N)"] = onset
             text = f"{self.medium.amplitude:g} N is below first contact at {onset:.3g} N"
