@@ -98,7 +98,12 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
     record = _Record.of(run)
     nt, cells = record.velocity.shape[:2]
     step = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
-    values = _space_time(record, measures)
+    values: dict[str, Any] = {"time": record.time, "cell": record.cells}
+    if "kinetic" in measures:
+        values["kinetic_energy"] = record.kinetic
+    if "wavenumber" in measures and cells > 1:
+        wavenumber, values["wavenumber_content"] = spectra.wavenumber_content(record.velocity, record.masses)
+        values["wavenumber"] = wavenumber / int(record.cells[1] - record.cells[0])
     if nt < 2:
         record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
@@ -118,11 +123,12 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
 class _Record:
     """What the measures need of a run, and what they tell besides their values: attributes, and what is left out.
 
-    ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) as numbers from 1, ``site``
-    the cell of the leading site, None without sites. ``attributes`` are those of variables, of groups under "".
+    ``masses`` (dof) in kg, ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) and
+    ``site``, the leading one's cell, as numbers from 1. ``attributes`` are those of variables, of groups under "".
     """
 
     model: Model
+    masses: np.ndarray
     velocity: Any
     time: np.ndarray
     interval: float
@@ -136,12 +142,8 @@ class _Record:
         field, leading = run["velocity"], leading_site(run)
         velocity = _StoredField(field) if field.nbytes > IN_MEMORY else field.values
         site = None if leading is None else int(run["sites/cell"].values[leading])
-        return cls(Case.of(run).model(), velocity, field_time(run), field_interval(run), run["cell"].values, site)
-
-    @property
-    def masses(self) -> np.ndarray:
-        """Masses (dof) of a cell in kg."""
-        return np.asarray(self.model.chain.cell.masses)
+        model, interval, cells = Case.of(run).model(), field_interval(run), run["cell"].values
+        return cls(model, np.asarray(model.chain.cell.masses), velocity, field_time(run), interval, cells, site)
 
     @cached_property
     def kinetic(self) -> np.ndarray:
@@ -157,17 +159,6 @@ class _StoredField:
 
     def __getitem__(self, index: Any) -> np.ndarray:
         return np.asarray(self._field[index].values)
-
-
-def _space_time(record: _Record, measures: Collection[str]) -> dict[str, Any]:
-    values = {"time": record.time, "cell": record.cells}
-    if "kinetic" in measures:
-        values["kinetic_energy"] = record.kinetic
-    if "wavenumber" in measures and len(record.cells) > 1:
-        wavenumber, content = spectra.wavenumber_content(record.velocity, record.masses)
-        spacing = int(record.cells[1] - record.cells[0])
-        values |= {"wavenumber": wavenumber / spacing, "wavenumber_content": content}
-    return values
 
 
 def _dispersions(record: _Record) -> dict[str, Any]:

@@ -32,7 +32,14 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     share = runs[comm.rank :: comm.size]
     measured = on_every_rank(comm, lambda: [measure_run(folder) for folder in share if has_fields(folder)])
     written = sorted(path for paths in comm.allgather(measured) for path in paths)
-    return written + on_root(comm, lambda: [_reassemble(path) for path in paths if (path / "index.json").exists()])
+
+    def reassemble(folder: Path) -> Path:
+        plan = Sweep.load(folder / "case.toml")
+        if not all(conclude(plan, plan.members(), MemberStore(folder, plan.options), {})):
+            raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
+        return folder / "ensemble.h5"
+
+    return written + on_root(comm, lambda: [reassemble(path) for path in paths if (path / "index.json").exists()])
 
 
 def measure_run(folder: Path) -> Path:
@@ -49,9 +56,8 @@ def is_measured(folder: Path) -> bool:
     with open_run(folder / "run.h5") as run:
         if not (folder / "analysis.h5").exists():
             return False
+        expected = {key: run.attrs.get(key) for key in ("case", "status")} | {"vipetsc_version": vipetsc.__version__}
         with open_netcdf(folder / "analysis.h5", "analysis") as analysis:
-            expected = {key: run.attrs.get(key) for key in ("case", "status")}
-            expected["vipetsc_version"] = vipetsc.__version__
             return all(analysis.attrs.get(key) == value for key, value in expected.items())
 
 
@@ -68,12 +74,3 @@ def _run_folders(path: Path) -> list[Path]:
         except (OSError, ValueError, KeyError) as error:
             raise FolderError(f"{one / 'run.h5'}: is not a run of vipetsc ({error})") from None
     return folders
-
-
-def _reassemble(folder: Path) -> Path:
-    """Put the ensemble of the sweep in ``folder`` together anew."""
-    plan = Sweep.load(folder / "case.toml")
-    outcomes = conclude(plan, plan.members(), MemberStore(folder, plan.options), {})
-    if not all(outcomes):
-        raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
-    return folder / "ensemble.h5"
