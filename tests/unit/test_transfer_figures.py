@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Case, Sweep
+from vipetsc.figures import portraits
 from vipetsc.figures.portraits import ContactMotion
 from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.study import Study
@@ -249,6 +250,16 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     resonator, host = (line.get_xydata().T for line in second.lines)
     np.testing.assert_array_equal(resonator[0], 1e3 * motion.displacement[:, 1])
     np.testing.assert_array_equal(host[1], motion.velocity[:, 0])
+
+
+def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatch):
+    monkeypatch.setattr(portraits, "PERIODS", 0.1)
+    folder = member_folder(open_ensemble(whole).isel(law=0, amplitude=1))
+    with open_run(folder / "run.h5") as run:
+        u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
+    shown = ContactMotion.read(folder).displacement
+    assert np.abs(shown[:, 1] - shown[:, 0]).max() >= np.abs(u[:, 2] - u[:, 1]).max()
+    assert len(shown) < 0.1 * len(u) * portraits.REFINE
 
 
 def test_regimes_without_an_ensemble_beside_them(whole):
