@@ -20,7 +20,8 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
     lines.append(f"{'figure':<8}{'paper':<9}{'pictures':<10}{'state':<9}claims      shows")
     record, inputs = read_record(root)["figures"], inputs_of(plan, root)
     for figure in plan.figures:
-        entry = record.get(figure.id, {"inputs": "", "pictures": []})
+        unrecorded = {path.stem for path in (root / "figures").glob(f"{figure.id}-*")}
+        entry = record.get(figure.id, {"inputs": "", "pictures": unrecorded})
         paths = [root / "figures" / f"{stem}.{kind}" for stem in entry["pictures"] for kind in FORMATS]
         drawn = [path for path in paths if path.exists()]
         current = len(drawn) == len(paths) and entry["inputs"] == inputs[figure.id]

@@ -7,10 +7,19 @@ import numpy as np
 
 from vipetsc.paper.claims.claim import Measurement, MissingEvidence
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence
-from vipetsc.paper.claims.thresholds import ABRUPT, FEWEST, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
+from vipetsc.paper.claims.thresholds import (
+    ABRUPT,
+    EXCITED,
+    FEWEST,
+    HIGH,
+    PEAK,
+    QUIET,
+    SEVERAL,
+    STRAIGHT,
+    STRAIGHT_EVERYWHERE,
+)
 
 SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
-EXCITED = 5 * np.pi / 9  # rad/cell
 AVERAGES = "energy_weighted", "masked", "joint"
 FIT = "r2_log_log", "r2_nonlinear", "exponent", "exponent_low", "exponent_high"
 
