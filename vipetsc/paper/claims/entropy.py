@@ -6,18 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vipetsc.paper.claims.claim import Measurement, MissingEvidence
-from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence
-from vipetsc.paper.claims.thresholds import (
-    ABRUPT,
-    EXCITED,
-    FEWEST,
-    HIGH,
-    PEAK,
-    QUIET,
-    SEVERAL,
-    STRAIGHT,
-    STRAIGHT_EVERYWHERE,
-)
+from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence
+from vipetsc.paper.claims.thresholds import ABRUPT, FEWEST, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
 
 SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
 AVERAGES = "energy_weighted", "masked", "joint"

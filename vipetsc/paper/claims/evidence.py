@@ -16,6 +16,8 @@ from vipetsc.paper.claims.claim import MissingEvidence
 from vipetsc.spectra import normalised
 from vipetsc.studies.backbone import initiation_of
 
+EXCITED = 5 * np.pi / 9  # rad/cell, driven in the paper's section II
+
 
 @dataclass(frozen=True)
 class MeasuredRun:

@@ -7,8 +7,8 @@ import numpy as np
 
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.paper.claims.claim import Measurement, MissingEvidence
-from vipetsc.paper.claims.evidence import Evidence, MeasuredRun
-from vipetsc.paper.claims.thresholds import BESIDE, EXCITED, NATIVE
+from vipetsc.paper.claims.evidence import EXCITED, Evidence, MeasuredRun
+from vipetsc.paper.claims.thresholds import BESIDE, NATIVE
 from vipetsc.spectra import Dispersion, ridge
 
 BRANCHES = f"share within {100 * BESIDE:g} % of the top edge from the Bloch branches"

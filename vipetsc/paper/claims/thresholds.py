@@ -3,7 +3,6 @@
 Sections (sec., App., Suppl.) are the paper's; SPEC is the specification that fixes what the paper leaves open.
 """
 
-import math
 import tomllib
 from importlib.resources import files
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 from vipetsc.paper.claims.claim import ClaimSpec, Criterion
 
 LAWS = "hertz", "bilinear"
-EXCITED = 5 * math.pi / 9  # rad/cell, of the paper's section II
 
 # Constants of quantities: what is counted or measured, rather than what decides.
 STRAIGHT, STRAIGHT_EVERYWHERE = 0.95, 0.9  # adjusted R^2 of a power law (SPEC 11, C7 and C8)
