@@ -10,7 +10,6 @@ import numpy as np
 from vipetsc.case import Case
 from vipetsc.contact.episodes import Episode
 from vipetsc.dynamics.energies import Energies
-from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Observer, Sample, Setup
 from vipetsc.io.store import GATHER_LIMIT, IMPACTS, LEDGER
 
@@ -91,18 +90,21 @@ class Recorder(Observer):
         Rank 0's chunk holds times, energies and all ranks' episodes; the fields are those of a rank's own cells, or on
         rank 0 of all.
         """
-        comm, count = self.setup.layout.comm, len(self._samples)
-        local = np.moveaxis(self._buffer[: len(self._field_times)], 2, 3)  # (samples, field, cell, dof)
-        block = gather_cells(comm, local) if self.columns is None else local
-        by_site = gather_sites(self.setup.layout, self._dissipated[:count])
-        logs = comm.gather(episodes)
+        layout, comm = self.setup.layout, self.setup.layout.comm
+        fields = np.moveaxis(self._buffer[: len(self._field_times)], 2, 3)  # (samples, field, cell, dof)
+        share = layout.sites, self._dissipated[: len(self._samples)], episodes, None if self.columns else fields
+        shares = comm.gather(share) if comm.size > 1 else [share]
         chunk: dict[str, np.ndarray] = {}
-        if logs is not None and by_site is not None:
+        if shares is not None:
+            sites, dissipated, logs, blocks = zip(*shares, strict=True)
             chunk |= {"time": np.array([t for t, _ in self._samples]), "field_time": np.array(self._field_times)}
             chunk |= {name: np.array([getattr(energies, name) for _, energies in self._samples]) for name in LEDGER}
-            chunk |= {"dissipated_by_site": by_site} | impact_table([episode for log in logs for episode in log])
-        if block is not None:
-            chunk |= {name: block[:, i] for i, name in enumerate(self.setup.case.output.fields)}
+            order = np.argsort([site for some in sites for site in some])
+            chunk["dissipated_by_site"] = np.concatenate(dissipated, axis=1)[:, order]
+            chunk |= impact_table([episode for log in logs for episode in log])
+            fields = fields if self.columns else np.concatenate(blocks, axis=2)
+        if shares is not None or self.columns:
+            chunk |= {name: fields[:, i] for i, name in enumerate(self.setup.case.output.fields)}
         self.setup.output.chunks.append(chunk or None)
         self._episodes += comm.allreduce(len(episodes))
         self._samples.clear()
@@ -113,33 +115,6 @@ def recorded_cells(case: Case) -> np.ndarray:
     """Cells (0-based) of the whole lattice whose fields are recorded."""
     first, last = case.output.window or (1, case.lattice.cells)
     return np.arange(first - 1, last, case.output.every)
-
-
-def gather_cells(comm: MPI.Comm, block: np.ndarray) -> np.ndarray | None:
-    """All ranks' blocks (samples, field, cell, dof) along the cells, on rank 0; all ranks must call it."""
-    block = np.ascontiguousarray(block)
-    if comm.size == 1:
-        return block
-    samples, fields, cells, dofs = block.shape
-    counts = comm.gather(cells)
-    if counts is None:
-        comm.Gatherv(block, None)
-        return None
-    sizes = [samples * fields * dofs * n for n in counts]
-    received = np.empty(sum(sizes))
-    comm.Gatherv(block, [received, sizes])
-    pieces = np.split(received, np.cumsum(sizes)[:-1])
-    shaped = [piece.reshape(samples, fields, n, dofs) for piece, n in zip(pieces, counts, strict=True)]
-    return np.concatenate(shaped, axis=2)
-
-
-def gather_sites(layout: Layout, values: np.ndarray) -> np.ndarray | None:
-    """All ranks' ``values`` (samples, site) in the order of the sites, on rank 0; all ranks must call it."""
-    gathered = layout.comm.gather((np.asarray(layout.sites, np.int64), values))
-    if gathered is None:
-        return None
-    sites, tables = zip(*gathered, strict=True)
-    return np.concatenate(tables, axis=1)[:, np.argsort(np.concatenate(sites))]
 
 
 def impact_table(episodes: list[Episode]) -> dict[str, np.ndarray]:

@@ -182,30 +182,26 @@ def fields_in_file(
     """The fields ``names`` of a new file with all of ``data``: of one rank's, or of one that ``comm`` shares."""
     with h5py.File(path, "w", **({"driver": "mpio", "comm": comm} if comm else {})) as file:
         put_dataset(file, data, write=comm is None or comm.rank == 0)
-        dims = field_dims(data)
-        for name in names:
-            add_variable(file, name, dims, [data.sizes[dim] for dim in dims], float, field_attributes(name))
+        for name, (dims, shape, attributes) in describe_fields(data, names).items():
+            add_variable(file, name, dims, shape, float, attributes)
         yield file
 
 
 @contextmanager
 def fields_in_memory(data: xr.Dataset, names: tuple[str, ...]) -> Iterator[Mapping[str, Any]]:
     """The fields ``names`` as arrays, which become variables of ``data``."""
-    dims = field_dims(data)
-    arrays = {name: np.empty([data.sizes[dim] for dim in dims]) for name in names}
+    described = describe_fields(data, names)
+    arrays = {name: np.empty(shape) for name, (_, shape, _) in described.items()}
     yield arrays
-    for name, values in arrays.items():
-        data[name] = dims, values, field_attributes(name)
+    for name, (dims, _, attributes) in described.items():
+        data[name] = dims, arrays[name], attributes
 
 
-def field_dims(data: xr.Dataset) -> tuple[str, ...]:
-    """Dimensions of a field in ``data``."""
-    return "field_time" if "field_time" in data else "time", "cell", "dof"
-
-
-def field_attributes(name: str) -> dict[str, str]:
-    """Attributes of a field."""
-    return {"units": FIELDS[name], "long_name": f"{name} of each mass"}
+def describe_fields(data: xr.Dataset, names: tuple[str, ...]) -> dict[str, tuple[list[str], list[int], dict[str, str]]]:
+    """Dimensions, shape and attributes of the fields ``names`` beside ``data``."""
+    dims = ["field_time" if "field_time" in data else "time", "cell", "dof"]
+    shape = [data.sizes[dim] for dim in dims]
+    return {name: (dims, shape, {"units": FIELDS[name], "long_name": f"{name} of each mass"}) for name in names}
 
 
 def put_chunks(fields: Mapping[str, Any], chunks: Chunks, rank: int, names: tuple[str, ...], columns: slice) -> None:
