@@ -86,29 +86,33 @@ def simulate(
     """
     begin = time.perf_counter(), time.process_time()
     output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
-    comm, model = output.comm, case.model()
+    model = case.model()
     output.begin(_description(case, model), force, resume)
-    layout = Layout.of(model, comm)
+    layout = Layout.of(model, output.comm)
     kind, refusal = select_engine(case.time.engine, model, ENGINES)
     setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
     run = Run(setup, [*OBSERVERS, *(["progress"] if progress else []), *observers])
     state = output.chunks.last_state() if resume else None
     if state is not None:
         run.restore(state)
-    ending, sentence = run.advance()
+    return _finish(run, *run.advance(), begin, {"engine_note": refusal} if refusal else {})
+
+
+def _finish(run: "Run", ending: str, sentence: str, begin: tuple[float, float], note: dict[str, str]) -> Result:
+    """Write the last checkpoint of a run that was stopped, or the files of one that ended; what rank 0 tells counts."""
+    output, comm = run.setup.output, run.setup.output.comm
     if ending == STOPPED:
         run.checkpoint()
         sentence += "; --resume goes on from there"
-    statistics = run.finish(ending == STOPPED) | ({"engine_note": refusal} if refusal else {})
+    statistics = run.finish(ending == STOPPED) | note
     cpu = comm.allreduce(time.process_time() - begin[1])
     statistics |= {"wall_seconds": round(time.perf_counter() - begin[0], 3), "cpu_seconds": round(cpu, 3)}
-    statistics = comm.bcast(statistics)
+    attributes = provenance(comm) | {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
+    attributes = comm.bcast(attributes)
     if ending != STOPPED:
-        attributes = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
-        attributes = comm.bcast(provenance(comm) | attributes)
-        output.finish(attributes, run.recorder.columns, {"case": case.model_dump(by_alias=True)})
-    setup.engine.destroy()
-    return Result(ending == COMPLETE, ending == STOPPED, sentence, statistics, output.folder)
+        output.finish(attributes, run.recorder.columns, {"case": run.setup.case.model_dump(by_alias=True)})
+    run.setup.engine.destroy()
+    return Result(ending == COMPLETE, ending == STOPPED, sentence, attributes["statistics"], output.folder)
 
 
 def _description(case: Case, model: Model) -> RunDescription:

@@ -61,10 +61,8 @@ def claim_folder(
 
     Parameters
     ----------
-    path
-        The folder, made if it is missing.
-    kind
-        What it is to hold.
+    path, kind
+        The folder, made if it is missing, and what it is to hold.
     text
         What the results are of, a resolved case.
     force
@@ -72,8 +70,8 @@ def claim_folder(
     resume
         Go on with results that are there and nothing else; None: go on if there are results of the same ``text``.
     difference
-        Of the marker's text: why results begun with it are not those asked for, None if they are. By default any
-        change of ``text`` is one.
+        Of the marker's text: why results begun with it are not those asked for, None if they are; by default any
+        change of ``text``.
 
     Raises
     ------
