@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import h5py
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
@@ -72,6 +73,16 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     assert done.returncode == 1
     assert "turn nnm.smallest_step" in done.stdout
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_a_file_that_is_no_branch_is_refused_on_all_ranks(vipetsc, tmp_path, ranks):
+    with h5py.File(tmp_path / "branch-x.h5", "w") as file:
+        file["energy"] = [1.0]
+    done = vipetsc(ranks, "plot", tmp_path)
+    assert done.returncode == 2
+    assert "is not a branch" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_branches_and_runs_never_share_a_folder(vipetsc, tmp_path):

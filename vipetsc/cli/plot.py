@@ -6,7 +6,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from vipetsc.io.folder import FolderError
-from vipetsc.parallel import on_root
+from vipetsc.parallel import on_every_rank, on_root
 
 _NOT_OURS = {"design": "design.h5: is not a search", "branches": "branch-*.h5: is not a branch"}
 
@@ -39,7 +39,7 @@ def source_of(paths: Sequence[Path]) -> tuple[str, Sequence[Path]]:
 def draw_source(
     source: str, folders: Sequence[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm
 ) -> list[Path]:
-    """Draw what ``folders`` hold (see `vipetsc.figures.draw`), measured first where that is missing or older."""
+    """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older."""
     from vipetsc.figures.registry import draw, figure_names
 
     def prepare() -> None:
@@ -52,13 +52,16 @@ def draw_source(
         elif source == "sweep":
             _prepare_sweeps(folders)
 
+    def draw_share() -> list[Path]:
+        try:
+            return draw(source, folders, names, formats, (comm.rank, comm.size))
+        except (OSError, KeyError, ValueError) as error:
+            if source not in _NOT_OURS:
+                raise
+            raise FolderError(f"{folders[0] / _NOT_OURS[source]} of vipetsc ({error})") from None
+
     on_root(comm, prepare)
-    try:
-        drawn = draw(source, folders, names, formats, (comm.rank, comm.size))
-    except (OSError, KeyError) as error:
-        if source not in _NOT_OURS:
-            raise
-        raise FolderError(f"{folders[0] / _NOT_OURS[source]} of vipetsc ({error})") from None
+    drawn = on_every_rank(comm, draw_share)
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
 
 
