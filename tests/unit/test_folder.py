@@ -74,7 +74,9 @@ def test_a_sweep_goes_on_by_itself_and_force_begins_it_anew(tmp_path):
     assert not claim_folder(tmp_path / "s", SWEEP, "same", resume=None)
     (tmp_path / "s/member").mkdir()
     (tmp_path / "s/index.json").touch()
+    written = (tmp_path / "s/case.toml").stat()
     assert claim_folder(tmp_path / "s", SWEEP, "same", resume=None)
+    assert (tmp_path / "s/case.toml").stat() == written  # going on touches nothing
     with pytest.raises(FolderError, match="holds another sweep; --force replaces it, --out chooses another folder"):
         claim_folder(tmp_path / "s", SWEEP, "other", resume=None)
     assert (tmp_path / "s/member").is_dir()
