@@ -8,8 +8,9 @@ import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.modes.kernel import CompiledSystem, contact_force, elongation, spring_force
-from vipetsc.modes.orbit import Arc, Flow, FlowError, compile_system
-from vipetsc.modes.system import System
+from vipetsc.modes.orbit import Arc, Flow, FlowError
+
+STEPS = 2000
 
 
 @njit
@@ -107,23 +108,18 @@ def _newmark(system: CompiledSystem, y: np.ndarray, duration: float, steps: int,
 
 
 class Newmark(Flow):
-    """Average acceleration with ``steps`` steps a period (2000 in the paper)."""
+    """Average acceleration with the paper's 2000 steps a period."""
 
     name = "newmark"
 
-    def __init__(self, system: System, steps: int = 2000) -> None:
-        super().__init__(system)
-        self.steps = steps
-        self._compiled = compile_system(system)
-
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """See ``Flow.arc``; the times of contact changes are ends of steps."""
-        count = max(round(self.steps * duration / period), 1)
+        count = max(round(STEPS * duration / period), 1)
         y = self.with_variations(start)
         w = np.empty((count + 1, len(self.system.contacts)))
-        if not _newmark(self._compiled, y, duration, count, w):
-            raise FlowError("Newmark's implicit step does not converge: raise the number of steps")
-        side = np.sign(w) * (np.abs(w) > self._compiled.contacts["clearance"])
+        if not _newmark(self.compiled, y, duration, count, w):
+            raise FlowError("Newmark's implicit step does not converge")
+        side = np.sign(w) * (np.abs(w) > self.compiled.contacts["clearance"])
         events = []
         for i, c in zip(*np.nonzero(np.diff(side, axis=0)), strict=True):
             onset = side[i + 1, c] != 0

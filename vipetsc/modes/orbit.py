@@ -8,6 +8,9 @@ import numpy as np
 from vipetsc.modes import kernel
 from vipetsc.modes.system import System, contact_directions, direction
 
+MOST_CHANGES = 2000
+"""Contact changes of one arc beyond which a flow gives up."""
+
 
 class FlowError(RuntimeError):
     """The flow could not cover the requested time."""
@@ -39,12 +42,19 @@ class Arc:
 
 
 class Flow:
-    """What every flow of a system offers; a subclass gives its ``name`` and ``arc``."""
+    """What every flow offers; a subclass gives its ``name``, ``arc`` and allowed errors.
+
+    ``rtol`` is the error per step relative to the orbit's size, ``rtol_sensitivity`` that of the sensitivities.
+    """
 
     name: ClassVar[str]
+    rtol: ClassVar[float] = 1e-13
+    rtol_sensitivity: ClassVar[float] = 1e-11
 
     def __init__(self, system: System) -> None:
         self.system = system
+        self.compiled = compile_system(system)
+        self.omega = float(system.linear_modes()[0][-1])
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """The orbit from ``start`` (2n,) over ``duration`` seconds; ``period`` helps to choose steps.
@@ -52,6 +62,10 @@ class Flow:
         Raises FlowError if the time cannot be covered.
         """
         raise NotImplementedError
+
+    def omega_ref(self, period: float) -> float:
+        """Frequency in rad/s by which velocities count as displacements: the fastest linear mode's, or the orbit's."""
+        return max(self.omega, 2 * np.pi / period)
 
     def with_variations(self, start: np.ndarray) -> np.ndarray:
         """The state (2n,) and the identity's columns beside it (2n, 1 + 2n)."""
@@ -69,28 +83,17 @@ class Flow:
 
 
 class Dop853Flow(Flow):
-    """Dormand and Prince's 8(5,3) pair, landing on every contact change; see ``kernel``.
-
-    ``rtol`` is the error per step relative to the orbit's size, ``rtol_sensitivity`` that of the sensitivities.
-    """
+    """Dormand and Prince's 8(5,3) pair, landing on every contact change; see ``kernel``."""
 
     name = "compiled"
 
-    def __init__(
-        self, system: System, rtol: float = 1e-13, rtol_sensitivity: float = 1e-11, capacity: int = 2000
-    ) -> None:
-        super().__init__(system)
-        self.rtol, self.rtol_sensitivity, self.capacity = rtol, rtol_sensitivity, capacity
-        self._compiled = compile_system(system)
-        self._omega = float(system.linear_modes()[0][-1])
-
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """See ``Flow.arc``."""
-        y, events = self.with_variations(start), np.empty((self.capacity, 4))
-        tolerances = kernel.Tolerances(self.rtol, self.rtol_sensitivity, max(self._omega, 2 * np.pi / period))
-        outcome, count, closed, steps = kernel.flow(self._compiled, tolerances, y, duration, events)
+        y, events = self.with_variations(start), np.empty((MOST_CHANGES, 4))
+        tolerances = kernel.Tolerances(self.rtol, self.rtol_sensitivity, self.omega_ref(period))
+        outcome, count, closed, steps = kernel.flow(self.compiled, tolerances, y, duration, events)
         if outcome != kernel.DONE:
-            why = {kernel.STUCK: "the step became too small", kernel.FULL: f"more than {self.capacity} contact changes"}
+            why = {kernel.STUCK: "the step became too small", kernel.FULL: f"more than {MOST_CHANGES} contact changes"}
             raise FlowError(f"the flow stopped after {count} contact changes in {duration:.6g} s: {why[outcome]}")
         return self.finish(start, y, duration, events[:count].copy(), closed, steps)
 

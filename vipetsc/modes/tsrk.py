@@ -10,39 +10,35 @@ import numpy as np
 
 from vipetsc.modes import kernel
 from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, correct
-from vipetsc.modes.orbit import Arc, Flow, FlowError, compile_system
+from vipetsc.modes.orbit import Arc, Flow, FlowError
 from vipetsc.modes.system import System
 
 
 class Tsrk(Flow):
-    """PETSc TSRK of type ``method``; tolerances as in ``Dop853Flow``.
+    """PETSc TSRK of type 8vr; options begin with ``-nnm_basic_`` for steps, with ``-nnm_none_`` for landings.
 
     8vr restarts every step; an FSAL type such as 5dp is restarted after each change, or its stale stage would spoil
     the sensitivities.
     """
 
     name = "tsrk"
+    rtol_sensitivity = 1e-10
 
-    def __init__(
-        self, system: System, method: str = "8vr", rtol: float = 1e-13, rtol_sensitivity: float = 1e-10
-    ) -> None:
+    def __init__(self, system: System) -> None:
         super().__init__(system)
-        self.rtol, self.rtol_sensitivity = rtol, rtol_sensitivity
-        self._omega = float(system.linear_modes()[0][-1])
-        tolerances = kernel.Tolerances(rtol, rtol_sensitivity, self._omega)
-        self._stepper = kernel.create_stepper(compile_system(system), tolerances, 1 + 2 * system.dofs)
+        tolerances = kernel.Tolerances(self.rtol, self.rtol_sensitivity, self.omega)
+        self._stepper = kernel.create_stepper(self.compiled, tolerances, 1 + 2 * system.dofs)
         self._y = PETSc.Vec().createSeq(self._stepper.end.size, comm=PETSc.COMM_SELF)
-        self._adaptive = self._solver(method, "basic")
-        self._fixed = self._solver(method, "none")
+        self._adaptive, self._fixed = self._solver("basic"), self._solver("none")
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
         """See ``Flow.arc``."""
         y, stepper, side = self.with_variations(start), self._stepper, self._stepper.side
         kernel.closed_sides(stepper.system, y, side)
         self._tolerances(start, period)
-        t, h, closed, steps, events = 0.0, 0.05 / self._omega, 0.0, 0, []
+        t, h, closed, steps, events = 0.0, 0.05 / self.omega, 0.0, 0, []
         while t < duration:
-            length, state, h = self._step(self._adaptive, y, min(h, 1 / self._omega, duration - t))
+            length, state, h = self._step(self._adaptive, y, min(h, 1 / self.omega, duration - t))
             steps += 1
             if length < kernel.SMALLEST_STEP * duration and length < duration - t:
                 raise FlowError(f"TSRK's step became too small at {t:.6g} s of {duration:.6g} s")
@@ -62,19 +58,18 @@ class Tsrk(Flow):
                 self._adaptive.restartStep()
         return self.finish(start, y, duration, np.array(events).reshape(-1, 4), closed, steps)
 
-    def _solver(self, method: str, adapt: str) -> PETSc.TS:
+    def _solver(self, adapt: str) -> PETSc.TS:
         ts = PETSc.TS().create(PETSc.COMM_SELF)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
         ts.setType("rk")
-        ts.setRKType(method)
+        ts.setRKType("8vr")
         ts.setRHSFunction(self._rates, self._y.duplicate())
         ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
         ts.setMaxTime(1e300)
         ts.setMaxSteps(2**31 - 1)
         ts.setMaxStepRejections(-1)
-        options = PETSc.Options()
-        for key, value in (("ts_adapt_type", adapt), ("ts_adapt_wnormtype", "infinity")):
-            options[f"nnm_{adapt}_{key}"] = value
+        options = PETSc.Options(f"nnm_{adapt}_")
+        options["ts_adapt_type"], options["ts_adapt_wnormtype"] = adapt, "infinity"
         ts.setOptionsPrefix(f"nnm_{adapt}_")
         ts.setFromOptions()
         return ts
@@ -82,7 +77,7 @@ class Tsrk(Flow):
     def _tolerances(self, start: np.ndarray, period: float) -> None:
         """Absolute tolerances from the orbit's size; velocities count as displacements over a radian."""
         n = self.system.dofs
-        omega = max(self._omega, 2 * np.pi / period)
+        omega = self.omega_ref(period)
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / omega)
         unit = np.repeat([1.0, omega], n)
         absolute = np.empty(self._stepper.end.shape)
@@ -90,9 +85,7 @@ class Tsrk(Flow):
         absolute[:, 1:] = self.rtol_sensitivity * unit[:, None] / unit[None, :]
         relative = np.full(absolute.shape, self.rtol_sensitivity)
         relative[:, 0] = self.rtol
-        atol, rtol = self._y.duplicate(), self._y.duplicate()
-        atol.setArray(absolute.ravel())
-        rtol.setArray(relative.ravel())
+        rtol, atol = (PETSc.Vec().createWithArray(a.ravel(), comm=PETSc.COMM_SELF) for a in (relative, absolute))
         self._adaptive.setTolerances(rtol=rtol, atol=atol)
 
     def _rates(self, ts: PETSc.TS, t: float, y: PETSc.Vec, dy: PETSc.Vec) -> None:
