@@ -54,6 +54,7 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
     assert "| DOP853 numpy |" in table.stdout
 
 
+@pytest.mark.mpirun
 def test_a_flight_on_two_ranks_is_timed_beside_its_memory(monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_scaling import on_ranks

@@ -33,6 +33,7 @@ def numbers(path):
     return {name: values for name, values in datasets(path).items() if values.dtype != object}
 
 
+@pytest.mark.mpirun
 def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     done = vipetsc(0, "design", case, "--out", out)
@@ -122,6 +123,7 @@ def test_what_is_wrong_with_a_search_is_named(change, message):
     assert message in str(error.value)
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
     """Everything wrong is said at once, once."""

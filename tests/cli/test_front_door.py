@@ -37,6 +37,7 @@ def case(tmp_path) -> Path:
     return path
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, case, tmp_path, ranks):
     ended = vipetsc(ranks, "run", case, "--out", tmp_path / "out")
@@ -67,6 +68,7 @@ def test_no_verb_is_the_builtin_case(vipetsc, tmp_path):
     assert forced.returncode == 0, forced.stderr
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_everything_wrong_with_a_case_is_said_at_once(vipetsc, tmp_path, ranks):
     path = tmp_path / "bad.toml"
@@ -167,6 +169,7 @@ def test_bands_as_json_and_picture(vipetsc, tmp_path):
     assert (tmp_path / "bands" / "bands.png").stat().st_size > 5000
 
 
+@pytest.mark.mpirun
 def test_doctor(vipetsc):
     ended = vipetsc(2, "doctor")
     assert ended.returncode == 0, ended.stdout
@@ -180,6 +183,7 @@ def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["statistics"]["method"] == "5dp"
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_path, ranks):
     """Explicit Euler without step control feeds energy in: the guard ends the run and keeps what is good."""
@@ -216,6 +220,7 @@ def await_checkpoints(process: subprocess.Popen, out: Path, ranks: int, number: 
 LONG = ("--set", "time.end=1.0")
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [0, 2])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, number):
@@ -243,6 +248,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, n
     assert not (out / "parts").exists()
 
 
+@pytest.mark.mpirun
 def test_one_killed_rank_ends_all_and_loses_nothing(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     process = begin(case, out, 2, *LONG)
@@ -267,6 +273,7 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize("limit", [300_000, 440_000])
 def test_a_disk_that_fills_ends_all_and_loses_nothing(vipetsc, case, tmp_path, ranks, limit):
@@ -310,6 +317,7 @@ MPI.COMM_WORLD.Barrier()
 """
 
 
+@pytest.mark.mpirun
 def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
     script = tmp_path / "fails.py"
     script.write_text(FAILS_ON_RANK_0_FOR_ALL)
@@ -319,6 +327,7 @@ def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
     assert ended.stderr.count("no right to write") == 1
 
 
+@pytest.mark.mpirun
 def test_a_rank_that_raises_ends_all(tmp_path):
     script = tmp_path / "fails.py"
     script.write_text(FAILS_ON_ONE_RANK)

@@ -67,6 +67,7 @@ def test_bad_cases_write_nothing(vipetsc, case, tmp_path, change, message):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.mpirun
 def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     done = vipetsc(2, "nnm", case, "--out", out, "--set", "nnm.smallest_step=1e-3")
@@ -75,6 +76,7 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_a_file_that_is_no_branch_is_refused_on_all_ranks(vipetsc, tmp_path, ranks):
     with h5py.File(tmp_path / "branch-x.h5", "w") as file:

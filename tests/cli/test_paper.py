@@ -75,6 +75,7 @@ def killed(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.mpirun
 def test_one_rank_makes_the_same_claims_as_two_that_were_killed(killed, tmp_path):
     done = make(0, tmp_path / "out", "C8", "C11")
     assert set(done["made"]) == {"scattering", "interband"}
@@ -83,6 +84,7 @@ def test_one_rank_makes_the_same_claims_as_two_that_were_killed(killed, tmp_path
     assert {row["verdict"] for row in json.loads(claims)} == {"holds"}
 
 
+@pytest.mark.mpirun
 def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(killed):
     before = {path: path.stat().st_mtime_ns for path in killed.rglob("*") if path.is_file()}
     assert make(2, killed) == {"made": [], "drawn": 0, "complete": True}
@@ -91,6 +93,7 @@ def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(killed):
     assert make(0, killed)["drawn"] == 2
 
 
+@pytest.mark.mpirun
 def test_every_figure_of_the_paper_is_offered(killed):
     plan = tiny_plan()
     folders = plan.folders(killed)
@@ -103,6 +106,7 @@ def test_every_figure_of_the_paper_is_offered(killed):
     assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf")}
 
 
+@pytest.mark.mpirun
 def test_a_changed_case_is_stale(killed):
     plan = tiny_plan()
     step = next(step for step in plan.steps if step.name == "design")
@@ -141,6 +145,7 @@ def test_list_says_what_is_left(vipetsc, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.mpirun
 def test_bad_ids_and_foreign_folders_are_refused(vipetsc, tmp_path):
     wrong = vipetsc(2, "paper", "--only", "fig99", "C7", "--out", tmp_path / "out")
     assert wrong.returncode == 2
@@ -260,6 +265,7 @@ return {
 """
 
 
+@pytest.mark.mpirun
 @pytest.mark.skipif(shutil.which("chromedriver") is None, reason="no chromedriver; scripts/test installs it")
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 900)])
 def test_the_report_fits_a_phone_and_a_desk(killed, browser, tmp_path, width, height):
@@ -278,6 +284,7 @@ def test_the_report_fits_a_phone_and_a_desk(killed, browser, tmp_path, width, he
     assert errors == []
 
 
+@pytest.mark.mpirun
 def test_the_report_says_what_it_must(killed):
     page = (killed / "report.html").read_text(encoding="utf-8")
     assert "quick: coarse grid" in page

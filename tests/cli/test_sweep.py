@@ -46,6 +46,7 @@ def case(tmp_path) -> Path:
     return path
 
 
+@pytest.mark.mpirun
 def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out)
@@ -100,6 +101,7 @@ def test_a_scaled_member_is_what_its_simulation_would_be(vipetsc, case, tmp_path
     assert np.array_equal(scaled["time"], run["time"])
 
 
+@pytest.mark.mpirun
 @pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGTERM)])
 def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, number):
     # Many members on the slower engine leave time to be killed in.
@@ -144,6 +146,7 @@ def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks,
     assert (tmp_path / "whole" / "ensemble.h5").read_bytes() == (out / "ensemble.h5").read_bytes()
 
 
+@pytest.mark.mpirun
 def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out, "--set", "sweep.contacts.sites=[[20], [41], [30]]")
@@ -190,6 +193,7 @@ def test_bad_sweeps_write_nothing(vipetsc, case, tmp_path, value):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.mpirun
 def test_full_fields_on_request(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     ended = vipetsc(
@@ -220,6 +224,7 @@ def test_full_fields_on_request(vipetsc, case, tmp_path):
     assert measured["partition/kinetic"] == pytest.approx(measured["kinetic_energy"].sum(axis=1), rel=1e-12)
 
 
+@pytest.mark.mpirun
 def test_measures_again_from_files(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     keys = (
