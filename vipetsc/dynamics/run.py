@@ -160,8 +160,8 @@ class Run:
             except (StalledError, RunawayError) as error:
                 reason = f"stalled: {error}" if isinstance(error, StalledError) else str(error)
                 good = "none" if self.last is None else f"t = {self.last:.6g} s"
-                place = fastest_place(self.setup)
-                return FAILED, f"{reason}, at t = {engine.time:.6g} s ({place}); last good sample: {good}"
+                fastest = fastest_place(self.setup)
+                return FAILED, f"{reason}, at t = {engine.time:.6g} s ({fastest}); last good sample: {good}"
             self.samples, self.last = self.samples + 1, t
             if any(observer.due for observer in self.observers):
                 self.checkpoint()

@@ -60,8 +60,8 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
             dataset[...] = values.astype(object) if values.dtype.kind == "U" else values
     for path, value in data.attrs.items():
         group, _, key = str(path).rpartition("/")
-        place = file.require_group(group) if group else file
-        place.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
+        node = file.require_group(group) if group else file
+        node.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
 
 
 def add_variable(
@@ -130,8 +130,8 @@ def _flat(groups: dict[str, xr.Dataset]) -> xr.Dataset:
 
 def _dimension(groups: dict[str, xr.Dataset], group: PurePosixPath, name: str) -> str:
     """Path of the coordinate ``name`` of a dimension met in ``group``: there, or in the nearest group around it."""
-    for place in (group, *group.parents):
-        around = groups.get(str(place))
+    for node in (group, *group.parents):
+        around = groups.get(str(node))
         if around is not None and name in around.variables and around.variables[name].dims == (name,):
-            return str(place / name).strip("/")
+            return str(node / name).strip("/")
     return str(group / name).strip("/")
