@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 
 from vipetsc.case import Case, Model
 from vipetsc.case.case import WEAKEST
-from vipetsc.lattice import Chain, Contact, Hertz, ToneBurst
+from vipetsc.lattice import Chain, Contact, ToneBurst
 
 SOURCES = Path(__file__).parent / "peers"
 BOOST = Path("/usr/include/boost/numeric/odeint.hpp")
@@ -55,7 +55,7 @@ def parameters(model: Model) -> str:
         ("masses", *chain.cell.masses),
         ("couplings", len(couplings)),
         *couplings,
-        ("contact", int(contact.law is Hertz), contact.stiffness, chain.cell.host, chain.cell.resonator),
+        ("contact", int(contact.law == "hertz"), contact.stiffness, chain.cell.host, chain.cell.resonator),
         ("sites", len(chain.sites)),
         *zip(chain.sites, chain.clearances, strict=True),
         ("drive", model.drive_cell, model.drive_mass, drive.window_amplitude, drive.frequency, drive.cycles),
@@ -155,7 +155,7 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
     stiffness, inverse_mass = chain.stiffness_matrix().tocsr(), 1 / chain.masses()
     first, columns, values = stiffness.indptr, stiffness.indices, stiffness.data
     host, resonator, clearance = _pairs(chain)
-    contact, exponent, n = law.stiffness, law.law.exponent, inverse_mass.size
+    contact, exponent, n = law.stiffness, law.exponent, inverse_mass.size
     amplitude, frequency, cycles, end = drive.window_amplitude, drive.frequency, drive.cycles, drive.duration
 
     @numba.njit

@@ -19,10 +19,10 @@ from vipetsc.contact.law import (
     force_law,
 )
 from vipetsc.contact.tracker import ImpactTracker
-from vipetsc.lattice import Bilinear, Contact, Hertz
+from vipetsc.lattice import Contact
 
 KC, D, R = 3e5, 2e-4, 0.7
-LAWS = pytest.mark.parametrize("law", [Hertz, Bilinear])
+LAWS = pytest.mark.parametrize("law", ["hertz", "bilinear"])
 
 
 @LAWS
@@ -46,7 +46,7 @@ def test_the_force_is_that_of_the_plain_law(law, side):
 def test_energy_force_and_gradient_belong_together(law):
     record, x = force_law(Contact(law, KC)), 3e-5
     h = 1e-4 * x
-    assert elastic_force(record, x) == pytest.approx(KC * x**law.exponent)
+    assert elastic_force(record, x) == pytest.approx(KC * x ** Contact(law, KC).exponent)
     assert elastic_force(record, -x) == -elastic_force(record, x)
     slope = (elastic_energy(record, x + h) - elastic_energy(record, x - h)) / (2 * h)
     assert slope == pytest.approx(elastic_force(record, x), rel=1e-6)
@@ -57,7 +57,7 @@ def test_energy_force_and_gradient_belong_together(law):
 
 
 def test_another_exponent_goes_between_the_two():
-    record, x = force_law(Contact(Hertz, KC))._replace(exponent=1.25), 3e-5
+    record, x = force_law(Contact("hertz", KC))._replace(exponent=1.25), 3e-5
     assert elastic_force(record, -x) == pytest.approx(-KC * x**1.25)
     assert elastic_force_and_slope(record, x)[1] == pytest.approx(1.25 * KC * x**0.25)
     assert elastic_energy(record, x) == pytest.approx(KC * x**2.25 / 2.25)
@@ -75,7 +75,7 @@ def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
     # Above the clearance between middle - width and middle + width.
     w = side * (np.poly1d([D]) - 40.0 * np.poly1d([1, -2 * middle, middle**2 - width**2]))
     start, end = motions(w, h)
-    contacts = create_contacts(Contact(Hertz, KC, R), [D, D])
+    contacts = create_contacts(Contact("hertz", KC, R), [D, D])
     change = changes.first_change(contacts, start, end, h)
     assert change.share * h == pytest.approx(middle - width)
     assert (change.site, change.function) == (1, 0 if side == 1 else 1)
@@ -103,7 +103,7 @@ def test_the_earliest_of_several_sites_changes_first(order):
     h, clearances = 1e-3, np.array([D, 3 * D, 5 * D])[::order]
     rate = 6 * D / h
     start, end = np.array([[0.0, rate, 0.0]] * 3), np.array([[6 * D, rate, 0.0]] * 3)
-    change = changes.first_change(create_contacts(Contact(Hertz, KC, R), clearances), start, end, h)
+    change = changes.first_change(create_contacts(Contact("hertz", KC, R), clearances), start, end, h)
     assert change.site == (0 if order == 1 else 2)
     assert change.share == pytest.approx(1 / 6)
 
@@ -113,7 +113,7 @@ def test_clipping_begins_where_g_falls_through_zero():
     w = np.poly1d([D + 1e-4]) - np.poly1d([20.0, 0.02, 0.0])  # ever faster out
     start, end = motions(w, h)
     for adhesion in ("allow", "clip"):
-        contacts = create_contacts(Contact(Hertz, KC, R, adhesion), [D, D])
+        contacts = create_contacts(Contact("hertz", KC, R, adhesion), [D, D])
         contacts.sites[1] = (CLOSED, D, approach)
         change = changes.first_change(contacts, start, end, h)
         assert (change.share > 1) == (adhesion == "allow")
@@ -161,7 +161,7 @@ def test_a_landing_within_the_tolerance_goes_on_while_it_gains():
 
 
 def test_the_tracker_follows_an_impact_from_onset_to_separation():
-    contact = Contact(Hertz, KC, R, approach_floor=0.05)
+    contact = Contact("hertz", KC, R, approach_floor=0.05)
     tracker = ImpactTracker(create_contacts(contact, [D, D]), (4, 9), 0.003)
     site = tracker.contacts.sites[1]
     tracker.start[1] = -D, 0.01, 0.0  # touches on the side -1, moving away: a graze
@@ -210,7 +210,7 @@ def test_the_contact_time_is_that_of_a_simulated_impact(law):
 
 
 def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
-    tracker = ImpactTracker(create_contacts(Contact(Hertz, KC), [D]), (0,), 0.003)
+    tracker = ImpactTracker(create_contacts(Contact("hertz", KC), [D]), (0,), 0.003)
     tracker.start[0] = 1.01 * D, -0.1, 0.0
     assert tracker.switch(0.0, np.zeros(1)) == 1
     assert tracker.contacts.sites["mode"].tolist() == [CLOSED]

@@ -6,11 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipetsc.lattice import (
-    Bilinear,
     Chain,
     Contact,
-    ContactLaw,
-    Hertz,
     Spring,
     ToneBurst,
     UnitCell,
@@ -92,7 +89,7 @@ def test_waves_at_a_frequency_lie_on_the_branch(cell):
     assert found == pytest.approx(speed, rel=1e-6)
     assert bloch(cell, kappa).frequency[1] == pytest.approx(frequency, rel=1e-12)
     low, high = gaps(pass_bands(cell))[0]
-    assert waves_at(cell, (low + high) / 2) == []
+    assert waves_at(cell, (low + high) / 2) == ()
 
 
 @settings(max_examples=40, deadline=None)
@@ -184,16 +181,15 @@ def test_wave_scale_is_linear_in_the_drive():
     assert chain.wave_scale(ToneBurst(1.0, 1206.34, 30, "hann")) == pytest.approx(one / 2, rel=1e-12)
 
 
-@pytest.mark.parametrize("law", [Hertz, Bilinear])
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_force_is_the_slope_of_the_potential(law):
     contact, d = Contact(law, 1e6), 2e-3
     w = np.array([-3e-3, -2.2e-3, -1e-3, 0.0, 1e-3, 2.2e-3, 3e-3])
     h = 1e-8
     slope = (contact.potential(w + h, d) - contact.potential(w - h, d)) / (2 * h)
     assert np.allclose(contact.force(w, d), slope, rtol=1e-6, atol=1e-9)
-    assert ContactLaw.named(law.name) is law
     with pytest.raises(KeyError):
-        ContactLaw.named("glue")
+        Contact("glue", 1e6).force(w, d)
 
 
 @given(
@@ -201,7 +197,7 @@ def test_force_is_the_slope_of_the_potential(law):
     st.floats(1e-4, 4e-3),
     st.floats(-2, 2),
     st.floats(0.01, 3),
-    st.sampled_from([Hertz, Bilinear]),
+    st.sampled_from(["hertz", "bilinear"]),
 )
 def test_contact_is_odd_and_restoring(w, d, rate, approach, law):
     contact = Contact(law, 1e6, 0.7)
@@ -214,12 +210,12 @@ def test_contact_is_odd_and_restoring(w, d, rate, approach, law):
 
 
 def test_restitution_takes_energy_out():
-    contact = Contact(Hertz, 1e6, 0.7)
+    contact = Contact("hertz", 1e6, 0.7)
     for side in (1, -1):
         assert contact.dissipation_factor(side * 2.0, side * 2.0) == pytest.approx(1.45)  # approaching: g > 1
         assert contact.dissipation_factor(-side * 2.0, side * 2.0) == pytest.approx(0.55)  # leaving: g < 1
-    assert Contact(Hertz, 1e6, 1.0).dissipation_factor(5.0, 0.1) == 1
+    assert Contact("hertz", 1e6, 1.0).dissipation_factor(5.0, 0.1) == 1
     assert contact.dissipation_factor(-1.0, 0.1) < 0
-    assert Contact(Hertz, 1e6, 0.7, adhesion="clip").dissipation_factor(-1.0, 0.1) == 0
-    floored = Contact(Hertz, 1e6, 0.7, approach_floor=0.5)
+    assert Contact("hertz", 1e6, 0.7, adhesion="clip").dissipation_factor(-1.0, 0.1) == 0
+    floored = Contact("hertz", 1e6, 0.7, approach_floor=0.5)
     assert floored.dissipation_factor(1.0, -1e-12) == pytest.approx(1 - 0.9)

@@ -31,7 +31,7 @@ def reference(case: Case):
         force = -stiffness @ u
         w, rate = u[resonator] - u[host], v[resonator] - v[host]
         x = np.where(side != 0, np.maximum(side * w - clearance, 0), 0)
-        push = side * contact.stiffness * x**contact.law.exponent * contact.dissipation_factor(rate, approach)
+        push = side * contact.stiffness * x**contact.exponent * contact.dissipation_factor(rate, approach)
         np.add.at(force, host, push)
         np.add.at(force, resonator, -push)
         force[model.drive_cell * dofs + model.drive_mass] += model.drive.force(t)

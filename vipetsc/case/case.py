@@ -23,9 +23,8 @@ from vipetsc.case.resolve import resolved, wave_speed, with_preset
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, TimeTable
 from vipetsc.lattice import waves_at
 from vipetsc.lattice.cell import UnitCell
-from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.contact import Contact, ContactLaw
-from vipetsc.lattice.drive import ToneBurst
+from vipetsc.lattice.chain import Chain, ToneBurst
+from vipetsc.lattice.contact import Contact
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
@@ -114,7 +113,7 @@ class Case(CaseFile):
         return Model(
             chain=chain,
             contact=Contact(
-                law=ContactLaw.named(contacts.law),
+                law=contacts.law,
                 stiffness=contacts.stiffness or 0.0,
                 restitution=contacts.restitution,
                 adhesion=contacts.adhesion,

@@ -11,7 +11,7 @@ from vipetsc.case.checks import Checks, check_lattice, check_sites
 from vipetsc.case.reading import CaseFile, Problem, Section, Table
 from vipetsc.case.resolve import clearances, site_cells, with_default_preset
 from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive
-from vipetsc.lattice import Chain, Contact, ContactLaw, contact_stiffness
+from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.presets import PRESETS
 
 
@@ -158,7 +158,7 @@ class NnmCase(CaseFile):
             defaults = (preset[key] for key in ("modulus", "radius", "poisson"))
             values = (d if v is None else v for v, d in zip(material, defaults, strict=True))
             stiffness = float(contact_stiffness(*values))
-        return Contact(ContactLaw.named(given.law), stiffness)
+        return Contact(given.law, stiffness)
 
     def clearance(self) -> float:
         """The clearance in m of the reduced model's contact."""

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.reading import Table
-from vipetsc.case.schema import ClearanceSpan, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
+from vipetsc.case.schema import ClearanceSpan, ContactsTable, DriveTable, LatticeTable, TimeTable
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.chain import log_clearances, spread_sites
@@ -47,15 +47,18 @@ def with_preset(table: Table) -> Table:
 
 def site_cells(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
     """The cells (1-based) with a contact; [] for a count without a preset to place it."""
-    sites = contacts.sites
-    if isinstance(sites, Span):
-        if sites.last is None:
-            return [sites.first + (sites.spacing or 1) * i for i in range(sites.count)]
-        return [c + 1 for c in spread_sites(sites.first, sites.last, sites.count)]
+    sites, preset = contacts.sites, PRESETS.get(str(lattice.preset))
+    if isinstance(sites, list):
+        return sites
     if isinstance(sites, int):
-        preset = PRESETS.get(str(lattice.preset))
-        return [c + 1 for c in preset.sites(lattice.cells, sites)] if preset and sites else []
-    return list(sites)
+        if preset is None or sites == 0:
+            return []
+        first, last, count = *preset.site_span(lattice.cells, sites), sites
+    elif sites.last is None:
+        return [sites.first + (sites.spacing or 1) * i for i in range(sites.count)]
+    else:
+        first, last, count = sites.first, sites.last, sites.count
+    return [c + 1 for c in spread_sites(first, last, count)]
 
 
 def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> list[float]:

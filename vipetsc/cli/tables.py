@@ -87,7 +87,7 @@ def validate_table(case: Case, ranks: int) -> str:
                     f"reading {case.lattice.reading}"),
         ("pass bands", ", ".join(f"{b.low:.2f}-{b.high:.2f}" for b in bands) + " rad/s"),
         ("gaps", ", ".join(f"{a:.2f}-{b:.2f}" for a, b in gaps(bands)) + " rad/s" if gaps(bands) else "none"),
-        ("contact", f"{contact.law.name}, {contact.stiffness:.6g} N/m^{contact.law.exponent:g}, "
+        ("contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.exponent:g}, "
                     f"restitution {contact.restitution:g}"),
         ("sites", _first_few([c + 1 for c in chain.sites])),
         ("clearance", _first_few([f"{1e3 * c:.4g}" for c in chain.clearances]) + " mm" if chain.sites else "none"),

@@ -42,7 +42,7 @@ class Contacts(NamedTuple):
 def force_law(contact: Contact) -> ForceLaw:
     """The record of a contact law."""
     clip = contact.adhesion == "clip"
-    return ForceLaw(contact.stiffness, contact.law.exponent, contact.damping, clip, contact.approach_floor)
+    return ForceLaw(contact.stiffness, contact.exponent, contact.damping, clip, contact.approach_floor)
 
 
 def create_contacts(contact: Contact, clearances: Sequence[float]) -> Contacts:

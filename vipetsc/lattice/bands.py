@@ -11,6 +11,8 @@ from scipy.optimize import brentq, minimize_scalar
 
 from vipetsc.lattice.cell import UnitCell
 
+GRID = np.linspace(0, np.pi, 721)  # wavenumbers between which extremes and waves are searched
+
 
 @dataclass(frozen=True)
 class BlochPoint:
@@ -59,10 +61,9 @@ def bloch(cell: UnitCell | Sequence[UnitCell], kappa: ArrayLike) -> BlochPoint:
     return BlochPoint(kappa, frequency, vectors * root[..., :, None], group_velocity)
 
 
-Matrix = Callable[[UnitCell, np.ndarray], np.ndarray]
-
-
-def _each(matrix: Matrix, cell: UnitCell | Sequence[UnitCell], kappa: np.ndarray) -> np.ndarray:
+def _each(
+    matrix: Callable[[UnitCell, np.ndarray], np.ndarray], cell: UnitCell | Sequence[UnitCell], kappa: np.ndarray
+) -> np.ndarray:
     """``matrix(cell, kappa)`` of one cell, or of several along a first axis."""
     return matrix(cell, kappa) if isinstance(cell, UnitCell) else np.stack([matrix(c, kappa) for c in cell])
 
@@ -79,63 +80,49 @@ def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
     return sign * float(bloch(cell, kappa).frequency[band - 1])
 
 
-def _maximum(function: Callable[[float], float], kappa: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Where in [0, pi] ``function`` is largest, and its value there: the best grid point, refined."""
+def _maximum(function: Callable[[float], float], values: np.ndarray) -> tuple[float, float]:
+    """Where in [0, pi] ``function`` is largest, and its value there: the best of its ``values`` on GRID, refined."""
     best = int(np.argmax(values))
-    bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, len(kappa) - 1)]
+    bracket = GRID[max(best - 1, 0)], GRID[min(best + 1, len(GRID) - 1)]
     refined = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
-    return (refined.x, -refined.fun) if -refined.fun > values[best] else (float(kappa[best]), float(values[best]))
-
-
-def pass_bands(cell: UnitCell, points: int = 721) -> list[Band]:
-    """Pass bands, lowest first; edges are the extremes over kappa in [0, pi], refined off the grid."""
-    return list(_pass_bands(cell, points))
+    return (refined.x, -refined.fun) if -refined.fun > values[best] else (float(GRID[best]), float(values[best]))
 
 
 @lru_cache
-def _pass_bands(cell: UnitCell, points: int) -> tuple[Band, ...]:
-    kappa = np.linspace(0, np.pi, points)
-    frequency = bloch(cell, kappa).frequency
+def pass_bands(cell: UnitCell) -> tuple[Band, ...]:
+    """Pass bands, lowest first; edges are the extremes over kappa in [0, pi], refined off the grid."""
     bands = []
-    for b in range(cell.dofs):
-        _, high = _maximum(partial(_frequency, cell, b + 1), kappa, frequency[:, b])
-        _, low = _maximum(partial(_frequency, cell, b + 1, sign=-1), kappa, -frequency[:, b])
-        bands.append(Band(b + 1, max(-low, 0.0), high))
+    for number, frequency in enumerate(bloch(cell, GRID).frequency.T, 1):
+        _, high = _maximum(partial(_frequency, cell, number), frequency)
+        _, low = _maximum(partial(_frequency, cell, number, sign=-1), -frequency)
+        bands.append(Band(number, max(-low, 0.0), high))
     return tuple(bands)
 
 
-def gaps(bands: list[Band]) -> list[tuple[float, float]]:
+def gaps(bands: Sequence[Band]) -> list[tuple[float, float]]:
     """Band gaps (low, high) in rad/s between consecutive pass bands; the region above is not one."""
     return [(a.high, b.low) for a, b in itertools.pairwise(bands) if b.low > a.high]
 
 
 @lru_cache
-def max_group_velocity(cell: UnitCell, band: int, points: int = 721) -> tuple[float, float, float]:
+def max_group_velocity(cell: UnitCell, band: int) -> tuple[float, float, float]:
     """Where ``band`` (1-based) is fastest: wavenumber (rad per cell), frequency (rad/s), |v_g| (cells/s)."""
 
     def speed(kappa: float) -> float:
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
 
-    kappa = np.linspace(0, np.pi, points)
-    fastest, largest = _maximum(speed, kappa, np.abs(bloch(cell, kappa).group_velocity[:, band - 1]))
+    fastest, largest = _maximum(speed, np.abs(bloch(cell, GRID).group_velocity[:, band - 1]))
     return fastest, _frequency(cell, band, fastest), largest
 
 
-def waves_at(cell: UnitCell, frequency: float, points: int = 721) -> list[tuple[int, float, float]]:
-    """Propagating waves of ``frequency`` (rad/s): (band, kappa in (0, pi), |v_g| in cells/s); [] in a gap."""
-    return list(_waves_at(cell, frequency, points))
-
-
 @lru_cache
-def _waves_at(cell: UnitCell, frequency: float, points: int) -> tuple[tuple[int, float, float], ...]:
-    kappa = np.linspace(0, np.pi, points)
-    offset = bloch(cell, kappa).frequency - frequency
+def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float], ...]:
+    """Propagating waves of ``frequency`` (rad/s): (band, kappa in (0, pi), |v_g| in cells/s); () in a gap."""
     waves = []
-    for b in range(cell.dofs):
-        for i in np.nonzero(offset[:-1, b] * offset[1:, b] <= 0)[0]:
-            if offset[i, b] == 0 and i > 0:
+    for number, offset in enumerate((bloch(cell, GRID).frequency - frequency).T, 1):
+        for i in np.nonzero(offset[:-1] * offset[1:] <= 0)[0]:
+            if offset[i] == 0 and i > 0:
                 continue
-            root = brentq(lambda x, b=b: _frequency(cell, b + 1, x) - frequency, kappa[i], kappa[i + 1], xtol=1e-13)
-            speed = float(abs(bloch(cell, root).group_velocity[b]))
-            waves.append((b + 1, root, speed))
+            root = brentq(lambda x, n=number: _frequency(cell, n, x) - frequency, GRID[i], GRID[i + 1], xtol=1e-13)
+            waves.append((number, root, float(abs(bloch(cell, root).group_velocity[number - 1]))))
     return tuple(waves)

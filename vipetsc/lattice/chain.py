@@ -1,16 +1,48 @@
-"""A finite lattice: how many cells, how it ends, which cells carry contacts, and its linear response."""
+"""A finite lattice: its cells, its ends, its contact sites, the tone burst that drives it, its linear response."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.cell import UnitCell
-from vipetsc.lattice.drive import ToneBurst
 
 Ends = Literal["fixed", "free", "periodic"]
+Envelope = Literal["paper", "hann"]
+
+
+@dataclass(frozen=True)
+class ToneBurst:
+    """The drive of one mass, Eq. (3) of the paper: F(t) = A [1 - cos(Om t/Nc)] sin(Om t) for 0 < t < 2 pi Nc/Om.
+
+    ``amplitude`` A in N, ``frequency`` Om in rad/s, ``cycles`` Nc. The paper's envelope peaks at 2A; the
+    authors' code has a factor 1/2 before it, here ``envelope = "hann"``.
+    """
+
+    amplitude: float
+    frequency: float
+    cycles: int
+    envelope: Envelope = "paper"
+
+    @property
+    def duration(self) -> float:
+        """Length of the burst in s."""
+        return 2 * np.pi * self.cycles / self.frequency
+
+    @property
+    def window_amplitude(self) -> float:
+        """The factor in N before 1 - cos."""
+        return self.amplitude if self.envelope == "paper" else self.amplitude / 2
+
+    def force(self, t: ArrayLike) -> np.ndarray:
+        """Force in N at time t in s."""
+        t = np.asarray(t, float)
+        phase = self.frequency * t
+        burst = self.window_amplitude * (1 - np.cos(phase / self.cycles)) * np.sin(phase)
+        return np.where((t > 0) & (t < self.duration), burst, 0.0)
 
 
 @dataclass(frozen=True)

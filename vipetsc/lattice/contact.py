@@ -5,38 +5,16 @@ F = kc [(w - D)_+^n - (-w - D)_+^n] g, restoring: -F on the resonator, +F on the
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+Law = Literal["hertz", "bilinear"]
 Adhesion = Literal["allow", "clip"]
 
-
-class ContactLaw:
-    """A law F = kc x^n for the indentation x > 0; a subclass gives its ``name`` and ``exponent``."""
-
-    name: ClassVar[str]
-    exponent: ClassVar[float]
-
-    @classmethod
-    def named(cls, name: str) -> "type[ContactLaw]":
-        """The law called ``name``; raises KeyError for an unknown one."""
-        return {law.name: law for law in cls.__subclasses__()}[name]
-
-
-class Hertz(ContactLaw):
-    """Spheres in elastic contact, n = 3/2."""
-
-    name = "hertz"
-    exponent = 1.5
-
-
-class Bilinear(ContactLaw):
-    """A linear stop, n = 1."""
-
-    name = "bilinear"
-    exponent = 1.0
+# n of the laws: spheres in elastic contact (Hertz) and a linear stop.
+EXPONENTS = {"hertz": 1.5, "bilinear": 1.0}
 
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
@@ -49,17 +27,22 @@ def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
 
 @dataclass(frozen=True)
 class Contact:
-    """A contact law with its ``stiffness`` kc in N/m^n and its ``restitution`` r in [0, 1]; 1 conserves energy.
+    """A ``law`` F = kc x^n, its ``stiffness`` kc in N/m^n and its ``restitution`` r in [0, 1]; 1 conserves energy.
 
     ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
     smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded.
     """
 
-    law: type[ContactLaw]
+    law: Law
     stiffness: float
     restitution: float = 1.0
     adhesion: Adhesion = "allow"
     approach_floor: float = 0.0
+
+    @property
+    def exponent(self) -> float:
+        """n of the law; raises KeyError for an unknown one."""
+        return EXPONENTS[self.law]
 
     @property
     def damping(self) -> float:
@@ -81,11 +64,10 @@ class Contact:
     ) -> np.ndarray:
         """Restoring force F in N for relative displacement w in m; g = 1 unless an approach is given."""
         w = np.asarray(w, float)
-        n = self.law.exponent
-        elastic = np.maximum(w - clearance, 0) ** n - np.maximum(-w - clearance, 0) ** n
+        elastic = np.maximum(w - clearance, 0) ** self.exponent - np.maximum(-w - clearance, 0) ** self.exponent
         return self.stiffness * elastic * self.dissipation_factor(rate, approach)
 
     def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
         """Elastic energy kc x^(n+1)/(n+1) in J stored at relative displacement w in m."""
         x = np.maximum(np.abs(np.asarray(w, float)) - clearance, 0)
-        return self.stiffness * x ** (self.law.exponent + 1) / (self.law.exponent + 1)
+        return self.stiffness * x ** (self.exponent + 1) / (self.exponent + 1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vipetsc.lattice.cell import UnitCell, diatomic, four_band
-from vipetsc.lattice.chain import log_clearances, spread_sites
+from vipetsc.lattice.chain import log_clearances
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,6 @@ class Preset:
     drive: dict[str, Any]
     site_span: Callable[[int, int], tuple[float, float]]
     clearance_span: Callable[[int], tuple[float, float]]
-
-    def sites(self, cells: int, count: int) -> tuple[int, ...]:
-        """``count`` sites (0-based cells) at the paper's places in a lattice of ``cells``."""
-        return spread_sites(*self.site_span(cells, count), count)
 
     def clearances(self, count: int) -> tuple[float, ...]:
         """The paper's clearances in m for ``count`` sites."""

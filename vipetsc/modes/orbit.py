@@ -100,7 +100,7 @@ class Dop853Flow(Flow):
 
 def compile_system(system: System) -> kernel.CompiledSystem:
     """The record of a system."""
-    contacts = [(p.clearance, p.law.stiffness, p.law.law.exponent) for p in system.contacts]
+    contacts = [(p.clearance, p.law.stiffness, p.law.exponent) for p in system.contacts]
     spring_rows = [direction(s.start, s.end, system.dofs) for s in system.springs]
     return kernel.CompiledSystem(
         1 / np.asarray(system.masses, float),

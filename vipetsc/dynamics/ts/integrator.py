@@ -21,7 +21,6 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.records import create_record
 from vipetsc.dynamics.ts.native import register
 from vipetsc.dynamics.ts.right_hand_side import observe, right_hand_side
-from vipetsc.lattice import Hertz
 from vipetsc.parallel import StopRequest
 
 # PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
@@ -81,7 +80,7 @@ class Integrator(Engine):
         self._any_open = False
         # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
         # as h^(5/2). The shares are those that the controller settles at.
-        hertz = model.contact.law is Hertz
+        hertz = model.contact.law == "hertz"
         share, order = (1 / 200, 2.5) if hertz else (1 / 20, 8)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
         self.observe(self.tracker.start)
