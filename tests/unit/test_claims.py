@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from vipetsc.case import Case, Sweep
 from vipetsc.lattice import bloch, pass_bands
-from vipetsc.paper.claims import measure_claims, thresholds, write_claims
-from vipetsc.paper.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED, Criterion, MissingEvidence, rounded, verdict
-from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence
-from vipetsc.paper.claims.measure import READINGS, measure_claim
+from vipetsc.paper.claims import criteria as constants
+from vipetsc.paper.claims import measure_claims, write_claims
+from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
+from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvidence
+from vipetsc.paper.claims.measure import READINGS, measure_claim, rounded
 from vipetsc.paper.claims.scattering import BRANCHES
-from vipetsc.paper.claims.thresholds import CLAIMS, LAWS
 from vipetsc.spectra import Parts, dispersion, part_energies, power_law
 from vipetsc.studies.ensemble import COMPLETE, Outcome, assemble
 
@@ -189,13 +189,13 @@ def test_thresholds_are_those_specified():
 
 
 def test_constants_inside_of_quantities_are_those_specified():
-    assert (thresholds.STRAIGHT, thresholds.STRAIGHT_EVERYWHERE, thresholds.FEWEST) == (0.95, 0.9, 4)
-    assert (thresholds.QUIET, thresholds.PEAK, thresholds.HIGH, thresholds.SEVERAL) == (0.1, (0.9, 1.8), 10.0, 3)
-    assert (thresholds.ABRUPT, thresholds.SUDDEN, thresholds.LOW) == (10**0.5, 10**0.5, 10)
-    assert (thresholds.BESIDE, thresholds.NATIVE) == (0.02, (7, 8))
-    assert (thresholds.PAPER_CELL, thresholds.GRID) == ((0.1, 0.5), 0.1)
-    assert thresholds.COUNTED == ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")
-    assert pytest.approx((1.5 - 1) / (2 * (1.5 + 1))) == thresholds.HERTZ_LIMIT
+    assert (constants.STRAIGHT, constants.STRAIGHT_EVERYWHERE, constants.FEWEST) == (0.95, 0.9, 4)
+    assert (constants.QUIET, constants.PEAK, constants.HIGH, constants.SEVERAL) == (0.1, (0.9, 1.8), 10.0, 3)
+    assert (constants.ABRUPT, constants.LOW) == (10**0.5, 10)
+    assert (constants.BESIDE, constants.NATIVE) == (0.02, (7, 8))
+    assert (constants.PAPER_CELL, constants.GRID) == ((0.1, 0.5), 0.1)
+    assert constants.COUNTED == ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")
+    assert pytest.approx((1.5 - 1) / (2 * (1.5 + 1))) == constants.HERTZ_LIMIT
 
 
 @pytest.mark.parametrize("claim, criterion", CRITERIA, ids=[f"{claim} {c.quantity}" for claim, c in CRITERIA])

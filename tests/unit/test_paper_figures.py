@@ -17,7 +17,7 @@ from vipetsc.case import Case
 from vipetsc.figures.drawing import NOTE, draw_each, save
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.style import DPI, new_figure, rc_style
-from vipetsc.paper.claims.thresholds import CLAIMS as SPECS
+from vipetsc.paper.claims.criteria import CLAIMS as SPECS
 from vipetsc.paper.figures import PAPER_FIGURES, describe
 from vipetsc.paper.plan import CLAIMS
 from vipetsc.paper.report import numbers, sources

@@ -3,11 +3,13 @@
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipetsc.io.folder import FolderError
-from vipetsc.studies.backbone import BRANCH, FEWEST, Initiation, Slope, align, relate_folders
+from vipetsc.io.netcdf import tabulated
+from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, Initiation, align, read_slope, relate_folders
 
 GRAZING = 0.03
 EXPONENT = -0.9
@@ -18,7 +20,9 @@ def branch(exponent=EXPONENT, factor=500.0, count=120):
     energy = GRAZING * np.concatenate([np.geomspace(0.01, 1.0, 10), np.geomspace(1.001, 1e7, count)])
     region = np.select([energy <= GRAZING, energy < 2 * GRAZING, energy < 1e4 * GRAZING], [1, 2, 3], 4)
     slope = np.where(region == 1, 0.0, factor * energy**exponent)
-    return Slope("hertz", "printed", energy, slope, region, GRAZING)
+    values = {"branch/energy": energy, "branch/slope": slope, "branch/region": region}
+    about = {"law": "hertz", "reading": "printed", "grazing": GRAZING}
+    return xr.Dataset(tabulated(LAYOUT, {"point": np.arange(len(energy))} | values), attrs=about)
 
 
 def lattice(slope, divisor, floor, initiation, count=60):
@@ -36,8 +40,8 @@ def test_energies_align_at_grazing():
     assert initiation.energy == pytest.approx(1.5e-3 * 400, rel=1e-14)
     amplitude = np.array([1.0, initiation.amplitude, 300.0])
     found = align(1.5e-3 * amplitude**2, np.array([1e-4, 0.3, 0.1]), initiation.energy, 1e-4, slope)
-    assert found.energy[1] == pytest.approx(GRAZING, rel=1e-14)
-    np.testing.assert_allclose(found.energy / found.energy[0], amplitude**2, rtol=1e-13)
+    assert found["energy"].values[1] == pytest.approx(GRAZING, rel=1e-14)
+    np.testing.assert_allclose(found["energy"].values / found["energy"].values[0], amplitude**2, rtol=1e-13)
 
 
 @settings(deadline=None, max_examples=25)
@@ -48,19 +52,19 @@ def test_power_laws_are_found(divisor, initiation, exponent, seed):
     work = np.random.default_rng(seed).permutation(initiation * np.geomspace(1e-2, 1e6, 50))
     transfer = np.where(work < initiation, 1e-30, (work * GRAZING / initiation) ** exponent * 500.0 / divisor)
     found = align(work, transfer, initiation, 0.0, slope)
-    known = slope.energy[slope.region == 3]
-    assert np.array_equal(found.fitted, (found.energy >= known.min()) & (found.energy <= known.max()))
-    assert found.divisor == pytest.approx(divisor, rel=1e-6)
-    assert found.law.exponent == pytest.approx(exponent, abs=1e-9)
-    assert found.steepness.exponent == pytest.approx(exponent, abs=1e-9)
-    assert found.law.r2_adjusted == pytest.approx(1.0, abs=1e-12)
+    known, energy = slope["branch/energy"].values[slope["branch/region"].values == 3], found["energy"].values
+    assert np.array_equal(found["fitted"].values, (energy >= known.min()) & (energy <= known.max()))
+    assert found.attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
+    assert found.attrs["exponent"] == pytest.approx(exponent, abs=1e-9)
+    assert found.attrs["slope_exponent"] == pytest.approx(exponent, abs=1e-9)
+    assert found.attrs["r2_adjusted"] == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("floor", [0.0, 1e-4, 1e-2])
 def test_floor_is_part_of_the_divisors_fit(floor):
     slope, divisor = branch(), 4e3
     work, transfer = lattice(slope, divisor, floor, initiation=0.6)
-    assert align(work, transfer, 0.6, floor, slope).divisor == pytest.approx(divisor, rel=1e-6)
+    assert align(work, transfer, 0.6, floor, slope).attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
 
 
 def test_divisor_is_the_least_squares_one():
@@ -68,12 +72,13 @@ def test_divisor_is_the_least_squares_one():
     work, transfer = lattice(slope, 4e3, floor, initiation=0.6)
     transfer = transfer * np.exp(0.2 * np.sin(np.arange(len(transfer))))
     found = align(work, transfer, 0.6, floor, slope)
-    energy, seen = found.energy[found.fitted], np.log(found.ibtet[found.fitted])
+    fitted, best = found["fitted"].values == 1, found.attrs["divisor"]
+    energy, seen = found["energy"].values[fitted], np.log(found["ibtet"].values[fitted])
 
     def misfit(divisor):
         return np.sum((np.log(500.0 * energy**EXPONENT / divisor + floor) - seen) ** 2)
 
-    assert misfit(found.divisor) < min(misfit(found.divisor * 1.01), misfit(found.divisor / 1.01))
+    assert misfit(best) < min(misfit(best * 1.01), misfit(best / 1.01))
 
 
 def test_failed_members_and_points_before_the_peak_are_left_out():
@@ -83,17 +88,17 @@ def test_failed_members_and_points_before_the_peak_are_left_out():
     late = int(np.argmin(np.abs(work * GRAZING / 0.6 - 20 * GRAZING)))
     transfer[late] = 2 * np.nanmax(transfer)
     found = align(work, transfer, 0.6, 1e-4, slope)
-    assert len(found.energy) == len(work) - 1
-    assert found.energy[found.fitted].min() == pytest.approx(work[late] * GRAZING / 0.6)
+    energy, fitted = found["energy"].values, found["fitted"].values == 1
+    assert len(energy) == len(work) - 1
+    assert energy[fitted].min() == pytest.approx(work[late] * GRAZING / 0.6)
 
 
 def test_too_few_points_have_no_law_and_no_region_three_is_an_error():
     slope = branch()
     work = 0.6 * np.array([0.1, 3.0, 30.0])
     found = align(work, np.array([1e-4, 0.3, 0.1]), 0.6, 1e-4, slope)
-    assert found.fitted.sum() < FEWEST and found.law is None and np.isnan(found.divisor)
-    low = slope.energy < 1.5 * GRAZING
-    short = Slope("hertz", "printed", slope.energy[low], slope.slope[low], slope.region[low], GRAZING)
+    assert found["fitted"].values.sum() < FEWEST and not found.attrs
+    short = slope.isel(point=slope["branch/energy"].values < 1.5 * GRAZING)
     with pytest.raises(ValueError, match="region III"):
         align(work, np.array([1e-4, 0.3, 0.1]), 0.6, 1e-4, short)
 
@@ -103,21 +108,21 @@ def write_branch(folder, slope, kinds=None):
     folder.mkdir(exist_ok=True)
     with h5py.File(folder / BRANCH, "w") as file:
         for name in ("energy", "slope", "region"):
-            file[name] = getattr(slope, name)
-        file["contacts"] = (slope.region > 1).astype(int)
-        file["kind"] = np.zeros(len(slope.energy), np.int8) if kinds is None else kinds
-        file.attrs["case"] = f'[lattice]\nreading = "{slope.reading}"\n[contacts]\nlaw = "{slope.law}"\n'
+            file[name] = slope[f"branch/{name}"].values
+        file["contacts"] = (slope["branch/region"].values > 1).astype(int)
+        file["kind"] = np.zeros(slope.sizes["point"], np.int8) if kinds is None else kinds
+        file.attrs["case"] = '[lattice]\nreading = "{reading}"\n[contacts]\nlaw = "{law}"\n'.format(**slope.attrs)
     return folder / BRANCH
 
 
 def test_branch_is_read_at_its_regular_points(tmp_path):
     slope = branch()
-    kinds = np.zeros(len(slope.energy), np.int8)
+    kinds = np.zeros(slope.sizes["point"], np.int8)
     kinds[9] = 6  # the located grazing point is not one of the continuation's own
-    found = Slope.read(write_branch(tmp_path / "b", slope, kinds))
-    assert found.grazing == pytest.approx(GRAZING, rel=1e-12)
-    assert len(found.energy) == len(slope.energy) - 1
-    assert (found.law, found.reading) == ("hertz", "printed")
+    found = read_slope(write_branch(tmp_path / "b", slope, kinds))
+    assert found.attrs.pop("grazing") == pytest.approx(GRAZING, rel=1e-12)
+    assert found.sizes["point"] == slope.sizes["point"] - 1
+    assert found.attrs == {"law": "hertz", "reading": "printed"}
 
 
 def test_folders_without_the_branch_are_refused(tmp_path):

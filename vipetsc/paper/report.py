@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image  # type: ignore[import-untyped]
 
 from vipetsc.io.atomic import write_text
-from vipetsc.paper.claims.claim import FAILS, HOLDS, IN_PART, UNMEASURED
+from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.paper.figures import READINGS, PaperFigure, describe
 
 WIDEST = 1500  # pixels of a picture in the page

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -15,9 +15,9 @@ from scipy.optimize import minimize_scalar
 import vipetsc
 from vipetsc.case import Case, case_id
 from vipetsc.io.folder import FolderError
-from vipetsc.io.netcdf import Variables, open_netcdf, tabulated, write_netcdf
+from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, open_run
-from vipetsc.spectra import PowerLaw, power_law
+from vipetsc.spectra import power_law
 from vipetsc.studies.members import leading_cell, linear_case
 
 FORMAT_VERSION = 1
@@ -37,33 +37,37 @@ LAYOUT = {
 }
 
 
-@dataclass(frozen=True)
-class Slope:
-    """df/dE of a branch along its regular points: ``energy`` in J, ``slope`` in Hz/J, ``region`` 1-4.
+def read_slope(path: Path) -> xr.Dataset:
+    """df/dE of a branch along its regular points: the variables ``branch/...`` of ``LAYOUT``.
 
-    ``grazing`` is the energy in J of the last point without contact: the transition from region I to II.
+    Attributes: ``law``, ``reading``, and ``grazing``, the energy in J of the last point without contact, where region I
+    passes into II. Raises OSError, or ValueError if the branch does not reach a contact.
     """
+    names = "energy", "slope", "region", "contacts", "kind"
+    with open_netcdf(path, "branch", (*names, "case")) as file:
+        energy, slope, region, contacts, kind = (file[name].values for name in names)
+        case = tomllib.loads(file.attrs["case"])
+    touching = np.nonzero(contacts > 0)[0]
+    if not touching.size or touching[0] == 0:
+        raise ValueError(f"{path}: the branch does not pass from region I to II; follow it to higher energy")
+    regular, about = kind == 0, {"grazing": float(energy[touching[0] - 1])}
+    about |= {key: case.get(section, {}).get(key, "") for section, key in (("contacts", "law"), ("lattice", "reading"))}
+    values = {"point": np.arange(regular.sum()), "branch/energy": energy[regular]}
+    values |= {"branch/slope": slope[regular], "branch/region": region[regular]}
+    return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
 
-    law: str
-    reading: str
-    energy: np.ndarray
-    slope: np.ndarray
-    region: np.ndarray
-    grazing: float
 
-    @classmethod
-    def read(cls, path: Path) -> Self:
-        """The slope of the branch in ``path``; raises OSError, or ValueError if it does not reach a contact."""
-        names = "energy", "slope", "region", "contacts", "kind"
-        with open_netcdf(path, "branch", (*names, "case")) as file:
-            energy, slope, region, contacts, kind = (file[name].values for name in names)
-            table = tomllib.loads(file.attrs["case"])
-        touching = np.nonzero(contacts > 0)[0]
-        if not touching.size or touching[0] == 0:
-            raise ValueError(f"{path}: the branch does not pass from region I to II; follow it to higher energy")
-        law, reading = table.get("contacts", {}).get("law", ""), table.get("lattice", {}).get("reading", "")
-        regular, grazing = kind == 0, float(energy[touching[0] - 1])
-        return cls(law, reading, energy[regular], slope[regular], region[regular], grazing)
+def log_slope(energy: np.ndarray, known: np.ndarray, slope: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """ln(df/dE) at ``energy`` (point) in J of a branch with the ``slope`` in Hz/J at ``known`` energies and regions.
+
+    Interpolated in logarithms between its points of region III, NaN beyond them. Raises ValueError if it has none.
+    """
+    inside = (region == VIBRO_IMPACT) & np.isfinite(slope) & (slope > 0)
+    if not inside.any():
+        raise ValueError("the branch has no region III; follow it to higher energy")
+    order = np.argsort(known[inside])
+    at, steep = np.log(known[inside][order]), np.log(slope[inside][order])
+    return np.asarray(np.interp(np.log(energy), at, steep, left=np.nan, right=np.nan))
 
 
 @dataclass(frozen=True)
@@ -90,44 +94,35 @@ class Initiation:
         return cls(amplitude, work * amplitude**2, float(touching.min()))
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """A transfer curve in the energies of a branch; ``divisor`` NaN, both laws None for too few points.
-
-    ``energy`` (point): work of the drive times grazing energy over initiation energy, J, rising. ``fitted``: which
-    points lie in region III at or behind the largest transfer. ``divisor``: what the slope is divided by, Hz/J.
-    ``law``: the transfer's power law over the fitted points, ``steepness`` that of the slope at their energies.
-    """
-
-    energy: np.ndarray
-    ibtet: np.ndarray
-    fitted: np.ndarray
-    divisor: float = np.nan
-    law: PowerLaw | None = None
-    steepness: PowerLaw | None = None
-
-
-def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, slope: Slope) -> Alignment:
-    """Lay the transfer ``ibtet`` (point) at the drive's ``work`` (point, J) over ``slope``.
+def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, branch: xr.Dataset) -> xr.Dataset:
+    """Lay the transfer ``ibtet`` (point) at the drive's ``work`` (point, J) over the slope of ``branch``.
 
     The paper's three steps: the lattice's energy is scaled so that the ``initiation`` energy (J) falls on the
     transition from region I to II; the slope is divided by a scalar s; the linear transfer ``floor`` is added.
-    s makes the sum over the fitted points of [ln(slope/s + floor) - ln(ibtet)]^2 least, the slope interpolated
-    between the branch's points of region III in logarithms. Raises ValueError for a branch without region III.
+    s makes the sum over the fitted points of [ln(slope/s + floor) - ln(ibtet)]^2 least.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``energy``, ``ibtet`` and ``fitted`` of ``LAYOUT``, energies rising, with the ``branch``. Attributes, unless
+        there are too few points to fit: the ``divisor`` s in Hz/J, the transfer's power law (``factor``, ``exponent``
+        with the ends of its 95 % interval, ``r2_adjusted``), and ``slope_exponent`` at the fitted energies.
+
+    Raises
+    ------
+    ValueError
+        For a branch without region III.
     """
     valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
     order = np.argsort(work[valid], kind="stable")
-    energy, ibtet = work[valid][order] * (slope.grazing / initiation), ibtet[valid][order]
-    region = (slope.region == VIBRO_IMPACT) & np.isfinite(slope.slope) & (slope.slope > 0)
-    if not region.any():
-        raise ValueError("the branch has no region III; follow it to higher energy")
-    known, steep = slope.energy[region], slope.slope[region]
-    fitted = (energy >= known.min()) & (energy <= known.max()) & (np.arange(len(energy)) >= np.argmax(ibtet))
+    energy, ibtet = work[valid][order] * (branch.attrs["grazing"] / initiation), ibtet[valid][order]
+    at = log_slope(energy, *(branch[f"branch/{name}"].values for name in ("energy", "slope", "region")))
+    fitted = np.isfinite(at) & (np.arange(len(energy)) >= np.argmax(ibtet))
+    values = {"energy": energy, "ibtet": ibtet, "fitted": fitted.astype(np.int8)}
+    aligned = xr.merge([xr.Dataset(tabulated(LAYOUT, values)), branch], combine_attrs="drop")
     if fitted.sum() < FEWEST:
-        return Alignment(energy, ibtet, fitted)
-    order = np.argsort(known)
-    at = np.interp(np.log(energy[fitted]), np.log(known[order]), np.log(steep[order]))
-    measured = np.log(ibtet[fitted])
+        return aligned
+    at, measured = at[fitted], np.log(ibtet[fitted])
 
     def misfit(logarithm: float) -> float:
         return float(np.sum((np.log(np.exp(at - logarithm) + floor) - measured) ** 2))
@@ -136,7 +131,10 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     start = float(np.mean(at - measured))
     best = minimize_scalar(misfit, bracket=(start, start + 0.5), options={"xtol": 1e-10})
     law, steepness = (power_law(energy[fitted], y) for y in (ibtet[fitted], np.exp(at)))
-    return Alignment(energy, ibtet, fitted, float(np.exp(best.x)), law, steepness)
+    low, high = law.exponent_interval
+    about = {"divisor": float(np.exp(best.x)), "factor": law.factor, "exponent": law.exponent, "exponent_low": low}
+    about |= {"exponent_high": high, "r2_adjusted": law.r2_adjusted, "slope_exponent": steepness.exponent}
+    return aligned.assign_attrs(about)
 
 
 def initiation_of(folder: Path, case: Case) -> Initiation:
@@ -158,35 +156,34 @@ def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
     """
     if "ibtet" not in ensemble or bool(ensemble["ibtet"].isnull().all()):
         return None
-    slopes, folder = [Slope.read(branch / BRANCH) for branch in branches], Path(ensemble.attrs["folder"])
-    variables: Variables = {}
-    attributes: dict[str, Any] = {}
+    slopes, folder = [read_slope(branch / BRANCH) for branch in branches], Path(ensemble.attrs["folder"])
+    related: dict[str, xr.Dataset] = {}
     left_out = []
     for curve, member in curves(ensemble):
         case = Case.load(member / "case.toml")
         sites = len(np.asarray(case.contacts.sites))
+        if not sites:
+            continue
         name = f"{case.lattice.reading}-{case.contacts.law}-{sites}-sites-{case.drive.cycles:g}-cycles"
-        related: Any = "another curve has the same law, reading, sites and cycles"
-        if f"{name}/case" not in attributes:
-            related = _relate_curve(curve, case, slopes, folder) if sites else None
-        if isinstance(related, str):
-            left_out.append(f"{name}: {related}")
-        elif related:
-            layout = {f"{name}/{key}": (f"{name}/{dim}", unit, text) for key, (dim, unit, text) in LAYOUT.items()}
-            variables |= tabulated(layout, {f"{name}/{key}": values for key, values in related[0].items()})
-            attributes |= {f"{name}/{key}": value for key, value in related[1].items()}
-    version = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
-    sources = {"case": ensemble.attrs["case"], "left_out": left_out, "sources": _sources(folder, branches)}
-    write_netcdf(folder / "backbone.h5", xr.Dataset(variables, attrs=version | sources | attributes))
-    return folder / "backbone.h5" if variables else None
+        relation: xr.Dataset | str = "another curve has the same law, reading, sites and cycles"
+        if name not in related:
+            relation = _relate_curve(curve, case, slopes, folder)
+        if isinstance(relation, str):
+            left_out.append(f"{name}: {relation}")
+        else:
+            related[name] = relation
+    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__, "case": ensemble.attrs["case"]}
+    about |= {"left_out": left_out, "sources": _sources(folder, branches)}
+    about |= {f"{name}/{key}": value for name, data in related.items() for key, value in data.attrs.items()}
+    groups = [data.rename({key: f"{name}/{key}" for key in data.variables}) for name, data in related.items()]
+    write_netcdf(folder / "backbone.h5", xr.merge(groups, combine_attrs="drop").assign_attrs(about))
+    return folder / "backbone.h5" if related else None
 
 
-def _relate_curve(
-    curve: xr.Dataset, case: Case, slopes: Sequence[Slope], folder: Path
-) -> tuple[dict[str, np.ndarray], dict[str, Any]] | str:
-    """Values and attributes of one curve's group, or why there is none."""
-    of_law = [slope for slope in slopes if slope.law == case.contacts.law]
-    of_law.sort(key=lambda slope: slope.reading != case.lattice.reading)
+def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], folder: Path) -> xr.Dataset | str:
+    """One curve beside the branch that suits it best, or why there is none."""
+    of_law = [slope for slope in slopes if slope.attrs["law"] == case.contacts.law]
+    of_law.sort(key=lambda slope: slope.attrs["reading"] != case.lattice.reading)
     untouched = curve["ibtet"].values[curve["contact_episodes"].values == 0]
     if not of_law:
         return f"no branch of the law {case.contacts.law}"
@@ -194,17 +191,11 @@ def _relate_curve(
         return "no member without contact"
     slope, initiation, floor = of_law[0], initiation_of(folder, case), float(untouched.mean())
     aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
-    if aligned.law is None or aligned.steepness is None:
-        return f"{aligned.fitted.sum()} points in region III behind the peak"
-    values = {"energy": aligned.energy, "ibtet": aligned.ibtet, "fitted": aligned.fitted.astype(np.int8)}
-    values |= {"point": np.arange(len(slope.energy)), "branch/energy": slope.energy}
-    values |= {"branch/slope": slope.slope, "branch/region": slope.region}
-    law, (low, high) = aligned.law, aligned.law.exponent_interval
-    about = {"case": case.to_toml(), "branch_reading": slope.reading, "grazing_energy": slope.grazing, "floor": floor}
-    about |= {"initiation_amplitude": initiation.amplitude, "initiation_energy": initiation.energy}
-    about |= {"onset_amplitude": initiation.onset, "divisor": aligned.divisor, "factor": law.factor}
-    about |= {"exponent": law.exponent, "exponent_low": low, "exponent_high": high, "r2_adjusted": law.r2_adjusted}
-    return values, about | {"slope_exponent": aligned.steepness.exponent}
+    if "exponent" not in aligned.attrs:
+        return f"{int(aligned['fitted'].sum())} points in region III behind the peak"
+    about = {"case": case.to_toml(), "branch_reading": slope.attrs["reading"]}
+    about |= {"grazing_energy": slope.attrs["grazing"], "floor": floor, "initiation_amplitude": initiation.amplitude}
+    return aligned.assign_attrs(about, initiation_energy=initiation.energy, onset_amplitude=initiation.onset)
 
 
 def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:

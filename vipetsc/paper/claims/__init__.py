@@ -1,4 +1,3 @@
 """The paper's seventeen claims (SPEC.md 11), each measured from files in both readings of its parameters."""
 
-from vipetsc.paper.claims.claim import Claim, write_claims
-from vipetsc.paper.claims.measure import measure_claims
+from vipetsc.paper.claims.measure import Claim, measure_claims, write_claims

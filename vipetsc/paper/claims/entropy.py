@@ -5,37 +5,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vipetsc.paper.claims.claim import Measurement, MissingEvidence
-from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence
-from vipetsc.paper.claims.thresholds import ABRUPT, FEWEST, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
+from vipetsc.paper.claims.criteria import ABRUPT, FEWEST, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
+from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence, Measurement, MissingEvidence
 
 SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
 AVERAGES = "energy_weighted", "masked", "joint"
-FIT = "r2_log_log", "r2_nonlinear", "exponent", "exponent_low", "exponent_high"
+FIT = "points", "r2_log_log", "r2_nonlinear", "exponent", "exponent_low", "exponent_high"
 
 
 @dataclass(frozen=True)
 class EntropyDecay:
-    """The entropy of one configuration and wavenumber, its error bars, and the power laws of its fall.
+    """The entropy of one number of ``sites`` at one wavenumber, and the power laws of its fall from the peak on.
 
-    Both ``r2`` are adjusted and NaN without a fit; ``exponent`` (log-log) has the interval from ``exponent_low`` to
-    ``exponent_high``; ``points`` from the peak on.
+    ``r2`` is the adjusted R^2 of the log-log line, ``best`` the better one of line and nonlinear fit, NaN without a
+    fit; the ``exponent`` of the line has a 95 % interval of ``half_width`` to either side.
     """
 
     sites: int
     curve: AmplitudeCurve
-    error: AmplitudeCurve | None
     points: int
     r2: float
-    r2_nonlinear: float
+    best: float
     exponent: float
-    exponent_low: float
-    exponent_high: float
-
-    @property
-    def best(self) -> float:
-        """The better adjusted R^2 of the two fits; NaN without one."""
-        return float(np.fmax(self.r2, self.r2_nonlinear))
+    half_width: float
 
     def reaches(self, r2: float, bound: float) -> bool:
         """Whether ``r2``, one of the fits', reaches ``bound`` over enough points."""
@@ -47,11 +39,6 @@ class EntropyDecay:
         y = self.curve.normalised.value
         return bool(0 < self.curve.peak < len(y) - 1 and y[-1] < 0.5 and y[0] < 0.5)
 
-    @property
-    def high_amplitude(self) -> float:
-        """The normalised entropy at ``HIGH``; NaN if the peak is not below it."""
-        return self.curve.normalised.interpolate(HIGH) if self.curve.peak_amplitude < HIGH else float("nan")
-
 
 def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: float) -> list[EntropyDecay]:
     """The configurations of a sweep with one ``average`` of the entropy; raises MissingEvidence."""
@@ -60,14 +47,12 @@ def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: 
     if f"{prefix}/points" not in ensemble or "sites" not in ensemble.coords:
         raise MissingEvidence(f"{step} holds no fits of the entropy over the numbers of sites")
     configurations = []
-    for sites in ensemble["sites"].values:
-        members = evidence.select(step, reading, **wanted, sites=int(sites))
+    for sites in map(int, ensemble["sites"].values):
+        members = evidence.select(step, reading, **wanted, sites=sites)
         curve = AmplitudeCurve.of(members, f"entropy/{average}")
-        error = AmplitudeCurve.of(members, "entropy/error") if "entropy/error" in members else None
-        fit = (float(members[f"{prefix}/{name}"]) for name in FIT)
-        points = members[f"{prefix}/points"].item()
-        points = int(points) if np.isfinite(points) else 0
-        configurations.append(EntropyDecay(int(sites), curve, error, points, *fit))
+        points, r2, r2_nonlinear, exponent, low, high = (members[f"{prefix}/{name}"].item() for name in FIT)
+        points, best = int(np.nan_to_num(points)), float(np.fmax(r2, r2_nonlinear))
+        configurations.append(EntropyDecay(sites, curve, points, r2, best, exponent, (high - low) / 2))
     return configurations
 
 
@@ -80,7 +65,8 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     spread = decays(evidence, SPREAD, reading, "energy_weighted", wavenumber=EXCITED)
     curves = [c.curve for c in spread]
     quiet = np.concatenate([c.normalised.value[c.untouched] for c in curves])
-    several = [c.high_amplitude for c in spread if c.sites >= SEVERAL]
+    several = [c.curve for c in spread if c.sites >= SEVERAL]
+    behind = [c.normalised.interpolate(HIGH) if c.peak_amplitude < HIGH else np.nan for c in several]
     fit = f"adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
     result.value |= {
         "floor of the normalised entropy": float(quiet.max()) if quiet.size else None,
@@ -91,7 +77,7 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
             PEAK[0] <= c.peak_amplitude <= PEAK[1] for c in curves
         ),
         f"normalised entropy at {HIGH:g} N behind the peak, {SEVERAL} sites or more": (
-            float(np.max(several)) if several else None
+            float(np.max(behind)) if behind else None
         ),
         f"share of configurations of spread sites with {fit}": _share(c.reaches(c.r2, STRAIGHT) for c in spread),
     }
@@ -107,7 +93,16 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.uncertainty["amplitudes"] = len(curves[0].amplitude)
     onsets = [float(c.amplitude[~c.untouched].min()) for c in curves if not c.untouched.all()]
     result.value["smallest amplitude with contact (N)"] = min(onsets, default=None)
-    _explain_weak_fits(result, spread)
+    late = [c for c in curves if c.peak_amplitude > PEAK[1]]
+    if late:
+        result.reasons.append(
+            f"{len(late)} of {len(spread)} configurations peak only from"
+            f" {min(c.peak_amplitude for c in late):.3g} N on, so that as few as {min(c.points for c in spread)} of"
+            f" {len(late[0].amplitude)} amplitudes are left for a power law"
+        )
+    weak = [f"{c.sites} ({c.r2:.3f})" for c in spread if c.r2 < STRAIGHT]
+    if weak:
+        result.reasons.append(f"spread sites short of {STRAIGHT:g}: {', '.join(weak)}")
 
 
 def _list_fits(result: Measurement, configurations: list[EntropyDecay], kind: str) -> None:
@@ -116,21 +111,8 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], kind: st
         result.value[f"adjusted R^2 (log-log), {name}"] = c.r2
         result.value[f"exponent, {name}"] = c.exponent
         result.value[f"peak (N), {name}"] = c.curve.peak_amplitude
-        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = (c.exponent_high - c.exponent_low) / 2
+        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = c.half_width
         result.uncertainty[f"points of the fit, {name}"] = c.points
-
-
-def _explain_weak_fits(result: Measurement, spread: list[EntropyDecay]) -> None:
-    late = [c.curve for c in spread if c.curve.peak_amplitude > PEAK[1]]
-    if late:
-        result.reasons.append(
-            f"{len(late)} of {len(spread)} configurations peak only from"
-            f" {min(c.peak_amplitude for c in late):.3g} N on, so that as few as {min(c.points for c in spread)} of"
-            f" {len(late[0].amplitude)} amplitudes are left for a power law"
-        )
-    weak = [f"{c.sites} ({c.r2:.3f})" for c in spread if not c.r2 >= STRAIGHT and np.isfinite(c.r2)]
-    if weak:
-        result.reasons.append(f"spread sites short of {STRAIGHT:g}: {', '.join(weak)}")
 
 
 def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -170,19 +152,19 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
 def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C9: error bars at high amplitude over those at the peak and without contact (Fig. 5)."""
     configurations = decays(evidence, SPREAD, reading, "energy_weighted", wavenumber=EXCITED)
+    peaks = [c.curve.peak_amplitude for c in configurations]
     over_peak, over_quiet = [], []
-    for c in configurations:
-        if c.error is None:
-            raise MissingEvidence(f"{SPREAD} holds no entropy/error over the amplitude")
-        high = c.error.value[c.error.amplitude >= HIGH]
+    for c, peak in zip(configurations, peaks, strict=True):
+        members = evidence.select(SPREAD, reading, wavenumber=EXCITED, sites=c.sites)
+        error = AmplitudeCurve.of(members, "entropy/error")
+        high = error.value[error.amplitude >= HIGH]
         if not high.size:
             raise MissingEvidence(f"{SPREAD} has no amplitude of {HIGH:g} N or more")
-        peak = c.curve.peak_amplitude
         # Where the peak is no lower than that, nothing lies behind it to compare with.
-        at_peak = c.error.value[(c.error.amplitude == peak) & (peak < HIGH)]
+        at_peak = error.value[(error.amplitude == peak) & (peak < HIGH)]
         over_peak.append(float(high.mean() / at_peak[0]) if at_peak.size else np.nan)
-        if c.error.untouched.any():
-            over_quiet.append(float(high.mean() / c.error.value[c.error.untouched].mean()))
+        if error.untouched.any():
+            over_quiet.append(float(high.mean() / error.value[error.untouched].mean()))
     growth = f"share of configurations with larger error bars from {HIGH:g} N on than"
     result.value[f"{growth} at the peak"] = _share(ratio > 1 for ratio in over_peak)
     if over_quiet:
@@ -194,7 +176,7 @@ def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
         result.uncertainty["smallest ratio to the error bars at the peak"] = min(finite)
         result.uncertainty["largest ratio to the error bars at the peak"] = max(finite)
     result.uncertainty["configurations"] = len(configurations)
-    late = sum(c.curve.peak_amplitude >= HIGH for c in configurations)
+    late = sum(peak >= HIGH for peak in peaks)
     if late:
         result.reasons.append(
             f"{late} of {len(configurations)} configurations have their peak at {HIGH:g} N or above: nothing is behind"

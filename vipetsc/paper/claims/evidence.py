@@ -1,8 +1,8 @@
-"""What claims are measured from: the steps of the paper in one folder, and which of their files were read."""
+"""What claims are measured from, the steps of the paper in one folder, and what a measurement gathers."""
 
 import tomllib
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,11 +12,29 @@ import xarray as xr
 from vipetsc.case import Case
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, member_folder, open_ensemble, select
-from vipetsc.paper.claims.claim import MissingEvidence
 from vipetsc.spectra import normalised
 from vipetsc.studies.backbone import initiation_of
 
 EXCITED = 5 * np.pi / 9  # rad/cell, driven in the paper's section II
+
+Numbers = dict[str, float | None]
+
+
+class MissingEvidence(Exception):
+    """What a claim is measured from is not there; the message says what."""
+
+
+@dataclass
+class Measurement:
+    """Numbers by name, their uncertainties, and sentences that explain them.
+
+    ``figure`` takes the place of the claim's where the picture's name depends on the data.
+    """
+
+    value: Numbers = field(default_factory=dict)
+    uncertainty: Numbers = field(default_factory=dict)
+    reasons: list[str] = field(default_factory=list)
+    figure: str = ""
 
 
 @dataclass(frozen=True)
@@ -104,24 +122,18 @@ class AmplitudeCurve:
         return float(np.interp(np.log(amplitude), x, self.value, left=np.nan, right=np.nan))
 
 
-class Evidence:
-    """The steps in ``root``, opened as they are asked for. Use it as a context manager.
+class Evidence(ExitStack):
+    """The steps in ``root``, opened as they are asked for, and closed when the context ends.
 
     ``files`` are those asked for so far, relative to ``root``, in order. Every method raises MissingEvidence for what
     is not there, OSError or ValueError for a file that cannot be used.
     """
 
     def __init__(self, root: str | Path) -> None:
+        super().__init__()
         self.root = Path(root)
         self.files: list[str] = []
-        self._stack = ExitStack()
         self._ensembles: dict[str, xr.Dataset] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
     def path(self, *parts: str) -> Path:
         """A file below ``root``, noted down."""
@@ -134,7 +146,7 @@ class Evidence:
 
     def open(self, *parts: str, needs: tuple[str, ...] = ()) -> xr.Dataset:
         """An HDF5 file below ``root`` with the variables and groups ``needs``."""
-        return self._stack.enter_context(open_netcdf(self.path(*parts), "file of results", needs))
+        return self.enter_context(open_netcdf(self.path(*parts), "file of results", needs))
 
     def ensemble(self, step: str) -> xr.Dataset:
         """The finished sweep of a step."""

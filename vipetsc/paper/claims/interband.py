@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from vipetsc.paper.claims.claim import Measurement, MissingEvidence
-from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MeasuredRun
-from vipetsc.paper.claims.thresholds import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
+from vipetsc.paper.claims.criteria import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
+from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MeasuredRun, Measurement, MissingEvidence
 
 STEP, AMPLITUDES, DESIGN = "interband", "interband-amplitudes", "design"
 
@@ -53,19 +52,19 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
     for law in LAWS:
         curve = _transfer(evidence, reading, law, 5, 30)
         floor = float(curve.value[curve.untouched].mean()) if curve.untouched.any() else np.nan
-        maxima.append(float(curve.value[curve.peak]))
+        highest = float(curve.value[curve.peak])
+        growth = curve.growth_ratio(LOW * floor, highest / 2)
+        maxima.append(highest)
         result.value |= {
             f"floor, {law}": floor,
-            f"ratio of amplitudes from the floor to half the maximum, {law}": curve.growth_ratio(
-                LOW * floor, maxima[-1] / 2
-            ),
-            f"maximum, {law}": maxima[-1],
+            f"ratio of amplitudes from the floor to half the maximum, {law}": growth,
+            f"maximum, {law}": highest,
             f"amplitude of the maximum (N), {law}": curve.peak_amplitude,
             f"transfer at the largest amplitude, {law}": float(curve.value[-1]),
         }
         # The larger of its two neighbours shows how well the grid of amplitudes resolves the maximum.
         beside = np.sort(curve.value[max(curve.peak - 1, 0) : curve.peak + 2])[-2:][0]
-        result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = maxima[-1] - float(beside)
+        result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - float(beside)
         result.uncertainty[f"amplitudes, {law}"] = len(curve.amplitude)
     result.uncertainty["spread of the maxima between the laws"] = float(np.ptp(maxima))
     lowest = next(c.interval[0] for c in CLAIMS["C11"].criteria if c.quantity.startswith("maximum"))
@@ -117,8 +116,8 @@ def split_errors(run: MeasuredRun) -> dict[str, float]:
     names = ("time", "bands/edges", "bands/energy", "bands/total", "frequency", "dispersion")
     time, edges, energy, total, frequency, dispersion = run.arrays(*names)
     drive, parts = run.case.model().drive, energy.sum(axis=0)
-    samples = max(round(2 * np.pi / drive.frequency / (time[1] - time[0])), 1)
-    window = np.full(min(samples, len(time)), 1 / min(samples, len(time)))
+    samples = min(max(round(2 * np.pi / drive.frequency / (time[1] - time[0])), 1), len(time))
+    window = np.full(samples, 1 / samples)
     middle, mean_parts, mean_total = (np.convolve(x, window, "valid") for x in (time, parts, total))
     inner = (middle >= drive.duration) & (middle <= time[-1] - drive.duration)
     after = time >= drive.duration
@@ -128,18 +127,16 @@ def split_errors(run: MeasuredRun) -> dict[str, float]:
     part = np.searchsorted(edges, frequency, side="right") - 1
     spectrum = np.bincount(part, dispersion.sum(axis=0), len(share))
     counted = np.isin(np.atleast_1d(run.analysis["bands/energy"].attrs["parts"]), COUNTED)
+    over_period = np.abs(mean_parts[inner] / mean_total[inner] - 1)
+    at_instants = np.abs(parts[after] - total[after]) / total[after]
     return {
         "largest error of the mean over the record": abs(parts.mean() / total.mean() - 1),
-        "mean error over a period of the drive, largest of the runs": float(
-            np.mean(np.abs(mean_parts[inner] / mean_total[inner] - 1))
-        ),
-        "largest share outside the paper's bands and gaps": float(share[~counted].sum()),
-        "largest difference of a part's share from that in the space-time spectrum": float(
+        "mean error over a period of the drive, largest of the runs": over_period.mean(),
+        "largest share outside the paper's bands and gaps": share[~counted].sum(),
+        "largest difference of a part's share from that in the space-time spectrum": (
             np.abs(share - spectrum / spectrum.sum()).max()
         ),
-        "mean error at an instant after the drive, largest of the runs": float(
-            np.mean(np.abs(parts[after] - total[after]) / total[after])
-        ),
+        "mean error at an instant after the drive, largest of the runs": at_instants.mean(),
     }
 
 
@@ -149,13 +146,12 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
         many, short, single = (_transfer(evidence, reading, law, *kind) for kind in ((5, 30), (5, 15), (1, 30)))
         shared, i, j = np.intersect1d(many.amplitude, short.amplitude, return_indices=True)
         logarithms = np.log(many.value[i]), np.log(short.value[j])
+        correlation = float(np.corrcoef(*logarithms)[0, 1]) if len(shared) > 2 else np.nan
         peaks = many.peak_amplitude, short.peak_amplitude
         result.value |= {
             f"maximum with one site, {law}": float(single.value.max()),
             f"maximum with one site over that with five, {law}": float(single.value.max() / many.value.max()),
-            f"correlation of 15 and 30 cycles, {law}": (
-                float(np.corrcoef(*logarithms)[0, 1]) if len(shared) > 2 else np.nan
-            ),
+            f"correlation of 15 and 30 cycles, {law}": correlation,
             f"ratio of the peaks' amplitudes, 15 and 30 cycles, {law}": max(peaks) / min(peaks),
             f"maximum with 15 cycles, {law}": float(short.value.max()),
         }

@@ -1,21 +1,17 @@
 """C15-C17: the reduced model's frequency-energy branches beside the lattice (the paper's section IV and supplement)."""
 
 import json
-from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-import xarray as xr
 
 from vipetsc.case import NnmCase
 from vipetsc.io.read import field_interval, nearest_cell, open_run
 from vipetsc.lattice import pass_bands, waves_at
 from vipetsc.modes.branch import KINDS
 from vipetsc.modes.system import System
-from vipetsc.paper.claims.claim import Measurement, MissingEvidence
-from vipetsc.paper.claims.evidence import Evidence, MeasuredRun
-from vipetsc.paper.claims.thresholds import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_EXPONENT, SAME_MOTION
-from vipetsc.studies.backbone import BRANCH
+from vipetsc.paper.claims.criteria import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_EXPONENT, SAME_MOTION
+from vipetsc.paper.claims.evidence import Evidence, MeasuredRun, Measurement, MissingEvidence
+from vipetsc.studies.backbone import BRANCH, log_slope
 
 INTERBAND, ONE_SITE = "interband", "interband-one-site"
 MAIN = "5-sites-30-cycles"
@@ -76,18 +72,23 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
         _, law, sites, _, cycles, _ = name.split("-")
         main = name.endswith(MAIN)
         label = law if main else f"{law}, {sites} site{'s' if sites != '1' else ''}, {cycles} cycles"
-        about = {key: relation.attrs[f"{name}/{key}"] for key in ("exponent", "slope_exponent", "branch_reading")}
+        length = len(name) + 1
+        about = {key[length:]: value for key, value in relation.attrs.items() if key.startswith(f"{name}/")}
         difference = abs(float(about["exponent"] - about["slope_exponent"]))
         fitted = relation[f"{name}/fitted"].values.astype(bool)
-        low, high = (relation.attrs[f"{name}/exponent_{end}"] for end in ("low", "high"))
+        energy, ibtet = (relation[f"{name}/{key}"].values[fitted] for key in ("energy", "ibtet"))
+        branch = (relation[f"{name}/branch/{key}"].values for key in ("energy", "slope", "region"))
+        # Transfer over (slope / divisor + floor); the mean factor is exp of the rms logarithm.
+        ratio = np.log(ibtet / (np.exp(log_slope(energy, *branch)) / about["divisor"] + about["floor"]))
         result.value |= {
-            f"adjusted R^2 in region III, {label}": float(relation.attrs[f"{name}/r2_adjusted"]),
+            f"adjusted R^2 in region III, {label}": float(about["r2_adjusted"]),
             f"exponent of the transfer, {label}": float(about["exponent"]),
             f"exponent of the slope, {label}": float(about["slope_exponent"]),
-            f"mean factor between transfer and slope, {label}": _mean_factor(relation, name, fitted),
+            f"mean factor between transfer and slope, {label}": float(np.exp(np.sqrt(np.mean(ratio**2)))),
             f"difference of the exponents, {label}": difference,
         }
-        result.uncertainty[f"transfer exponent's 95 % interval (+/-), {label}"] = float((high - low) / 2)
+        interval = float((about["exponent_high"] - about["exponent_low"]) / 2)
+        result.uncertainty[f"transfer exponent's 95 % interval (+/-), {label}"] = interval
         result.uncertainty[f"points of the fit, {label}"] = int(fitted.sum())
         if main and difference > SAME_EXPONENT:
             result.reasons.append(
@@ -99,80 +100,59 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
     result.reasons += [text for text in left_out if text.startswith(reading)]
 
 
-def _mean_factor(relation: xr.Dataset, name: str, fitted: np.ndarray) -> float:
-    """exp of the rms logarithm of transfer over (slope / divisor + floor), the slope interpolated in region III."""
-    energy, ibtet = (relation[f"{name}/{key}"].values[fitted] for key in ("energy", "ibtet"))
-    known, slope, region = (relation[f"{name}/branch/{key}"].values for key in ("energy", "slope", "region"))
-    inside = (region == 3) & np.isfinite(slope) & (slope > 0)
-    known, slope = known[inside], slope[inside]
-    order = np.argsort(known)
-    slope = np.exp(np.interp(np.log(energy), np.log(known[order]), np.log(slope[order])))
-    ratio = np.log(ibtet / (slope / relation.attrs[f"{name}/divisor"] + relation.attrs[f"{name}/floor"]))
-    return float(np.exp(np.sqrt(np.mean(ratio**2))))
-
-
-@dataclass(frozen=True)
-class PairMotion:
-    """Host and resonator of the contact cell of one run: velocities (t, 2) in m/s, and what tells their regime.
-
-    ``correlation`` of the two velocities; ``above``: share of the pair's kinetic energy at frequencies above the
-    driven band, of the whole record under a Hann window.
-    """
-
-    run: MeasuredRun
-    velocity: np.ndarray
-    correlation: float
-    above: float
-
-    @classmethod
-    def of(cls, run: MeasuredRun, fields: xr.Dataset) -> Self:
-        """The motion in ``fields``, an open ``run.h5``; raises MissingEvidence if the cell was not recorded."""
-        model = run.case.model()
-        cell, site = model.chain.cell, int(fields["sites/cell"].values[0])
-        index = nearest_cell(fields, site)
-        if "velocity" not in fields or fields["cell"].values[index] != site:
-            raise MissingEvidence(f"the velocity of cell {site} was not recorded")
-        pair = [cell.host, cell.resonator]
-        velocity = fields["velocity"][:, index].values[:, pair]
-        spectrum = np.abs(np.fft.rfft(velocity * np.hanning(len(velocity))[:, None], axis=0)) ** 2
-        energy = spectrum @ np.asarray(cell.masses)[pair]
-        frequency = 2 * np.pi * np.fft.rfftfreq(len(velocity), field_interval(fields))
-        waves = waves_at(cell, model.drive.frequency)
-        edge = pass_bands(cell)[waves[0][0] - 1].high if waves else model.drive.frequency
-        above = float(energy[frequency > edge].sum() / energy.sum())
-        return cls(run, velocity, float(np.corrcoef(velocity.T)[0, 1]), above)
-
-    def correlation_with(self, other: Self) -> float:
-        """Correlation of the resonator's velocity with that of ``other`` at the same times."""
-        n = min(len(self.velocity), len(other.velocity))
-        return float(np.corrcoef(self.velocity[:n, 1], other.velocity[:n, 1])[0, 1])
-
-
 def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C17: regimes of host and resonator at the only site of the lattice (Suppl., Figs. S4, S5)."""
     evidence.ensemble(ONE_SITE)
     for law in LAWS:
-        motions = []
-        for run in evidence.runs(ONE_SITE, reading, law=law):
-            with open_run(evidence.path(ONE_SITE, run.folder.name, "run.h5")) as fields:
-                motions.append(PairMotion.of(run, fields))
-        touching = [m for m in motions if m.run.episodes]
-        if len(touching) < 2 or motions[0].run.episodes:
+        runs = evidence.runs(ONE_SITE, reading, law=law)
+        host, resonator, above = zip(*(pair_motion(evidence, run) for run in runs), strict=True)
+        correlation = [_correlation(*pair) for pair in zip(host, resonator, strict=True)]
+        touching = [i for i, run in enumerate(runs) if run.episodes]
+        if len(touching) < 2 or runs[0].episodes:
             raise MissingEvidence(f"{ONE_SITE}, {law}: one amplitude without contact and two with are needed")
         first, last = touching[0], touching[-1]
-        grazing = first.correlation_with(motions[0])
+        grazing = _correlation(resonator[first], resonator[0])
         result.value |= {
-            f"I: correlation of host and resonator, {law}": motions[0].correlation,
+            f"I: correlation of host and resonator, {law}": correlation[0],
             f"II: correlation with the motion without contact, {law}": grazing,
-            f"III: largest share of energy above the driven band, {law}": max(m.above for m in touching),
-            f"IV: correlation of host and resonator, {law}": last.correlation,
-            f"IV: share of energy above the driven band, {law}": last.above,
+            f"III: largest share of energy above the driven band, {law}": max(above[i] for i in touching),
+            f"IV: correlation of host and resonator, {law}": correlation[last],
+            f"IV: share of energy above the driven band, {law}": above[last],
         }
-        result.value |= {f"correlation at {m.run.amplitude:g} N, {law}": m.correlation for m in touching[:-1]}
-        result.uncertainty[f"amplitudes, {law}"] = len(motions)
+        result.value |= {f"correlation at {runs[i].amplitude:g} N, {law}": correlation[i] for i in touching[:-1]}
+        result.uncertainty[f"amplitudes, {law}"] = len(runs)
         if grazing < SAME_MOTION:
-            run = first.run
+            run = runs[first]
             beyond = 100 * (run.amplitude / run.onset - 1)
-            above = f", {beyond:.2g} % above first contact," if np.isfinite(beyond) else ""
-            text = f"{law}: at {run.amplitude:g} N{above} the resonator's motion has already left the linear one"
+            excess = f", {beyond:.2g} % above first contact," if np.isfinite(beyond) else ""
+            text = f"{law}: at {run.amplitude:g} N{excess} the resonator's motion has already left the linear one"
             result.reasons.append(text)
+
+
+def pair_motion(evidence: Evidence, run: MeasuredRun) -> tuple[np.ndarray, np.ndarray, float]:
+    """Velocities (t) in m/s of host and resonator at the only site of a run, and how much of their motion is fast.
+
+    That is the share of the pair's kinetic energy at frequencies above the driven band, of the whole record under a
+    Hann window. Raises MissingEvidence if the cell was not recorded.
+    """
+    model = run.case.model()
+    cell = model.chain.cell
+    pair = [cell.host, cell.resonator]
+    with open_run(evidence.path(ONE_SITE, run.folder.name, "run.h5")) as fields:
+        site = int(fields["sites/cell"].values[0])
+        index, interval = nearest_cell(fields, site), field_interval(fields)
+        if "velocity" not in fields or fields["cell"].values[index] != site:
+            raise MissingEvidence(f"the velocity of cell {site} was not recorded")
+        velocity = fields["velocity"][:, index].values[:, pair]
+    spectrum = np.abs(np.fft.rfft(velocity * np.hanning(len(velocity))[:, None], axis=0)) ** 2
+    energy = spectrum @ np.asarray(cell.masses)[pair]
+    frequency = 2 * np.pi * np.fft.rfftfreq(len(velocity), interval)
+    waves = waves_at(cell, model.drive.frequency)
+    edge = pass_bands(cell)[waves[0][0] - 1].high if waves else model.drive.frequency
+    return *velocity.T, float(energy[frequency > edge].sum() / energy.sum())
+
+
+def _correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Correlation of two motions at the same times."""
+    n = min(len(first), len(second))
+    return float(np.corrcoef(first[:n], second[:n])[0, 1])

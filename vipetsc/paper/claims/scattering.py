@@ -6,9 +6,8 @@ from typing import Self
 import numpy as np
 
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
-from vipetsc.paper.claims.claim import Measurement, MissingEvidence
-from vipetsc.paper.claims.evidence import EXCITED, Evidence, MeasuredRun
-from vipetsc.paper.claims.thresholds import BESIDE, NATIVE
+from vipetsc.paper.claims.criteria import BESIDE, NATIVE
+from vipetsc.paper.claims.evidence import EXCITED, Evidence, MeasuredRun, Measurement, MissingEvidence
 from vipetsc.spectra import Dispersion, ridge
 
 BRANCHES = f"share within {100 * BESIDE:g} % of the top edge from the Bloch branches"
@@ -76,12 +75,6 @@ class AmplitudeTriple:
             result.value["first contact (N)"] = onset
             text = f"{self.medium.amplitude:g} N is below first contact at {onset:.3g} N"
         result.reasons.append(f"{text}: the lattice is linear there")
-
-    def explain_high(self, result: Measurement) -> None:
-        """Add a reason if the high amplitude is but a few times that of first contact."""
-        onset = result.value.get("first contact (N)")
-        if onset:
-            result.reasons.append(f"{self.high.amplitude:g} N is {self.high.amplitude / onset:.3g} times first contact")
 
 
 def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -151,17 +144,19 @@ def _branch_share(run: MeasuredRun) -> float:
 def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C4: new wavenumbers at high over medium amplitude, and the share reflected (Figs. 2, 3)."""
     triple = AmplitudeTriple.of(evidence, reading, "wavenumber_content", "kinetic_energy")
+    new = {name: triple.new_share(run) for name, run in triple.runs.items()}
     for name, run in triple.runs.items():
-        shares = {"share at new wavenumbers": triple.new_share(run)}
+        shares = {"share at new wavenumbers": new[name]}
         shares["share of the incident energy reflected"] = _reflected_share(triple, run)
         for quantity, (share, deviation) in shares.items():
             result.value[f"{quantity}, {name} amplitude"] = share
             text = quantity.replace("of the incident energy ", "")
             result.uncertainty[f"deviation over time of the {text}, {name} amplitude"] = deviation
-    high, medium = (triple.new_share(run)[0] for run in (triple.high, triple.medium))
-    result.value["new wavenumbers, high over medium amplitude"] = high / medium
+    result.value["new wavenumbers, high over medium amplitude"] = new["high"][0] / new["medium"][0]
     triple.explain_medium(result)
-    triple.explain_high(result)
+    onset = result.value.get("first contact (N)")
+    if onset:
+        result.reasons.append(f"{triple.high.amplitude:g} N is {triple.high.amplitude / onset:.3g} times first contact")
 
 
 def _reflected_share(triple: AmplitudeTriple, run: MeasuredRun) -> tuple[float, float]:
@@ -184,28 +179,21 @@ def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C5: share of the packet in its own wavenumber bins before it meets a site (Fig. 4)."""
     triple = AmplitudeTriple.of(evidence, reading, "wavenumber_content", "partition")
     arrival = triple.distance / max_group_velocity(triple.low.case.unit_cell(), OPTICAL)[2]
-    shares = np.array([_native_shares(run, triple.duration, arrival) for run in triple.runs.values()])
-    for method, share in zip(("Fourier", "wavelet"), shares.T, strict=True):
+    first, last = NATIVE[0] - 1, NATIVE[-1]
+    shares = []
+    for run in triple.runs.values():
+        time, wavenumber, content = run.arrays("time", "wavenumber", "wavenumber_content")
+        snapshot, bounds, energy = run.arrays("partition/snapshot", "partition/bounds", "partition/energy")
+        sampled, transformed = ((t >= triple.duration) & (t <= arrival) for t in (time, snapshot))
+        if not (sampled.any() and transformed.any()):
+            raise MissingEvidence("no sample lies between the drive's end and the arrival at the first site")
+        content, energy = content[sampled].sum(axis=0), energy.compress(transformed, axis=1).sum(axis=1)
+        inside = (wavenumber >= bounds[first]) & (wavenumber <= bounds[last])
+        shares.append((content[inside].sum() / content.sum(), energy[first:last].sum() / energy.sum()))
+    for method, share in zip(("Fourier", "wavelet"), np.transpose(shares), strict=True):
         quantity = f"smallest share in bins {NATIVE[0]} and {NATIVE[1]}, {method}"
         result.value[quantity] = share.min()
         result.uncertainty[f"spread over the amplitudes: {quantity}"] = np.ptp(share)
-
-
-def _native_shares(run: MeasuredRun, start: float, end: float) -> tuple[float, float]:
-    """Shares of the bins ``NATIVE`` between two times in s, by Fourier transform and by wavelets."""
-    time, wavenumber, content = run.arrays("time", "wavenumber", "wavenumber_content")
-    snapshot, bounds, energy = run.arrays("partition/snapshot", "partition/bounds", "partition/energy")
-    content = content[_between(time, start, end)].sum(axis=0)
-    inside = (wavenumber >= bounds[NATIVE[0] - 1]) & (wavenumber <= bounds[NATIVE[-1]])
-    energy = energy.compress(_between(snapshot, start, end), axis=1).sum(axis=1)
-    return content[inside].sum() / content.sum(), energy[NATIVE[0] - 1 : NATIVE[-1]].sum() / energy.sum()
-
-
-def _between(time: np.ndarray, start: float, end: float) -> np.ndarray:
-    inside = (time >= start) & (time <= end)
-    if not inside.any():
-        raise MissingEvidence("no sample lies between the drive's end and the arrival at the first site")
-    return inside
 
 
 def reconstruction(evidence: Evidence, reading: str, result: Measurement) -> None:

@@ -1,0 +1,124 @@
+"""What decides on a claim: the criteria in ``claims.toml``, and the constants inside of the quantities they compare.
+
+Every number that decides stands in one of the two. Sections (sec., App., Suppl.) are the paper's; SPEC is the
+specification that fixes what the paper leaves open.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from math import inf, isfinite
+from typing import Any
+
+HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
+ROUNDING = 1e-9  # of a measured number beside its threshold
+LAWS = "hertz", "bilinear"
+
+# Constants of quantities: what is counted or measured, rather than what decides.
+STRAIGHT, STRAIGHT_EVERYWHERE = 0.95, 0.9  # adjusted R^2 of a power law (SPEC 11, C7 and C8)
+FEWEST = 4  # points of a fit: three lie near some power law by chance
+QUIET = 0.1  # normalised entropy that is still "nearly zero" (sec. II.C)
+ABRUPT = 10**0.5  # ratio of amplitudes, half a decade, in which an abrupt rise leads from QUIET to half the peak
+PEAK = 0.9, 1.8  # N (sec. II.C; SPEC 4: 1.1-1.4 N)
+HIGH, SEVERAL = 10.0, 3  # N, the paper's high amplitude; sites that are several
+BESIDE = 0.02  # half-width of the band about a Bloch branch over the top edge of the pass bands
+NATIVE = 7, 8  # wavenumber bins that the packet starts in (SPEC 11, C5)
+PAPER_CELL, GRID = (0.1, 0.5), 0.1  # (lambda, eta) of the paper, spacing of its grid (SPEC 11, C10; Suppl. 3)
+LOW = 10  # times the floor: up to there the transfer has not set in
+COUNTED = "band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2"  # the parts that the paper filters (App. A3)
+FEWEST_FOLDS = 2  # back in energy and forth again (SPEC 9)
+HERTZ_LIMIT = 0.1  # d ln f / d ln E of a resonator on a spring of force w^n, n = 3/2: (n - 1)/(2 (n + 1))
+SAME_MOTION, SAME_EXPONENT = 0.9, 0.2
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """The comparison of the number called ``quantity`` with ``threshold``.
+
+    ========  =============  ========================================================
+    "<="      bound          at most
+    ">="      bound          at least
+    "within"  (low, high)    in the closed interval
+    "of"      (count, all)   the quantity is a share: at least ``count`` out of ``all``
+    ========  =============  ========================================================
+
+    ``source`` is where SPEC.md or the paper gives the threshold. A claim that fails a ``decisive`` criterion does not
+    hold.
+    """
+
+    quantity: str
+    comparison: str
+    threshold: float | tuple[float, float]
+    unit: str
+    source: str
+    decisive: bool = False
+
+    def met(self, value: float | None) -> bool:
+        """Whether ``value`` keeps to the threshold; a number that is not there or not finite does not."""
+        low, high = self.interval
+        scale = high if self.comparison == "of" else 1
+        return value is not None and isfinite(value) and low - ROUNDING <= value * scale <= high + ROUNDING
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Lowest and highest number that meets the criterion; counts for shares."""
+        if isinstance(self.threshold, tuple):
+            return self.threshold
+        return (-inf, self.threshold) if self.comparison == "<=" else (self.threshold, inf)
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        unit = f" {self.unit}" if self.unit else ""
+        if self.comparison == "of":
+            return f"{self.quantity}: at least {low:g} of {high:g}"
+        if self.comparison == "within":
+            return f"{self.quantity}: {low:.4g} to {high:.4g}{unit}"
+        return f"{self.quantity} {self.comparison} {self.threshold:.4g}{unit}"
+
+
+@dataclass(frozen=True)
+class ClaimSpec:
+    """A claim before it is measured: a sentence, where the ``paper`` makes it, and what decides on it.
+
+    ``figure`` is the stem of the picture that shows it, and may hold ``{reading}``. ``measure`` names a function
+    "module.name" (evidence, reading, measurement) that fills the measurement, or raises MissingEvidence.
+    """
+
+    claim: str
+    paper: str
+    figure: str
+    measure: str
+    criteria: tuple[Criterion, ...]
+
+
+def verdict(criteria: Sequence[Criterion], value: Mapping[str, float | None]) -> tuple[str, list[str]]:
+    """The verdict on the numbers ``value``, and the quantities of the criteria that are not met or not measured.
+
+    It holds when every criterion is met, not at all when none is or a decisive one is not, and else in part; what
+    was not measured keeps it from holding.
+    """
+    missed = [c for c in criteria if not c.met(value.get(c.quantity))]
+    failed = [c for c in missed if value.get(c.quantity) is not None]
+    names = [c.quantity for c in missed]
+    if not missed:
+        return HOLDS, names
+    if len(missed) == len(criteria):
+        return FAILS if failed else UNMEASURED, names
+    return FAILS if any(c.decisive for c in failed) else IN_PART, names
+
+
+def _criteria(rows: Sequence[Sequence[Any]]) -> tuple[Criterion, ...]:
+    """The criteria of one claim; those of both laws (quantities that end in *) first, law by law."""
+    criteria = []
+    for law in (*LAWS, ""):
+        for quantity, comparison, threshold, unit, source, *decisive in rows:
+            if quantity.endswith("*") == bool(law):
+                name = quantity.replace("*", f", {law}")
+                bounds = tuple(threshold) if isinstance(threshold, list) else threshold
+                criteria.append(Criterion(name, comparison, bounds, unit, source, bool(decisive)))
+    return tuple(criteria)
+
+
+_TABLES = tomllib.loads((files("vipetsc.paper.claims") / "claims.toml").read_text(encoding="utf-8"))
+CLAIMS = {key: ClaimSpec(**table | {"criteria": _criteria(table["criteria"])}) for key, table in _TABLES.items()}
