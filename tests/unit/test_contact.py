@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from vipetsc.contact import changes, landing
+from vipetsc.contact import changes, search
 from vipetsc.contact.law import (
     CLIPPED,
     CLOSED,
@@ -128,36 +128,36 @@ def test_clipping_begins_where_g_falls_through_zero():
 
 
 def test_a_landing_on_a_root_converges_and_one_on_a_near_miss_is_searched_again():
-    attempt = landing.begin_landing(0.4, 1.0)
+    attempt = search.begin_landing(0.4, 1.0)
     for _ in range(8):
         value, rate = np.exp(attempt.length) - 2, np.exp(attempt.length)
-        attempt, outcome = landing.correct(attempt, value, rate, 1e-10, 1e-10)
-        if outcome != landing.RETRY:
+        attempt, outcome = search.correct(attempt, value, rate, 1e-10, 1e-10)
+        if outcome != search.RETRY:
             break
-    assert outcome == landing.LANDED
+    assert outcome == search.LANDED
     assert attempt.length == pytest.approx(np.log(2), abs=1e-10)
 
-    attempt, outcome = landing.begin_landing(0.5, 1.0), landing.RETRY
+    attempt, outcome = search.begin_landing(0.5, 1.0), search.RETRY
     outcomes = []
-    while outcome not in (landing.MISSED, landing.LANDED):
+    while outcome not in (search.MISSED, search.LANDED):
         value, rate = -1e-6 - (attempt.length - 0.5) ** 2, -2 * (attempt.length - 0.5)
-        attempt, outcome = landing.correct(attempt, value, rate, 1e-10, 1e-10)
+        attempt, outcome = search.correct(attempt, value, rate, 1e-10, 1e-10)
         outcomes.append(outcome)
-        if outcome == landing.SEARCH:
-            attempt = landing.shorten(attempt, 0.9)
-    assert outcomes[0] == landing.SEARCH
-    assert outcomes[-1] == landing.MISSED
-    assert len(outcomes) == landing.MOST_ATTEMPTS
+        if outcome == search.SEARCH:
+            attempt = search.shorten(attempt, 0.9)
+    assert outcomes[0] == search.SEARCH
+    assert outcomes[-1] == search.MISSED
+    assert len(outcomes) == search.MOST_ATTEMPTS
 
 
 def test_a_landing_within_the_tolerance_goes_on_while_it_gains():
     """With a goal below the tolerance, the last attempt that still halves the distance is followed by another."""
-    start = landing.begin_landing(0.5, 1.0)
-    attempt, outcome = landing.correct(start, 1e-11, 1.0, 1e-10, 1e-14)
-    assert outcome == landing.RETRY
+    start = search.begin_landing(0.5, 1.0)
+    attempt, outcome = search.correct(start, 1e-11, 1.0, 1e-10, 1e-14)
+    assert outcome == search.RETRY
     assert attempt.length == 0.5 - 1e-11
-    assert landing.correct(attempt, 0.9e-11, 1.0, 1e-10, 1e-14)[1] == landing.LANDED
-    assert landing.correct(attempt, 0.9e-14, 1.0, 1e-10, 1e-14)[1] == landing.LANDED
+    assert search.correct(attempt, 0.9e-11, 1.0, 1e-10, 1e-14)[1] == search.LANDED
+    assert search.correct(attempt, 0.9e-14, 1.0, 1e-10, 1e-14)[1] == search.LANDED
 
 
 def test_the_tracker_follows_an_impact_from_onset_to_separation():
@@ -166,11 +166,11 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     site = tracker.contacts.sites[1]
     tracker.start[1] = -D, 0.01, 0.0  # touches on the side -1, moving away: a graze
     assert tracker.switch(0.1, np.array([0.0, 0.25])) == 0
-    assert tracker.counts.grazes == 1
+    assert tracker.counts["grazes"] == 1
     tracker.start[1] = -D, -0.01, 0.0
     assert tracker.switch(0.2, np.array([0.0, 0.25])) == 1
     assert (site["mode"], site["approach"]) == (-CLOSED, -0.05)
-    assert (tracker.counts.floored, tracker.counts.grazes) == (1, 1)
+    assert (tracker.counts["floored"], tracker.counts["grazes"]) == (1, 1)
     assert tracker.contact_time() == tracker.duration(0.05)
 
     tracker.end[1] = -1.5 * D, 0.0, 0.0
@@ -178,22 +178,26 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     assert tracker.start[1, 0] == -1.5 * D
     tracker.end[1] = -D, 0.2, 0.0  # g = 1 + .45 (-.2/.05) < 0: the contact pulls
     tracker.accept_step(1e-3)
-    (episode,) = tracker.unfinished(np.array([0.0, 0.5]))
+    (episode,) = tracker.take_episodes(np.array([0.0, 0.5]), unfinished=True)
     assert (episode.site, episode.side, episode.onset, episode.approach_velocity) == (9, -1, 0.2, -0.01)
     assert episode.loss == 0.25
     assert np.isnan(episode.separation)
     assert episode.indentation == pytest.approx(0.5 * D, rel=0.05)
     assert episode.force > KC * (0.5 * D) ** 1.5
-    assert tracker.counts.pulled == 1
+    assert tracker.counts["pulled"] == 1
 
     resumed = ImpactTracker(create_contacts(contact, [D, D]), (4, 9), 0.003)
     resumed.restore(tracker.checkpoint())
     for each in (tracker, resumed):
         each.start[1] = -D, 0.2, 0.0
         assert each.switch(0.3, np.array([0.0, 0.75])) == 1
-        (closed,) = each.take_closed()
+        (closed,) = each.take_episodes(np.zeros(2))
         assert (closed.separation, closed.loss, closed.indentation) == (0.3, 0.5, episode.indentation)
-        assert (each.take_closed(), each.open, each.contacts.sites["mode"].tolist()) == ([], {}, [FREE, FREE])
+        assert (each.take_episodes(np.zeros(2)), each.open, each.contacts.sites["mode"].tolist()) == (
+            [],
+            {},
+            [FREE, FREE],
+        )
         assert each.counts == tracker.counts
     assert tracker.contact_time() == np.inf
 
@@ -214,4 +218,4 @@ def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
     tracker.start[0] = 1.01 * D, -0.1, 0.0
     assert tracker.switch(0.0, np.zeros(1)) == 1
     assert tracker.contacts.sites["mode"].tolist() == [CLOSED]
-    assert tracker.counts.grazes == 0
+    assert tracker.counts["grazes"] == 0

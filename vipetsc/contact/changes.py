@@ -97,8 +97,7 @@ def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: floa
             if order == 0:
                 c[:] = factor * b + offset
             else:
-                for k in range(5):
-                    c[k] = factor * 5.0 * (b[k + 1] - b[k]) / h + offset
+                c[:5] = factor * 5.0 * (b[1:] - b[:5]) / h + offset
             share = first_upcrossing_after_start(c[: 6 - order], tolerance)
             if share < first.share:
                 first = Change(share, i, function)
@@ -115,16 +114,13 @@ def _push(contacts: Contacts, i: int, b: np.ndarray, d: np.ndarray, s: float) ->
 @njit(error_model="numpy")
 def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
-    b, d = np.empty(6), np.empty(5)
+    b = np.empty(6)
     bernstein(start[i], end[i], h, b)
-    for k in range(5):
-        d[k] = 5.0 * (b[k + 1] - b[k]) / h
+    d = 5.0 * (b[1:] - b[:5]) / h
     site = contacts.sites[i]
     side = 1.0 if site.mode > 0 else -1.0
     deepest = max(side * b[0], side * b[5])
-    recoil = np.empty(5)
-    for k in range(5):
-        recoil[k] = side * (b[k] - b[k + 1])
+    recoil = side * (b[:5] - b[1:])
     if recoil[0] < 0.0:
         turn = first_upcrossing(recoil)
         if turn <= 1.0:

@@ -1,15 +1,33 @@
-"""Modes of sites over time: switching at located changes, and the log of episodes."""
+"""Modes of sites over time: switching at located changes, and the log of impacts."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, astuple
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.special import gamma
 
-from vipetsc.contact import changes
-from vipetsc.contact.changes import Change, Extremes, Switching
-from vipetsc.contact.episodes import Episode, ImpactCounts
+from vipetsc.contact.changes import Extremes, extremes, switching
 from vipetsc.contact.law import CLIPPED, FREE, Contacts
+
+# Limits of the contact law, of which it is counted how often they acted.
+LIMITS = ("grazes", "floored", "clipped", "pulled")
+
+
+@dataclass
+class Episode:
+    """One contact of one site: 0-based site, side (+1, -1), times in s, velocity in m/s, depth in m, N, J.
+
+    ``separation`` is NaN while the contact lasts.
+    """
+
+    site: int
+    side: int
+    onset: float
+    approach_velocity: float
+    separation: float = np.nan
+    indentation: float = 0.0
+    force: float = 0.0
+    loss: float = 0.0
 
 
 class ImpactTracker:
@@ -36,15 +54,7 @@ class ImpactTracker:
         self.open: dict[int, Episode] = {}
         self.pulling: set[int] = set()
         self.closed: list[Episode] = []
-        self.counts = ImpactCounts()
-
-    def first_change(self, h: float) -> Change:
-        """The first change of a site's mode in the step of ``h`` seconds from ``start`` to ``end``."""
-        return changes.first_change(self.contacts, self.start, self.end, h)
-
-    def switching(self, change: Change) -> Switching:
-        """The switching function of ``change`` at the end of the step."""
-        return changes.switching(self.contacts, change.site, change.function, self.end[change.site])
+        self.counts = dict.fromkeys(LIMITS, 0)
 
     def contact_time(self) -> float:
         """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
@@ -54,17 +64,17 @@ class ImpactTracker:
     def accept_step(self, h: float) -> None:
         """Take the step of ``h`` seconds as done: update the open episodes; its end is the next one's start."""
         for i, episode in self.open.items():
-            self.update_episode(i, episode, changes.extremes(self.contacts, i, self.start, self.end, h))
+            self.update_episode(i, episode, extremes(self.contacts, i, self.start, self.end, h))
         self.start, self.end = self.end, self.start
 
-    def update_episode(self, i: int, episode: Episode, extremes: Extremes) -> None:
-        """Update the open episode of site ``i`` with the extremes of a stretch of time."""
-        episode.indentation = max(episode.indentation, extremes.indentation)
-        episode.force = max(episode.force, extremes.force)
+    def update_episode(self, i: int, episode: Episode, reached: Extremes) -> None:
+        """Update the open episode of site ``i`` with the extremes ``reached`` in a stretch of time."""
+        episode.indentation = max(episode.indentation, reached.indentation)
+        episode.force = max(episode.force, reached.force)
         # A pull within the landing's rounding is none.
-        if extremes.smallest_force < -1e-9 * episode.force and i not in self.pulling:
+        if reached.smallest_force < -1e-9 * episode.force and i not in self.pulling:
             self.pulling.add(i)
-            self.counts.pulled += 1
+            self.counts["pulled"] += 1
 
     def switch(self, t: float, energies: np.ndarray) -> int:
         """Switch every site that has landed at time ``t`` (motion in ``start``); returns how many.
@@ -74,12 +84,12 @@ class ImpactTracker:
         switched = 0
         for i, site in enumerate(self.contacts.sites):
             for function in range(2):
-                value, rate, tolerance, mode = changes.switching(self.contacts, i, function, self.start[i])
+                value, rate, tolerance, mode = switching(self.contacts, i, function, self.start[i])
                 if value < -tolerance:
                     continue
                 # At a landing |w - D| is rounding: the rate tells on which side the site goes on.
                 if rate <= 0 and value <= tolerance:
-                    self.counts.grazes += int(site["mode"] == FREE)
+                    self.counts["grazes"] += int(site["mode"] == FREE)
                     continue
                 self._set_mode(i, mode, t, float(energies[i]))
                 switched += 1
@@ -92,7 +102,7 @@ class ImpactTracker:
         site["mode"] = mode
         if before == FREE:
             rate, floor = float(self.start[i, 1]), self.contacts.law.approach_floor
-            self.counts.floored += int(abs(rate) < floor)
+            self.counts["floored"] += int(abs(rate) < floor)
             site["approach"] = side * max(abs(rate), floor)
             self.open[i] = Episode(self.numbers[i], side, t, rate, loss=-energy)
         elif mode == FREE:
@@ -102,16 +112,14 @@ class ImpactTracker:
             episode.loss += energy
             self.closed.append(episode)
         elif abs(mode) == CLIPPED:
-            self.counts.clipped += 1
+            self.counts["clipped"] += 1
 
-    def take_closed(self) -> list[Episode]:
-        """Episodes closed since the last call."""
-        closed, self.closed = self.closed, []
-        return closed
-
-    def unfinished(self, energies: np.ndarray) -> list[Episode]:
-        """Copies of the episodes still open, with the loss so far; ``energies`` as in ``switch``."""
-        return [Episode(**asdict(e) | {"loss": e.loss + float(energies[i])}) for i, e in self.open.items()]
+    def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> list[Episode]:
+        """Episodes closed since the last call, and ``unfinished`` ones as they are; ``energies`` as in ``switch``."""
+        episodes, self.closed = self.closed, []
+        if unfinished:
+            episodes += [replace(e, loss=e.loss + float(energies[i])) for i, e in self.open.items()]
+        return episodes
 
     def duration(self, speed: float) -> float:
         """Contact time in s of an isolated conservative impact at ``speed`` in m/s (Johnson 1985, sec. 11.4)."""
@@ -122,20 +130,18 @@ class ImpactTracker:
         return float(2 * integral * depth / speed)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Modes, approach velocities, open episodes and counts."""
-        episodes = [[i, i in self.pulling, *asdict(e).values()] for i, e in self.open.items()]
+        """Sites with their modes, open episodes and counts."""
+        episodes = [[i, i in self.pulling, *astuple(e)] for i, e in self.open.items()]
         return {
-            "mode": self.contacts.sites["mode"].copy(),
-            "approach": self.contacts.sites["approach"].copy(),
+            "sites": self.contacts.sites.copy(),
             "open": np.array(episodes, float),
-            "impact_counts": np.array(astuple(self.counts)),
+            "impact_counts": np.array(list(self.counts.values())),
         }
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Go back to a checkpoint."""
-        self.contacts.sites["mode"] = checkpoint["mode"]
-        self.contacts.sites["approach"] = checkpoint["approach"]
+        self.contacts.sites[:] = checkpoint["sites"]
         rows = checkpoint["open"].tolist()
         self.open = {int(row[0]): Episode(int(row[2]), int(row[3]), *row[4:]) for row in rows}
         self.pulling = {int(row[0]) for row in rows if row[1]}
-        self.counts = ImpactCounts(*checkpoint["impact_counts"].tolist())
+        self.counts = dict(zip(LIMITS, checkpoint["impact_counts"].tolist(), strict=True))

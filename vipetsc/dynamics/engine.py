@@ -8,7 +8,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.episodes import Episode
+from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.layout import Layout
 from vipetsc.parallel import StopRequest
 
@@ -44,12 +44,8 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def take_episodes(self) -> list[Episode]:
-        """Episodes closed since the last call that this rank logs."""
-
-    @abstractmethod
-    def unfinished(self) -> list[Episode]:
-        """Copies of the open episodes that this rank logs, with the loss so far."""
+    def take_episodes(self, unfinished: bool = False) -> list[Episode]:
+        """Episodes closed since the last call that this rank logs; and copies of ``unfinished`` ones, as they are."""
 
     @abstractmethod
     def statistics(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case
-from vipetsc.contact.episodes import Episode
+from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.observers import Observer, Sample, Setup
 from vipetsc.io.store import GATHER_LIMIT, IMPACTS, LEDGER
@@ -70,7 +70,7 @@ class Recorder(Observer):
     def finish(self, stopped: bool) -> None:
         """See ``Observer``: the last chunk holds the episodes that are still open, too."""
         if not stopped:
-            self._write(self.setup.engine.take_episodes() + self.setup.engine.unfinished())
+            self._write(self.setup.engine.take_episodes(unfinished=True))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """See ``Observer``."""

@@ -43,7 +43,7 @@ def correct(landing: Landing, motion: np.ndarray, floor: float) -> tuple[Landing
     """The next attempt after one that ended with (w, w', w'') = ``motion``: Newton's method, or bisection.
 
     The outcome is CROSSING when the length is known to ``floor`` seconds, EXTREMUM when the gap's largest value is
-    known so and not above zero, and NONE when another attempt is needed. ``contact.landing`` stops at a tolerance on
+    known so and not above zero, and NONE when another attempt is needed. ``contact.search`` stops at a tolerance on
     w; the sensitivities of an orbit with many contacts need the length to rounding.
     """
     sign, offset, extremum, low, high, length, attempts = landing

@@ -9,8 +9,8 @@ import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Change, extremes, first_change, switching
-from vipetsc.contact.landing import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
 from vipetsc.contact.law import CLOSED, FREE, contact_force
+from vipetsc.contact.search import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
 from vipetsc.dynamics.propagator.collocation import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.free_motion import ROUNDING, first_onset, shift
 from vipetsc.dynamics.propagator.substep import (

@@ -8,9 +8,8 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.contact.changes import Extremes
-from vipetsc.contact.episodes import Episode
 from vipetsc.contact.law import create_contacts
-from vipetsc.contact.tracker import ImpactTracker
+from vipetsc.contact.tracker import Episode, ImpactTracker
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.propagator.advance import DONE, FAILED, ORDER, advance_cluster
 from vipetsc.dynamics.propagator.collocation import collocation
@@ -129,12 +128,9 @@ class Cluster:
             _, _, *extremes = self._motion.history[site].tolist()
             self.tracker.update_episode(site, episode, Extremes(*extremes))
 
-    def take_episodes(self) -> list[Episode]:
-        """Episodes closed since the last call; none where another rank logs them."""
-        closed = self.tracker.take_closed()
-        return closed if self.logs else []
-
-    def unfinished(self) -> list[Episode]:
-        """Copies of the open episodes; none where another rank logs them."""
-        self._update_episodes()
-        return self.tracker.unfinished(self._motion.energy) if self.logs else []
+    def take_episodes(self, unfinished: bool) -> list[Episode]:
+        """Episodes closed since the last call, and ``unfinished`` ones; none where another rank logs them."""
+        if unfinished:
+            self._update_episodes()
+        episodes = self.tracker.take_episodes(self._motion.energy, unfinished)
+        return episodes if self.logs else []

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.episodes import Episode
+from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.cluster import group_dofs
@@ -138,13 +138,9 @@ class Propagator(Engine):
             array[at : at + d] = self._halo.columns[:d, column]
             at += d
 
-    def take_episodes(self) -> list[Episode]:
-        """Episodes closed since the last call that this rank logs."""
-        return [episode for cluster in self._forces.clusters for episode in cluster.take_episodes()]
-
-    def unfinished(self) -> list[Episode]:
-        """Copies of the open episodes that this rank logs."""
-        return [episode for cluster in self._forces.clusters for episode in cluster.unfinished()]
+    def take_episodes(self, unfinished: bool = False) -> list[Episode]:
+        """See ``Engine``."""
+        return [episode for cluster in self._forces.clusters for episode in cluster.take_episodes(unfinished)]
 
     def statistics(self) -> dict[str, Any]:
         """Linear steps and what the clusters did, the step and its band."""

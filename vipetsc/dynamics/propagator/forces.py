@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, fields
 from itertools import pairwise
 from math import factorial
 from typing import Any
@@ -12,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.episodes import ImpactCounts
+from vipetsc.contact.tracker import LIMITS
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.cluster import Cluster, ContactDof, group_dofs
 from vipetsc.dynamics.propagator.free_motion import DofTables, active_clusters, apply_impulses
@@ -20,9 +19,8 @@ from vipetsc.dynamics.propagator.halo import HaloRegions
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.substep import HISTORY, SUBSTEP_STATE, ClusterMotion
 
-# What clusters and their trackers count.
+# What clusters count.
 COUNTS = ("substeps", "rejected", "landings", "switches")
-LIMITS = tuple(field.name for field in fields(ImpactCounts))
 
 
 class Forces:
@@ -75,7 +73,7 @@ class Forces:
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
         logs = [cluster.logs for cluster in self.clusters]
-        limits = [astuple(cluster.tracker.counts) for cluster in self.clusters if cluster.logs]
+        limits = [list(cluster.tracker.counts.values()) for cluster in self.clusters if cluster.logs]
         total = np.array([*(self._motion.state[name][logs].sum() for name in COUNTS),
                           *np.array(limits, np.int64).reshape(-1, len(LIMITS)).sum(axis=0)])  # fmt: skip
         self._comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)

@@ -12,10 +12,9 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact import landing
-from vipetsc.contact.changes import Change
-from vipetsc.contact.episodes import Episode
-from vipetsc.contact.tracker import ImpactTracker
+from vipetsc.contact.changes import Change, first_change, switching
+from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, begin_landing, correct, shorten
+from vipetsc.contact.tracker import Episode, ImpactTracker
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.records import create_record
@@ -171,7 +170,7 @@ class Integrator(Engine):
         self.counts.steps += 1
         end = target if count == 1 else self.time + h
         self.observe(self.tracker.end, end)
-        change = self.tracker.first_change(h)
+        change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h)
         self._buffer[:] = change.share, -float(self._stop.requested)
         self.comm.Allreduce(MPI.IN_PLACE, self._buffer, MPI.MIN)
         if self._buffer[0] <= 1.0:
@@ -199,9 +198,9 @@ class Integrator(Engine):
         """
         comm, tracker = self.comm, self.tracker
         owner = comm.allreduce(comm.rank if change.share == share else comm.size, MPI.MIN)
-        attempt, outcome = landing.begin_landing(share, h), landing.RETRY
+        attempt, outcome = begin_landing(share, h), RETRY
         self.counts.landings += 1
-        while outcome == landing.RETRY:
+        while outcome == RETRY:
             length = attempt.length
             self.saved.copy(self.state)
             self.ts.restartStep()
@@ -217,20 +216,19 @@ class Integrator(Engine):
             attempt, outcome = comm.bcast(self._judge(attempt, change) if comm.rank == owner else None, owner)
         tracker.accept_step(length)
         self.time += length
-        if outcome == landing.LANDED:
+        if outcome == LANDED:
             self._switch()
 
-    def _judge(self, attempt: landing.Landing, change: Change) -> tuple[landing.Landing, int]:
+    def _judge(self, attempt: Landing, change: Change) -> tuple[Landing, int]:
         """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it."""
-        function = self.tracker.switching(change)
-        attempt, outcome = landing.correct(
-            attempt, function.value, function.rate, function.tolerance, function.tolerance
-        )
-        if outcome != landing.SEARCH:
+        tracker, site = self.tracker, change.site
+        value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, tracker.end[site])
+        attempt, outcome = correct(attempt, value, rate, tolerance, tolerance)
+        if outcome != SEARCH:
             return attempt, outcome
         # A graze: short of it, go on from here; beyond it, search again on the shorter step.
-        share = self.tracker.first_change(attempt.length).share
-        return (landing.shorten(attempt, share), landing.RETRY) if share <= 1.0 else (attempt, landing.MISSED)
+        share = first_change(tracker.contacts, tracker.start, tracker.end, attempt.length).share
+        return (shorten(attempt, share), RETRY) if share <= 1.0 else (attempt, MISSED)
 
     def _switch(self) -> None:
         """Switch modes of all landed sites and set the step with which to go on."""
@@ -248,17 +246,13 @@ class Integrator(Engine):
         self.observe(tracker.start)
         self.ts.restartStep()
 
-    def take_episodes(self) -> list[Episode]:
-        """Episodes closed since the last call, of the owned sites."""
-        return self.tracker.take_closed()
-
-    def unfinished(self) -> list[Episode]:
-        """Copies of the owned sites' open episodes."""
-        return self.tracker.unfinished(self.state.array_r[self._dissipated :])
+    def take_episodes(self, unfinished: bool = False) -> list[Episode]:
+        """See ``Engine``: those of the owned sites."""
+        return self.tracker.take_episodes(self.state.array_r[self._dissipated :], unfinished)
 
     def statistics(self) -> dict[str, Any]:
         """Steps, what landings and limits of the contact law there were, and how the right-hand side is called."""
-        limits = {name: self.comm.allreduce(count) for name, count in asdict(self.tracker.counts).items()}
+        limits = {name: self.comm.allreduce(count) for name, count in self.tracker.counts.items()}
         statistics = asdict(self.counts) | limits
         statistics["switches"] = self.comm.allreduce(self.counts.switches)
         return statistics | {"method": self.ts.getRKType(), "right_hand_side": self.right_hand_side}
