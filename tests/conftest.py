@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -18,11 +19,17 @@ petsc4py.init(["pytest", "-no_signal_handler"])
 from mpi4py import MPI
 
 import h5py
+import hypothesis
 import numpy as np
 import pytest
 
 from vipetsc.case import Case
+from vipetsc.cli.main import main
 from vipetsc.parallel import StopRequest
+
+# A first call may have to load kernels, or compile them.
+hypothesis.settings.register_profile("vipetsc", deadline=None)
+hypothesis.settings.load_profile("vipetsc")
 
 
 @pytest.fixture
@@ -96,6 +103,31 @@ def vipetsc():
         return subprocess.run(command, timeout=timeout, check=False, **options)
 
     return call
+
+
+@pytest.fixture
+def in_process(capsys, monkeypatch):
+    """Call the program on one rank in this process, where how a process begins and ends is not what is tested.
+
+    ``in_process("run", ..., cwd=None)`` returns what the fixture ``vipetsc`` returns.
+    """
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def call(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess:
+        words = list(map(str, arguments))
+        capsys.readouterr()
+        with monkeypatch.context() as context:
+            if cwd:
+                context.chdir(cwd)
+            try:
+                code = main(words)
+            except SystemExit as end:
+                code = end.code
+        return subprocess.CompletedProcess(words, code, *capsys.readouterr())
+
+    yield call
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

@@ -70,31 +70,31 @@ def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, case, tmp_path
     assert_same_bits(before, numbers(out / "design.h5"))
 
 
-def test_pictures_again_from_the_file_alone(vipetsc, case, tmp_path):
+def test_pictures_again_from_the_file_alone(in_process, case, tmp_path):
     out, bare = tmp_path / "out", tmp_path / "bare"
-    assert vipetsc(0, "design", case, "--out", out, "--set", "design.readings=['printed']").returncode == 0
+    assert in_process("design", case, "--out", out, "--set", "design.readings=['printed']").returncode == 0
     bare.mkdir()
     (out / "design.h5").rename(bare / "design.h5")
-    done = vipetsc(0, "plot", bare, "--format", "png", "--format", "pdf")
+    done = in_process("plot", bare, "--format", "png", "--format", "pdf")
     assert done.returncode == 0, done.stderr
     drawn = {p.name: p.stat().st_size for p in (bare / "figures").iterdir()}
     assert drawn.keys() == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
     assert min(drawn.values()) > 5000
     assert (bare / "figures" / "cost_maps.png").read_bytes() == (out / "figures" / "cost_maps.png").read_bytes()
-    one = vipetsc(0, "plot", bare / "design.h5", "--fig", "cost_maps")
+    one = in_process("plot", bare / "design.h5", "--fig", "cost_maps")
     assert one.stdout.split() == [str(bare / "figures" / "cost_maps.png")]
-    wrong = vipetsc(0, "plot", bare, "--fig", "ledger")
+    wrong = in_process("plot", bare, "--fig", "ledger")
     assert wrong.returncode == 2
     assert "cost_maps" in wrong.stderr
     (bare / "design.h5").write_bytes(b"nothing")
-    broken = vipetsc(0, "plot", bare)
+    broken = in_process("plot", bare)
     assert broken.returncode == 2
     assert "is not a search" in broken.stderr
 
 
-def test_a_grid_without_a_good_cell_says_so(vipetsc, case, tmp_path):
+def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
     stiff = ("--set", "design.lambda.first=5.0", "--set", "design.lambda.last=6.0")
-    done = vipetsc(0, "design", case, "--out", tmp_path / "out", *stiff)
+    done = in_process("design", case, "--out", tmp_path / "out", *stiff)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("none is out of phase") == 6
     assert np.isnan(datasets(tmp_path / "out" / "design.h5")["optimum_lambda"]).all()
@@ -140,13 +140,13 @@ def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
     assert not (tmp_path / "out").exists()
 
 
-def test_results_of_other_kinds_are_never_replaced(vipetsc, case, tmp_path):
+def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
     for evidence in ("run.h5", "branch-mode-1.h5", "index.json"):
         folder = tmp_path / evidence.split(".")[0]
         folder.mkdir()
         (folder / "case.toml").write_text("")
         (folder / evidence).write_text("results")
-        done = vipetsc(0, "design", case, "--out", folder, "--force")
+        done = in_process("design", case, "--out", folder, "--force")
         assert done.returncode == 2
         assert "of this kind" in done.stderr
     search = tmp_path / "search"
@@ -154,10 +154,10 @@ def test_results_of_other_kinds_are_never_replaced(vipetsc, case, tmp_path):
     (search / "case.toml").write_text("")
     (search / "design.h5").write_text("results")
     for verb in (("run",), ("nnm", "runs/nnm-cubic.toml")):
-        done = vipetsc(0, *verb, "--out", search, "--force")
+        done = in_process(*verb, "--out", search, "--force")
         assert done.returncode == 2
         assert "of this kind" in done.stderr
-    missing = vipetsc(0, "design", tmp_path / "nowhere.toml")
+    missing = in_process("design", tmp_path / "nowhere.toml")
     assert missing.returncode == 2
     assert "a case file (TOML) is needed" in missing.stderr
 

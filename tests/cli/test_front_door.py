@@ -57,14 +57,14 @@ def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, case, tmp_path, ra
     assert min(pictures.values()) > 5000
 
 
-def test_no_verb_is_the_builtin_case(vipetsc, tmp_path):
+def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
     ended = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "runs" / "four-band" / "run.h5").exists()
-    again = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
+    again = in_process("--set", "time.end=0.01", *QUICK, cwd=tmp_path)
     assert again.returncode == 2
     assert "--force" in again.stderr
-    forced = vipetsc(0, "--set", "time.end=0.01", *QUICK, "--force", cwd=tmp_path)
+    forced = in_process("--set", "time.end=0.01", *QUICK, "--force", cwd=tmp_path)
     assert forced.returncode == 0, forced.stderr
 
 
@@ -112,55 +112,55 @@ def test_everything_wrong_with_a_case_is_said_at_once(vipetsc, tmp_path, ranks):
         (("run", "--resume", "--out", "new"), "no unfinished run"),
     ],
 )
-def test_bad_input_is_exit_code_2_and_writes_nothing(vipetsc, tmp_path, arguments, text):
-    ended = vipetsc(0, *arguments, cwd=tmp_path)
+def test_bad_input_is_exit_code_2_and_writes_nothing(in_process, tmp_path, arguments, text):
+    ended = in_process(*arguments, cwd=tmp_path)
     assert ended.returncode == 2
     assert text in ended.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_case_that_is_not_toml(vipetsc, tmp_path):
+def test_a_case_that_is_not_toml(in_process, tmp_path):
     path = tmp_path / "case.toml"
     path.write_bytes(b"\x89HDF\r\n\x1a\n\xff\xfe")
-    ended = vipetsc(0, "validate", path)
+    ended = in_process("validate", path)
     assert ended.returncode == 2
     assert "not a TOML file" in ended.stderr
 
 
-def test_a_folder_that_is_not_a_run_is_never_replaced(vipetsc, case, tmp_path):
+def test_a_folder_that_is_not_a_run_is_never_replaced(in_process, case, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.tex").write_text("years of work")
     for force in ((), ("--force",)):
-        ended = vipetsc(0, "run", case, "--out", out, *force)
+        ended = in_process("run", case, "--out", out, *force)
         assert ended.returncode == 2
         assert "not a run's" in ended.stderr
     assert [p.name for p in out.iterdir()] == ["thesis.tex"]
 
 
-def test_a_run_file_that_is_not_ours(vipetsc, tmp_path):
+def test_a_run_file_that_is_not_ours(in_process, tmp_path):
     (tmp_path / "run.h5").write_text("not HDF5 at all")
-    ended = vipetsc(0, "plot", tmp_path)
+    ended = in_process("plot", tmp_path)
     assert ended.returncode == 2
     assert "run.h5" in ended.stderr
     assert "Traceback" not in ended.stderr
 
 
-def test_a_frequency_in_a_gap_is_a_warning(vipetsc, tmp_path):
-    ended = vipetsc(0, "validate", "--set", "drive.frequency=650.0")
+def test_a_frequency_in_a_gap_is_a_warning(in_process, tmp_path):
+    ended = in_process("validate", "--set", "drive.frequency=650.0")
     assert ended.returncode == 0
     assert "no pass band" in ended.stdout
 
 
-def test_validate_prints_what_follows_from_the_case(vipetsc):
-    ended = vipetsc(0, "validate")
+def test_validate_prints_what_follows_from_the_case(in_process):
+    ended = in_process("validate")
     assert ended.returncode == 0
     for text in ("3214.90-3644.75", "Om = 1023.27", "v_g = 428.68", "4421", "75, 106, 138, 169, 200"):
         assert text in ended.stdout
 
 
-def test_bands_as_json_and_picture(vipetsc, tmp_path):
-    ended = vipetsc(0, "bands", "--json", "--set", "lattice.reading=printed", "--out", tmp_path / "bands")
+def test_bands_as_json_and_picture(in_process, tmp_path):
+    ended = in_process("bands", "--json", "--set", "lattice.reading=printed", "--out", tmp_path / "bands")
     assert ended.returncode == 0, ended.stderr
     table = json.loads(ended.stdout)
     edges = [(round(b["low"], 2), round(b["high"], 2)) for b in table["bands"]]

@@ -28,7 +28,7 @@ def case(tmp_path):
     return path
 
 
-def test_branch_files_picture_and_refusal(vipetsc, case, tmp_path):
+def test_branch_files_picture_and_refusal(vipetsc, in_process, case, tmp_path):
     out = tmp_path / "out"
     done = vipetsc(0, "nnm", case, "--out", out)
     assert done.returncode == 0, done.stderr
@@ -41,17 +41,17 @@ def test_branch_files_picture_and_refusal(vipetsc, case, tmp_path):
         "branch-out-of-phase.csv",
         "figures/branch-out-of-phase.png",
     }
-    again = vipetsc(0, "nnm", case, "--out", out)
+    again = in_process("nnm", case, "--out", out)
     assert again.returncode == 2
     assert "--force" in again.stderr
-    assert vipetsc(0, "nnm", case, "--out", out, "--force").returncode == 0
+    assert in_process("nnm", case, "--out", out, "--force").returncode == 0
 
 
-def test_resumed_branch_is_the_uninterrupted_one(vipetsc, case, tmp_path):
+def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert vipetsc(0, "nnm", case, "--out", whole, "--set", "nnm.points=80").returncode == 0
-    assert vipetsc(0, "nnm", case, "--out", parts, "--set", "nnm.points=30").returncode == 0
-    assert vipetsc(0, "nnm", case, "--out", parts, "--set", "nnm.points=80", "--resume").returncode == 0
+    assert in_process("nnm", case, "--out", whole, "--set", "nnm.points=80").returncode == 0
+    assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=30").returncode == 0
+    assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=80", "--resume").returncode == 0
     first, second = (datasets(p / "branch-out-of-phase.h5") for p in (whole, parts))
     assert_same_bits(first, second)
 
@@ -60,8 +60,8 @@ def test_resumed_branch_is_the_uninterrupted_one(vipetsc, case, tmp_path):
     ("change", "message"),
     [("nnm.modes=[7]", "2 modes"), ("nnm.flow=rk4", "nnm.flow"), ("nmn.flow=1", "did you mean nnm")],
 )
-def test_bad_cases_write_nothing(vipetsc, case, tmp_path, change, message):
-    done = vipetsc(0, "nnm", case, "--out", tmp_path / "out", "--set", change)
+def test_bad_cases_write_nothing(in_process, case, tmp_path, change, message):
+    done = in_process("nnm", case, "--out", tmp_path / "out", "--set", change)
     assert done.returncode == 2
     assert message in done.stderr
     assert not (tmp_path / "out").exists()
@@ -87,7 +87,7 @@ def test_a_file_that_is_no_branch_is_refused_on_all_ranks(vipetsc, tmp_path, ran
     assert "Traceback" not in done.stderr
 
 
-def test_branches_and_runs_never_share_a_folder(vipetsc, tmp_path):
+def test_branches_and_runs_never_share_a_folder(in_process, tmp_path):
     """--force replaces results of its own kind only."""
     run, branches = tmp_path / "run", tmp_path / "branches"
     for folder, evidence in ((run, "run.h5"), (branches, "branch-mode-1.h5")):
@@ -95,7 +95,7 @@ def test_branches_and_runs_never_share_a_folder(vipetsc, tmp_path):
         (folder / "case.toml").write_text("")
         (folder / evidence).write_text("results")
     for arguments in (("nnm", "runs/nnm-cubic.toml", "--out", run), ("run", "--out", branches)):
-        ended = vipetsc(0, *arguments, "--force")
+        ended = in_process(*arguments, "--force")
         assert ended.returncode == 2
         assert "of this kind" in ended.stderr
     assert (run / "run.h5").read_text() == "results"

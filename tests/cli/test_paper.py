@@ -137,8 +137,8 @@ SAME = (
 )
 
 
-def test_list_says_what_is_left(vipetsc, tmp_path):
-    listed = vipetsc(0, "paper", "--list", "--out", tmp_path / "none")
+def test_list_says_what_is_left(in_process, tmp_path):
+    listed = in_process("paper", "--list", "--out", tmp_path / "none")
     assert listed.returncode == 0, listed.stderr
     assert re.search(r"^scattering +missing +\d+ min +.*C7 C8", listed.stdout, re.M)
     assert all(re.search(rf"^{figure.id} .*missing", listed.stdout, re.M) for figure in PAPER_FIGURES)
@@ -159,9 +159,9 @@ def test_bad_ids_and_foreign_folders_are_refused(vipetsc, tmp_path):
     assert "not a paper's of this kind" in foreign.stderr
 
 
-def test_quick_and_full_do_not_mix(vipetsc, tmp_path):
+def test_quick_and_full_do_not_mix(in_process, tmp_path):
     (tmp_path / "plan.json").write_text('{"grid": "full"}')
-    mixed = vipetsc(0, "paper", "--quick", "--only", "fig10", "--out", tmp_path)
+    mixed = in_process("paper", "--quick", "--only", "fig10", "--out", tmp_path)
     assert mixed.returncode == 2
     assert "holds the paper on the full grid; choose another --out for the quick one" in mixed.stderr
 

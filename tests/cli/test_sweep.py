@@ -77,9 +77,8 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, case, tmp_path
     assert "holds another sweep; --force replaces it" in changed.stderr
 
 
-def test_a_scaled_member_is_what_its_simulation_would_be(vipetsc, case, tmp_path):
-    vipetsc(
-        0,
+def test_a_scaled_member_is_what_its_simulation_would_be(in_process, case, tmp_path):
+    in_process(
         "sweep",
         case,
         "--out",
@@ -92,7 +91,7 @@ def test_a_scaled_member_is_what_its_simulation_would_be(vipetsc, case, tmp_path
     (member,) = json.loads((tmp_path / "out" / "index.json").read_text())["members"]
     assert member["status"] == "scaled"
     folder = tmp_path / "out" / member["id"]
-    ended = vipetsc(0, "run", folder / "case.toml", "--out", tmp_path / "run")
+    ended = in_process("run", folder / "case.toml", "--out", tmp_path / "run")
     assert ended.returncode == 0, ended.stderr
     scaled, run = datasets(folder / "run.h5"), datasets(tmp_path / "run" / "run.h5")
     for name in ("energy/kinetic", "energy/spring", "energy/work"):
@@ -161,11 +160,10 @@ def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
         assert len(file.attrs["failed"]) == 6
 
 
-def test_a_member_that_does_not_come_out_is_recorded(vipetsc, case, tmp_path):
+def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path):
     # A contact this stiff needs steps below the rounding of the time: the run stalls, the quiet one does not.
     out = tmp_path / "out"
-    ended = vipetsc(
-        0,
+    ended = in_process(
         "sweep",
         case,
         "--out",
@@ -187,8 +185,8 @@ def test_a_member_that_does_not_come_out_is_recorded(vipetsc, case, tmp_path):
 
 
 @pytest.mark.parametrize("value", ["sweep.drive.amplitud=[1.0]", "sweep.feilds=true", "sweep.drive.amplitude=[0.0]"])
-def test_bad_sweeps_write_nothing(vipetsc, case, tmp_path, value):
-    ended = vipetsc(0, "sweep", case, "--out", tmp_path / "out", "--set", value)
+def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
+    ended = in_process("sweep", case, "--out", tmp_path / "out", "--set", value)
     assert ended.returncode == 2, ended.stdout
     assert not (tmp_path / "out").exists()
 
@@ -249,7 +247,7 @@ def test_measures_again_from_files(vipetsc, case, tmp_path):
     assert "holds no run.h5" in nothing.stderr
 
 
-def test_validate_counts_the_members(vipetsc, case):
-    ended = vipetsc(0, "validate", case, "--set", "sweep.contacts.sites=[[20], [41]]")
+def test_validate_counts_the_members(in_process, case):
+    ended = in_process("validate", case, "--set", "sweep.contacts.sites=[[20], [41]]")
     assert ended.returncode == 0, ended.stderr
     assert "12 members (2 x 6), 6 of them impossible" in ended.stdout

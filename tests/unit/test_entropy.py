@@ -79,7 +79,7 @@ def test_one_long_transform_gives_the_same_packet():
     assert weight[0] == pytest.approx(power.sum(axis=0), rel=1e-6, abs=1e-12)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 99), st.integers(-200, 200), st.floats(1e-9, 1e9))
 def test_entropy_does_not_depend_on_the_amplitude(seed, power, factor):
     signal = noise((3, 40), seed)

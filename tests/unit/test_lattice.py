@@ -92,7 +92,7 @@ def test_waves_at_a_frequency_lie_on_the_branch(cell):
     assert waves_at(cell, (low + high) / 2) == ()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(cells(), st.floats(-np.pi, np.pi))
 def test_stiffness_is_hermitian_and_not_negative(cell, kappa):
     k = cell.stiffness_matrix(kappa)
@@ -102,7 +102,7 @@ def test_stiffness_is_hermitian_and_not_negative(cell, kappa):
     assert np.allclose(bloch(cell, kappa).frequency, bloch(cell, -kappa).frequency, atol=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(cells(), st.floats(0.3, 2.8))
 def test_bloch_vectors_solve_the_problem_and_group_velocity_is_the_slope(cell, kappa):
     point = bloch(cell, kappa)
@@ -119,7 +119,7 @@ def test_bloch_vectors_solve_the_problem_and_group_velocity_is_the_slope(cell, k
         assert np.allclose(point.group_velocity, slope, atol=1e-5)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(cells(), st.integers(3, 9))
 def test_a_periodic_chain_has_the_bloch_frequencies(cell, n):
     chain = Chain(cell, n, "periodic")
@@ -129,7 +129,7 @@ def test_a_periodic_chain_has_the_bloch_frequencies(cell, n):
     assert np.allclose(squared, expected, atol=1e-8)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(cells(), st.integers(2, 6))
 def test_ends_hold_or_let_go(cell, n):
     fixed, free = (Chain(cell, n, ends).stiffness_matrix().toarray() for ends in ("fixed", "free"))

@@ -96,7 +96,7 @@ def test_half_map_of_an_asymmetric_system():
     period=st.floats(1e-4, 10),
     kind=st.sampled_from([Relative, Logarithmic, Grazing]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_charts_encode_decode_and_differentiate(x, period, kind):
     x = D * np.array(x)
     if abs(abs(x[1] - x[0]) / D - 1) < 1e-3:
@@ -127,7 +127,7 @@ def test_the_relative_chart_weighs_gaps_by_the_larger_of_gap_and_clearance(gap, 
     size=st.tuples(*[st.floats(-3, 0)] * 6),
     start=st.sampled_from(["below", "landed", "extremum"]),
 )
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_the_first_change_of_a_gap_is_found(c, size, start):
     """Against dense sampling: nothing is missed, and nothing comes before what is found."""
     c = np.array(c) * 10.0 ** np.array(size)

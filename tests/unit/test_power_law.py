@@ -17,7 +17,7 @@ def scattered(seed=0, exponent=-1.3, spread=0.1):
     return 3.0 * X**exponent * np.exp(spread * np.random.default_rng(seed).standard_normal(len(X)))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.floats(-4, 4), st.floats(1e-6, 1e6), st.integers(3, 30))
 def test_an_exact_law_is_recovered(exponent, factor, count):
     x = np.geomspace(0.1, 20, count)
@@ -60,7 +60,7 @@ def test_the_nonlinear_fit_is_least_in_squares():
     assert fit.r2_adjusted == pytest.approx(1 - (1 - r2) * 11 / 10, rel=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 99), st.floats(1e-8, 1e8), st.floats(1e-3, 1e3))
 def test_units_change_the_factor_alone(seed, up, along):
     y = scattered(seed)
@@ -98,7 +98,7 @@ def test_the_peak_starts_the_decay():
         from_peak(X, np.where(X < 1, np.nan, y))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=20, unique=True))
 def test_normalised_spans_its_range(values):
     scaled = normalised(values)

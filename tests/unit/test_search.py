@@ -128,7 +128,7 @@ def test_a_massless_host_or_resonator_is_refused(eta):
         search("printed", [0.1], [eta], KAPPA)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(lam=st.floats(0.05, 2), eta=st.floats(0.05, 0.95), kappa=st.floats(0.01, 3.1), reading=st.sampled_from(READINGS))
 def test_deflection_knows_neither_phase_nor_length_nor_direction(lam, eta, kappa, reading):
     """A wave to the left deflects as one to the right; a unit vector deflects by sqrt(2) at most."""

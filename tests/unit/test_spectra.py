@@ -46,7 +46,7 @@ def test_a_plane_wave_lands_on_its_bin(row, direction):
     assert fold.wavenumber[k] == pytest.approx(abs(kappa))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(2, 40), st.integers(2, 40), st.integers(0, 99))
 def test_energies_obey_parseval(nt, n, seed):
     velocity = noise((nt, n, 2), seed)
@@ -64,7 +64,7 @@ def test_energies_obey_parseval(nt, n, seed):
     assert fold.energy.sum() == pytest.approx(found.energy.sum(), rel=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(2, 60), st.integers(1, 5), st.integers(0, 99), st.lists(st.floats(1, 40), max_size=5, unique=True))
 def test_parts_are_a_partition(nt, n, seed, inner):
     edges = np.array([0.0, *sorted(inner), np.inf])

@@ -114,7 +114,7 @@ def test_one_impossible_member_does_not_spoil_the_others():
     count=st.integers(2, 40),
     kind=st.sampled_from(["log", "linear"]),
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_range_has_its_ends_and_rises(first, ratio, count, kind):
     plan = read(f"[sweep.drive]\namplitude = {{ {kind} = [{first!r}, {first * ratio!r}], count = {count} }}")
     values = np.array(plan.axes[0].values[0])

@@ -71,7 +71,7 @@ def test_bank_is_transform_binning_and_inverse(kc):
         assert np.abs(parts[..., :90] - bank.split(signal)).max() < 1e-12
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(2, 200), st.sampled_from([6.0, 12.0]), st.integers(0, 99), st.floats(-1e3, 1e3))
 def test_dual_parts_sum_to_any_signal(cells, kc, seed, mean):
     signal = noise(cells, seed) + mean

@@ -76,6 +76,18 @@ def hertz():
     return follow(reduced("hertz"), OUT_OF_PHASE, 3e-4, energy=(1e-4, 1e9), chart="auto")
 
 
+@pytest.fixture(scope="module")
+def in_phase():
+    """Corrector and points of the in-phase branch from the linear mode to the limit, without special points."""
+    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
+    growing = Continuation(
+        corrector, linear_start(corrector, IN_PHASE, 1e-3), StepControl(energy=(0.0, 6e9), points=20000)
+    )
+    points = [growing.point, *growing]
+    assert growing.finished
+    return corrector, points
+
+
 def of_kind(special: list[Point], kind: str) -> list[Point]:
     return [p for p in special if p.kind == kind]
 
@@ -222,10 +234,13 @@ def test_short_contacts_inside_a_step_are_found():
         assert len(arc.events) == changes
 
 
-def test_in_phase_through_the_first_tongues():
+def test_in_phase_through_the_first_tongues(in_phase):
     """The grazing cascade and the 5:1 and 7:1 resonances, without a jump; grazing at its own energy."""
-    corrector, points, special = follow(reduced(), IN_PHASE, 1e-3, frequency=(100.0, 333.0))
-    graze = of_kind(special, "grazing")[0]
+    corrector, points = in_phase
+    points = list(itertools.takewhile(lambda p: p.frequency < 333, points))
+    locator = Locator(corrector, "relative", grazing=True)
+    special = itertools.chain.from_iterable(itertools.starmap(locator.between, itertools.pairwise(points)))
+    graze = next(p for p in special if p.kind == "grazing")
     assert graze.energy == pytest.approx(GRAZING[IN_PHASE], rel=1e-10)
     assert max(p.residual for p in points) <= 1e-11
     assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
@@ -234,14 +249,11 @@ def test_in_phase_through_the_first_tongues():
     assert not [s for s in map(monitor.check, points) if s]
 
 
-def test_in_phase_through_every_odd_tongue_to_the_limit():
+def test_in_phase_through_every_odd_tongue_to_the_limit(in_phase):
     """At the tip of the k:1 tongue the resonator strikes (k + 1)/2 times in a quarter period, for every odd k."""
-    system = reduced()
-    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["quarter"]))
-    start = linear_start(corrector, IN_PHASE, 1e-3)
-    growing = Continuation(corrector, start, StepControl(energy=(0.0, 6e9), points=20000))
-    points = [growing.point, *growing]
-    assert growing.finished
+    corrector, points = in_phase
+    system = corrector.problem.system
+    assert points[-1].energy > 6e9
     assert max(p.residual for p in points) <= 3e-12
     assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
     assert not list(suspects(points))

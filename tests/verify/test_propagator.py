@@ -208,7 +208,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(folder, looks):
         assert resumed.statistics[name] == straight.statistics[name], name
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=12), st.floats(0.1, 1.0), st.floats(0.05, 2.0))
 def test_no_onset_is_missed(coefficients, length, clearance):
     jet = np.array(coefficients)
