@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from vipetsc.case import Case
-from vipetsc.figures.drawing import NOTE, draw_each, save
-from vipetsc.figures.schematics import lattice_page, reduced_model
-from vipetsc.figures.style import DPI, new_figure, rc_style
+from vipetsc.figures.lattice import lattice_page, reduced_model
+from vipetsc.figures.style import DPI, NOTE, draw_each, new_figure, rc_style, save
 from vipetsc.paper.claims.criteria import CLAIMS as SPECS
 from vipetsc.paper.figures import PAPER_FIGURES, describe
 from vipetsc.paper.plan import CLAIMS

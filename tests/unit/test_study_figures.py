@@ -12,11 +12,10 @@ from matplotlib.image import imread
 
 from vipetsc.case import Case, Sweep
 from vipetsc.figures.entropy import AVERAGES, COLOURS
-from vipetsc.figures.entropy_time import LEAST_WEIGHT
 from vipetsc.figures.partition import bin_colours, shown_bins
 from vipetsc.figures.registry import FIGURES, draw
-from vipetsc.figures.scattering import KC
-from vipetsc.figures.study import Study, Wave, in_pi, series_of
+from vipetsc.figures.scattering import KC, LEAST_WEIGHT
+from vipetsc.figures.study import Wave, in_pi, series_of
 from vipetsc.figures.style import GREY, rc_style
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
@@ -105,21 +104,21 @@ def test_every_figure_is_drawn_from_files(whole):
 
 def test_nothing_is_yielded_where_the_data_lack(whole, curves):
     for name in OF_FIELDS:
-        assert list(FIGURES[name].function(Study((curves,)))) == []
-        assert list(FIGURES[name].function(Study(()))) == []
+        assert list(FIGURES[name].function([curves])) == []
+        assert list(FIGURES[name].function([])) == []
     for name in OF_CURVES:
-        assert list(FIGURES[name].function(Study((whole,)))) == []
+        assert list(FIGURES[name].function([whole])) == []
 
 
 def test_suffixes_tell_figures_apart(curves):
-    names = [suffix for suffix, _ in FIGURES["entropy_history"].function(Study((curves,)))]
+    names = [suffix for suffix, _ in FIGURES["entropy_history"].function([curves])]
     assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
-    named = [suffix for suffix, _ in FIGURES["entropy_history"].function(Study((curves, curves)))]
+    named = [suffix for suffix, _ in FIGURES["entropy_history"].function([curves, curves])]
     assert named[:4] == [f"curves-{name}" for name in names]
 
 
 def test_amplitudes_share_scales_and_show_what_was_measured(whole):
-    figure = only("amplitudes", Study((whole,)))
+    figure = only("amplitudes", [whole])
     assert figure._suptitle.get_text() == "Calibrated reading, 2 sites, κ* = 5π/9"
     panels = [axes for axes in figure.axes if axes.images and axes.get_title(loc="left")]
     assert len(panels) == 9
@@ -146,7 +145,7 @@ def test_amplitudes_share_scales_and_show_what_was_measured(whole):
 
 
 def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
-    figure = only("wavelets", Study((whole,)))
+    figure = only("wavelets", [whole])
     panels = np.reshape([axes for axes in figure.axes if axes.images], (4, 3))
     assert len(limits([axes.images[0] for axes in panels.flat])) == 1
     for axes in panels.flat:
@@ -154,7 +153,7 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
         np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
     for row in panels:
         assert len({axes.texts[0].get_text() for axes in row}) == 1
-    (series,) = [series.snapshot_times() for series in series_of(Study((whole,)))]
+    (series,) = [series.snapshot_times() for series in series_of([whole])]
     assert np.all(np.diff(series) > 0)
     with open_run(members(whole)[2] / "run.h5") as run:
         site = np.min(run["sites/cell"].values)
@@ -184,7 +183,7 @@ def test_bins_shown_hold_the_driven_ones(share, count, shown):
 
 
 def test_partition_shows_seven_bins_and_all_colours(whole):
-    figure = only("partition", Study((whole,)))
+    figure = only("partition", [whole])
     with h5py.File(members(whole)[1] / "analysis.h5") as file:
         field = file["partition/kinetic_energy"][...]
     bins = shown_bins(5 * np.pi / 9, 12)
@@ -206,7 +205,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
 
 
 def test_explained_inverse_is_the_filter_banks(whole):
-    figure = only("partition_explained", Study((whole,)))
+    figure = only("partition_explained", [whole])
     by_title = {axes.get_title(loc="left"): axes for axes in figure.axes if axes.get_title(loc="left")}
     snapshot = next(axes for title, axes in by_title.items() if title.startswith("(a)")).lines[0].get_ydata()
     parts = filter_bank(CELLS).split(np.array(snapshot))
@@ -218,7 +217,7 @@ def test_explained_inverse_is_the_filter_banks(whole):
 
 
 def test_reconstruction_shows_energies_error_and_cross_terms(whole):
-    figure = only("reconstruction", Study((whole,)))
+    figure = only("reconstruction", [whole])
     grid = np.reshape(figure.axes, (3, 3))
     for column, (folder, amplitude) in enumerate(zip(members(whole), (0.1, 2.0, 20.0), strict=True)):
         with h5py.File(folder / "analysis.h5") as file:
@@ -240,7 +239,7 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
 
 @pytest.mark.parametrize("average", AVERAGES)
 def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
-    figures = drawn("entropy", Study((curves,)))
+    figures = drawn("entropy", [curves])
     assert len(figures) == 2 * 2 * len(AVERAGES)
     figure = figures[f"calibrated-5pi-9-{average}"]
     grid = np.reshape(figure.axes, (2, 2))
@@ -283,7 +282,7 @@ def test_some_configuration_has_a_power_law(curves):
 
 
 def test_all_panels_by_wavenumber_and_configuration(curves):
-    figures = drawn("entropy_all", Study((curves,)))
+    figures = drawn("entropy_all", [curves])
     assert len(figures) == 2 * len(AVERAGES)
     grid = np.reshape(figures["printed-masked"].axes, (2, 2))
     assert [axes.get_ylabel() for axes in grid[:, 0]] == ["κ* = 4π/9", "κ* = 5π/9"]
@@ -295,7 +294,7 @@ def test_all_panels_by_wavenumber_and_configuration(curves):
 
 
 def test_entropy_maps_leave_quiet_cells_blank(whole):
-    figure = only("entropy_maps", Study((whole,)))
+    figure = only("entropy_maps", [whole])
     images = maps(figure)
     assert len(limits(images)) == 1
     overs = [axes for axes in figure.axes if any(line.get_label() == "H(t)" for line in axes.lines)]
@@ -315,7 +314,7 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
 
 
 def test_entropy_history_is_an_image_over_amplitude(curves):
-    figure = drawn("entropy_history", Study((curves,)))["calibrated-5pi-9"]
+    figure = drawn("entropy_history", [curves])["calibrated-5pi-9"]
     for axes, sites in zip(figure.axes, (2, 3), strict=False):
         mesh = axes.collections[0]
         fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9, "sites": sites}

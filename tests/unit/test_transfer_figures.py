@@ -12,7 +12,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.figures import portraits
 from vipetsc.figures.portraits import ContactMotion
 from vipetsc.figures.registry import FIGURES, draw
-from vipetsc.figures.study import Study
+from vipetsc.figures.study import read_sweeps
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.transfer import closing_error
 from vipetsc.figures.transfer_curves import transfer_curves
@@ -66,7 +66,7 @@ def whole(tmp_path_factory):
 def drawn(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     with rc_style():
-        found = {suffix: make() for suffix, make in FIGURES[name].function(Study.read(folders))}
+        found = {suffix: make() for suffix, make in FIGURES[name].function(read_sweeps(folders))}
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
     return found
 
@@ -100,7 +100,7 @@ def test_ibtet_shows_the_ensembles_values(reduced):
 
 
 def test_floor_is_that_of_members_without_contact(reduced):
-    found = list(transfer_curves(Study.read([reduced])))
+    found = list(transfer_curves(read_sweeps([reduced])))
     assert [c.case.contacts.law for c in found] == ["hertz", "bilinear"]
     for curve in found:
         assert curve.floor == pytest.approx(curve.ibtet[0], rel=1e-9)
@@ -168,7 +168,7 @@ def test_whole_members_alone_make_no_curves(whole):
 
 
 def test_nothing_to_draw_from_nothing():
-    assert all(not dict(FIGURES[name].function(Study(()))) for name in NAMES)
+    assert all(not dict(FIGURES[name].function([])) for name in NAMES)
 
 
 def test_transfer_has_a_panel_a_band_and_both_segments(whole):

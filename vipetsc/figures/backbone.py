@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, panel_title, shade_regions
+from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, note, panel_title, shade_regions
 from vipetsc.io.netcdf import open_netcdf
 
 NEEDS = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
@@ -22,15 +22,9 @@ MARKS = {
     "symmetry-breaking": ("^", "symmetry breaking"),
     "period-doubling": ("v", "period doubling"),
 }
-MOST_MARKS = 12  # with more special points, tongues are labelled by their resonance instead
-
-
-def read_branch(path: Path) -> xr.Dataset:
-    """A ``branch-<name>.h5``, its points' ``kind`` by name; raises OSError or ValueError."""
-    with open_netcdf(path, "branch", NEEDS) as file:
-        branch = file.load()
-    kinds = np.array(branch["kind"].attrs["flag_meanings"].split())
-    return branch.assign(kind=("point", kinds[branch["kind"].values]))
+HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
+MOST_MARKS = 12  # with more special points, tongues are labelled by their resonance instead, at their highest fold
+LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
 
 
 def backbone(paths: Sequence[Path]) -> Figure:
@@ -38,12 +32,19 @@ def backbone(paths: Sequence[Path]) -> Figure:
 
     Raises OSError or ValueError for a file that holds none.
     """
-    branches = [read_branch(path) for path in paths]
+    branches = []
+    for path in paths:
+        with open_netcdf(path, "branch", NEEDS) as file:
+            branch = file.load()
+        kinds = np.array(branch["kind"].attrs["flag_meanings"].split())
+        branches.append(branch.assign(kind=("point", kinds[branch["kind"].values])))
     if not all(branch.sizes["point"] for branch in branches):
         return empty_figure("no point of the branch was found")
-    flows = [_flows(branch) for branch in branches]
-    has_orbits = any("orbits/number" in branch for branch in branches)
-    heights = (1.5, 1.0) + (1.0,) * any(flows) + (0.95,) * has_orbits
+    has_flows, has_orbits = (
+        any(str(name).startswith(group) for branch in branches for name in branch.variables)
+        for group in ("flows/", "orbits/number")
+    )
+    heights = (1.5, 1.0) + (1.0,) * has_flows + (0.95,) * has_orbits
     figure = style.new_figure(style.COLUMN if len(branches) == 1 else style.PAGE, 1.55 * sum(heights))
     rows = figure.subfigures(len(heights), len(branches), squeeze=False, height_ratios=heights)
     for column, branch in enumerate(branches):
@@ -51,8 +52,8 @@ def backbone(paths: Sequence[Path]) -> Figure:
         frequency_energy(upper, branch)
         panel_title(upper, f"({'abcdef'[column]}) {_heading(branch, len(branches) > 1)}")
         slope(rows[1, column].subplots(), branch)
-        if any(flows):
-            flow_differences(rows[2, column].subplots(), branch, flows[column])
+        if has_flows:
+            flow_differences(rows[2, column].subplots(), branch)
         if has_orbits:
             portraits(rows[-1, column], branch)
     return figure
@@ -67,11 +68,6 @@ def _heading(branch: xr.Dataset, with_law: bool) -> str:
     return ", ".join(filter(None, parts))
 
 
-def _flows(branch: xr.Dataset) -> list[str]:
-    """The names of other flows that the branch was compared with."""
-    return list(dict.fromkeys(str(name).split("/")[1] for name in branch.variables if str(name).startswith("flows/")))
-
-
 def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
     """Frequency over energy; unstable parts coloured, special points marked, grazing in the inset."""
     energy, frequency, kind = (branch[name].values for name in ("energy", "frequency", "kind"))
@@ -83,10 +79,15 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
     for name, (mark, label) in MARKS.items() if few else ():
         at = kind == name
         if at.any():
-            axes.plot(energy[at], frequency[at], mark, ms=3, mfc="white", mec=style.BLACK, mew=0.6, label=label,
-                      zorder=4)  # fmt: skip
+            axes.plot(energy[at], frequency[at], mark, ms=3, label=label, **HOLLOW)
     if not few:
-        _label_tongues(axes, branch)
+        axes.margins(y=0.08)
+        for number in LABELLED_TONGUES:
+            tongue = branch.isel(point=branch["resonance"].values == number)
+            if tongue.sizes["point"]:
+                tip = tongue.isel(point=int(np.argmax(tongue["frequency"].values)))
+                at = float(tip["energy"]), float(tip["frequency"])
+                note(axes, f"{number}:1", at, (1, 3), fontsize=5.5, color=style.GREY, ha="center")
     axes.plot([], [], color=style.BLUE, label="stable")
     if np.any(branch["multiplier_max"] > UNSTABLE):
         axes.plot([], [], color=style.VERMILION, label="unstable")
@@ -101,17 +102,6 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
         axes.legend(loc="lower right" if clear else "best", fontsize=5.5)
 
 
-def _label_tongues(axes: Axes, branch: xr.Dataset, largest: int = 5) -> None:
-    """Write k:1 at the fold of highest frequency of every tongue up to ``largest``:1; later ones crowd together."""
-    axes.margins(y=0.08)
-    for number in range(3, largest + 1, 2):
-        tongue = branch.isel(point=branch["resonance"].values == number)
-        if tongue.sizes["point"]:
-            tip = tongue.isel(point=int(np.argmax(tongue["frequency"].values)))
-            axes.annotate(f"{number}:1", (float(tip["energy"]), float(tip["frequency"])), (1, 3), fontsize=5.5,
-                          textcoords="offset points", color=style.GREY, ha="center")  # fmt: skip
-
-
 def slope(axes: Axes, branch: xr.Dataset) -> None:
     """|df/dE| over energy at the regular points where contacts act, at all without contact."""
     _shade(axes, branch)
@@ -122,8 +112,10 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
     axes.set_xlim(energy.min(), energy.max())
 
 
-def flow_differences(axes: Axes, branch: xr.Dataset, flows: Sequence[str]) -> None:
+def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
     """How far other flows are from the branch at the same amplitude: frequency (full) and energy (open marks)."""
+    names = filter(lambda name: name.startswith("flows/"), map(str, branch.variables))
+    flows = dict.fromkeys(name.split("/")[1] for name in names)
     if not flows:
         annotate_empty(axes, "no other flow was compared")
         return
@@ -181,7 +173,7 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     inset = axes.inset_axes([0.55, 0.1, 0.41, 0.36])
     _line(inset, branch, 0.9)
     at = folds[(folds >= start) & (folds <= last)]
-    inset.plot(energy[at], frequency[at], "o", ms=2.5, mfc="white", mec=style.BLACK, mew=0.6, zorder=4)
+    inset.plot(energy[at], frequency[at], "o", ms=2.5, **HOLLOW)
     x, y = energy[start : last + 1], frequency[start : last + 1]
     inset.set(xlim=(x.min() - 0.15 * np.ptp(x), x.max() + 0.1 * np.ptp(x)), ylim=(y.min() - 0.1 * np.ptp(y), y.max()))
     inset.tick_params(labelsize=5, pad=1.5)

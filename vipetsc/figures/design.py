@@ -1,5 +1,7 @@
 """The (lambda, eta) search: Bloch deflections, cost maps with optima, dispersion against the parameters (Fig. S3)."""
 
+from itertools import cycle
+
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
@@ -8,7 +10,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import KAPPA, colours, draw_map, panel_title
+from vipetsc.figures.panels import KAPPA, draw_map, panel_title
 
 WEIGHTED = 2  # index of the weighted cost
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
@@ -79,7 +81,7 @@ def cost_maps(search: xr.Dataset) -> Figure:
 def _inset(axes: Axes, cell: xr.Dataset) -> None:
     """The dispersion of a ``cell`` of the search, in the corner where cells are veiled."""
     inset = axes.inset_axes((0.5, 0.1, 0.46, 0.46))
-    for branch, colour in zip(cell["frequency"].values.T / 1e3, colours(cell.sizes["band"]), strict=True):
+    for branch, colour in zip(cell["frequency"].values.T / 1e3, cycle(style.SERIES), strict=False):
         inset.plot(cell["wavenumber"].values / np.pi, branch, color=colour, lw=0.8)
     inset.set(xlim=(0, 1), ylim=(0, None), xticks=(), yticks=())
     inset.set_xlabel("κ", labelpad=1, fontsize=6.5)

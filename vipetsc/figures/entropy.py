@@ -1,21 +1,24 @@
-"""Mean wavenumber entropy against amplitude, with the power laws fitted from the peak on (paper, Figs. 5 and S2)."""
+"""Wavenumber entropy against amplitude: means with power laws (paper, Figs. 5 and S2), histories (Fig. A2)."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
-from vipetsc.figures import style
-from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.panels import annotate_empty, label_outer, panel_title
-from vipetsc.figures.study import AMPLITUDE, Study, counted, grouped, in_pi, reading_of, suffix, table
+from vipetsc.figures import panels, style
+from vipetsc.figures.panels import label_outer, panel_title, percentile_norm
+from vipetsc.figures.study import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
+from vipetsc.figures.style import Drawing
+from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes as axes_of
+from vipetsc.io.read import member_folder
 
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
@@ -24,6 +27,7 @@ LABELS = 5  # most labels of the legend: three averages, another reading, the po
 FACETS = ("reading", "wavenumber")
 SPAN = 4e-3, 40.0  # of the logarithmic axes: room for what is written above the peak
 FEWEST = 4  # amplitudes that show a peak and a power law
+MOST_COLUMNS = 3  # of histories
 
 
 class EntropyCurve(NamedTuple):
@@ -50,22 +54,45 @@ class EntropyCurve(NamedTuple):
         normalised = LOW + scale * (value[valid] - value[valid].min())
         return cls(row[AMPLITUDE].values[valid], normalised, scale * error[valid], fit)
 
-    def power_law(self) -> tuple[np.ndarray, np.ndarray]:
-        """Amplitudes from the peak on and the log-log line there; empty without a fit."""
-        if not np.isfinite(self.fit["factor"]):
-            return np.zeros(0), np.zeros(0)
-        x = self.amplitude[self.amplitude >= self.fit["peak_amplitude"] * (1 - 1e-9)]
-        return x, self.fit["factor"] * x ** self.fit["exponent"]
+
+def entropy(sweeps: Sweeps) -> Iterator[Drawing]:
+    """Entropy against amplitude for each reading, wavenumber and average: linear above, log-log with fits below."""
+    for ensemble, rows, stem in _facets(sweeps):
+        for average in _averages(rows):
+            yield f"{stem}-{average}", partial(_entropy, ensemble, rows, average)
 
 
-def with_entropies(study: Study, name: str = "entropy/energy_weighted") -> Iterator[tuple[xr.Dataset, bool]]:
-    """The ensembles with entropies at four amplitudes or more, and whether their pictures need the sweep's name."""
-    measured = [e for e in study.ensembles if "entropy/energy_weighted" in e and AMPLITUDE in axes_of(e)]
+def entropy_all(sweeps: Sweeps) -> Iterator[Drawing]:
+    """Every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
+    for ensemble, rows, stem in _facets(sweeps, ("reading",)):
+        if len({_driven_wavenumber(row, ensemble) for row in rows}) > 1:
+            for average in _averages(rows):
+                yield f"{stem}-{average}", partial(_entropy_all, ensemble, rows, average)
+
+
+def entropy_history(sweeps: Sweeps) -> Iterator[Drawing]:
+    """H(t) against amplitude as an image for every configuration of a reading and wavenumber."""
+    for ensemble, rows, stem in _facets(sweeps, needs="entropy/history"):
+        shown = [row for row in rows if np.isfinite(row["entropy/history"]).any()]
+        if shown:
+            yield stem, partial(_history, ensemble, shown)
+
+
+def _facets(
+    sweeps: Sweeps, names: Collection[str] = FACETS, needs: str = "entropy/energy_weighted"
+) -> Iterator[tuple[xr.Dataset, list[xr.Dataset], str]]:
+    """Every ensemble with entropies at ``FEWEST`` amplitudes or more, by those of the axes ``names`` that it has.
+
+    With it a configuration's members over rising amplitude, for each of them, and what tells the facet from others.
+    """
+    measured = [e for e in sweeps if "entropy/energy_weighted" in e and AMPLITUDE in axes_of(e)]
     measured = [e for e in measured if e.sizes[AMPLITUDE] >= FEWEST]
-    yield from ((e, len(measured) > 1) for e in measured if name in e)
+    for ensemble in (e for e in measured if needs in e):
+        stem = partial(suffix, ensemble=ensemble, named=len(measured) > 1, dims=names)
+        yield from ((ensemble, rows, name) for name, rows in grouped(_rows(ensemble), stem).items())
 
 
-def rows_of(ensemble: xr.Dataset) -> list[xr.Dataset]:
+def _rows(ensemble: xr.Dataset) -> list[xr.Dataset]:
     """The members of each configuration over rising amplitude; the values of all other axes are scalars."""
     others = [name for name in axes_of(ensemble) if name != AMPLITUDE]
     ordered = ensemble.sortby(AMPLITUDE)
@@ -73,23 +100,19 @@ def rows_of(ensemble: xr.Dataset) -> list[xr.Dataset]:
     return [ordered.isel(dict(zip(others, map(int, index), strict=True))) for index in np.ndindex(*shape)]
 
 
-def facets(ensemble: xr.Dataset, names: Collection[str] = FACETS) -> list[list[xr.Dataset]]:
-    """The rows by the values of ``names``, those that the sweep varies."""
-    varied = [name for name in names if name in axes_of(ensemble)]
-    return list(grouped(rows_of(ensemble), lambda row: repr([row[name].item() for name in varied])).values())
+def _averages(rows: Sequence[xr.Dataset]) -> list[str]:
+    """The averages of which some of the ``rows`` has a curve."""
+    return [average for average in AVERAGES if any(EntropyCurve.of(row, average) for row in rows)]
 
 
-def row_title(row: xr.Dataset, ensemble: xr.Dataset) -> str:
+def _row_title(row: xr.Dataset, ensemble: xr.Dataset) -> str:
     """A configuration in its facet: "5 sites"."""
-    parts = []
-    for name in axes_of(ensemble):
-        if name not in (*FACETS, AMPLITUDE):
-            value = row[name].item()
-            parts.append(counted(value, "site") if name == "sites" else f"{name} {value}")
+    values = {name: row[name].item() for name in axes_of(ensemble) if name not in (*FACETS, AMPLITUDE)}
+    parts = (counted(value, "site") if name == "sites" else f"{name} {value}" for name, value in values.items())
     return ", ".join(parts) or "all members"
 
 
-def driven_wavenumber(row: xr.Dataset, ensemble: xr.Dataset) -> str:
+def _driven_wavenumber(row: xr.Dataset, ensemble: xr.Dataset) -> str:
     """The drive's wavenumber as a fraction of pi; empty if the sweep drives by frequency."""
     if "wavenumber" in axes_of(ensemble):
         return f"κ* = {in_pi(row['wavenumber'].item())}"
@@ -97,107 +120,75 @@ def driven_wavenumber(row: xr.Dataset, ensemble: xr.Dataset) -> str:
     return "" if shared is None else f"κ* = {in_pi(coordinate([shared])[0])}"
 
 
-def facet_title(row: xr.Dataset, ensemble: xr.Dataset, wave: bool = True) -> str:
-    """The sweep's name, its reading and wavenumber."""
+def _heading(row: xr.Dataset, ensemble: xr.Dataset, shown: str, wave: bool = True) -> str:
+    """The sweep's name, its reading and wavenumber, and what is ``shown``."""
     reading = row["reading"].item() if "reading" in axes_of(ensemble) else reading_of(ensemble)
-    parts = f"{reading} reading", driven_wavenumber(row, ensemble) if wave else ""
+    parts = f"{reading} reading", _driven_wavenumber(row, ensemble) if wave else "", shown
     return f"{table(ensemble)['name']}: {', '.join(filter(None, parts))}"
 
 
-def entropy(study: Study) -> Iterator[Drawing]:
-    """Entropy against amplitude for each reading, wavenumber and average: linear above, log-log with fits below."""
-    for ensemble, named in with_entropies(study):
-        for rows in facets(ensemble):
-            yield from _by_average(_entropy, ensemble, rows, suffix(rows[0], ensemble, named, FACETS))
-
-
-def entropy_all(study: Study) -> Iterator[Drawing]:
-    """Every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
-    for ensemble, named in with_entropies(study):
-        for rows in facets(ensemble, ("reading",)):
-            if len({driven_wavenumber(row, ensemble) for row in rows}) > 1:
-                yield from _by_average(_entropy_all, ensemble, rows, suffix(rows[0], ensemble, named, ("reading",)))
-
-
-def _by_average(
-    page: Callable[..., Figure], ensemble: xr.Dataset, rows: Sequence[xr.Dataset], stem: str
-) -> Iterator[Drawing]:
-    """A page for every average of which some of the ``rows`` has a curve."""
-    for average in AVERAGES:
-        if any(EntropyCurve.of(row, average) for row in rows):
-            yield f"{stem}-{average}", partial(page, ensemble, rows, average)
-
-
 def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
-    heading = f"{facet_title(rows[0], ensemble)}, {AVERAGES[average]} mean entropy"
-    figure, grid = _panels(2, len(rows), 1.42, heading, 0.38, LABELS)
+    heading = _heading(rows[0], ensemble, f"{AVERAGES[average]} mean entropy")
+    legend_columns = 3 if len(rows) > 4 else 2
+    figure, grid = _panels(2, len(rows), 1.42, heading, 0.38, -(-LABELS // legend_columns))
     for (upper, lower), row in zip(grid.T, rows, strict=True):
-        panel_title(upper, row_title(row, ensemble))
-        curve = EntropyCurve.of(row, average)
+        panel_title(upper, _row_title(row, ensemble))
+        curve = _curve_or_reason(upper, row, average)
         if curve is None:
-            annotate_empty(upper, _why_no_curve(row, average))
-            annotate_empty(lower, "")
+            lower.set_axis_off()
             continue
         for name, label in AVERAGES.items():
             if name != average:
                 _faint(upper, row, name, label, color=COLOURS[name], lw=0.6, alpha=0.5)
         _points(upper, curve, average, 2.2)
-        for other in _other_readings(row, ensemble):
-            label = f"{other['reading'].item()} reading"
-            _faint(lower, other, average, label, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)))
+        same = [name for name in axes_of(ensemble) if name not in ("reading", AMPLITUDE)]
+        for other in _rows(ensemble) if "reading" in axes_of(ensemble) else ():
+            if other["reading"] != row["reading"] and all(other[name] == row[name] for name in same):
+                label = f"{other['reading'].item()} reading"
+                _faint(lower, other, average, label, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)))
         _log_panel(lower, curve, average, 2.2, 6.0)
         upper.set(xlim=(0, 1.04 * curve.amplitude[-1]), ylim=(-0.05, 1.45))
     label_outer(grid, "A (N)", "Normalised entropy")
     pairs = [pair for axes in grid.flat for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in pairs}
-    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=_legend_columns(len(rows)))
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=legend_columns)
     return figure
 
 
 def _entropy_all(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
-    by_wavenumber = grouped(rows, partial(driven_wavenumber, ensemble=ensemble))
-    heading = f"{facet_title(rows[0], ensemble, False)}, {AVERAGES[average]} mean entropy"
+    by_wavenumber = grouped(rows, partial(_driven_wavenumber, ensemble=ensemble))
+    heading = _heading(rows[0], ensemble, f"{AVERAGES[average]} mean entropy", wave=False)
     figure, grid = _panels(len(by_wavenumber), len(rows) // len(by_wavenumber), 1.15, heading)
     label_outer(grid, "A (N)", "")
     for line, (wavenumber, of_wavenumber) in zip(grid, by_wavenumber.items(), strict=True):
         line[0].set_ylabel(wavenumber)
         for axes, row in zip(line, of_wavenumber, strict=True):
-            curve = EntropyCurve.of(row, average)
             if axes in grid[0]:
-                panel_title(axes, row_title(row, ensemble))
-            if curve is None:
-                annotate_empty(axes, _why_no_curve(row, average))
-                continue
-            _log_panel(axes, curve, average, 1.6, 5.5)
-            axes.tick_params(labelbottom=axes in grid[-1])
+                panel_title(axes, _row_title(row, ensemble))
+            curve = _curve_or_reason(axes, row, average)
+            if curve is not None:
+                _log_panel(axes, curve, average, 1.6, 5.5)
+                axes.tick_params(labelbottom=axes in grid[-1])
     return figure
 
 
-def _other_readings(row: xr.Dataset, ensemble: xr.Dataset) -> Iterator[xr.Dataset]:
-    """The same configuration in the other readings."""
-    if "reading" in axes_of(ensemble):
-        same = [name for name in axes_of(ensemble) if name not in ("reading", AMPLITUDE)]
-        for other in rows_of(ensemble):
-            if other["reading"] != row["reading"] and all(other[name] == row[name] for name in same):
-                yield other
-
-
-def _why_no_curve(row: xr.Dataset, average: str) -> str:
-    return "no members" if np.isfinite(row[f"entropy/{average}"]).sum() < 2 else "nothing touches"
-
-
-def _legend_columns(columns: int) -> int:
-    return 3 if columns > 4 else 2
+def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve | None:
+    """The curve of ``row``; ``axes`` say why if there is none."""
+    curve = EntropyCurve.of(row, average)
+    if curve is None:
+        none_came_out = np.isfinite(row[f"entropy/{average}"]).sum() < 2
+        panels.annotate_empty(axes, "no members" if none_came_out else "nothing touches")
+    return curve
 
 
 def _panels(
-    rows: int, columns: int, height: float, heading: str, gap: float = 0.1, labels: int = 0
+    rows: int, columns: int, height: float, heading: str, gap: float = 0.1, legend_rows: int = 0
 ) -> tuple[Figure, np.ndarray]:
-    """A grid of panels of ``height`` inches, ``gap`` apart, and room for a legend of so many ``labels``.
+    """A grid of panels of ``height`` inches, ``gap`` apart, and room for a legend of ``legend_rows``.
 
     Laid out by hand, since fitting dozens of panels takes long.
     """
-    left, right, top, bottom = 0.52, 0.06, 0.45, 0.42 + 0.15 * -(-labels // _legend_columns(columns))
+    left, right, top, bottom = 0.52, 0.06, 0.45, 0.42 + 0.15 * legend_rows
     width = style.PAGE * max(columns, 4) / 6
     tall = top + bottom + rows * height + (rows - 1) * gap
     figure = style.new_figure(width, tall, fitted=False)
@@ -224,14 +215,60 @@ def _points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
 
 
 def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float, fontsize: float) -> None:
-    """The curve in logarithms, the power law as a thick black line with both adjusted R^2."""
+    """The curve in logarithms, the power law from the peak on as a thick black line with both adjusted R^2."""
     _points(axes, curve, average, size)
-    x, y = curve.power_law()
-    if len(x):
-        axes.plot(x, y, color=style.BLACK, lw=2.0, zorder=4, label="power law, adjusted R² (of nonlinear fit)")
-        fit = curve.fit
+    amplitude, fit = curve.amplitude, curve.fit
+    if np.isfinite(fit["factor"]):
+        x = amplitude[amplitude >= fit["peak_amplitude"] * (1 - 1e-9)]
+        label = "power law, adjusted R² (of nonlinear fit)"
+        axes.plot(x, fit["factor"] * x ** fit["exponent"], color=style.BLACK, lw=2.0, zorder=4, label=label)
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, ha="left", va="top", fontsize=fontsize)
     else:
         axes.text(0.04, 0.04, "no power law", transform=axes.transAxes, fontsize=fontsize, color=style.GREY)
-    axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * curve.amplitude[0], 1.25 * curve.amplitude[-1]))
+    axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * amplitude[0], 1.25 * amplitude[-1]))
+
+
+def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figure:
+    columns = min(len(configurations), MOST_COLUMNS)
+    rows = -(-len(configurations) // columns)
+    width = max(style.PAGE * columns / MOST_COLUMNS, style.COLUMN)
+    heading = _heading(configurations[0], ensemble, "entropy H(t) of every amplitude")
+    figure = style.new_figure(width, 0.7 + 1.9 * rows, heading)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    shown = [(row, _start_of_averages(row)) for row in configurations]
+    norm = percentile_norm(row["entropy/history"].where(row["entropy/time"] >= start) for row, start in shown)
+    for axes, (row, start) in zip(grid.flat, shown, strict=False):
+        image = _image(axes, row, norm)
+        if start > 0:
+            axes.axvline(start, color="white", lw=0.7, ls="--")
+        panel_title(axes, _row_title(row, ensemble))
+    for axes in grid.flat[len(configurations) :]:
+        axes.set_axis_off()
+    label_outer(grid, "Time (s)", "Amplitude A (N)")
+    panels.colour_bar(figure, image, grid.flat, "H(t) (bit)", extend="both")
+    return figure
+
+
+def _image(axes: Axes, row: xr.Dataset, norm: Normalize) -> QuadMesh:
+    """The image of H(t) over amplitude, dotted where contact begins."""
+    times, history, amplitude = (row[name].values for name in ("entropy/time", "entropy/history", AMPLITUDE))
+    time = times[np.argmax(np.isfinite(times).sum(axis=1))]
+    finite = np.isfinite(time)
+    options = {"norm": norm, "cmap": "viridis", "shading": "nearest", "rasterized": True}
+    image = axes.pcolormesh(time[finite], amplitude, history[:, finite], **options)
+    axes.set(yscale="log", xlim=time[finite][[0, -1]])
+    touched = row["contact_episodes"].values > 0
+    if touched.any() and not touched.all():
+        first = int(np.argmax(touched))
+        axes.axhline(np.sqrt(amplitude[first - 1] * amplitude[first]), color="white", lw=0.8, ls=":")
+    return image
+
+
+def _start_of_averages(row: xr.Dataset) -> float:
+    """When the averages over time begin, in s, from the analysis of the first member; 0 if it is gone."""
+    folder = member_folder(row.isel({AMPLITUDE: 0}))
+    if folder is None or not (folder / "analysis.h5").exists():
+        return 0.0
+    with open_netcdf(folder / "analysis.h5", "analysis") as analysis:
+        return float(analysis.attrs.get("entropy/start", 0.0))

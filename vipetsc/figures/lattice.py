@@ -1,4 +1,4 @@
-"""The unit cell drawn as masses and springs with its clearance; the lattice as a strip with its sites."""
+"""A unit cell as masses and springs, a lattice as a strip with its sites (paper, Figs. 1, 6); the reduced model."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,14 +14,18 @@ from scipy.sparse.csgraph import breadth_first_order
 
 from vipetsc.case import Case
 from vipetsc.figures import style
-from vipetsc.figures.panels import panel_title
-from vipetsc.lattice import Chain, UnitCell
-from vipetsc.lattice.cell import Spring
+from vipetsc.figures.panels import band_diagram, note, panel_title
+from vipetsc.figures.study import counted
+from vipetsc.figures.style import with_prefix
+from vipetsc.lattice import Chain, Spring, UnitCell
 
 PITCH = 2.0  # distance between neighbouring masses of the drawing
 HALF = 0.34  # half the side of a mass
 WIDE, TALL = 1.0, 0.62  # half the width and height of a host that holds its resonator
 GAP = 0.17  # clearance as drawn
+SIDE = 0.5  # half the side of a mass of the reduced model
+STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
+ROD = {"color": style.BLACK, "lw": 0.7}
 
 Point = tuple[float, float]
 
@@ -30,7 +34,7 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """The unit cell of the run's lattice and, below it, the lattice with ends, drive and contact sites."""
     model = Case.of(run).model()
     figure = style.new_figure(style.PAGE, 2.7)
-    upper, lower = figure.subplots(2, 1, gridspec_kw={"height_ratios": (2.1, 1)})
+    upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
     draw_unit_cell(upper, model.chain.cell)
     draw_lattice(lower, model.chain, model.drive_cell)
     panel_title(upper, "(a) Unit cell")
@@ -38,14 +42,61 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     return figure
 
 
+def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
+    """The cell, its dispersion with the drive marked, and the lattice with as many contact ``sites`` as listed."""
+    figure = style.new_figure(style.PAGE, 2.9 + STRIP * len(sites))
+    upper, lower = figure.subfigures(2, 1, height_ratios=(2.9, STRIP * len(sites)))
+    left, right = upper.subplots(1, 2, width_ratios=(1.55, 1))
+    draw_unit_cell(left, case.unit_cell())
+    panel_title(left, f"(a) Unit cell, {case.lattice.reading} reading")
+    band_diagram(right, case.unit_cell(), case.drive.frequency)
+    panel_title(right, "(b) Bands; gaps shaded, drive dotted")
+    table = case.model_dump(by_alias=True, exclude_none=True, exclude={"contacts": {"clearance"}})
+    for i, (axes, count) in enumerate(zip(lower.subplots(len(sites), 1, squeeze=False).flat, sites, strict=True)):
+        table["contacts"]["sites"] = count
+        model = Case.from_table(table).model()
+        draw_lattice(axes, model.chain, model.drive_cell, brief=True)
+        legend = "; cell above, clearance in mm below; driven at the arrow" if i == 0 else ""
+        panel_title(axes, f"(c.{i + 1}) {counted(count, 'contact site')}{legend}")
+    return figure
+
+
+def reduced_model(masses: tuple[float, float], springs: tuple[float, float], clearance: float) -> Figure:
+    """The 2-DoF model: host held by a wall, resonator on it by a spring and the contact; kg, N/m, m."""
+    figure = style.new_figure(style.PAGE * 0.72, 1.7)
+    axes = figure.subplots()
+    _wall(axes, (-0.35, -0.8), 0.35, 1.9)
+    axes.plot([0, 0], [-0.8, 1.1], color=style.BLACK, lw=1.0)
+    host, resonator = 2.6, 6.6
+    start, end = host + SIDE, resonator - SIDE
+    _spring(axes, [(0, 0), (host - SIDE, 0)], rf"$k_1$ = {with_prefix(springs[0], 'N/m')}")
+    _spring(axes, [(start, 0.26), (end, 0.26)], rf"$k_2$ = {with_prefix(springs[1], 'N/m')}")
+    middle, gap = (start + end) / 2, 0.16
+    for edge, stop in ((start, middle - gap), (end, middle + gap)):
+        axes.plot([edge, stop], [-0.3, -0.3], color=style.VERMILION, lw=1.0)
+        axes.plot([stop, stop], [-0.46, -0.14], color=style.VERMILION, lw=2.0)
+    below = {"ha": "center", "va": "top", "fontsize": 6.5}
+    axes.text(middle, -0.56, f"contact on both sides, Δ = {1e3 * clearance:.4g} mm", color=style.VERMILION, **below)
+    for i, (x, mass, colour) in enumerate(zip((host, resonator), masses, (style.SKY, style.ORANGE), strict=True)):
+        _mass(axes, (x, 0), SIDE, i, colour)
+        axes.text(x, -SIDE - 0.06, with_prefix(1e3 * mass, "g"), **below)
+        arrow = {"arrowstyle": "-|>", "lw": 0.8, "color": style.BLUE, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", (x + 0.9, 0.85), (x, 0.85), arrowprops=arrow)
+        axes.plot([x, x], [0.72, 0.98], color=style.BLUE, lw=0.8)
+        axes.text(x + 0.95, 0.85, f"$u_{i + 1}$", va="center", fontsize=7, color=style.BLUE)
+    axes.set(xlim=(-0.5, 8.0), ylim=(-0.95, 1.2), aspect="equal")
+    axes.set_axis_off()
+    return figure
+
+
 class _Layout(NamedTuple):
-    """Where the masses of a cell stand, half their widths, and the cell's left and right border."""
+    """Where masses stand and half their widths; the cell's borders; whether the resonator sits inside its host."""
 
     centre: dict[int, Point]
     half: dict[int, float]
     left: float
     right: float
-    nested: bool  # whether the resonator sits inside its host
+    nested: bool
 
     def blocked(self, low: float, high: float, y: float) -> bool:
         """Whether a mass stands between ``low`` and ``high`` at height ``y``."""
@@ -55,25 +106,31 @@ class _Layout(NamedTuple):
 def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     """Masses, springs and the contact pair of ``cell``; a resonator held by its host alone sits inside it."""
     layout = _layout(cell)
+    nested_pair = {cell.host, cell.resonator} if layout.nested else set()
     level, highest = TALL + 0.6, TALL
     for spring in cell.springs:
-        if layout.nested and {spring.start, spring.end} == {cell.host, cell.resonator} and not spring.next_cell:
-            continue
-        used = (_outer_spring if spring.next_cell else _inner_spring)(axes, layout, spring, level, cell.host)
-        highest = max(highest, used)
-        if used and not spring.next_cell:
-            level += 0.55
+        if spring.next_cell:
+            highest = max(highest, _outer_spring(axes, layout, spring, level))
+        elif {spring.start, spring.end} != nested_pair:
+            used = _inner_spring(axes, layout, spring, level)
+            highest, level = max(highest, used), level + 0.55 * (used > 0)
     for i, centre in layout.centre.items():
-        if not (layout.nested and i in (cell.host, cell.resonator)):
+        if i not in nested_pair:
             colour = {cell.host: style.SKY, cell.resonator: style.ORANGE}.get(i, style.PALE)
-            draw_mass(axes, centre, HALF, i, colour)
+            _mass(axes, centre, HALF, i, colour)
             # Beside the mass's lower left corner, clear of what hangs below it and of the spring on its left.
             corner = centre[0] - HALF - 0.05, centre[1] - HALF
             axes.text(*corner, with_prefix(1e3 * cell.masses[i], "g"), ha="right", va="center", fontsize=6.5, zorder=4)
+    host, resonator = layout.centre[cell.host], layout.centre[cell.resonator]
     if layout.nested:
-        _host_with_resonator(axes, layout.centre[cell.host], cell)
+        _host_with_resonator(axes, host, cell)
     else:
-        _contact_link(axes, layout.centre[cell.host], layout.centre[cell.resonator])
+        # A bowed double arrow between the pair, whose resonator other masses hold too.
+        arrow = {"arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)), "shrinkA": 9,
+                 "shrinkB": 9, "connectionstyle": "arc3,rad=0.45"}  # fmt: skip
+        axes.annotate("", resonator, host, zorder=2, arrowprops=arrow)
+        middle = np.mean([host, resonator], axis=0)
+        note(axes, "contact, Δ", middle, (-16, 0), ha="right", va="center", color=style.VERMILION)
     low, high = min(y for _, y in layout.centre.values()) - TALL - 0.55, highest + 0.5
     for wall in (layout.left, layout.right):
         axes.plot([wall, wall], [low + 0.15, high - 0.1], color=style.GREY, lw=0.6, ls=(0, (4, 3)))
@@ -83,17 +140,9 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
 
 
 def _layout(cell: UnitCell) -> _Layout:
+    """The shortest way through the cell on one line, the other masses below it."""
     pairs = [({s.start, s.end}, s.next_cell) for s in cell.springs if cell.resonator in (s.start, s.end)]
     nested = bool(pairs) and all(pair == {cell.host, cell.resonator} and not out for pair, out in pairs)
-    centre = _centres(cell, nested)
-    half = {i: WIDE if nested and i == cell.host else HALF for i in centre}
-    left = min(x - half[i] for i, (x, _) in centre.items()) - 0.9
-    right = max(x + half[i] for i, (x, _) in centre.items()) + 1.5
-    return _Layout(centre, half, left, right, nested)
-
-
-def _centres(cell: UnitCell, nested: bool) -> dict[int, Point]:
-    """Position of every mass: the shortest way through the cell on one line, the others below it."""
     joined = np.zeros((cell.dofs, cell.dofs), bool)
     for spring in cell.springs:
         if not spring.next_cell:
@@ -122,128 +171,115 @@ def _centres(cell: UnitCell, nested: bool) -> dict[int, Point]:
         while (x, y - 0.75 * PITCH) in centre.values():
             x += 0.5 * PITCH
         centre[hanging[0][0]] = (x, y - 0.75 * PITCH)
-    return centre
+    half = {i: WIDE if nested and i == cell.host else HALF for i in centre}
+    left = min(x - half[i] for i, (x, _) in centre.items()) - 0.9
+    right = max(x + half[i] for i, (x, _) in centre.items()) + 1.5
+    return _Layout(centre, half, left, right, nested)
 
 
-def _inner_spring(axes: Axes, layout: _Layout, spring: Spring, level: float, host: int) -> float:
+def _inner_spring(axes: Axes, layout: _Layout, spring: Spring, level: float) -> float:
     """A spring between two masses of the cell; returns the height at which it goes round others, else 0."""
     a, b = sorted((spring.start, spring.end), key=lambda i: layout.centre[i])
     (xa, ya), (xb, yb) = layout.centre[a], layout.centre[b]
     text = with_prefix(spring.stiffness, "N/m")
-    if abs(xa - xb) < 0.1:
-        top, bottom = (a, b) if ya > yb else (b, a)
-        drop = TALL if layout.nested and top == host else HALF
-        draw_spring(axes, [(xa, layout.centre[top][1] - drop), (xb, layout.centre[bottom][1] + HALF)], text)
+    if abs(xa - xb) < 0.1:  # b stands above a
+        drop = TALL if layout.half[b] == WIDE else HALF
+        _spring(axes, [(xb, yb - drop), (xa, ya + HALF)], text)
     elif abs(ya - yb) >= 0.1:
         short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
-        draw_spring(axes, [(xa + short[0], ya + short[1]), (xb - short[0], yb - short[1])], text)
+        _spring(axes, [(xa + short[0], ya + short[1]), (xb - short[0], yb - short[1])], text)
     elif layout.blocked(xa, xb, ya):
-        draw_spring(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
+        _spring(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
         return level
     else:
-        draw_spring(axes, [(xa + layout.half[a], ya), (xb - layout.half[b], yb)], text)
+        _spring(axes, [(xa + layout.half[a], ya), (xb - layout.half[b], yb)], text)
     return 0.0
 
 
-def _outer_spring(axes: Axes, layout: _Layout, spring: Spring, level: float, host: int) -> float:
+def _outer_spring(axes: Axes, layout: _Layout, spring: Spring, level: float) -> float:
     """A spring to the next cell and the end of the last one's; returns the height at which it goes round masses."""
     used, text = 0.0, with_prefix(spring.stiffness, "N/m")
     for mass, wall, side in ((spring.start, layout.right, 1), (spring.end, layout.left, -1)):
         x, y = layout.centre[mass]
         if layout.blocked(min(x, side * np.inf), max(x, side * np.inf), y):
-            draw_spring(axes, [(x, y + HALF), (x, level), (wall, level)], text)
+            _spring(axes, [(x, y + HALF), (x, level), (wall, level)], text)
             used = level
             continue
         start = x + side * layout.half[mass]
         if side > 0:
-            draw_spring(axes, [(start, y), (wall, y)], text)
+            _spring(axes, [(start, y), (wall, y)], text)
         else:
-            axes.plot([start, wall], [y, y], color=style.BLACK, lw=0.7, zorder=2)
-        axes.plot([wall, wall + 0.4 * side], [y, y], color=style.BLACK, lw=0.7, ls=(0, (1, 1.5)), zorder=2)
+            axes.plot([start, wall], [y, y], zorder=2, **ROD)
+        axes.plot([wall, wall + 0.4 * side], [y, y], ls=(0, (1, 1.5)), zorder=2, **ROD)
     return used
 
 
-def draw_mass(axes: Axes, centre: Point, half: float, index: int, colour: str) -> None:
+def _mass(axes: Axes, centre: Point, half: float, index: int, colour: str) -> None:
     """A box of half the side ``half`` with the mass's symbol; ``index`` counts from 0."""
     box = {"boxstyle": "round,pad=0,rounding_size=0.08", "fc": colour, "ec": style.BLACK, "lw": 0.7, "zorder": 3}
     axes.add_patch(FancyBboxPatch((centre[0] - half, centre[1] - half), 2 * half, 2 * half, **box))
     axes.text(*centre, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
 
 
-def draw_wall(axes: Axes, corner: Point, width: float, height: float) -> None:
-    """A hatched wall."""
+def _wall(axes: Axes, corner: Point, width: float, height: float) -> None:
     axes.add_patch(Rectangle(corner, width, height, fc="white", ec=style.GREY, hatch="//////", lw=0.0))
 
 
 def _host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None:
     """The host as a box with two stops, the resonator between them on its spring."""
     x, y = centre
-    reach = HALF * 0.82
+    reach, outer = HALF * 0.82, HALF * 0.82 + GAP
 
-    def box(left: float, bottom: float, width: float, height: float, colour: str, zorder: int) -> None:
-        axes.add_patch(Rectangle((left, bottom), width, height, fc=colour, ec=style.BLACK, lw=0.7, zorder=zorder))
+    def box(dx: float, dy: float, width: float, height: float, colour: str, zorder: int) -> None:
+        axes.add_patch(Rectangle((x + dx, y + dy), width, height, fc=colour, ec=style.BLACK, lw=0.7, zorder=zorder))
 
-    box(x - WIDE, y - TALL, 2 * WIDE, 2 * TALL, style.SKY, 3)
-    box(x - WIDE + 0.1, y - TALL + 0.1, 2 * WIDE - 0.2, 2 * TALL - 0.2, "white", 3)
-    for left, bottom in itertools.product((x - reach - GAP - 0.1, x + reach + GAP), (y - 0.52, y + 0.2)):
+    box(-WIDE, -TALL, 2 * WIDE, 2 * TALL, style.SKY, 3)
+    box(0.1 - WIDE, 0.1 - TALL, 2 * WIDE - 0.2, 2 * TALL - 0.2, "white", 3)
+    for left, bottom in itertools.product((-outer - 0.1, outer), (-0.52, 0.2)):
         box(left, bottom, 0.1, 0.32, style.SKY, 4)
     stiffness = sum(s.stiffness for s in cell.springs if cell.resonator in (s.start, s.end))
-    draw_spring(axes, [(x - WIDE + 0.1, y), (x - reach, y)], "", turns=3, height=0.09)
-    box(x - reach, y - reach, 2 * reach, 2 * reach, style.ORANGE, 5)
+    _spring(axes, [(x - WIDE + 0.1, y), (x - reach, y)], "", turns=3, height=0.09)
+    box(-reach, -reach, 2 * reach, 2 * reach, style.ORANGE, 5)
     axes.text(x, y, f"$m_{{{cell.resonator + 1}}}$", ha="center", va="center", zorder=6)
     line = {"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("Δ", (x + reach + GAP / 2, y + 0.36), (x + reach + GAP / 2, y + TALL + 0.2), ha="center",
                   fontsize=7, color=style.VERMILION, zorder=7, arrowprops=line)  # fmt: skip
     masses = (f"$m_{{{i + 1}}}$ {with_prefix(1e3 * cell.masses[i], 'g')}" for i in (cell.host, cell.resonator))
-    axes.text(x, y - TALL - 0.08, f"{',  '.join(masses)}\ninner spring {with_prefix(stiffness, 'N/m')}",
-              ha="center", va="top", fontsize=6.5, linespacing=1.3)  # fmt: skip
+    text = f"{',  '.join(masses)}\ninner spring {with_prefix(stiffness, 'N/m')}"
+    axes.text(x, y - TALL - 0.08, text, ha="center", va="top", fontsize=6.5, linespacing=1.3)
 
 
-def _contact_link(axes: Axes, host: Point, resonator: Point) -> None:
-    """A bowed double arrow between the pair, for a resonator that other masses hold too."""
-    arrow = {"arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)), "shrinkA": 9,
-             "shrinkB": 9, "connectionstyle": "arc3,rad=0.45"}  # fmt: skip
-    axes.annotate("", resonator, host, zorder=2, arrowprops=arrow)
-    middle = (host[0] + resonator[0]) / 2, (host[1] + resonator[1]) / 2
-    axes.annotate("contact, Δ", middle, (-16, 0), textcoords="offset points", ha="right", va="center",
-                  fontsize=6.5, color=style.VERMILION)  # fmt: skip
-
-
-def draw_spring(axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, height: float = 0.13) -> None:
+def _spring(axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, height: float = 0.13) -> None:
     """A line through ``corners``, a zigzag with straight leads on its longest leg, its stiffness beside it."""
     legs = np.stack([corners[:-1], corners[1:]], axis=1)
     longest = int(np.argmax(np.hypot(*(legs[:, 1] - legs[:, 0]).T)))
     for leg in np.delete(legs, longest, axis=0):
-        axes.plot(*leg.T, color=style.BLACK, lw=0.7, zorder=2)
+        axes.plot(*leg.T, zorder=2, **ROD)
     start, along = legs[longest, 0], legs[longest, 1] - legs[longest, 0]
     across = np.array([-along[1], along[0]]) / np.hypot(*along)
     s = np.concatenate([[0, 0.2], 0.2 + 0.6 * (np.arange(2 * turns) + 0.5) / (2 * turns), [0.8, 1]])
     swing = np.zeros(len(s))
     swing[2:-2] = height * (-1.0) ** np.arange(2 * turns)
     points = start + s[:, None] * along + swing[:, None] * across
-    axes.plot(*points.T, color=style.BLACK, lw=0.7, zorder=2 if height > 0.1 else 6, solid_joinstyle="round")
-    if abs(along[1]) > abs(along[0]):
-        axes.text(*(start + along / 2 + (0.2, 0)), text, fontsize=6.5, ha="left", va="center")
-    else:
-        axes.text(*(start + along / 2 + (0, 0.2)), text, fontsize=6.5, ha="center", va="bottom")
+    axes.plot(*points.T, zorder=2 if height > 0.1 else 6, solid_joinstyle="round", **ROD)
+    upright = abs(along[1]) > abs(along[0])
+    shift, alignment = ((0.2, 0), ("left", "center")) if upright else ((0, 0.2), ("center", "bottom"))
+    axes.text(*(start + along / 2 + shift), text, fontsize=6.5, ha=alignment[0], va=alignment[1])
 
 
 def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = False) -> None:
-    """The lattice as a strip of cells: how it ends, where it is driven (0-based cell), where contacts are.
-
-    A ``brief`` one leaves out the words that several strips would repeat.
-    """
+    """The lattice as a strip: its ends, drive (0-based cell) and contacts; a ``brief`` one says less."""
     n = chain.cells
     axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
     if n <= 150:
         axes.vlines(np.arange(1, n) + 0.5, 0, 1, color="white", lw=0.5)
     if chain.ends == "fixed":
         for wall in (0.5 - 0.02 * n, n + 0.5):
-            draw_wall(axes, (wall, -0.25), 0.02 * n, 1.5)
+            _wall(axes, (wall, -0.25), 0.02 * n, 1.5)
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
+    arrow = {"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8}
     axes.annotate("" if brief else "drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left",
-                  va="center", fontsize=7, color=style.BLUE,
-                  arrowprops={"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8})  # fmt: skip
+                  va="center", fontsize=7, color=style.BLUE, arrowprops=arrow)  # fmt: skip
     below = {"ha": "center", "va": "top", "fontsize": 6.5}
     last, width = -np.inf, max(0.006 * n, 1)
     for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
@@ -260,9 +296,3 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = Fa
         axes.text(middle, -0.95, "clearance Δ (mm) of the contact sites", color=style.VERMILION, **below)
     axes.set(xlim=(-0.035 * n, 1.035 * n), ylim=(-1.7, 2.3))
     axes.set_axis_off()
-
-
-def with_prefix(value: float, unit: str) -> str:
-    """A value with the prefix that keeps it readable: 20 kN/m, 2.5 g."""
-    factor, prefix = style.si_prefix(value)
-    return f"{value / factor:.4g} {prefix}{unit}"

@@ -1,6 +1,8 @@
 """Panels that figures share: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
 
 from collections.abc import Iterable, Sequence
+from itertools import cycle
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -57,6 +59,14 @@ def log_norm(largest: float, decades: float = DECADES) -> LogNorm:
     return LogNorm(top * 10.0**-decades, top, clip=True)
 
 
+def percentile_norm(fields: Iterable[xr.DataArray]) -> Normalize:
+    """Colours from the lowest to the highest percentile of what is finite in the ``fields``."""
+    values = np.concatenate([np.ravel(field) for field in fields])
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite if len(finite) else [0, 1], (2, 99.8))
+    return Normalize(low, high if high > low else low + 1)
+
+
 def draw_map(
     axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize, cmap: str = "inferno"
 ) -> AxesImage:
@@ -73,6 +83,12 @@ def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, cmap: str =
     image = draw_map(axes, time, cells, field.values.T, norm, cmap)
     axes.set(xlabel="Time (s)", ylabel="Cell")
     return image
+
+
+def content_map(axes: Axes, content: xr.DataArray, norm: Normalize) -> AxesImage:
+    """Map of ``content`` (t, wavenumber), time to the right, wavenumbers in pi rad/cell."""
+    time, kappa = content["time"].values, content["wavenumber"].values / np.pi
+    return draw_map(axes, time, kappa, content.values.T, norm, "viridis")
 
 
 def recorded_sites(run: xr.Dataset) -> np.ndarray:
@@ -114,7 +130,7 @@ def dispersion_map(axes: Axes, spectrum: xr.DataArray, norm: Normalize, cell: Un
 def band_diagram(axes: Axes, cell: UnitCell, frequency: float | None = None) -> None:
     """Bloch branches of ``cell`` in colours, gaps shaded, the drive's ``frequency`` (rad/s) dotted."""
     kappa, bands = np.linspace(0, np.pi, 361), pass_bands(cell)
-    for branch, colour in zip(bloch(cell, kappa).frequency.T, colours(len(bands)), strict=True):
+    for branch, colour in zip(bloch(cell, kappa).frequency.T, cycle(style.SERIES), strict=False):
         axes.plot(kappa / np.pi, branch / 1e3, color=colour)
     shade_bands(axes, gaps(bands))
     if frequency is not None:
@@ -136,24 +152,15 @@ def label_outer(grid: np.ndarray, xlabel: str, ylabel: str) -> None:
         axes.set_ylabel(ylabel)
 
 
-def colours(count: int) -> list[str]:
-    """The first ``count`` colours of a series, which then begins again."""
-    return [style.SERIES[i % len(style.SERIES)] for i in range(count)]
-
-
-def colour_bar(
-    figure: FigureBase, image: AxesImage, axes: Axes | Iterable[Axes], label: str, pad: float = 0.01, aspect: float = 20
-) -> Colorbar:
-    """Colour bar of a map whose lowest colour stands for what is below it as well."""
+def colour_bar(figure: FigureBase, image: Any, axes: Axes | Iterable[Axes], label: str, **options: Any) -> Colorbar:
+    """Colour bar of a map, by default one whose lowest colour stands for what is below it as well."""
     panels = axes if isinstance(axes, Axes) else list(axes)
-    return figure.colorbar(image, ax=panels, label=label, pad=pad, aspect=aspect, extend="min")
+    return figure.colorbar(image, ax=panels, label=label, **{"pad": 0.01, "extend": "min"} | options)
 
 
-def centred_limits(axes: Axes, x: np.ndarray, y: np.ndarray, margin: float) -> None:
-    """Limits symmetric about zero that hold ``x`` and ``y`` with a ``margin`` (a factor)."""
-    for set_limits, values in ((axes.set_xlim, x), (axes.set_ylim, y)):
-        reach = margin * np.abs(values).max() or 1.0
-        set_limits(-reach, reach)
+def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float], **options: Any) -> None:
+    """A small text beside the point ``at``, ``shift`` points away from it."""
+    axes.annotate(text, at, shift, textcoords="offset points", **{"fontsize": 6.5} | options)
 
 
 def shade_regions(axes: Axes, energy: np.ndarray, region: np.ndarray, left: float, at_top: bool) -> None:

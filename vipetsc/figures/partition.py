@@ -1,11 +1,9 @@
 """The wave's energy in twelve wavenumber bins: in space-time, reconstructed, and how the bins are made."""
 
 import itertools
-from collections.abc import Sequence
 
 import matplotlib as mpl
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
@@ -51,21 +49,37 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
 @from_series(FIELD, wave=True)
 def partition(series: AmplitudeSeries) -> Figure:
     """Energy of seven bins in space-time at the medium amplitude, contours of all, the driven band (paper, Fig. 4)."""
-    medium = series.runs[1]
-    heading = f"{series.title}; maps: medium amplitude, {medium.amplitude:g} N"
-    figure = style.new_figure(style.PAGE, 6.6, heading)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(2, 1.1))
+    medium, wave = series.runs[1], series.wave
     field = medium.analysis[FIELD].load()
-    colours = bin_colours(len(field))
-    *maps, band = upper.subplots(2, 4).flat
-    _maps(maps, medium.run, field, shown_bins(series.wave.wavenumber, len(field)))
-    panels.colour_bar(upper, maps[0].images[0], [*maps, band], "Energy of a bin in a cell (J)", aspect=40)
-    _coloured_band(band, series, medium.analysis["partition/bounds"].values, colours)
+    bins, colours = shown_bins(wave.wavenumber, len(field)), bin_colours(len(field))
+    norm = panels.log_norm(float(field[bins].max()), DECADES)
+    figure = style.new_figure(style.PAGE, 6.6, f"{series.title}; maps: medium amplitude, {medium.amplitude:g} N")
+    upper, lower = figure.subfigures(2, 1, height_ratios=(2, 1.1))
+    grid = upper.subplots(2, 4)
+    *maps, band = grid.flat
+    for axes, b, roman in zip(maps, bins, ROMAN, strict=False):
+        image = panels.space_time_map(axes, field[b], norm)
+        panels.mark_sites(axes, medium.run)
+        panel_title(axes, f"(a.{roman}) $K_{{{b + 1}}}$")
+        axes.set_ylabel("Cell" if axes in grid[:, 0] else "")
+        axes.tick_params(labelleft=axes in grid[:, 0])
+    for axes in maps[len(bins) :]:
+        axes.set_axis_off()
+    panels.colour_bar(upper, image, grid.flat, "Energy of a bin in a cell (J)", aspect=40)
+
+    for ends, colour in zip(itertools.pairwise(medium.analysis["partition/bounds"].values), colours, strict=True):
+        kappa = np.linspace(*ends, 31)
+        branch = bloch(medium.model.chain.cell, kappa).frequency[:, wave.band - 1]
+        band.plot(kappa / np.pi, branch / 1e3, color=colour, lw=3, solid_capstyle="butt")
+    band.axvline(wave.wavenumber / np.pi, color=style.BLACK, lw=0.6, ls=":")
+    band.set(xlabel="κ (π rad/cell)", ylabel="ω (krad/s)", xlim=(0, 1))
+    panel_title(band, f"(c) Band {wave.band} by bin")
+
     contours = lower.subplots(1, 3, sharey=True)
-    for column, member, heading in series.headings():
-        _contours(contours[column], member, colours)
-        panel_title(contours[column], f"(b.{ROMAN[column]}) {heading}")
-        contours[column].set_xlabel("Time (s)")
+    for axes, roman, (_, member, heading) in zip(contours, ROMAN, series.headings(), strict=False):
+        _contours(axes, member, colours)
+        panel_title(axes, f"(b.{roman}) {heading}")
+        axes.set_xlabel("Time (s)")
     contours[0].set_ylabel("Cell")
     edges = np.arange(len(colours) + 1) + 0.5
     keys = mpl.cm.ScalarMappable(BoundaryNorm(edges, len(colours)), ListedColormap(colours))
@@ -75,26 +89,11 @@ def partition(series: AmplitudeSeries) -> Figure:
     return figure
 
 
-def _maps(grid: Sequence[Axes], run: xr.Dataset, field: xr.DataArray, bins: Sequence[int]) -> None:
-    """Energy of the ``bins`` in space-time to one scale; panels without a bin are left empty."""
-    norm = panels.log_norm(float(field[list(bins)].max()), DECADES)
-    for i, axes in enumerate(grid):
-        if i >= len(bins):
-            axes.set_axis_off()
-            continue
-        panels.space_time_map(axes, field[bins[i]], norm)
-        panels.mark_sites(axes, run)
-        panel_title(axes, f"(a.{ROMAN[i]}) $K_{{{bins[i] + 1}}}$")
-        axes.set_ylabel("" if i % 4 else "Cell")
-        axes.tick_params(labelleft=i % 4 == 0)
-
-
 def _contours(axes: Axes, member: MeasuredRun, colours: np.ndarray) -> None:
     """Every bin where its energy exceeds ``LEVEL`` of the largest of any, filled and outlined in its colour."""
-    field, cells = member.analysis[FIELD].values, member.analysis["cell"].values
-    time = member.analysis["partition/snapshot"].values
+    field, cells, time = (member.analysis[name].values for name in (FIELD, "cell", "partition/snapshot"))
     step = max(1, len(cells) // 300)
-    widths = [share * length for share, length in zip(BLUR, field.shape[1:], strict=True)]
+    widths = np.multiply(BLUR, field.shape[1:])
     smooth = [gaussian_filter(energy, widths, mode="nearest")[:, ::step] for energy in field]
     level = LEVEL * max(float(energy.max()) for energy in smooth)
     # The strongest lie beneath, so that what is scattered out of them is seen.
@@ -106,30 +105,17 @@ def _contours(axes: Axes, member: MeasuredRun, colours: np.ndarray) -> None:
     axes.set(xlim=time[[0, -1]], ylim=cells[[0, -1]])
 
 
-def _coloured_band(axes: Axes, series: AmplitudeSeries, bounds: np.ndarray, colours: np.ndarray) -> None:
-    """The driven band, each bin's part of it in the bin's colour; the driven wavenumber dotted."""
-    cell, band = series.runs[0].model.chain.cell, series.wave.band
-    for low, high, colour in zip(bounds[:-1], bounds[1:], colours, strict=True):
-        kappa = np.linspace(low, high, 31)
-        axes.plot(kappa / np.pi, bloch(cell, kappa).frequency[:, band - 1] / 1e3, color=colour, lw=3,
-                  solid_capstyle="butt")  # fmt: skip
-    axes.axvline(series.wave.wavenumber / np.pi, color=style.BLACK, lw=0.6, ls=":")
-    axes.set(xlabel="κ (π rad/cell)", ylabel="ω (krad/s)", xlim=(0, 1))
-    panel_title(axes, f"(c) Band {band} by bin")
-
-
 @from_series("partition/reconstructed")
 def reconstruction(series: AmplitudeSeries) -> Figure:
-    """Kinetic energy and that of the bins' sum over time, relative error, the share between bins (paper, Fig. A1)."""
+    """Total and reconstructed energy over time, relative error, the share between bins (paper, Fig. A1)."""
     figure = style.new_figure(style.PAGE, 5.0, series.title)
     grid = figure.subplots(3, 3, sharex="col", sharey="row")
-    for column, member, heading in series.headings():
+    for (energies, errors, shares), member in zip(grid.T, series.runs, strict=True):
         time, kinetic, reconstructed, error, cross, parts = (
             member.analysis[f"partition/{name}"].values
             for name in ("snapshot", "kinetic", "reconstructed", "error", "cross_share", "energy")
         )
         square = member.amplitude**2
-        energies, errors, shares = grid[:, column]
         energies.plot(time, kinetic / square, color=style.BLACK, lw=1.4, label="KE of the lattice")
         energies.plot(time, reconstructed / square, color=style.ORANGE, lw=0.8, ls=(0, (3, 2)),
                       label="KE of the bins' sum")  # fmt: skip
@@ -139,13 +125,14 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
         shares.plot(time, cross, color=style.GREEN, lw=0.8)
         shares.set(ylim=(0, 1), xlabel="Time (s)", xlim=time[[0, -1]])
         shares.locator_params(axis="x", nbins=5)
-        for row, axes in enumerate(grid[:, column]):
-            panel_title(axes, f"({'abc'[column]}.{ROMAN[row]})" + f" {heading}" * (row == 0))
+    for row, line in enumerate(grid):
+        for axes, (tag, _, heading) in zip(line, series.headings(row), strict=True):
+            panel_title(axes, f"{tag} {heading}" if row == 0 else tag)
     grid[0, 0].set(ylabel="Kinetic energy / A² (J/N²)", ylim=(0, None))
     grid[0, 0].legend(loc="upper left")
     grid[1, 0].set(ylabel="Relative error")
-    grid[1, 0].annotate("1 %", (1, 0.01), (-2, -2), xycoords=("axes fraction", "data"), textcoords="offset points",
-                        ha="right", va="top", color=style.VERMILION)  # fmt: skip
+    panels.note(grid[1, 0], "1 %", (1, 0.01), (-2, -2), xycoords=("axes fraction", "data"), fontsize=8,
+                ha="right", va="top", color=style.VERMILION)  # fmt: skip
     grid[2, 0].set(ylabel="Share of KE between bins")
     return figure
 
@@ -154,8 +141,10 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
 def partition_explained(series: AmplitudeSeries) -> Figure:
     """A snapshot, its wavelet transform cut into bins, the inverse of some, their energy in space-time (Fig. S1)."""
     member = series.runs[1]
-    field, cells = member.analysis[FIELD].load(), member.analysis["cell"].values
-    snapshots, bounds = (member.analysis[f"partition/{name}"].values for name in ("snapshot", "bounds"))
+    field = member.analysis[FIELD].load()
+    cells, snapshots, bounds = (
+        member.analysis[name].values for name in ("cell", "partition/snapshot", "partition/bounds")
+    )
     time = float(snapshots[np.argmin(np.abs(snapshots - series.snapshot_times()[2]))])
     sample = int(np.argmin(np.abs(field_time(member.run) - time)))
     signal = member.run["velocity"][sample, :, member.model.chain.cell.host].values
@@ -179,7 +168,7 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     norm = panels.log_norm(float(field[bins].max()), DECADES)
     # Bins rise upwards, as in the wavelet domain.
     traces, maps = ([figure.add_subplot(grid[row, column]) for row in range(EXPLAINED)] for column in (2, 3))
-    for row, (b, trace, energy) in enumerate(zip(reversed(bins), traces, maps, strict=True)):
+    for roman, b, trace, energy in zip(ROMAN, reversed(bins), traces, maps, strict=False):
         trace.plot(cells, parts[b], color=colours[b], lw=0.5)
         trace.set(xlim=cells[[0, -1]], ylim=(-largest, largest))
         trace.yaxis.tick_right()
@@ -187,15 +176,15 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
         panels.mark_sites(energy, member.run)
         energy.axvline(time, color="white", lw=0.6)
         for axes, tag, what in ((trace, "c", "Velocity (m/s)"), (energy, "d", "Energy")):
-            panel_title(axes, f"({tag}.{ROMAN[row]}) {what} of $K_{{{b + 1}}}$")
-            axes.tick_params(labelbottom=row == EXPLAINED - 1)
+            panel_title(axes, f"({tag}.{roman}) {what} of $K_{{{b + 1}}}$")
+            axes.tick_params(labelbottom=axes in (traces[-1], maps[-1]))
             axes.set_xlabel("")
         middle = float(np.clip(0.5 * (bounds[b] + bounds[b + 1]), nodes.kappa[0], np.pi)) / np.pi
         ends = (1.0, middle), (0.0, 0.5), below.get_yaxis_transform(), trace.transAxes
         figure.add_artist(ConnectionPatch(*ends, arrowstyle="-|>", color=colours[b], lw=0.7, mutation_scale=6))
     traces[-1].set_xlabel("Cell")
     maps[-1].set_xlabel("Time (s)")
-    panels.colour_bar(figure, image, maps, "Energy of a bin in a cell (J)", 0.02, 40)
+    panels.colour_bar(figure, image, maps, "Energy of a bin in a cell (J)", pad=0.02, aspect=40)
     return figure
 
 

@@ -16,15 +16,14 @@ from scipy.interpolate import CubicHermiteSpline
 
 from vipetsc.case import Case
 from vipetsc.figures import style
-from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.panels import centred_limits, empty_figure, panel_title, recorded_sites
-from vipetsc.figures.study import Labels, MeasuredRun, Study, grouped, sites_of, transfer_members
+from vipetsc.figures.panels import empty_figure, note, panel_title, recorded_sites
+from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
+from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer_curves import TransferCurve, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site
 
 REFINE = 4  # points drawn for each sample
 PERIODS = 10  # of the drive that a portrait shows
-RED = "#CC0000"
 
 
 def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -60,8 +59,8 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     relative.set_xlim(-wide, wide)
     for wall in (-clearance, clearance):
         relative.axvline(wall, color=style.VERMILION, lw=0.8, ls=style.DASHED)
-    relative.annotate("clearance", (clearance, 1), (-2, -2), xycoords=("data", "axes fraction"), color=style.VERMILION,
-                      textcoords="offset points", ha="right", va="top", fontsize=6.5)  # fmt: skip
+    note(relative, "clearance", (clearance, 1), (-2, -2), xycoords=("data", "axes fraction"), ha="right", va="top",
+         color=style.VERMILION)  # fmt: skip
     if len(onsets):
         figure.colorbar(after, ax=panels, label="Time (s)", pad=0.01)
     else:
@@ -88,8 +87,15 @@ def _trajectory(
     lines = LineCollection(list(segments), array=time[before:-1], norm=norm, cmap="viridis", lw=0.4, rasterized=True)
     axes.add_collection(lines)
     axes.plot(x[: before + 1], y[: before + 1], color=style.GREY, lw=0.4, rasterized=True)
-    centred_limits(axes, x, y, 1.06)
+    _centred_limits(axes, x, y, 1.06)
     return lines
+
+
+def _centred_limits(axes: Axes, x: np.ndarray, y: np.ndarray, margin: float) -> None:
+    """Limits symmetric about zero that hold ``x`` and ``y`` with a ``margin`` (a factor)."""
+    for set_limits, values in ((axes.set_xlim, x), (axes.set_ylim, y)):
+        reach = margin * np.abs(values).max() or 1.0
+        set_limits(-reach, reach)
 
 
 class ContactMotion(NamedTuple):
@@ -114,21 +120,22 @@ class ContactMotion(NamedTuple):
             return cls(member.case, u, v, float(member.analysis["ibtet"]))
 
 
-def phase_regimes(study: Study) -> Iterator[Drawing]:
+def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
     """Trajectories of one embedded contact cell, for every law and reading, beside the transfer curve."""
-    members, curves = [], list(transfer_curves(study))
-    for member in transfer_members(study):
+    members = []
+    for member in transfer_members(sweeps):
         run = member.run
         if len(recorded_sites(run)) == run.sizes["site"] == 1 and "displacement" in run and "velocity" in run:
             members.append((member.case, member.folder))
-
-    def settings(case: Case) -> str:
-        return f"{case.contacts.law}-{Labels.of(case).page_stem}"
-
-    for name, group in grouped(members, lambda pair: settings(pair[0])).items():
+    curves = list(transfer_curves(sweeps))
+    for name, group in grouped(members, lambda pair: _settings(pair[0])).items():
         sites = sites_of(group[0][0])
-        matching = [c for c in curves if settings(c.case) == name and sites_of(c.case) == sites]
-        yield name, partial(_page, [folder for _, folder in group], matching[0] if matching else None)
+        curve = next((c for c in curves if _settings(c.case) == name and sites_of(c.case) == sites), None)
+        yield name, partial(_page, [folder for _, folder in group], curve)
+
+
+def _settings(case: Case) -> str:
+    return f"{case.contacts.law}-{Labels.of(case).page_stem}"
 
 
 def _page(folders: Sequence[Path], curve: TransferCurve | None) -> Figure:
@@ -139,38 +146,29 @@ def _page(folders: Sequence[Path], curve: TransferCurve | None) -> Figure:
     heading = f"{labels.law}, {case.lattice.reading}, {labels.configuration}, cell {sites_of(case)[0]}"
     figure = style.new_figure(style.PAGE, 3.4, heading, left=True)
     left, right = figure.subfigures(1, 2, width_ratios=(1, 0.62 * columns))
-    _curve(left.subplots(), motions, curve)
-    panels = right.subplots(2, columns, squeeze=False).ravel()
+    transfer, panels = left.subplots(), right.subplots(2, columns, squeeze=False).ravel()
+    if curve is not None:
+        transfer.plot(curve.amplitude, curve.ibtet, "-o", color=style.GREY, ms=2, lw=0.7)
     for number, (axes, motion) in enumerate(zip(panels, motions, strict=False), 1):
-        _trajectories(axes, motion, number)
+        point = motion.case.drive.amplitude, motion.ibtet
+        transfer.plot(*point, "o", color=style.RED, ms=4, zorder=3)
+        note(transfer, str(number), point, (4, 3), fontsize=7.5, color=style.RED)
+        displacement = 1e3 * motion.displacement
+        for j, colour in ((1, style.BLUE), (0, style.RED)):
+            axes.plot(displacement[:, j], motion.velocity[:, j], color=colour, lw=0.5)
+        _centred_limits(axes, displacement, motion.velocity, 1.08)
+        axes.tick_params(labelsize=6, pad=1.5)
+        axes.set_xlabel("$u$ (mm)", fontsize=7)
+        axes.set_ylabel(r"$\dot u$ (m/s)", fontsize=7, labelpad=0)
+        axes.set_box_aspect(1)
+        panel_title(axes, f"{number}: {point[0]:.4g} N")
+    transfer.set(xscale="log", yscale="log", xlabel="Amplitude of the drive (N)", ylabel="Inter-band transfer (1)")
+    transfer.margins(x=0.08, y=0.12)
+    panel_title(transfer, "Transfer to higher bands")
     for axes in panels[len(motions) :]:
         axes.set_axis_off()
-    keys = [Line2D([], [], color=c, label=n) for c, n in ((RED, "host"), (style.BLUE, "resonator"))]
+    keys = [Line2D([], [], color=c, label=n) for c, n in ((style.RED, "host"), (style.BLUE, "resonator"))]
     has_room = len(motions) < len(panels)
     title = f"{PERIODS} periods of the drive\nabout the largest $|w|$" if has_room else None
     panels[-1].legend(handles=keys, loc="center" if has_room else "upper right", title=title, title_fontsize=6.5)
     return figure
-
-
-def _curve(axes: Axes, motions: Sequence[ContactMotion], curve: TransferCurve | None) -> None:
-    if curve is not None:
-        axes.plot(curve.amplitude, curve.ibtet, "-o", color=style.GREY, ms=2, lw=0.7)
-    for number, motion in enumerate(motions, 1):
-        point = motion.case.drive.amplitude, motion.ibtet
-        axes.plot(*point, "o", color=RED, ms=4, zorder=3)
-        axes.annotate(str(number), point, (4, 3), textcoords="offset points", ha="left", fontsize=7.5, color=RED)
-    axes.set(xscale="log", yscale="log", xlabel="Amplitude of the drive (N)", ylabel="Inter-band transfer (1)")
-    axes.margins(x=0.08, y=0.12)
-    panel_title(axes, "Transfer to higher bands")
-
-
-def _trajectories(axes: Axes, motion: ContactMotion, number: int) -> None:
-    displacement = 1e3 * motion.displacement
-    for j, colour in ((1, style.BLUE), (0, RED)):
-        axes.plot(displacement[:, j], motion.velocity[:, j], color=colour, lw=0.5)
-    centred_limits(axes, displacement, motion.velocity, 1.08)
-    axes.tick_params(labelsize=6, pad=1.5)
-    axes.set_xlabel("$u$ (mm)", fontsize=7)
-    axes.set_ylabel(r"$\dot u$ (m/s)", fontsize=7, labelpad=0)
-    axes.set_box_aspect(1)
-    panel_title(axes, f"{number}: {motion.case.drive.amplitude:.4g} N")

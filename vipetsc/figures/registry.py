@@ -2,25 +2,26 @@
 
 import difflib
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vipetsc.figures import design, runs, style
-from vipetsc.figures.backbone import backbone
-from vipetsc.figures.drawing import Drawing, draw_each, save
-from vipetsc.figures.entropy import entropy, entropy_all
-from vipetsc.figures.entropy_time import entropy_history, entropy_maps
-from vipetsc.figures.lattice import unit_cell
-from vipetsc.figures.partition import partition, partition_explained, reconstruction
-from vipetsc.figures.portraits import phase, phase_regimes
-from vipetsc.figures.scattering import amplitudes, wavelets
-from vipetsc.figures.schematics import bands
-from vipetsc.figures.study import Study
-from vipetsc.figures.transfer import band_energies, transfer, transfer_dispersions
-from vipetsc.figures.transfer_curves import ibtet, ibtet_backbone
+from vipetsc.figures import (
+    backbone,
+    design,
+    entropy,
+    lattice,
+    partition,
+    portraits,
+    runs,
+    scattering,
+    transfer,
+    transfer_curves,
+)  # fmt: skip
+from vipetsc.figures.study import read_sweeps, table
+from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.lattice import UnitCell
@@ -32,7 +33,7 @@ class FigureSpec(NamedTuple):
     """A figure of what folders of a ``source`` hold; one of sweeps is drawn from those that take the ``measure``.
 
     ``function`` is (run, analysis or None) -> Figure for a run, (search) -> Figure for a design, (paths) -> Figure
-    for branches; of sweeps it offers drawings: (Study) -> iterator of (suffix, () -> Figure).
+    for branches; of sweeps it offers drawings: (ensembles) -> iterator of (suffix, () -> Figure).
     """
 
     function: Callable[..., Any]
@@ -46,12 +47,14 @@ def _specs(source: str, *functions: Callable[..., Any], measure: str = "") -> di
 
 # The dearest of a run first, so that ranks which share the work finish together.
 FIGURES: dict[str, FigureSpec] = {
-    **_specs(RUN, runs.spacetime, runs.dispersion, phase, unit_cell, runs.impacts, runs.ledger),
-    **_specs(SWEEP, amplitudes, wavelets, partition, partition_explained, reconstruction, measure="entropy"),
-    **_specs(SWEEP, entropy, entropy_all, entropy_maps, entropy_history, measure="entropy"),
-    **_specs(SWEEP, transfer, transfer_dispersions, band_energies, ibtet, ibtet_backbone, measure="transfer"),
-    **_specs(SWEEP, phase_regimes, measure="transfer"),
-    "branch": FigureSpec(backbone, BRANCHES),
+    **_specs(RUN, runs.spacetime, runs.dispersion, portraits.phase, lattice.unit_cell, runs.impacts, runs.ledger),
+    **_specs(SWEEP, scattering.amplitudes, scattering.wavelets, scattering.entropy_maps, measure="entropy"),
+    **_specs(SWEEP, partition.partition, partition.partition_explained, partition.reconstruction, measure="entropy"),
+    **_specs(SWEEP, entropy.entropy, entropy.entropy_all, entropy.entropy_history, measure="entropy"),
+    **_specs(SWEEP, transfer.transfer, transfer.transfer_dispersions, transfer.band_energies, measure="transfer"),
+    **_specs(SWEEP, transfer_curves.ibtet, transfer_curves.ibtet_backbone, measure="transfer"),
+    **_specs(SWEEP, portraits.phase_regimes, measure="transfer"),
+    "branch": FigureSpec(backbone.backbone, BRANCHES),
     **_specs(DESIGN, design.deflections, design.cost_maps),
     **_specs(DESIGN, design.dispersion_against_lambda, design.dispersion_against_eta),
 }
@@ -104,22 +107,14 @@ def draw(
     OSError, ValueError
         If a file cannot be read, or a picture not written.
     """
-    with style.rc_style():
+    with rc_style():
         return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, itertools.count(*share))
 
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
     """Draw the dispersion diagram of ``cell`` into ``path``; ``frequency`` in rad/s marks a drive."""
-    with style.rc_style():
-        return save(bands(cell, frequency), Path(path))
-
-
-def study_drawings(study: Study, names: Iterable[str]) -> Iterator[Drawing]:
-    """Every picture of the figures ``names`` that a study allows, each with the stem of its file."""
-    for name in names:
-        spec = FIGURES[name]
-        for suffix, make in spec.function(study.measuring(spec.measure)):
-            yield f"{name}-{suffix}" if suffix else name, make
+    with rc_style():
+        return save(runs.bands(cell, frequency), Path(path))
 
 
 def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[Drawing]:
@@ -127,22 +122,25 @@ def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None =
 
     Files stay open until the last drawing was asked for.
     """
-    names = figure_names(source, names)
+    specs = {name: FIGURES[name] for name in figure_names(source, names)}
     folder = folders[0]
-    if source == SWEEP:
-        yield from study_drawings(Study.read(folders), names)
-    elif source == BRANCHES:
-        for name, path in itertools.product(names, sorted(folder.glob("branch-*.h5"))):
-            paths = [other / path.name for other in folders if (other / path.name).exists()]
-            stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
-            yield stem, partial(FIGURES[name].function, paths)
-    else:
-        with ExitStack() as stack:
-            if source == RUN:
-                data: tuple[Any, ...] = (stack.enter_context(open_run(folder / "run.h5")), None)
-                if (folder / "analysis.h5").exists():
-                    data = data[0], stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
-            else:
-                data = (stack.enter_context(open_netcdf(folder / "design.h5", "search", ("cost", "frequency"))),)
-            for name in names:
-                yield name, partial(FIGURES[name].function, *data)
+    with ExitStack() as stack:
+        if source == SWEEP:
+            ensembles = read_sweeps(folders)
+            for name, spec in specs.items():
+                measured = [e for e in ensembles if spec.measure in table(e)["sweep"]["measures"]]
+                for suffix, make in spec.function(measured):
+                    yield f"{name}-{suffix}" if suffix else name, make
+        elif source == BRANCHES:
+            for spec, path in itertools.product(specs.values(), sorted(folder.glob("branch-*.h5"))):
+                paths = [other / path.name for other in folders if (other / path.name).exists()]
+                stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
+                yield stem, partial(spec.function, paths)
+        elif source == RUN:
+            run, analysis = stack.enter_context(open_run(folder / "run.h5")), None
+            if (folder / "analysis.h5").exists():
+                analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
+            yield from ((name, partial(spec.function, run, analysis)) for name, spec in specs.items())
+        else:
+            search = stack.enter_context(open_netcdf(folder / "design.h5", "search", ("cost", "frequency")))
+            yield from ((name, partial(spec.function, search)) for name, spec in specs.items())

@@ -1,16 +1,17 @@
-"""Wavenumber scattering at three amplitudes: energy, wavenumbers and dispersion; wavelets at four times."""
+"""Wavenumber scattering at three amplitudes: energy, wavenumbers, dispersion, wavelets, entropy (Figs. 2, 3, A2)."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import KAPPA, ROMAN, panel_title
+from vipetsc.figures.panels import KAPPA, panel_title
 from vipetsc.figures.study import AmplitudeSeries, from_series
 from vipetsc.io.read import field_time
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import transform
 
 KC, NODES = 12.0, 120  # the wavelets of the entropy, on a grid twice as fine
+LEAST_WEIGHT = 1e-5  # of the largest: cells with less energy have no entropy
 ROWS = {
     "kinetic_energy": "Energy of a cell",
     "wavenumber_content": "Energy of a wavenumber",
@@ -32,20 +33,17 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
     for row, (name, label) in enumerate(ROWS.items()):
         fields = [member.analysis[name].load() / member.amplitude**2 for member in series.runs]
         norm = panels.log_norm(max(float(field.max()) for field in fields))
-        for column, member, heading in series.headings():
-            axes, field = grid[row, column], fields[column]
+        for axes, field, (tag, member, heading) in zip(grid[row], fields, series.headings(row), strict=True):
             if name == "kinetic_energy":
                 image = panels.space_time_map(axes, field, norm)
                 panels.mark_sites(axes, member.run)
             elif name == "wavenumber_content":
-                time, kappa = field["time"].values, field["wavenumber"].values / np.pi
-                image = panels.draw_map(axes, time, kappa, field.values.T, norm, "viridis")
+                image = panels.content_map(axes, field, norm)
                 axes.plot(0.015, series.wave.wavenumber / np.pi, ">", color=style.SKY, mec="white", mew=0.3, ms=4,
                           transform=axes.get_yaxis_transform())  # fmt: skip
             else:
                 image = panels.dispersion_map(axes, field, norm, cell)
             axes.set(xlabel=KAPPA if name == "dispersion" else "Time (s)", ylabel="")
-            tag = f"({'abc'[column]}.{ROMAN[row]})"
             panel_title(axes, f"{tag} {heading}" if row == 0 else tag)
         panels.colour_bar(figure, image, grid[row], f"{label} / A² (J/N²)")
     grid[0, 0].set(ylabel="Cell")
@@ -64,25 +62,57 @@ def wavelets(series: AmplitudeSeries) -> Figure:
     fields, times = [], []
     for member in series.runs:
         time = field_time(member.run)
-        rows = [int(np.argmin(np.abs(time - t))) for t in series.snapshot_times()]
-        host = member.run["velocity"][rows, :, member.model.chain.cell.host].values
+        samples = [int(np.argmin(np.abs(time - t))) for t in series.snapshot_times()]
+        host = member.run["velocity"][samples, :, member.model.chain.cell.host].values
         fields.append(np.abs(transform(host, kappa, KC)[..., : host.shape[-1]]) / abs(member.amplitude))
-        times.append(time[rows])
+        times.append(time[samples])
     norm = panels.log_norm(max(float(field.max()) for field in fields), 2.5)
 
     figure = style.new_figure(style.PAGE, 6.6, series.title)
     grid = figure.subplots(4, 3, sharex=True, sharey=True)
-    for column, member, heading in series.headings():
-        for row, moment in enumerate(MOMENTS):
-            axes, cells = grid[row, column], member.run["cell"].values
-            image = panels.draw_map(axes, cells, kappa / np.pi, fields[column][row], norm, "magma_r")
+    for row, moment in enumerate(MOMENTS):
+        for axes, field, time, (tag, member, heading) in zip(
+            grid[row], fields, times, series.headings(row), strict=True
+        ):
+            image = panels.draw_map(axes, member.run["cell"].values, kappa / np.pi, field[row], norm, "magma_r")
             axes.axhline(series.wave.wavenumber / np.pi, color=style.BLACK, lw=0.7)
             panels.mark_sites(axes, member.run, style.GREY, "x")
-            axes.text(0.97, 0.94, f"t = {times[column][row]:.3g} s", transform=axes.transAxes, ha="right", va="top",
+            axes.text(0.97, 0.94, f"t = {time[row]:.3g} s", transform=axes.transAxes, ha="right", va="top",
                       bbox={"facecolor": "white", "alpha": 0.6, "lw": 0, "pad": 1.0})  # fmt: skip
-            text = f"({'abc'[column]}.{ROMAN[row]}) {moment}"
-            panel_title(axes, text if row else f"{heading}\n{text}")
+            panel_title(axes, f"{tag} {moment}" if row else f"{heading}\n{tag} {moment}")
     grid[0, 0].set(ylim=(0, 1))
     panels.label_outer(grid, "Cell", "κ (π rad/cell)")
     panels.colour_bar(figure, image, grid.flat, "Wavelet transform |X| / A (m/s/N)", aspect=50)
+    return figure
+
+
+@from_series("entropy/local")
+def entropy_maps(series: AmplitudeSeries) -> Figure:
+    """H(x, t) at three amplitudes to one scale, with the energy-weighted H(t) over each; paper, Fig. A2.
+
+    Cells are blank where they have hardly any energy: only the wavelets' tails are there.
+    """
+    weights = [member.analysis["entropy/weight"] for member in series.runs]
+    fields = [
+        member.analysis["entropy/local"].where(weight > LEAST_WEIGHT * weight.max())
+        for member, weight in zip(series.runs, weights, strict=True)
+    ]
+    norm = panels.percentile_norm(fields)
+    figure = style.new_figure(style.PAGE, 2.7, series.title)
+    grid = figure.subplots(1, 3, sharey=True)
+    for axes, field, (tag, member, heading) in zip(grid, fields, series.headings(), strict=True):
+        time, history = (member.analysis[f"entropy/{name}"].values for name in ("snapshot", "history"))
+        image = panels.space_time_map(axes, field, norm, "viridis")
+        panels.mark_sites(axes, member.run, style.GREY)
+        # The line shares the colours' limits, so that the colour bar is its axis too.
+        over = axes.twinx()
+        over.plot(time, history, color="white", lw=2.0)
+        over.plot(time, history, color=style.VERMILION, lw=0.9, label="H(t)")
+        start = member.analysis.attrs["entropy/start"]
+        over.axvline(start, color=style.BLACK, lw=0.7, ls="--", label="averages begin")
+        over.set(ylim=(norm.vmin, norm.vmax), xlim=time[[0, -1]], yticks=[])
+        panel_title(axes, f"{tag} {heading}")
+        axes.set_ylabel("Cell" if axes is grid[0] else "")
+    over.legend(loc="upper left")
+    panels.colour_bar(figure, image, grid, "H(x, t) and line: H(t) (bit)", extend="both")
     return figure

@@ -1,7 +1,7 @@
 """What the pictures of sweeps are drawn from: ensembles, members with their fields, and how they are named."""
 
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -14,8 +14,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model
-from vipetsc.figures.drawing import Drawing
-from vipetsc.figures.panels import recorded_sites
+from vipetsc.figures.panels import ROMAN, recorded_sites
+from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_ensemble, open_run, whole_members
 from vipetsc.lattice import waves_at
@@ -25,24 +25,16 @@ LEVELS = ("Low", "Medium", "High")
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Study:
-    """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`."""
+Sweeps = Sequence[xr.Dataset]
+"""Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`."""
 
-    ensembles: tuple[xr.Dataset, ...]
-
-    @classmethod
-    def read(cls, folders: Iterable[Path]) -> Self:
-        """The sweeps among ``folders``; raises OSError or ValueError."""
-        return cls(tuple(open_ensemble(folder) for folder in folders if (folder / "ensemble.h5").exists()))
-
-    def measuring(self, measure: str) -> "Study":
-        """The same without the sweeps that do not take the ``measure``."""
-        return Study(tuple(e for e in self.ensembles if measure in table(e)["sweep"]["measures"]))
+SweepFigure = Callable[[Sweeps], Iterator[Drawing]]
+"""Offers the drawings that the data of sweeps allow, each with a suffix for its file's name."""
 
 
-StudyFigure = Callable[[Study], Iterator[Drawing]]
-"""Offers the drawings that the data of a study allow, each with a suffix for its file's name."""
+def read_sweeps(folders: Iterable[Path]) -> Sweeps:
+    """The finished sweeps among ``folders``; raises OSError or ValueError."""
+    return [open_ensemble(folder) for folder in folders if (folder / "ensemble.h5").exists()]
 
 
 @dataclass(frozen=True)
@@ -72,9 +64,9 @@ class MeasuredRun:
         return self.case.drive.amplitude
 
 
-def transfer_members(study: Study) -> Iterator[MeasuredRun]:
+def transfer_members(sweeps: Sweeps) -> Iterator[MeasuredRun]:
     """The whole members with sites and a band above the driven one, each open until the next is asked for."""
-    for ensemble in study.ensembles:
+    for ensemble in sweeps:
         for _, folder in whole_members(ensemble):
             with MeasuredRun.open(folder) as member:
                 # The transfer of a lattice without a higher band is not a number.
@@ -101,7 +93,7 @@ class Wave(NamedTuple):
 class AmplitudeSeries:
     """One configuration at a low, a medium and a high amplitude.
 
-    ``suffix`` tells it from the others of a study; ``varied`` are the values of what else the sweep varies.
+    ``suffix`` tells it from the others of the sweeps; ``varied`` are the values of what else the sweep varies.
     """
 
     suffix: str
@@ -120,10 +112,11 @@ class AmplitudeSeries:
         parts = [f"{case.lattice.reading.capitalize()} reading", *self.varied, counted(len(sites_of(case)), "site")]
         return ", ".join(parts + ([f"κ* = {in_pi(self.wave.wavenumber)}"] if self.wave.band else []))
 
-    def headings(self) -> Iterator[tuple[int, MeasuredRun, str]]:
-        """Column, run and the column's title."""
-        for column, (level, member) in enumerate(zip(LEVELS, self.runs, strict=True)):
-            yield column, member, f"{level} amplitude, {member.amplitude:g} N"
+    def headings(self, row: int | None = None) -> Iterator[tuple[str, MeasuredRun, str]]:
+        """For each column of a figure: the tag of its panel in a ``row``, such as "(a.ii)", the run, its heading."""
+        for column, level, member in zip("abc", LEVELS, self.runs, strict=True):
+            tag = f"({column})" if row is None else f"({column}.{ROMAN[row]})"
+            yield tag, member, f"{level} amplitude, {member.amplitude:g} N"
 
     def snapshot_times(self) -> np.ndarray:
         """Four times in s, from the linear wave: half way to the first site, at it, past the last, near the end.
@@ -139,16 +132,16 @@ class AmplitudeSeries:
 
 def from_series(
     *needs: str, wave: bool = False, sites: bool = False
-) -> Callable[[Callable[[AmplitudeSeries], Figure]], StudyFigure]:
+) -> Callable[[Callable[[AmplitudeSeries], Figure]], SweepFigure]:
     """Decorator of a figure of an `AmplitudeSeries`: offers one picture a series whose analyses hold ``needs``.
 
     Of those only series that drive a ``wave`` of a pass band, or that recorded contact ``sites`` and cells beside them.
     """
 
-    def decorate(page: Callable[[AmplitudeSeries], Figure]) -> StudyFigure:
+    def decorate(page: Callable[[AmplitudeSeries], Figure]) -> SweepFigure:
         @wraps(page)
-        def offer(study: Study) -> Iterator[Drawing]:
-            for series in series_of(study, *needs):
+        def offer(sweeps: Sweeps) -> Iterator[Drawing]:
+            for series in series_of(sweeps, *needs):
                 run = series.runs[0].run
                 has_sites = len(recorded_sites(run)) > 0 and run.sizes["cell"] > 1
                 if (series.wave.band or not wave) and (has_sites or not sites):
@@ -159,22 +152,20 @@ def from_series(
     return decorate
 
 
-def series_of(study: Study, *needs: str) -> Iterator[AmplitudeSeries]:
+def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
     """Every configuration of the sweeps with full fields at its lowest, middle and highest amplitude.
 
     ``needs`` names what their analyses must hold. Files are open until the next one is asked for.
     """
-    measured = [(ensemble, triples) for ensemble in study.ensembles if (triples := _triples(ensemble))]
-    for ensemble, triples in measured:
-        for triple in triples:
-            with ExitStack() as stack:
-                runs = tuple(stack.enter_context(MeasuredRun.open(folder)) for _, folder in triple)
-                if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
-                    first = triple[0][0]
-                    names = set(axes(ensemble)) - {AMPLITUDE, "reading", "wavenumber", "sites"}
-                    values = [(name, first[name].item()) for name in axes(ensemble) if name in names]
-                    varied = tuple(value if isinstance(value, str) else f"{name} {value:g}" for name, value in values)
-                    yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), runs, varied)
+    measured = [(ensemble, triples) for ensemble in sweeps if (triples := _triples(ensemble))]
+    for ensemble, triple in ((ensemble, triple) for ensemble, triples in measured for triple in triples):
+        with ExitStack() as stack:
+            runs = tuple(stack.enter_context(MeasuredRun.open(folder)) for _, folder in triple)
+            if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
+                first = triple[0][0]
+                others = [name for name in axes(ensemble) if name not in (AMPLITUDE, "reading", "wavenumber", "sites")]
+                varied = tuple(_in_words(first, name, " ") for name in others)
+                yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), runs, varied)
 
 
 def _triples(ensemble: xr.Dataset) -> list[list[tuple[xr.Dataset, Path]]]:
@@ -185,6 +176,12 @@ def _triples(ensemble: xr.Dataset) -> list[list[tuple[xr.Dataset, Path]]]:
     rows = grouped(whole_members(ensemble), lambda pair: repr([pair[0][name].item() for name in others]))
     ordered = [sorted(row, key=lambda pair: pair[0][AMPLITUDE].item()) for row in rows.values()]
     return [[row[0], row[len(row) // 2], row[-1]] for row in ordered if len(row) >= len(LEVELS)]
+
+
+def _in_words(member: xr.Dataset, name: str, joint: str) -> str:
+    """The value of a swept key; a number after the key's name."""
+    value = member[name].item()
+    return value if isinstance(value, str) else f"{name}{joint}{value:g}"
 
 
 def table(ensemble: xr.Dataset) -> dict[str, Any]:
@@ -216,9 +213,8 @@ def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collecti
     for name in axes(ensemble):
         tells = name in ("reading", "wavenumber") or ensemble.sizes[name] > 1
         if name != AMPLITUDE and tells and (dims is None or name in dims):
-            value = member[name].item()
-            text = value if isinstance(value, str) else f"{name}-{value:g}"
-            text = in_pi(value).replace("π", "pi").replace("/", "-") if name == "wavenumber" else text
+            wave = name == "wavenumber"
+            text = in_pi(member[name].item()).replace("π", "pi") if wave else _in_words(member, name, "-")
             parts.append("".join(c if c.isalnum() or c in "-." else "-" for c in text))
     return "-".join(parts)
 

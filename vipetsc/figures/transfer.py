@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,9 @@ from matplotlib.figure import Figure, SubFigure
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.panels import KAPPA, panel_title
-from vipetsc.figures.study import Labels, MeasuredRun, Study, grouped, transfer_members
+from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, transfer_members
+from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
@@ -29,9 +30,9 @@ LARGEST_ERROR = 0.01
 LEAST_SHARE = 1e-3  # of the largest total: the error is not judged below
 
 
-def transfer(study: Study) -> Iterator[Drawing]:
+def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
     """For every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
-    for member in transfer_members(study):
+    for member in transfer_members(sweeps):
         if "velocity" in member.run and all(name in member.analysis for name in ("kinetic_energy", *SEGMENTS)):
             yield Labels.of(member.case).member_stem, partial(nine_panels, member)
 
@@ -42,7 +43,7 @@ def nine_panels(member: MeasuredRun) -> Figure:
     velocity = run["velocity"].values
     figure = style.new_figure(style.PAGE, 7.6, Labels.of(member.case).member, left=True)
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
-    letters = iter("abcdefghijklmnopqrstuvwxyz")
+    letters = iter(ascii_lowercase)
     _space_time(upper, member, velocity, letters)
     _dispersions(middle, member, letters)
     cells = INPUT_CELL, member.model.chain.cells // 2
@@ -117,11 +118,11 @@ def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
     shown = frequency <= 1.1e-3 * bands[-1].high
     panels.shade_bands(axes, ((band.low, band.high) for band in bands), "x")
     for band in bands:
-        axes.annotate(str(band.number), (0.5e-3 * (band.low + band.high), 0), (0, 2), ha="center", color=style.GREY,
-                      xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=6.5)  # fmt: skip
+        panels.note(axes, str(band.number), (0.5e-3 * (band.low + band.high), 0), (0, 2), ha="center", color=style.GREY,
+                    xycoords=("data", "axes fraction"))  # fmt: skip
     inset = axes.inset_axes([0.42, 0.70, 0.56, 0.28])
     roles = {cell.host: " (host)", cell.resonator: " (resonator)"}
-    for j, colour in enumerate(panels.colours(cell.dofs)):
+    for j, colour in zip(range(cell.dofs), cycle(style.SERIES), strict=False):
         line = {"color": colour, "lw": 0.5, "alpha": 0.85, "rasterized": True}
         label = f"mass {j + 1}{roles.get(j, '')}"
         axes.plot(frequency[shown], np.maximum(spectrum[shown, j], 1e-300), label=label, **line)
@@ -137,9 +138,9 @@ def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
     inset.set_xlabel("s", fontsize=5.5, labelpad=-4, loc="right")
 
 
-def transfer_dispersions(study: Study) -> Iterator[Drawing]:
+def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
     """Every reading and configuration: laws in rows, amplitudes in columns."""
-    members = ((m.case, m.folder) for m in transfer_members(study) if "dispersion" in m.analysis)
+    members = ((m.case, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis)
     for name, group in grouped(members, lambda pair: Labels.of(pair[0]).page_stem).items():
         yield name, partial(_dispersion_table, group)
 
@@ -167,12 +168,12 @@ def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
     return figure
 
 
-def band_energies(study: Study) -> Iterator[Drawing]:
+def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
     """Energies of all parts and their sum over time for every whole member; mean shares for every sweep."""
-    for member in transfer_members(study):
+    for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and member.analysis.sizes["time"] > 1:
             yield Labels.of(member.case).member_stem, partial(energies_over_time, member)
-    with_shares = (curve for curve in transfer_curves(study) if "bands/share" in curve.data)
+    with_shares = (curve for curve in transfer_curves(sweeps) if "bands/share" in curve.data)
     for name, curves in grouped(with_shares, lambda curve: Labels.of(curve.case).page_stem).items():
         yield f"shares-{name}", partial(shares, curves)
 

@@ -12,15 +12,14 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import style
-from vipetsc.figures.drawing import Drawing
 from vipetsc.figures.panels import label_outer, panel_title, shade_regions
-from vipetsc.figures.study import AMPLITUDE, Labels, Study, grouped, sites_of
+from vipetsc.figures.study import AMPLITUDE, Labels, Sweeps, grouped, sites_of
+from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves
 
 LINES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.PURPLE, "D"), (style.ORANGE, "v"))
 FEWEST = 6  # amplitudes that make a curve
-RED = "#CC0000"
 
 
 class TransferCurve(NamedTuple):
@@ -48,9 +47,9 @@ class AlignedCurve(NamedTuple):
 Curve = TypeVar("Curve", TransferCurve, AlignedCurve)
 
 
-def transfer_curves(study: Study) -> Iterator[TransferCurve]:
+def transfer_curves(sweeps: Sweeps) -> Iterator[TransferCurve]:
     """The curves of all sweeps with at least ``FEWEST`` amplitudes whose transfer is known."""
-    for ensemble in study.ensembles:
+    for ensemble in sweeps:
         for row, folder in curves(ensemble, AMPLITUDE) if "ibtet" in ensemble else ():
             case, data = Case.load(folder / "case.toml"), row.sortby(AMPLITUDE)
             transfer = data["ibtet"].values
@@ -78,9 +77,9 @@ def columns_of_laws(
     return figure
 
 
-def ibtet(study: Study) -> Iterator[Drawing]:
+def ibtet(sweeps: Sweeps) -> Iterator[Drawing]:
     """One page a reading: laws in columns, linear and log-log scales in rows."""
-    for reading, of_reading in grouped(transfer_curves(study), lambda curve: curve.case.lattice.reading).items():
+    for reading, of_reading in grouped(transfer_curves(sweeps), lambda curve: curve.case.lattice.reading).items():
         yield reading, partial(_page, reading, of_reading)
 
 
@@ -130,9 +129,9 @@ def _draw(axes: Axes, shown: Sequence[TransferCurve], kinds: dict[str, tuple[str
             axes.axhline(curve.floor, color=colour, lw=0.6, ls=(0, (4, 3)), zorder=1)
 
 
-def ibtet_backbone(study: Study) -> Iterator[Drawing]:
+def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
     """Every reading and configuration of ``backbone.h5``, laws in columns; one made of another sweep is passed over."""
-    for ensemble in study.ensembles:
+    for ensemble in sweeps:
         path = Path(ensemble.attrs["folder"]) / "backbone.h5"
         aligned = _aligned_curves(path, ensemble.attrs["case"]) if path.exists() else []
         ylabel = "Inter-band transfer, normalised slope (1)"
@@ -167,7 +166,7 @@ def _superposition(axes: Axes, aligned: AlignedCurve) -> str:
     label = f"slope, $E^{{{curve['slope_exponent']:.2f}}}$ there"
     axes.plot(branch, np.where(scaled > 0, scaled, np.nan), color=style.BLACK, lw=0.8, ls=style.DASHED, label=label)
     axes.plot(energy, transfer, "-o", color=style.BLUE, ms=2.6, mfc="white", mew=0.6, lw=0.6, label="lattice")
-    axes.plot(energy[fitted], transfer[fitted], "o", color=RED, ms=2.8, label="in region III")
+    axes.plot(energy[fitted], transfer[fitted], "o", color=style.RED, ms=2.8, label="in region III")
     label = f"$E^{{{curve['exponent']:.2f}}}$, adj. $R^2$ {curve['r2_adjusted']:.3f}"
     law = curve["factor"] * energy[fitted] ** curve["exponent"]
     axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4, label=label)

@@ -12,9 +12,9 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case
-from vipetsc.figures.drawing import Drawing
+from vipetsc.figures.lattice import lattice_page, reduced_model
 from vipetsc.figures.registry import FIGURES, drawings
-from vipetsc.figures.schematics import lattice_page, reduced_model
+from vipetsc.figures.style import Drawing
 from vipetsc.lattice.presets import PRESETS
 
 READINGS = "calibrated", "printed"

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.figures import style
-from vipetsc.figures.drawing import Drawing, draw_each
+from vipetsc.figures.style import Drawing, draw_each
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import PAPER, claim_folder, provenance
 from vipetsc.paper.figures import TRANSFER
