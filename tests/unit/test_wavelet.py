@@ -104,7 +104,7 @@ def test_nodes_span_the_log_grid():
     assert nodes.kappa[[0, -1]] == pytest.approx([np.pi / 60, np.pi * 5 / 3])
     assert np.diff(np.log(nodes.kappa)) == pytest.approx(np.full(len(nodes.kappa) - 1, nodes.weight))
     assert nodes.weight <= np.log(2) / 4
-    of = Nodes.log(6.0).bins()
+    of = Nodes.log(6.0).bins
     kappa = Nodes.log(6.0).kappa
     assert set(of) == set(range(BINS))
     assert np.all(of[kappa > np.pi] == BINS - 1)

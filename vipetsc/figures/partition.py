@@ -150,7 +150,7 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     signal = member.run["velocity"][sample, :, member.model.chain.cell.host].values
     nodes = Nodes.log(KC)
     wavelets = transform(signal, nodes.kappa, KC)
-    parts = inverse(wavelets, nodes, KC, len(field))[:, : len(cells)]
+    parts = inverse(wavelets, nodes, KC)[:, : len(cells)]
     bins = shown_bins(series.wave.wavenumber, len(field), EXPLAINED)
     colours = bin_colours(len(field))
 

@@ -64,8 +64,8 @@ class Parts:
 def split(signal: np.ndarray, interval: float, edges: ArrayLike) -> Iterator[np.ndarray]:
     """The parts of ``signal`` (t, ...) sampled every ``interval`` s, between consecutive ``edges`` (rad/s).
 
-    Yields one array of the signal's shape a part. They add up to the signal, and their mean squares over
-    time (trapezoidal rule) to its mean square.
+    Yields one array of the signal's shape a part. With edges from 0 to infinity they add up to the signal, and their
+    mean squares over time (trapezoidal rule) to its mean square.
     """
     nt = len(signal)
     spectrum = fft.dct(signal, type=1, axis=0)
@@ -96,13 +96,10 @@ def part_kinetic_energy(
     velocity: np.ndarray, masses: ArrayLike, interval: float, low: float, high: float
 ) -> np.ndarray:
     """Kinetic energy (t, cell) in J of what moves between the frequencies ``low`` and ``high`` (rad/s)."""
-    edges = [0.0, low, high, np.inf] if low > 0 else [0.0, high, np.inf]
-    wanted = len(edges) - 3
     energy = np.zeros(velocity.shape[:2])
     for j, mass in enumerate(np.asarray(masses)):
-        for p, part in enumerate(split(np.asarray(velocity[..., j]), interval, edges)):
-            if p == wanted:
-                energy += 0.5 * mass * part**2
+        (part,) = split(np.asarray(velocity[..., j]), interval, [low, high])
+        energy += 0.5 * mass * part**2
     return energy
 
 

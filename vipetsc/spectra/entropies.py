@@ -13,13 +13,12 @@ count in it as much as the others.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy import fft
 
 from vipetsc.compiled import njit
-from vipetsc.spectra.wavelet import padded_length, wavelet_spectrum, wavenumbers
+from vipetsc.spectra.wavelet import padded_length, transform_filters
 
 NODES = 60
 CHUNK = 4  # snapshots that are transformed together
@@ -77,10 +76,10 @@ def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES)
         exponent = np.frexp(largest)[1]
         signal = np.ldexp(signal, -exponent[:, None])
         total, s_log_s = np.zeros(signal.shape), np.zeros(signal.shape)
-        for octave in _octaves(cells, kc, nodes):
-            spectrum = fft.rfft(signal, octave.length)
-            for low, filters in octave.filters:
-                x = np.empty((len(signal), len(filters), octave.length), dtype=complex)
+        for length, groups in _octaves(cells, kc, nodes):
+            spectrum = fft.rfft(signal, length)
+            for low, filters in groups:
+                x = np.empty((len(signal), len(filters), length), dtype=complex)
                 _filter(spectrum, filters, low, x)
                 _accumulate(fft.ifft(x, overwrite_x=True), total, s_log_s)
         _entropies(total, s_log_s, local[rows])
@@ -88,31 +87,25 @@ def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES)
     return local, weight
 
 
-class _Octave(NamedTuple):
-    """Nodes that share a padded ``length``; for groups of them the band's first row and the filters from there on."""
-
-    length: int
-    filters: list[tuple[int, np.ndarray]]
-
-
 @lru_cache(maxsize=8)
-def _octaves(cells: int, kc: float, nodes: int) -> tuple[_Octave, ...]:
-    """All nodes, those within an octave together: the lowest of them sets the padding for all."""
+def _octaves(cells: int, kc: float, nodes: int) -> list[tuple[int, list[tuple[int, np.ndarray]]]]:
+    """For each octave of nodes the padded length, which its lowest node sets, and its filters.
+
+    The filters come in groups: the first row of the band where any of them lets something through, and their rows
+    (kappa, band) from there on.
+    """
     kappa = np.pi * np.arange(1, nodes + 1) / nodes
     octaves = []
     for number in range(int(np.log2(nodes)) + 1):
         some = kappa[2**number - 1 : 2 ** (number + 1) - 1]
-        octave = _Octave(padded_length(cells, kc, some[0]), [])
-        filters = np.sqrt(kc / some)[:, None] * wavelet_spectrum(some, kc, wavenumbers(octave.length))
-        if octave.length % 2 == 0:
-            filters[:, -1] *= 0.5
+        length, groups = padded_length(cells, kc, some[0]), []
+        filters = transform_filters(some, kc, length)
         for first in range(0, len(some), GROUP):
             group = filters[first : first + GROUP]
             inside = np.flatnonzero(group.max(axis=0) > np.finfo(float).eps * group.max())
-            low, high = int(inside[0]), int(inside[-1]) + 1
-            octave.filters.append((low, np.ascontiguousarray(group[:, low:high])))
-        octaves.append(octave)
-    return tuple(octaves)
+            groups.append((int(inside[0]), np.ascontiguousarray(group[:, inside[0] : inside[-1] + 1])))
+        octaves.append((length, groups))
+    return octaves
 
 
 @njit("void(c16[:,::1], f8[:,::1], i8, c16[:,:,::1])")

@@ -36,13 +36,13 @@ class PowerLaw:
         return np.asarray(self.factor * np.asarray(x, dtype=float) ** self.exponent)
 
 
-def r2_adjusted(y: ArrayLike, fitted: ArrayLike, parameters: int = 2) -> float:
-    """1 - (1 - R^2)(n - 1)/(n - p) of a fit with p ``parameters``, the constant among them; NaN if y is constant."""
+def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
+    """1 - (1 - R^2)(n - 1)/(n - 2) of a fit with two parameters, a constant among them; NaN if y is constant."""
     y, fitted = np.asarray(y, dtype=float), np.asarray(fitted, dtype=float)
     scatter = np.sum((y - y.mean()) ** 2)
     if scatter == 0:
         return float("nan")
-    return float(1 - np.sum((y - fitted) ** 2) / scatter * (len(y) - 1) / (len(y) - parameters))
+    return float(1 - np.sum((y - fitted) ** 2) / scatter * (len(y) - 1) / (len(y) - 2))
 
 
 def _interval(value: float, deviation: float, freedom: int) -> tuple[float, float]:
@@ -81,14 +81,8 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     deviation = float(np.sqrt(variance / (u @ u)))
     at_one = cy - slope * cx
     low, high = _interval(at_one, float(np.sqrt(variance / len(x) + (cx * deviation) ** 2)), freedom)
-    return PowerLaw(
-        float(np.exp(at_one)),
-        slope,
-        r2_adjusted(v, slope * u),
-        (float(np.exp(low)), float(np.exp(high))),
-        _interval(slope, deviation, freedom),
-        len(x),
-    )
+    intervals = (float(np.exp(low)), float(np.exp(high))), _interval(slope, deviation, freedom)
+    return PowerLaw(float(np.exp(at_one)), slope, r2_adjusted(v, slope * u), *intervals, len(x))
 
 
 def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float) -> PowerLaw:
@@ -106,18 +100,13 @@ def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float)
     except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
         nan = float("nan")
         return PowerLaw(nan, nan, nan, (nan, nan), (nan, nan), len(u))
-    freedom = len(u) - 2
     # The factor's deviation by linear propagation from (c, b) to a.
     factor = c * np.exp(cy - b * cx)
     of_factor = np.array([factor / c, -cx * factor])
-    return PowerLaw(
-        float(factor),
-        float(b),
-        r2_adjusted(w, law(u, c, b)),
-        _interval(float(factor), float(np.sqrt(of_factor @ covariance @ of_factor)), freedom),
-        _interval(float(b), float(np.sqrt(covariance[1, 1])), freedom),
-        len(u),
-    )
+    deviations = float(np.sqrt(of_factor @ covariance @ of_factor)), float(np.sqrt(covariance[1, 1]))
+    values = float(factor), float(b)
+    intervals = (_interval(*estimate, len(u) - 2) for estimate in zip(values, deviations, strict=True))
+    return PowerLaw(*values, r2_adjusted(w, law(u, c, b)), *intervals, len(u))
 
 
 def from_peak(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:

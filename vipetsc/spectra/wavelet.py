@@ -1,4 +1,4 @@
-"""Morlet wavelets in space: transform, inverse per wavenumber bin, and the equivalent bank of FFT filters.
+"""Morlet wavelets in space: transform, inverse per wavenumber bin, the equivalent bank of FFT filters, bin energies.
 
 The paper's Eqs. (A4)-(A7), made consistent: the wavelet of the node kappa is Psi(kc eta/kappa), Psi(s) =
 exp(-(s - kc)^2 / 2), over the wavenumbers 0 < eta <= pi alone. A real signal is twice the real part of what its
@@ -16,8 +16,9 @@ from scipy import fft
 LOWEST = np.pi / 60
 """Lowest node in rad per cell; what lies below it belongs to the first bin."""
 
-BINS = 12
-VOICES = 256
+BINS = 12  # wavenumber bins of equal width in [0, pi]
+VOICES = 256  # nodes an octave
+CHUNK = 16  # snapshots that are partitioned together
 
 Normalisation = Literal["analytic", "dual"]
 
@@ -42,9 +43,10 @@ class Nodes:
         kappa = LOWEST * ratio ** (np.arange(steps + 1) / steps)
         return cls(kappa, float(np.log(ratio) / steps))
 
-    def bins(self, count: int = BINS) -> np.ndarray:
-        """Bin (node) of every node, from 0: edges k pi/count, all nodes above pi in the last."""
-        return np.minimum((self.kappa * count / np.pi).astype(int), count - 1)
+    @property
+    def bins(self) -> np.ndarray:
+        """Bin (node) of every node, from 0: edges k pi/BINS, all nodes above pi in the last."""
+        return np.minimum((self.kappa * BINS / np.pi).astype(int), BINS - 1)
 
 
 def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
@@ -82,6 +84,14 @@ def wavenumbers(length: int) -> np.ndarray:
     return 2 * np.pi * np.arange(length // 2 + 1) / length
 
 
+def transform_filters(kappa: np.ndarray, kc: float, length: int) -> np.ndarray:
+    """sqrt(kc/kappa) Psi(kc eta/kappa) (kappa, k) over the wavenumbers of a real transform of ``length``."""
+    filters = np.sqrt(kc / kappa)[:, None] * wavelet_spectrum(kappa, kc, wavenumbers(length))
+    if length % 2 == 0:
+        filters[:, -1] *= 0.5
+    return filters
+
+
 def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | None = None) -> np.ndarray:
     """Complex wavelet transform X (..., kappa, x), Eq. (A5), of real signals (..., cell); X in the signal's unit.
 
@@ -94,15 +104,12 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
     length = padded_length(cells, kc, float(kappa.min())) if length is None else length
     if length < cells:
         raise ValueError(f"length = {length}: below the {cells} cells of the signal")
-    filters = np.sqrt(kc / kappa)[:, None] * wavelet_spectrum(kappa, kc, wavenumbers(length))
-    if length % 2 == 0:
-        filters[:, -1] *= 0.5
     spectrum = np.zeros((*signal.shape[:-1], len(kappa), length), dtype=complex)
-    spectrum[..., : length // 2 + 1] = fft.rfft(signal, length)[..., None, :] * filters
+    spectrum[..., : length // 2 + 1] = fft.rfft(signal, length)[..., None, :] * transform_filters(kappa, kc, length)
     return fft.ifft(spectrum, overwrite_x=True)
 
 
-def inverse(x: np.ndarray, nodes: Nodes, kc: float, bins: int = BINS) -> np.ndarray:
+def inverse(x: np.ndarray, nodes: Nodes, kc: float) -> np.ndarray:
     """Parts (bin, ..., x), Eq. (A7), of the signals whose transform at ``nodes`` is ``x`` (..., kappa, x), uncropped.
 
     u_b = 2 Re (1/C) sum over the nodes of bin b of (dkappa/kappa) sqrt(kappa/kc) IFFT[FFT(X) Psi(kc eta/kappa)].
@@ -114,8 +121,8 @@ def inverse(x: np.ndarray, nodes: Nodes, kc: float, bins: int = BINS) -> np.ndar
     if length % 2 == 0:
         filters[:, -1] *= 2
     spectrum = fft.fft(x)[..., : length // 2 + 1] * filters
-    bin_of = nodes.bins(bins)
-    return np.stack([fft.irfft(spectrum[..., bin_of == b, :].sum(axis=-2), length) for b in range(bins)])
+    bin_of = nodes.bins
+    return np.stack([fft.irfft(spectrum[..., bin_of == b, :].sum(axis=-2), length) for b in range(BINS)])
 
 
 @dataclass(frozen=True)
@@ -146,21 +153,83 @@ def filter_bank(
     kc: float = 6.0,
     normalisation: Normalisation = "analytic",
     *,
-    bins: int = BINS,
     voices: float = VOICES,
     length: int | None = None,
 ) -> Bank:
-    """The bank of ``bins`` filters for lattices of ``cells``, padded to ``length`` (``padded_length``)."""
+    """The bank of filters of all bins for lattices of ``cells``, padded to ``length`` (``padded_length``)."""
     if normalisation not in ("analytic", "dual"):
         raise ValueError(f"normalisation = {normalisation!r}: analytic or dual")
     length = padded_length(cells, kc) if length is None else length
     nodes, eta = Nodes.log(kc, voices), wavenumbers(length)
     gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, eta) ** 2
-    bin_of = nodes.bins(bins)
-    transfer = np.stack([gain[bin_of == b].sum(axis=0) for b in range(bins)])
+    bin_of = nodes.bins
+    transfer = np.stack([gain[bin_of == b].sum(axis=0) for b in range(BINS)])
     if normalisation == "dual":
         low = eta < LOWEST
         transfer[:, ~low] /= transfer[:, ~low].sum(axis=0)
-        transfer[:, low] = np.arange(bins)[:, None] == 0
+        transfer[:, low] = np.arange(BINS)[:, None] == 0
     transfer.flags.writeable = False
     return Bank(transfer, cells, length)
+
+
+@dataclass(frozen=True)
+class Partition:
+    """Kinetic energies in J of the parts v_b of a velocity field.
+
+    ``energy`` (bin, t) summed over the lattice, ``field`` (bin, t, cell) or None, ``kinetic`` (t) of the velocities
+    themselves, ``reconstructed`` (t): KE_rec = 1/2 sum m (sum_b v_b)^2.
+    """
+
+    energy: np.ndarray
+    field: np.ndarray | None
+    kinetic: np.ndarray
+    reconstructed: np.ndarray
+
+    @property
+    def error(self) -> np.ndarray:
+        """e (t) = |KE_rec - KE| / KE (the paper's Eq. (A8)), 0 at rest."""
+        return _share(np.abs(self.reconstructed - self.kinetic), self.kinetic)
+
+    @property
+    def cross_share(self) -> np.ndarray:
+        """1 - sum_b KE_b / KE (t): the energy in products of different parts, 0 at rest."""
+        return _share(self.kinetic - self.energy.sum(axis=0), self.kinetic)
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0)
+
+
+def partition(
+    velocity: np.ndarray,
+    masses: ArrayLike,
+    kc: float = 6.0,
+    normalisation: Normalisation = "analytic",
+    *,
+    fields: bool = False,
+) -> Partition:
+    """Partition the kinetic energy of ``velocity``, (t, cell) or (t, cell, dof) in m/s, by wavenumber bins.
+
+    ``masses`` in kg, (dof) or a scalar. A few snapshots at a time are held, so ``velocity`` may be an HDF5
+    dataset. With ``fields`` the energies in space-time are kept too.
+    """
+    mass_list = np.atleast_1d(np.asarray(masses, dtype=float))
+    nt, cells = velocity.shape[:2]
+    if mass_list.shape != (velocity.shape[2:] or (1,)):
+        raise ValueError(f"masses: {len(mass_list)} given for velocities of shape {velocity.shape}")
+    bank = filter_bank(cells, kc, normalisation)
+    energy, kinetic, reconstructed = np.zeros((BINS, nt)), np.zeros(nt), np.zeros(nt)
+    field = np.zeros((BINS, nt, cells)) if fields else None
+    for first in range(0, nt, CHUNK):
+        rows = slice(first, min(first + CHUNK, nt))
+        block = np.asarray(velocity[rows], dtype=float).reshape(-1, cells, len(mass_list))
+        for j, mass in enumerate(mass_list):
+            of_mass = np.ascontiguousarray(block[..., j])
+            parts = bank.split(of_mass)
+            whole = parts.sum(axis=0)
+            kinetic[rows] += 0.5 * mass * np.einsum("tc,tc->t", of_mass, of_mass)
+            energy[:, rows] += 0.5 * mass * np.einsum("btc,btc->bt", parts, parts)
+            reconstructed[rows] += 0.5 * mass * np.einsum("tc,tc->t", whole, whole)
+            if field is not None:
+                field[:, rows] += 0.5 * mass * parts**2
+    return Partition(energy, field, kinetic, reconstructed)
