@@ -1,5 +1,5 @@
 """The command line; no numerics here. The manual describes verbs and options.
 
-``main`` holds arguments and exit codes, ``verbs`` what each verb does, ``plot`` which pictures a folder gets;
-``tables``, ``branches`` and ``doctor`` what is printed.
+``main`` holds arguments and exit codes, ``verbs`` what each verb does, ``plot`` which pictures a folder gets,
+``tables`` what is printed.
 """

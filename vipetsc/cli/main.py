@@ -64,24 +64,17 @@ class Parser(argparse.ArgumentParser):
 
 def main(arguments: list[str]) -> int:
     """Run the verb named in ``arguments`` on all ranks; returns the exit code."""
-    options = _parser().parse_args(_with_verb(arguments))
+    if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help", "--version")):
+        arguments = ["run", *arguments]  # of the built-in case
+    options = _parser().parse_args(arguments)
     try:
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
-        function: Verb = options.function
-        return function(options, MPI.COMM_WORLD)
+        code: int = options.function(options, MPI.COMM_WORLD)
+        return code
     except (CaseError, FolderError) as error:
         verbs.echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return verbs.BAD_INPUT
-
-
-def _with_verb(arguments: list[str]) -> list[str]:
-    """No verb means the built-in case, as ``run``."""
-    if arguments and arguments[0] in {*VERBS, "-h", "--help", "--version"}:
-        return arguments
-    if arguments and not arguments[0].startswith("-"):
-        return arguments  # argparse names the verbs
-    return ["run", *arguments]
 
 
 def _parser() -> Parser:

@@ -11,20 +11,11 @@ from vipetsc.parallel import on_every_rank, on_root
 _NOT_OURS = {"design": "design.h5: is not a search", "branches": "branch-*.h5: is not a branch"}
 
 
-def draw_folders(
-    paths: Sequence[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm
-) -> list[Path]:
-    """Draw runs, sweeps, branches or a search, whichever ``paths`` hold; ``names`` are figures of that kind.
-
-    Returns the files written, on rank 0. Raises FolderError for folders that hold nothing to draw or cannot share a
-    page, and for a figure that does not exist.
-    """
-    source, folders = on_root(comm, lambda: source_of(paths))
-    return draw_source(source, folders, names, formats, comm)
-
-
 def source_of(paths: Sequence[Path]) -> tuple[str, Sequence[Path]]:
-    """What the folders ``paths`` hold, and the folders themselves where files were named; raises FolderError."""
+    """Which of runs, sweeps, branches or a search ``paths`` hold, and the folders where files were named.
+
+    Raises FolderError for folders that cannot share a page.
+    """
     if all(any(path.glob("branch-*.h5")) and not (path / "run.h5").exists() for path in paths):
         return "branches", paths
     if (paths[0] / "ensemble.h5").exists():
@@ -37,9 +28,17 @@ def source_of(paths: Sequence[Path]) -> tuple[str, Sequence[Path]]:
 
 
 def draw_source(
-    source: str, folders: Sequence[Path], names: list[str] | None, formats: tuple[str, ...], comm: MPI.Comm
+    source: str,
+    folders: Sequence[Path],
+    comm: MPI.Comm,
+    names: list[str] | None = None,
+    formats: tuple[str, ...] = ("png",),
 ) -> list[Path]:
-    """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older."""
+    """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older.
+
+    ``names`` are figures of the kind ``source``. Returns the files written, on rank 0. Raises FolderError for folders
+    that hold nothing to draw, and for a figure that does not exist.
+    """
     from vipetsc.figures.registry import draw, figure_names
 
     def prepare() -> None:

@@ -1,21 +1,33 @@
-"""What the verbs print: tables of a case, its bands, and how runs and sweeps ended."""
+"""What the verbs print: tables of a case, its bands, an installation, and how runs, sweeps and branches ended."""
 
+import importlib
 import json
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+import math
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TextIO
 
+from mpi4py import MPI
+
+import h5py
 import numpy as np
 
-from vipetsc.case import Case, Model
+from vipetsc.case import Case
+from vipetsc.io.folder import provenance
 from vipetsc.io.store import GATHER_LIMIT
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
+    from vipetsc.modes.branch import Branch
+    from vipetsc.modes.point import Point
     from vipetsc.studies.sweep import SweepResult
 
 # Time of one step of the default method per mass and per step, measured on one 2020s core.
 _STEP_SECONDS, _STEP_SECONDS_PER_MASS = 2e-5, 7e-8
+
+MODULES = ("scipy", "matplotlib", "jinja2", "numba", "pydantic", "tqdm", "tomli_w", "xarray", "h5netcdf")
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
@@ -38,9 +50,8 @@ def bands_table(cell: UnitCell) -> dict[str, Any]:
     }
 
 
-def bands_report(cell: UnitCell) -> str:
+def bands_report(bands: dict[str, Any]) -> str:
     """``bands_table`` as text."""
-    bands = bands_table(cell)
     lines = ["band       low      high  rad/s    fastest: kappa/pi   rad/s   cells/s"]
     for row in bands["bands"]:
         best = row["max_group_velocity"]
@@ -76,8 +87,13 @@ def validate_table(case: Case, ranks: int) -> str:
     model = case.model()
     cell, chain, contact = model.chain.cell, model.chain, model.contact
     bands, waves = pass_bands(cell), waves_at(cell, model.drive.frequency)
-    size, steps = _size(case, model), _steps(model)
+    first, last = case.output.window or (1, case.lattice.cells)
+    columns = len(range(first - 1, last, case.output.every)) * cell.dofs * len(case.output.fields)
+    size = 8 * columns * -(-model.samples // case.output.stride)
+    # At least one step a sample, and the top band resolved.
+    steps = model.samples * max(np.ceil(model.sample_interval * bands[-1].high / 0.37), 1) * 1.3
     seconds = steps * (_STEP_SECONDS + _STEP_SECONDS_PER_MASS * chain.cells * cell.dofs / ranks)
+    duration = f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
     writer = case.output.writer
     if writer == "auto":
         writer = "parallel" if size > GATHER_LIMIT and ranks > 1 else "gather"
@@ -98,23 +114,10 @@ def validate_table(case: Case, ranks: int) -> str:
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("file size", f"{size / 2**20:.4g} MiB ({writer})"),
-        ("cost", f"about {steps:.3g} steps of engine ts, {_duration(seconds)} on {ranks} rank{'s' * (ranks > 1)}"
+        ("cost", f"about {steps:.3g} steps of engine ts, {duration} on {ranks} rank{'s' * (ranks > 1)}"
                  " before contacts"),
     ]  # fmt: skip
     return table(rows)
-
-
-def _size(case: Case, model: Model) -> int:
-    """Bytes of the recorded fields."""
-    first, last = case.output.window or (1, case.lattice.cells)
-    columns = len(range(first - 1, last, case.output.every)) * model.chain.cell.dofs * len(case.output.fields)
-    return 8 * columns * -(-model.samples // case.output.stride)
-
-
-def _steps(model: Model) -> float:
-    """Expected steps of the default method: at least one a sample, and the top band resolved."""
-    highest = pass_bands(model.chain.cell)[-1].high
-    return model.samples * max(np.ceil(model.sample_interval * highest / 0.37), 1) * 1.3
 
 
 def _first_few(items: Sequence[object]) -> str:
@@ -122,18 +125,12 @@ def _first_few(items: Sequence[object]) -> str:
     return "none" if not items else shown + (f", ... ({len(items)})" if len(items) > 8 else "")
 
 
-def _duration(seconds: float) -> str:
-    return f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
-
-
 def run_table(result: "Result") -> str:
     """How a run ended and its numbers."""
     s = result.statistics
     if s["engine"] == "propagator":
-        steps = (
-            f"{s['steps']} linear ({s['method']}, {s['bandwidth']} cells each way, exact to {s['truncation']:.1g}), "
-        )
-        steps += f"{s['substeps']} with forces"
+        steps = f"{s['steps']} linear ({s['method']}, {s['bandwidth']} cells each way, exact to {s['truncation']:.1g})"
+        steps += f", {s['substeps']} with forces"
     else:
         steps = f"{s['steps']} accepted, {s['rejected']} rejected ({s['method']}, {s['right_hand_side']})"
     limits = ", ".join(f"{name} {s[name]}" for name in ("grazes", "floored", "clipped", "pulled") if s[name])
@@ -149,3 +146,91 @@ def run_table(result: "Result") -> str:
     if "engine_note" in s:
         rows.append(("engine", f"{s['engine']}: {s['engine_note']}"))
     return f"{result.sentence}\n{table(rows)}"
+
+
+def branch_log(stream: TextIO) -> Callable[["Branch", "Point"], None]:
+    """A live table of growing branches: a line a point, no more than two a second."""
+    title = "branch           point      T (s)        E (J)  Newton  contacts  max multiplier\n"
+    last = -math.inf
+
+    def show(branch: "Branch", point: "Point") -> None:
+        nonlocal title, last
+        now = time.monotonic()
+        if now - last < 0.5:
+            return
+        stream.write(
+            f"{title}{branch.name:<14} {point.index:7d} {point.period:10.4e} {point.energy:12.6e} {point.newton:7d}"
+            f" {point.episodes:9d} {point.multiplier:15.6g}\n"
+        )
+        stream.flush()
+        title, last = "", now
+
+    return show
+
+
+def branch_table(branch: "Branch") -> str:
+    """How a branch went: length, range, special points, power laws, findings."""
+    regular = branch.regular()
+    lines = [f"{branch.name}: {len(regular)} points; {branch.ending}"]
+    if regular:
+        energy, frequency = branch.column("energy"), branch.column("frequency")
+        residual = max(p.residual for p in regular)
+        lines.append(
+            f"  E {energy.min():.6g} to {energy.max():.6g} J, f {frequency.min():.9g} to {frequency.max():.9g} Hz,"
+            f" largest residual {residual:.1e}"
+        )
+    special = [p for p in branch.points if p.kind != "regular"]
+    for kind in sorted({p.kind for p in special}):
+        of_kind = [p for p in special if p.kind == kind]
+        lines.append(f"  {kind}: {len(of_kind)}")
+        lines += [f"    E = {p.energy:.12g} J, f = {p.frequency:.11g} Hz" for p in of_kind[:4]]
+    for region, law in branch.fits().items():
+        lines.append(
+            f"  region {region}: df/dE ~ E^{law['exponent']:.4f}, adjusted R^2 {law['adjusted_r2']:.5f}"
+            f" ({law['points']} points)"
+        )
+    return "\n".join(lines + [f"  ! {finding}" for finding in branch.findings])
+
+
+def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
+    """The checks as a table, and whether all is well; all ranks must call it."""
+    from petsc4py import PETSc
+
+    scalar = np.dtype(PETSc.ScalarType)
+    parallel = "yes" if comm.size > 1 else "under mpirun"
+    # Name, value (None if it is missing), remedy.
+    checks = [
+        ("petsc scalars", str(scalar) if scalar == np.float64 else None, "a real double PETSc (Debian: petsc-dev)"),
+        ("parallel HDF5", parallel if comm.size == 1 or h5py.get_config().mpi else None,
+         "the MPI build of h5py (Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*)"),
+        ("mpirun", shutil.which("mpirun"), "apt install openmpi-bin"),
+    ]  # fmt: skip
+    for module in MODULES:
+        remedy = f"pip install --constraint scripts/constraints.txt {module.replace('_', '-')}"
+        checks.append((module, _version(module), remedy))
+    rows = [(name.replace("_version", ""), str(value)) for name, value in provenance(comm).items()]
+    rows += [(name, f"MISSING: {remedy}" if value is None else value) for name, value, remedy in checks]
+    rows.append(("native right-hand side", _native()))
+    hosts = comm.allgather(MPI.Get_processor_name())
+    rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
+    healthy = all(value is not None for _, value, _ in checks)
+    verdict = "all is well" if healthy else "something is missing, see above"
+    return f"{table(rows)}\n{verdict}", healthy
+
+
+def _version(module: str) -> str | None:
+    try:
+        return str(getattr(importlib.import_module(module), "__version__", "yes"))
+    except ImportError:
+        return None
+
+
+def _native() -> str:
+    """Whether the compiled right-hand side can be registered with PETSc."""
+    from vipetsc.dynamics.ts import native
+
+    try:
+        native.compile_callback()
+    except (AttributeError, OSError) as error:
+        return f"no, the Python one is used ({error})"
+    return "yes"

@@ -14,9 +14,8 @@ from mpi4py import MPI
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
 from vipetsc.case.reading import read_toml
-from vipetsc.cli.doctor import doctor_table
-from vipetsc.cli.plot import draw_folders, draw_source
-from vipetsc.cli.tables import bands_report, bands_table, run_table, sweep_table, validate_table
+from vipetsc.cli import tables
+from vipetsc.cli.plot import draw_source, source_of
 from vipetsc.io.atomic import write_text
 from vipetsc.parallel import StopRequest, on_root
 
@@ -43,7 +42,7 @@ def _load(kind: type[AnyCase], options: argparse.Namespace, comm: MPI.Comm) -> A
 
 
 def _output(options: argparse.Namespace, name: str) -> Path:
-    return Path(options.out or Path("runs") / name)
+    return options.out or Path("runs") / name
 
 
 def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
@@ -56,13 +55,13 @@ def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
         echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
     folder, stop = _output(options, case.name), StopRequest().install()
     result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
-    echo(comm, run_table(result))
+    echo(comm, tables.run_table(result))
     if result.resumable:
         return FAILED
     if case.output.fields and result.statistics["samples"] > 1:
         on_root(comm, lambda: measure_run(folder))
         if case.output.figures:
-            echo_paths(comm, draw_source("run", [folder], None, ("png",), comm))
+            echo_paths(comm, draw_source("run", [folder], comm))
     return DONE if result.complete else FAILED
 
 
@@ -73,24 +72,23 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
     plan = _load(Sweep, options, comm)
     folder = _output(options, plan.name)
     result = run_sweep(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
-    echo(comm, sweep_table(result))
+    echo(comm, tables.sweep_table(result))
     if plan.figures and (folder / "ensemble.h5").exists():
-        echo_paths(comm, draw_source("sweep", [folder], None, ("png",), comm))
+        echo_paths(comm, draw_source("sweep", [folder], comm))
     return DONE if result.complete else FAILED
 
 
 def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
-    from vipetsc.cli.branches import BranchLog, branch_table
     from vipetsc.modes.follow import follow_all, prepare_folder
 
     case = _load(NnmCase, options, comm)
     folder = _output(options, case.name)
     on_root(comm, lambda: prepare_folder(case, folder, options.force, options.resume))
-    branches = follow_all(case, folder, comm, options.resume, BranchLog(sys.stderr))
+    branches = follow_all(case, folder, comm, options.resume, tables.branch_log(sys.stderr))
     for branch in branches:
-        echo(comm, branch_table(branch))
-    echo_paths(comm, draw_source("branches", [folder], None, ("png",), comm))
+        echo(comm, tables.branch_table(branch))
+    echo_paths(comm, draw_source("branches", [folder], comm))
     failed = comm.bcast(any(branch.ending.startswith("failed") for branch in branches))
     return FAILED if failed else DONE
 
@@ -100,11 +98,10 @@ def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
     case = _load(Case, options, comm)
 
     def report() -> str:
-        lines = [validate_table(case, comm.size)]
+        lines = [tables.validate_table(case, comm.size)]
         if options.case is not None and "sweep" in read_toml(options.case):
             plan = Sweep.load(options.case, options.set)
-            members = plan.members()
-            counts = " x ".join(map(str, plan.shape))
+            members, counts = plan.members(), " x ".join(map(str, plan.shape))
             impossible = sum(member.case is None for member in members)
             lines.append(f"  sweep        {len(members)} members ({counts}), {impossible} of them impossible")
         return "\n".join(lines + [f"warning: {warning}" for warning in case.warnings()])
@@ -124,9 +121,10 @@ def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
         cell = case.unit_cell()
         folder.mkdir(parents=True, exist_ok=True)
         picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
-        text = json.dumps(bands_table(cell) | {"picture": str(picture)}, indent=2)
+        numbers = tables.bands_table(cell)
+        text = json.dumps(numbers | {"picture": str(picture)}, indent=2)
         write_text(folder / "bands.json", text + "\n")
-        return text if options.json else f"{bands_report(cell)}\n  {picture}"
+        return text if options.json else f"{tables.bands_report(numbers)}\n  {picture}"
 
     echo(comm, on_root(comm, report))
     return DONE
@@ -139,7 +137,7 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
     case = _load(DesignCase, options, comm)
     folder = _output(options, case.name)
     echo(comm, on_root(comm, lambda: search_design(case, folder, options.force)))
-    echo_paths(comm, draw_source("design", [folder], None, ("png",), comm))
+    echo_paths(comm, draw_source("design", [folder], comm))
     return DONE
 
 
@@ -153,7 +151,8 @@ def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Pictures of what folders hold again, from their files."""
-    echo_paths(comm, draw_folders(options.path, options.fig, tuple(options.format or ("png",)), comm))
+    source, folders = on_root(comm, lambda: source_of(options.path))
+    echo_paths(comm, draw_source(source, folders, comm, options.fig, tuple(options.format or ("png",))))
     return DONE
 
 
@@ -180,6 +179,6 @@ def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Versions, MPI, HDF5 and ranks; what is missing and how to get it."""
-    text, healthy = doctor_table(comm)
+    text, healthy = tables.doctor_table(comm)
     echo(comm, text)
     return DONE if healthy else FAILED

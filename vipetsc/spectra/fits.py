@@ -91,22 +91,21 @@ def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float)
     def law(u: np.ndarray, c: float, b: float) -> np.ndarray:
         return np.asarray(c * np.exp(b * u))
 
-    def gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
+    def slopes(u: np.ndarray, c: float, b: float) -> np.ndarray:
         return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
     tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
     try:
-        (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=gradient, **tolerances)
+        (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=slopes, **tolerances)
     except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
         nan = float("nan")
         return PowerLaw(nan, nan, nan, (nan, nan), (nan, nan), len(u))
     # The factor's deviation by linear propagation from (c, b) to a.
     factor = c * np.exp(cy - b * cx)
-    of_factor = np.array([factor / c, -cx * factor])
-    deviations = float(np.sqrt(of_factor @ covariance @ of_factor)), float(np.sqrt(covariance[1, 1]))
-    values = float(factor), float(b)
-    intervals = (_interval(*estimate, len(u) - 2) for estimate in zip(values, deviations, strict=True))
-    return PowerLaw(*values, r2_adjusted(w, law(u, c, b)), *intervals, len(u))
+    gradient = np.array([factor / c, -cx * factor])
+    of_factor = _interval(float(factor), float(np.sqrt(gradient @ covariance @ gradient)), len(u) - 2)
+    of_exponent = _interval(float(b), float(np.sqrt(covariance[1, 1])), len(u) - 2)
+    return PowerLaw(float(factor), float(b), r2_adjusted(w, law(u, c, b)), of_factor, of_exponent, len(u))
 
 
 def from_peak(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
