@@ -4,27 +4,16 @@ A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses
 """
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from vipetsc.case.checks import (
-    Checks,
-    check_drive,
-    check_lattice,
-    check_sampling,
-    check_sites,
-    check_stiffness,
-    too_coarse,
-)
-from vipetsc.case.reading import CaseFile, Problem, Table
-from vipetsc.case.resolve import resolved, wave_speed, with_preset
+from vipetsc.case.reading import CaseFile, Problem, Table, Valid
+from vipetsc.case.resolve import check_lattice, check_sites, resolved, site_cells, wave_speed, with_preset
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, TimeTable
-from vipetsc.lattice import waves_at
-from vipetsc.lattice.cell import UnitCell
-from vipetsc.lattice.chain import Chain, ToneBurst
-from vipetsc.lattice.contact import Contact
+from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
@@ -77,20 +66,24 @@ class Case(CaseFile):
         tables, samples = resolved(sections), sections["time"].samples
         if samples is not None:
             cell, interval = sections["lattice"].unit_cell(), tables["time"]["sample_interval"]
-            problems = too_coarse(cell, interval, "time.samples", samples)
+            problems = _too_coarse(cell, interval, "time.samples", samples)
         return tables, problems
 
     @classmethod
-    def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
+    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """What is wrong between keys."""
-        lattice, contacts, checks = sections["lattice"], sections["contacts"], Checks(invalid)
-        cell = check_lattice(checks, lattice)
-        if checks.valid("lattice.cells", "contacts.sites"):
-            check_sites(checks, lattice, contacts)
-            check_stiffness(checks, lattice, contacts)
-        check_drive(checks, sections["drive"], lattice, cell)
-        check_sampling(checks, sections["time"], sections["output"], cell, lattice.cells)
-        return checks.problems
+        lattice, contacts = sections["lattice"], sections["contacts"]
+        cell, problems = check_lattice(lattice) if valid("lattice") else (None, [])
+        yield from problems
+        if valid("lattice.cells", "contacts.sites"):
+            yield from check_sites(lattice, contacts)
+            yield from _check_stiffness(contacts, bool(site_cells(lattice, contacts)), valid)
+        length = lattice.cells if valid("lattice.cells") else None
+        yield from _check_drive(sections["drive"], length, cell, valid)
+        yield from _check_sampling(sections["time"], cell, valid)
+        window = sections["output"].window
+        if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
+            yield Problem("output.window", window, f"must be [first, last] within cells 1 to {length}")
 
     def unit_cell(self) -> UnitCell:
         """The unit cell, from the preset in its reading or from ``[lattice.cell]``."""
@@ -142,6 +135,57 @@ class Case(CaseFile):
         if model.end <= model.drive.duration:
             sentences.append(f"time.end = {model.end:.6g} s comes before the burst is over")
         return sentences
+
+
+def _check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
+    """The contact stiffness is given once: as a number, or by the material."""
+    material = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
+    given = [key for key, value in material.items() if value is not None]
+    missing = [key for key in material if key not in given]
+    if contacts.stiffness is not None and given:
+        yield Problem("contacts.stiffness", contacts.stiffness, f"give it or {', '.join(given)}, not both")
+    if contacts.stiffness is None and missing and any_sites and valid(*(f"contacts.{key}" for key in material)):
+        yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
+
+
+def _check_drive(drive: DriveTable, length: int | None, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
+    """The frequency is given in one way, and the driven mass exists."""
+    if valid("drive"):
+        by_band = drive.wavenumber is not None or drive.at is not None
+        ways = [way for way in (drive.frequency, drive.wavenumber, drive.at) if way is not None]
+        remedy = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
+        if len(ways) != 1:
+            yield Problem("drive.frequency", drive.frequency, remedy)
+        elif by_band != (drive.band is not None):
+            yield Problem("drive.band", drive.band, remedy)
+        if cell and drive.band is not None and drive.band > cell.dofs:
+            yield Problem("drive.band", drive.band, f"the cell has {cell.dofs} bands")
+    if length is not None and drive.cell > length:
+        yield Problem("drive.cell", drive.cell, f"outside the lattice; cells count from 1 to {length}")
+    if cell and drive.mass > cell.dofs:
+        yield Problem("drive.mass", drive.mass, f"the cell has {cell.dofs} masses")
+
+
+def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
+    """The samples resolve the bands, and there is one before the end."""
+    interval = time.sample_interval
+    if interval == "auto" or not valid("time.sample_interval"):
+        return
+    if cell:
+        yield from _too_coarse(cell, interval, "time.sample_interval", interval)
+    if time.samples is not None:
+        yield Problem("time.samples", time.samples, "give it or time.sample_interval, not both")
+    if time.end != "traverse" and time.end < interval:
+        yield Problem("time.end", time.end, "shorter than one sample interval")
+
+
+def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
+    """The problem of samples every ``interval`` s, asked for by ``key``, beyond the top band's Nyquist interval."""
+    nyquist = np.pi / pass_bands(cell)[-1].high
+    if interval < nyquist:
+        return []
+    given = "" if interval == value else f"an interval of {interval:.4g} s is "
+    return [Problem(key, value, f"{given}too coarse for the bands; the top band's Nyquist interval is {nyquist:.4g} s")]
 
 
 def case_id(case: Case) -> str:

@@ -1,11 +1,12 @@
 """The case of the verb ``design``: which (lambda, eta) are searched, in which readings."""
 
+from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.reading import CaseFile, Problem, Section, Table
+from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.schema import Positive
 
 LARGEST = 20_000_000  # Bloch problems (lambda, eta, kappa) of a reading whose bands fit in memory and on disk
@@ -62,19 +63,17 @@ class DesignCase(CaseFile):
         return fields, problems
 
     @classmethod
-    def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
+    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """What is wrong between the keys of a valid section."""
-        if invalid:
-            return []
-        design, problems = sections["design"], []
+        if not valid("design"):
+            return
+        design = sections["design"]
         for key, grid in (("lambda", design.lam), ("eta", design.eta)):
             if not grid.first < grid.last:
-                remedy = f"must be above design.{key}.first = {grid.first}"
-                problems.append(Problem(f"design.{key}.last", grid.last, remedy))
+                yield Problem(f"design.{key}.last", grid.last, f"must be above design.{key}.first = {grid.first}")
         if len(set(design.readings)) < len(design.readings):
-            problems.append(Problem("design.readings", design.readings, "name each reading once"))
+            yield Problem("design.readings", design.readings, "name each reading once")
         size = design.lam.count * design.eta.count * design.wavenumbers
         if size > LARGEST:
             remedy = f"times design.eta.count and design.wavenumbers it is {size}; at most {LARGEST} fit"
-            problems.append(Problem("design.lambda.count", design.lam.count, remedy))
-        return problems
+            yield Problem("design.lambda.count", design.lam.count, remedy)

@@ -3,13 +3,13 @@
 The system itself is built by ``vipetsc.modes.system.System.from_case``.
 """
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from vipetsc.case.checks import Checks, check_lattice, check_sites
-from vipetsc.case.reading import CaseFile, Problem, Section, Table
-from vipetsc.case.resolve import clearances, site_cells, with_default_preset
+from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
+from vipetsc.case.resolve import check_lattice, check_sites, clearances, site_cells, with_default_preset
 from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.presets import PRESETS
@@ -108,41 +108,31 @@ class NnmCase(CaseFile):
         return super().read(with_default_preset(table))
 
     @classmethod
-    def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
+    def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
         """What is wrong between keys."""
-        if invalid:
+        if not valid("lattice", "contacts", "nnm"):
             return []
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
-        checks = Checks(set())
-        remedy = 'a system of one\'s own needs "own" and [nnm.own]'
-        checks.require((nnm.system == "own") == (nnm.custom is not None), "nnm.system", nnm.system, remedy)
-        for key in ("energy", "frequency"):
-            low, high = getattr(nnm, key)
-            checks.require(low < high, f"nnm.{key}", [low, high], "must be [low, high]")
-        goes_down = nnm.direction != "up"
-        remedy = "going down needs a lowest energy above 0 (J)"
-        checks.require(not goes_down or nnm.energy[0] > 0, "nnm.energy", nnm.energy, remedy)
-        remedy = "must be below nnm.largest_step"
-        checks.require(nnm.smallest_step < nnm.largest_step, "nnm.smallest_step", nnm.smallest_step, remedy)
-        cell = None
+        problems, dofs = [*_check_options(nnm)], 2
         if nnm.system == "own":
-            dofs = _check_custom(checks, nnm.custom) if nnm.custom else 0
+            dofs = len(nnm.custom.masses) if nnm.custom else 0
         else:
-            cell = check_lattice(checks, lattice)
-            dofs = cell.dofs * lattice.cells if cell and nnm.system == "chain" else 2
+            cell, wrong = check_lattice(lattice)
+            problems += wrong
         if nnm.system == "chain":
-            sites = site_cells(lattice, contacts)
-            checks.require(bool(sites), "contacts.sites", sites, f"name cells from 1 to {lattice.cells}")
-            check_sites(checks, lattice, contacts)
+            dofs = cell.dofs * lattice.cells if cell else 2
+            if not site_cells(lattice, contacts):
+                problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
+            problems += check_sites(lattice, contacts)
         elif nnm.system == "reduced":
-            given = contacts.clearance
-            fits = not isinstance(given, list) or len(given) == 1
-            checks.require(fits, "contacts.clearance", given, "the reduced model has one contact")
-            missing = given is None and lattice.preset is None
-            checks.require(not missing, "contacts.clearance", None, "missing; give the clearance in m")
+            if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
+                problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
+            if contacts.clearance is None and lattice.preset is None:
+                problems.append(Problem("contacts.clearance", None, "missing; give the clearance in m"))
         beyond = [mode for mode in nnm.modes if mode > dofs]
-        checks.require(not beyond or bool(checks.problems), "nnm.modes", beyond, f"the system has {dofs} modes")
-        return checks.problems
+        if beyond and not problems:
+            problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))
+        return problems
 
     def physics(self) -> tuple[Any, ...]:
         """What a branch that is resumed must keep: the system, the shooting map and the flow."""
@@ -151,14 +141,9 @@ class NnmCase(CaseFile):
 
     def contact(self) -> Contact:
         """The contact law without dissipation; stiffness from the paper's material where none is given."""
-        given, preset = self.contacts, PRESETS[self.lattice.preset or "four-band"].contacts
-        stiffness = given.stiffness
-        if stiffness is None:
-            material = (getattr(given, key) for key in ("modulus", "radius", "poisson"))
-            defaults = (preset[key] for key in ("modulus", "radius", "poisson"))
-            values = (d if v is None else v for v, d in zip(material, defaults, strict=True))
-            stiffness = float(contact_stiffness(*values))
-        return Contact(given.law, stiffness)
+        given = PRESETS[self.lattice.preset or "four-band"].contacts | self.contacts.model_dump(exclude_none=True)
+        material = given["modulus"], given["radius"], given["poisson"]
+        return Contact(given["law"], float(given.get("stiffness") or contact_stiffness(*material)))
 
     def clearance(self) -> float:
         """The clearance in m of the reduced model's contact."""
@@ -171,14 +156,24 @@ class NnmCase(CaseFile):
         return Chain(self.lattice.unit_cell(), self.lattice.cells, self.lattice.ends, sites, gaps)
 
 
-def _check_custom(checks: Checks, system: SystemTable) -> int:
-    """Check that springs and contacts join two masses, or a mass and the ground; returns the number of masses."""
-    count = len(system.masses)
-    pairs = [(f"springs[{i}]", s.start, s.end) for i, s in enumerate(system.springs, 1)]
-    pairs += [(f"smooth[{i}]", s.start, s.end) for i, s in enumerate(system.smooth, 1)]
-    pairs += [(f"contacts[{i}]", p.host, p.resonator) for i, p in enumerate(system.contacts, 1)]
+def _check_options(nnm: NnmTable) -> Iterator[Problem]:
+    """What is wrong with a system of one's own, and with the bounds of a branch and its steps."""
+    if (nnm.system == "own") != (nnm.custom is not None):
+        yield Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]')
+    for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
+        if not low < high:
+            yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
+    if nnm.direction != "up" and not nnm.energy[0] > 0:
+        yield Problem("nnm.energy", nnm.energy, "going down needs a lowest energy above 0 (J)")
+    if not nnm.smallest_step < nnm.largest_step:
+        yield Problem("nnm.smallest_step", nnm.smallest_step, "must be below nnm.largest_step")
+    if nnm.system != "own" or nnm.custom is None:
+        return
+    masses = len(nnm.custom.masses)
+    pairs = [(f"springs[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.springs, 1)]
+    pairs += [(f"smooth[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.smooth, 1)]
+    pairs += [(f"contacts[{i}]", p.host, p.resonator) for i, p in enumerate(nnm.custom.contacts, 1)]
     for key, start, end in pairs:
-        fits = start != end and max(start, end) <= count
-        remedy = f"is not a pair of the system's {count} masses (0 is the ground)"
-        checks.require(fits, f"nnm.own.{key}", [start, end], remedy)
-    return count
+        if start == end or max(start, end) > masses:
+            remedy = f"is not a pair of the system's {masses} masses (0 is the ground)"
+            yield Problem(f"nnm.own.{key}", [start, end], remedy)

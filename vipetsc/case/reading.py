@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
@@ -25,6 +25,7 @@ SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "d
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
 Table = dict[str, Any]  # a parsed TOML table
+Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,12 @@ class CaseError(ValueError):
     """A case that cannot be used; ``problems`` holds all reasons."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
-        self.problems = list(problems)
-        self.source = source
-        count = len(self.problems)
-        heading = f"{source}: {count} problem{'s' if count > 1 else ''}"
-        super().__init__("\n".join([heading, *(f"  {p}" for p in self.problems)]))
+        self.problems, self.source = list(problems), source
+        super().__init__(self.problems, source)  # what it is pickled by, on its way to other ranks
 
-    def __reduce__(self) -> tuple[type[Self], tuple[list[Problem], str]]:
-        return type(self), (self.problems, self.source)
+    def __str__(self) -> str:
+        plural = "s" if len(self.problems) > 1 else ""
+        return "\n  ".join([f"{self.source}: {len(self.problems)} problem{plural}", *map(str, self.problems)])
 
 
 class Section(BaseModel):
@@ -118,12 +117,17 @@ class CaseFile(Section):
                 kind: Any = field.annotation
                 fields[key], wrong = read_section(kind, table.get(key, {}), key)
                 problems += wrong
-        return fields, problems + cls.check(fields, {p.key for p in problems})
+        invalid = {problem.key for problem in problems}
+
+        def valid(*keys: str) -> bool:
+            return not any(i == k or i.startswith((f"{k}.", f"{k}[")) for i in invalid for k in keys)
+
+        return fields, problems + [p for p in cls.check(fields, valid) if valid(p.key)]
 
     @classmethod
-    def check(cls, sections: dict[str, Any], invalid: set[str]) -> list[Problem]:
-        """What is wrong between keys; the keys in ``invalid`` are reported already and hold their defaults."""
-        return []
+    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterable[Problem]:
+        """What is wrong between keys; those that are not ``valid`` are reported already and hold their defaults."""
+        return ()
 
     def to_toml(self) -> str:
         """The resolved case as TOML; reading it back gives the same case."""

@@ -1,13 +1,14 @@
-"""From the choices of a case file to plain numbers: sites, clearances, stiffness, frequency, times."""
+"""From the choices of a case file to plain numbers: presets, cell, sites, clearances, stiffness, frequency, times."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from vipetsc.case.reading import Table
-from vipetsc.case.schema import ClearanceSpan, ContactsTable, DriveTable, LatticeTable, TimeTable
+from vipetsc.case.reading import Problem, Table
+from vipetsc.case.schema import ClearanceSpan, ContactsTable, LatticeTable, Span
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
-from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.cell import UnitCell, cell_problems
 from vipetsc.lattice.chain import log_clearances, spread_sites
 from vipetsc.lattice.contact import contact_stiffness
 from vipetsc.lattice.presets import PRESETS
@@ -71,52 +72,60 @@ def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> li
     return [given] * count if isinstance(given, float) else list(given)
 
 
+def check_lattice(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
+    """The unit cell, or what is wrong with it."""
+    problems = []
+    if lattice.preset is not None and lattice.cell is not None:
+        problems.append(Problem("lattice.preset", lattice.preset, "give a preset or [lattice.cell], not both"))
+    for key, value in (("lattice.lambda", lattice.lam), ("lattice.eta", lattice.eta)):
+        if value is not None and lattice.preset != "four-band":
+            problems.append(Problem(key, value, "only the four-band preset has it"))
+    wrong = cell_problems(*lattice.cell.arguments()) if lattice.cell else []
+    problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
+    return None if problems else lattice.unit_cell(), problems
+
+
+def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
+    """What is wrong with where the contacts are, and with their clearances."""
+    cells, sites, clearance = site_cells(lattice, contacts), contacts.sites, contacts.clearance
+    if outside := [c for c in cells if not 1 <= c <= lattice.cells]:
+        yield Problem("contacts.sites", outside, f"outside the lattice; cells count from 1 to {lattice.cells}")
+    if isinstance(sites, Span) and None not in (sites.last, sites.spacing):
+        yield Problem("contacts.sites.spacing", None, "give last or spacing, not both")
+    if twice := sorted({c for c in cells if cells.count(c) > 1}):
+        yield Problem("contacts.sites", twice, "named twice; a cell carries one contact pair")
+    if isinstance(sites, int) and sites > 0 and lattice.preset is None:
+        yield Problem("contacts.sites", sites, "a count needs a preset; list the cells or give {first, last, count}")
+    if isinstance(clearance, list) and len(clearance) != len(cells):
+        yield Problem("contacts.clearance", clearance, f"one clearance for each of the {len(cells)} sites is needed")
+    if clearance is None and lattice.preset is None and cells:
+        yield Problem("contacts.clearance", None, "missing; give the clearance in m")
+
+
 def resolved(sections: dict[str, Any]) -> dict[str, Table]:
     """The sections of a valid lattice run as tables in which every choice is made."""
     tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()}
-    lattice, cell = sections["lattice"], sections["lattice"].unit_cell()
-    tables["contacts"] = _resolved_contacts(tables["contacts"], lattice, sections["contacts"])
-    frequency = _frequency(cell, sections["drive"])
-    for key in ("wavenumber", "band", "at"):
-        tables["drive"].pop(key, None)
-    tables["drive"]["frequency"] = frequency
-    cycles = sections["drive"].cycles
-    tables["time"] |= _resolved_time(cell, lattice.cells, frequency, cycles, sections["time"])
-    tables["time"].pop("samples", None)
-    return tables
-
-
-def _resolved_contacts(table: Table, lattice: LatticeTable, contacts: ContactsTable) -> Table:
-    """Sites and clearances listed, the stiffness as a number."""
-    sites = site_cells(lattice, contacts)
-    table = table | {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
-    modulus, radius, poisson = contacts.modulus, contacts.radius, contacts.poisson
-    if modulus is None or radius is None or poisson is None or contacts.stiffness is not None:
-        return table
-    table = {key: value for key, value in table.items() if key not in ("modulus", "radius", "poisson")}
-    return table | {"stiffness": float(contact_stiffness(modulus, radius, poisson))}
-
-
-def _frequency(cell: UnitCell, drive: DriveTable) -> float:
-    """The drive's frequency in rad/s."""
-    if drive.wavenumber is not None and drive.band is not None:
-        return float(bloch(cell, drive.wavenumber).frequency[drive.band - 1])
-    if drive.at is not None and drive.band is not None:
-        return max_group_velocity(cell, drive.band)[1]
-    assert drive.frequency is not None
-    return drive.frequency
-
-
-def _resolved_time(cell: UnitCell, cells: int, frequency: float, cycles: int, time: TimeTable) -> dict[str, float]:
-    """End and sample interval in s."""
-    end, interval = time.end, time.sample_interval
+    lattice, contacts, drive, time = (sections[name] for name in ("lattice", "contacts", "drive", "time"))
+    cell, sites, law = lattice.unit_cell(), site_cells(lattice, contacts), tables["contacts"]
+    law |= {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
+    if contacts.stiffness is None and law.keys() >= REPLACES["stiffness"]:
+        law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law.pop("radius"), law.pop("poisson")))
+    frequency, end, interval = drive.frequency, time.end, time.sample_interval
+    if drive.wavenumber is not None:
+        frequency = float(bloch(cell, drive.wavenumber).frequency[drive.band - 1])
+    elif drive.at is not None:
+        frequency = max_group_velocity(cell, drive.band)[1]
     if end == "traverse":
-        end = 2 * np.pi * cycles / frequency + cells / wave_speed(cell, frequency)
+        end = 2 * np.pi * drive.cycles / frequency + lattice.cells / wave_speed(cell, frequency)
     if time.samples is not None:
         interval = end / (time.samples - 1)
     elif interval == "auto":
         interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
-    return {"sample_interval": float(interval), "end": float(end)}
+    tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in REPLACES["frequency"]}
+    tables["drive"]["frequency"] = frequency
+    tables["time"] |= {"sample_interval": float(interval), "end": float(end)}
+    tables["time"].pop("samples", None)
+    return tables
 
 
 def wave_speed(cell: UnitCell, frequency: float) -> float:
