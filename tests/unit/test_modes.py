@@ -17,15 +17,14 @@ from scipy.integrate import DOP853
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
-from vipetsc.modes import tableau
+from vipetsc.modes import dop853
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.continuation import Continuation, Guards, StepControl, half_trace_change, unit
-from vipetsc.modes.orbit import Dop853Flow
-from vipetsc.modes.point import half_traces, linear_start, multipliers
+from vipetsc.modes.dop853 import Dop853Flow
+from vipetsc.modes.point import half_traces, linear_start, multipliers, sample_orbit
 from vipetsc.modes.regions import slope_laws, tell_regions
-from vipetsc.modes.samples import sample_orbit
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import Locator
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
@@ -191,7 +190,7 @@ def test_a_step_that_starts_on_a_near_miss_leaves_it(rounding):
 
 def test_the_tableau_is_the_one_of_dop853():
     for name in ("A", "B", "E3", "E5"):
-        ours, reference = getattr(tableau, name), getattr(DOP853, name)
+        ours, reference = getattr(dop853, name), getattr(DOP853, name)
         assert np.array_equal(ours, reference[tuple(slice(n) for n in ours.shape)]), name
 
 
@@ -275,10 +274,10 @@ def test_portrait_is_the_orbit_itself():
     start = linear_start(corrector, 1, 0.02)
     points = list(Continuation(corrector, start, StepControl(points=150, energy=(0, 0.5))))
     point = points[-1]
-    orbit = sample_orbit(corrector.problem, point, 40)
-    arc = corrector.problem.flow.arc(np.append(point.x, [0, 0]), orbit.time[33], point.period)
-    assert orbit.displacement[33] == pytest.approx(arc.end[:2], rel=1e-8)
-    assert orbit.velocity[33] == pytest.approx(arc.end[2:], rel=1e-8)
+    displacement, velocity = sample_orbit(corrector.problem, point, 40)
+    arc = corrector.problem.flow.arc(np.append(point.x, [0, 0]), 33 / 40 * point.period, point.period)
+    assert displacement[33] == pytest.approx(arc.end[:2], rel=1e-8)
+    assert velocity[33] == pytest.approx(arc.end[2:], rel=1e-8)
 
 
 def test_case_reports_everything_at_once():

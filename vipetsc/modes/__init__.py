@@ -12,8 +12,8 @@ v(T/2; u0, 0) = 0. If f is odd the orbit u(t + T/2) = -u(t) passes the centre u 
 
 The whole period is there for comparison: its condition is 1e6 times worse. n equations for n + 1 unknowns: a branch.
 
-**Variational equations.** S' = [[0, I], [-M^-1 (K + f'(u)), 0]] S is integrated beside the orbit (``kernel``: DOP853 of
-Hairer et al. 1993, ``tableau``; ``tsrk``: PETSc; ``newmark``: the paper's rule). At a contact change h(u) = |w| - D = 0
+**Variational equations.** S' = [[0, I], [-M^-1 (K + f'(u)), 0]] S is integrated beside the orbit (``dop853`` of
+Hairer et al. 1993; ``tsrk``: PETSc; ``newmark``: the paper's rule). At a contact change h(u) = |w| - D = 0
 the slope f' jumps, and S passes it with the saltation matrix (Leine and Nijmeijer 2004, ch. 7)
 
     S+ = (I + (g+ - g-) grad h^T / (grad h^T g-)) S-,
@@ -39,7 +39,7 @@ that appear or go, the correction over the step and the turn of the tangent; ``a
 for a branch that retraces itself.
 
 **Files.** ``follow`` shares the branches of a case over ranks, ``branch`` writes and reads them, ``regions`` tells the
-regions of a backbone and fits their power laws, ``samples`` looks closer at single orbits.
+regions of a backbone and fits their power laws, ``point`` looks closer at single orbits.
 
 A loop of one's own (importing the package loads PETSc)::
 
@@ -60,9 +60,9 @@ E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 
 
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
+from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.follow import follow_all
 from vipetsc.modes.newmark import Newmark
-from vipetsc.modes.orbit import Dop853Flow
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import Locator, switch

@@ -1,18 +1,22 @@
-"""Is a branch one branch? Jumps between arcs, retracing and the return to the linear mode, detected."""
+"""Is a branch one branch, whatever the flow? Jumps, retracing and the return to the linear mode; comparisons."""
 
 import itertools
 from collections.abc import Iterator
 
 import numpy as np
+import xarray as xr
 
-from vipetsc.modes.continuation import Continuation, Guards, StepControl, chart_at, half_trace_change
+from vipetsc.io.netcdf import variable
+from vipetsc.modes.chart import Relative
+from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl, chart_at, half_trace_change
+from vipetsc.modes.orbit import Flow, FlowError
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Corrector
+from vipetsc.modes.shooting import Corrector, Shooting
 
 
-def suspects(points: list[Point], guards: Guards | None = None) -> Iterator[tuple[int, str]]:
-    """Steps of a branch that violate a guard: (place of the left point, which guard and by how much)."""
-    guards = guards or Guards()
+def suspects(points: list[Point]) -> Iterator[tuple[int, str]]:
+    """Steps of a branch that violate a default guard: (place of the left point, which guard and by how much)."""
+    guards = Guards()
     for i, (a, b) in enumerate(itertools.pairwise(points)):
         change = half_trace_change(a, b)
         if abs(a.episodes - b.episodes) > guards.contacts:
@@ -21,71 +25,113 @@ def suspects(points: list[Point], guards: Guards | None = None) -> Iterator[tupl
             yield i, f"asinh of a half-trace changes by {change:.2g}"
 
 
-def is_jump(corrector: Corrector, left: Point, right: Point, control: StepControl, points: int = 400) -> bool:
+def is_jump(corrector: Corrector, left: Point, right: Point, control: StepControl) -> bool:
     """Whether the guarded branch from ``left`` misses ``right``.
 
     Follows the branch from the left point with the guards on, until it passes the right one or is further
     from the left point than three times the step.
     """
     chart = chart_at(corrector.problem, "relative", left)
-    goal = chart.encode(right.x, right.period)
-    origin = chart.encode(left.x, left.period)
+    origin, goal = chart.encode(left.x, left.period), chart.encode(right.x, right.period)
     reach = float(np.linalg.norm(goal - origin))
-    guarded = StepControl(
-        first=min(control.first, reach / 4), smallest=control.smallest, largest=reach / 4, points=points
-    )
-    last = origin
+    largest, last = reach / 4, origin
+    guarded = StepControl(first=min(control.first, largest), smallest=control.smallest, largest=largest, points=400)
     for point in Continuation(corrector, left, guarded):
         here = chart.encode(point.x, point.period)
-        chord = here - last
-        share = np.clip((goal - last) @ chord / (chord @ chord), 0.0, 1.0)
-        missed = np.linalg.norm(last + share * chord - goal)
+        share, missed, length = (float(a[0]) for a in _nearest(goal, last[None, :], here[None, :]))
         # a smooth arc leaves its chord by its length times the turn allowed
-        if 0 < share < 1 and missed <= guarded.guards.turn * np.linalg.norm(chord):
-            return bool(missed > 0.02 * reach)
+        if 0 < share < 1 and missed <= guarded.guards.turn * length:
+            return missed > 0.02 * reach
         if np.linalg.norm(here - origin) > 3 * reach:
             return True
         last = here
     return True
 
 
+def jumps(points: list[Point], corrector: Corrector, control: StepControl) -> Iterator[str]:
+    """Sentences about steps that jumped to another arc; only suspicious ones are followed again."""
+    for i, why in suspects(points):
+        a, b = points[i], points[i + 1]
+        try:
+            jumped = is_jump(corrector, a, b, control)
+        except (ContinuationError, FlowError):
+            jumped = True
+        if jumped:
+            yield (
+                f"jump between points {a.index} and {b.index} (E = {a.energy:.6g} -> {b.energy:.6g} J, "
+                f"f = {a.frequency:.6g} -> {b.frequency:.6g} Hz): {why}; both satisfy the equations "
+                f"(residuals {a.residual:.0e}, {b.residual:.0e})"
+            )
+
+
+def _nearest(place: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where each chord is nearest to ``place``, as a share of the chord; the distance there; the chords' lengths."""
+    chords = ends - starts
+    squared = np.einsum("ij,ij->i", chords, chords)
+    share = np.clip(np.einsum("ij,ij->i", place - starts, chords) / np.maximum(squared, 1e-300), 0, 1)
+    return share, np.linalg.norm(starts + share[:, None] * chords - place, axis=1), np.sqrt(squared)
+
+
 class BranchMonitor:
     """Tells when a growing branch retraces itself and when it returns to a linear mode."""
 
     def __init__(self, corrector: Corrector) -> None:
-        self.problem = corrector.problem
-        self._linear = corrector.problem.system.linear_modes()[0] / (2 * np.pi)
-        self._track = np.empty((256, corrector.problem.system.dofs + 2))
-        self._count = 0
+        system = corrector.problem.system
+        self._linear = system.linear_modes()[0] / (2 * np.pi)
+        self._track = np.empty((0, system.dofs + 2))
         self._touched = False
 
     def check(self, point: Point) -> str | None:
         """A sentence when the branch does what it should not; None otherwise."""
-        if self._count == len(self._track):
-            self._track = np.vstack([self._track, np.empty_like(self._track)])
         size = np.abs(point.x).max()
         here = np.array([*(point.x / size), np.log(size), np.log(point.period)])
-        track = self._track[: self._count]
-        self._track[self._count] = here
-        self._count += 1
+        track, self._track = self._track, np.vstack([self._track, here])
+        detuning = np.abs(point.frequency / self._linear - 1)
         if point.episodes > 0:
             self._touched = True
-        elif self._touched and np.abs(point.frequency / self._linear - 1).min() < 1e-9:
-            mode = int(np.abs(point.frequency / self._linear - 1).argmin()) + 1
-            return f"returned to linear mode {mode} at E = {point.energy:.6g} J (point {point.index})"
+        elif self._touched and detuning.min() < 1e-9:
+            where = f"at E = {point.energy:.6g} J (point {point.index})"
+            return f"returned to linear mode {detuning.argmin() + 1} {where}"
         if len(track) < 10 or not self._touched:
             return None
         starts, ends = track[:-6], track[1:-5]
-        chords = ends - starts
-        lengths = np.einsum("ij,ij->i", chords, chords)
-        share = np.clip(np.einsum("ij,ij->i", here - starts, chords) / np.maximum(lengths, 1e-300), 0, 1)
-        distance = np.linalg.norm(starts + share[:, None] * chords - here, axis=1)
-        nearest = int(distance.argmin())
-        step = here - track[-1]
-        along = chords[nearest] @ step / max(np.sqrt(lengths[nearest]) * np.linalg.norm(step), 1e-300)
-        close = distance[nearest] < 1e-4 * np.linalg.norm(step)
-        if close and along < -0.999:
-            return f"retraces itself: point {point.index} lies on the step after point {nearest + 1}, backwards"
-        if close and along > 0.999:
-            return f"closed on itself: point {point.index} lies on the step after point {nearest + 1}"
-        return None
+        _, distance, length = _nearest(here, starts, ends)
+        i, step = int(distance.argmin()), here - track[-1]
+        size = np.linalg.norm(step)
+        along = (ends[i] - starts[i]) @ step / max(length[i] * size, 1e-300)
+        if distance[i] >= 1e-4 * size or abs(along) <= 0.999:
+            return None
+        where = f"point {point.index} lies on the step after point {i + 1}"
+        return f"retraces itself: {where}, backwards" if along < 0 else f"closed on itself: {where}"
+
+
+def compare(reference: Corrector, points: list[Point], flow: Flow) -> dict[str, xr.Variable]:
+    """What ``flow`` gives on every fourth of ``points``, as variables of the branch's file; NaN where it fails.
+
+    The points are corrected keeping the first contact's w (or the largest displacement): at the same energy or
+    frequency the comparison would be ill-posed where the branch is vertical or flat. The differences are the flow's
+    values over the branch's, less 1.
+    """
+    problem = Shooting(flow, reference.problem.map)
+    corrector = Corrector(problem, max(reference.tolerance, 1e-12))
+    contacts, chosen = problem.system.contacts, points[::4]
+    difference = np.full((2, len(chosen)), np.nan)
+    for i, point in enumerate(chosen):
+        chart = Relative(problem.system, point.x, point.period, rest=problem.map.start == "rest")
+        xi = chart.encode(point.x, point.period)
+        row = np.zeros(len(xi))
+        row[contacts[0].resonator if contacts else int(np.abs(point.x).argmax())] = 1.0
+        # begin beside the orbit, or a flow whose residual passes there would not move at all
+        attempt = corrector.solve(chart, xi + 1e-6 * (1 - row), row, row @ xi)
+        if attempt.converged:
+            x, period = chart.decode(attempt.xi)
+            difference[:, i] = problem.energy(x) / point.energy - 1, point.period / period - 1
+    axis, group = f"compared_{flow.name}", f"flows/{flow.name}"
+    text = "relative {} difference of " + f"{flow.name} at the same amplitude"
+    numbers, energies = [p.index for p in chosen], [p.energy for p in chosen]
+    return {
+        axis: variable(axis, numbers, "1", f"number of the point compared with {flow.name}"),
+        f"{group}/energy": variable(axis, energies, "J", "energy of the branch"),
+        f"{group}/energy_difference": variable(axis, difference[0], "1", text.format("energy")),
+        f"{group}/frequency_difference": variable(axis, difference[1], "1", text.format("frequency")),
+    }

@@ -13,7 +13,6 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.modes.point import Point
 from vipetsc.modes.regions import slope_laws, tell_regions
-from vipetsc.modes.samples import Comparison, OrbitSamples
 
 KINDS = ("regular", "fold-energy", "fold-frequency", "branch-point", "symmetry-breaking", "period-doubling", "grazing")
 # Quantities of a point: name in the files, type, unit, description.
@@ -50,8 +49,8 @@ class Branch:
     complete: bool = False
     ending: str = "not finished"
     findings: list[str] = field(default_factory=list)
-    orbits: list[tuple[Point, OrbitSamples]] = field(default_factory=list)
-    comparisons: list[Comparison] = field(default_factory=list)
+    orbits: list[tuple[Point, tuple[np.ndarray, np.ndarray]]] = field(default_factory=list)
+    comparisons: dict[str, xr.Variable] = field(default_factory=dict)
 
     def regular(self) -> list[Point]:
         """The points of the continuation itself."""
@@ -118,33 +117,23 @@ class Branch:
             data[stored] = variable("point", self.column(name), units, text)
         attributes = {"name": self.name, "case": self.case, "complete": int(self.complete), "ending": self.ending}
         attributes |= {"next_step": self.next_step, "findings": "\n".join(self.findings), "fits": self.fits()}
-        return xr.Dataset(data | self._orbit_variables() | self._comparison_variables(), attrs=attributes)
+        return xr.Dataset(data | self._orbit_variables() | self.comparisons, attrs=attributes)
 
     def _orbit_variables(self) -> dict[str, xr.Variable]:
         if not self.orbits:
             return {}
         points, orbits = zip(*self.orbits, strict=True)
-        samples, axes = len(orbits[0].time), ("orbit", "phase", "dof")
+        displacement, velocity = zip(*orbits, strict=True)
+        samples, axes = len(displacement[0]), ("orbit", "phase", "dof")
         return {
             "orbit": variable("orbit", np.arange(len(points)), "1", "stored orbit"),
             "phase": variable("phase", np.arange(samples) / samples, "1", "time over the period"),
             "orbits/energy": variable("orbit", [p.energy for p in points], "J", "energy"),
             "orbits/period": variable("orbit", [p.period for p in points], "s", "period"),
             "orbits/number": variable("orbit", [p.index for p in points], "1", "number of the regular point"),
-            "orbits/displacement": variable(axes, [o.displacement for o in orbits], "m", "displacement"),
-            "orbits/velocity": variable(axes, [o.velocity for o in orbits], "m/s", "velocity"),
+            "orbits/displacement": variable(axes, displacement, "m", "displacement"),
+            "orbits/velocity": variable(axes, velocity, "m/s", "velocity"),
         }
-
-    def _comparison_variables(self) -> dict[str, xr.Variable]:
-        data = {}
-        for c in self.comparisons:
-            axis, group = f"compared_{c.name}", f"flows/{c.name}"
-            data[axis] = variable(axis, c.number, "1", f"number of the point compared with {c.name}")
-            data[f"{group}/energy"] = variable(axis, c.energy, "J", "energy of the branch")
-            for name in ("energy_difference", "frequency_difference"):
-                text = f"relative {name.replace('_', ' ')} of {c.name} at the same amplitude"
-                data[f"{group}/{name}"] = variable(axis, getattr(c, name), "1", text)
-        return data
 
     @classmethod
     def read(cls, path: Path) -> Self:

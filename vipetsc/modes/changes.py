@@ -23,12 +23,15 @@ EXTREMUM_ATTEMPTS, MOST_ATTEMPTS = 40, 120
 ROUNDING = 1e-8
 
 
-class Landing(NamedTuple):
-    """An attempt to end a step of ``length`` s, between ``low`` and ``high``, where sign w - offset rises through zero.
+class Change(NamedTuple):
+    """The change of a ``contact`` to or from a ``side``, and an attempt to end a step of ``length`` s on it.
 
-    With ``extremum`` it is to end where that gap is largest. ``attempts`` were made at it.
+    The gap sign w - offset rises through zero between the lengths ``low`` and ``high``; an ``extremum`` is landed on
+    where that gap is largest. ``attempts`` were made at it. Without a change, ``contact`` is -1.
     """
 
+    contact: int
+    side: int
     sign: float
     offset: float
     extremum: bool
@@ -39,14 +42,14 @@ class Landing(NamedTuple):
 
 
 @njit
-def correct(landing: Landing, motion: np.ndarray, floor: float) -> tuple[Landing, int]:
+def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, int]:
     """The next attempt after one that ended with (w, w', w'') = ``motion``: Newton's method, or bisection.
 
     The outcome is CROSSING when the length is known to ``floor`` seconds, EXTREMUM when the gap's largest value is
     known so and not above zero, and NONE when another attempt is needed. ``contact.search`` stops at a tolerance on
     w; the sensitivities of an orbit with many contacts need the length to rounding.
     """
-    sign, offset, extremum, low, high, length, attempts = landing
+    contact, side, sign, offset, extremum, low, high, length, attempts = change
     gap = sign * motion[0] - offset
     value, rate = (-sign * motion[1], -sign * motion[2]) if extremum else (gap, sign * motion[1])
     if value > 0.0:
@@ -60,12 +63,12 @@ def correct(landing: Landing, motion: np.ndarray, floor: float) -> tuple[Landing
         target = length + newton
         if not low < target < high:
             target = 0.5 * (low + high)
-        return Landing(sign, offset, extremum, low, high, target, attempts), NONE
+        return Change(contact, side, sign, offset, extremum, low, high, target, attempts), NONE
     if not extremum:
-        return landing, CROSSING
+        return change, CROSSING
     if gap <= 0.0:
-        return landing, EXTREMUM
-    return Landing(sign, offset, False, 0.0, length, 0.5 * length, 0), NONE
+        return change, EXTREMUM
+    return Change(contact, side, sign, offset, False, 0.0, length, 0.5 * length, 0), NONE
 
 
 @njit
@@ -96,13 +99,13 @@ def _slope(c: np.ndarray, x: float) -> float:
 
 
 @njit
-def _root(c: np.ndarray, low: float, high: float) -> float:
-    """Where the polynomial turns positive between low and high."""
+def _bisect(c: np.ndarray, low: float, high: float, sign: float) -> float:
+    """Where the polynomial turns positive between low and high; given a ``sign``, where its slope no longer has it."""
     for _ in range(60):
         middle = 0.5 * (low + high)
         if middle in (low, high):
             break
-        if _value(c, middle) > 0.0:
+        if sign * _slope(c, middle) <= 0.0 if sign else _value(c, middle) > 0.0:
             high = middle
         else:
             low = middle
@@ -113,19 +116,10 @@ def _root(c: np.ndarray, low: float, high: float) -> float:
 def _extremum(c: np.ndarray, share: float) -> float:
     """The zero of the slope near ``share``, in its quarter of the step."""
     low = 0.25 * min(np.floor(4.0 * share), 3.0)
-    high = low + 0.25
     sign = _slope(c, low)
-    if sign * _slope(c, high) >= 0.0:  # two of them in one quarter
+    if sign * _slope(c, low + 0.25) >= 0.0:  # two of them in one quarter
         return share
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if middle in (low, high):
-            break
-        if _slope(c, middle) * sign > 0.0:
-            low = middle
-        else:
-            high = middle
-    return 0.5 * (low + high)
+    return _bisect(c, low, low + 0.25, sign)
 
 
 @njit
@@ -167,7 +161,7 @@ def first_rise(c: np.ndarray) -> tuple[float, int]:
             end = 0.25 * part
             if end > left:
                 if _value(c, end) > 0.0:
-                    return _root(c, left, end), CROSSING
+                    return _bisect(c, left, end, 0.0), CROSSING
                 if end >= top:
                     break
                 left = end
@@ -175,7 +169,7 @@ def first_rise(c: np.ndarray) -> tuple[float, int]:
             break
         peak = _value(c, top)
         if peak > margin:
-            return _root(c, left, top), CROSSING
+            return _bisect(c, left, top, 0.0), CROSSING
         if peak > -margin:
             return top, EXTREMUM
     return 1.0, NONE

@@ -6,7 +6,7 @@ encodes (x, period) as xi, decodes it, and gives d(x, period)/d xi (n + 1, n + 1
 
 import numpy as np
 
-from vipetsc.modes.system import System, contact_directions
+from vipetsc.modes.system import System
 
 
 class Relative:
@@ -19,7 +19,7 @@ class Relative:
     def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
         self.size, self.period = float(np.abs(x).max()), period
         self.weights = np.eye(len(x)) / self.size
-        for row, pair in zip(contact_directions(system), system.contacts, strict=True):
+        for row, pair in zip(system.contact_rows, system.contacts, strict=True):
             if rest:
                 scale = min(max(abs(row @ x), pair.clearance), self.size)
                 self.weights[pair.resonator] = row / scale
@@ -79,12 +79,9 @@ class Grazing:
 
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:
         self.size, self.period = float(np.abs(x).max()), period
-        w = contact_directions(system) @ x
-        clearance = np.array([p.clearance for p in system.contacts])
-        nearest = int(np.abs(np.abs(w) / clearance - 1).argmin())
-        self.row = contact_directions(system)[nearest]
-        self.index, self.clearance = system.contacts[nearest].resonator, clearance[nearest]
-        self.sign = float(np.sign(w[nearest]))
+        nearest = int(np.abs(np.abs(system.contact_rows @ x) / system.clearances - 1).argmin())
+        self.row, self.clearance = system.contact_rows[nearest], system.clearances[nearest]
+        self.index, self.sign = system.contacts[nearest].resonator, float(np.sign(self.row @ x))
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
         """The unknowns of initial values and period."""

@@ -1,14 +1,13 @@
 """Pseudo-arclength continuation as an iterator over points; the caller owns the loop."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
 
 import numpy as np
 
 from vipetsc.modes.chart import CHARTS, Chart, Grazing, Relative
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Attempt, Corrector, Shooting
+from vipetsc.modes.shooting import Attempt, Corrector, Shooting, null_vector
 
 
 class ContinuationError(RuntimeError):
@@ -29,11 +28,6 @@ class Guards:
     corrector: float = 0.05
     turn: float = 0.2
 
-    @classmethod
-    def off(cls) -> Self:
-        """Ordinary step control: Newton's convergence alone decides."""
-        return cls(np.inf, np.inf, np.inf, np.inf)
-
 
 @dataclass(frozen=True)
 class StepControl:
@@ -47,14 +41,15 @@ class StepControl:
     first: float = 1e-3
     smallest: float = 1e-13
     largest: float = 0.1
-    growth: float = 2.0
     points: int = 5000
-    energy: tuple[float, float] = (0.0, np.inf)
-    frequency: tuple[float, float] = (0.0, np.inf)
+    energy: Sequence[float] = (0.0, np.inf)
+    frequency: Sequence[float] = (0.0, np.inf)
     chart: str = "relative"
     guards: Guards = field(default_factory=Guards)
 
 
+# Most growth of a step over the last one.
+GROWTH = 2.0
 # What a guard holds down, for messages.
 GUARDED = {
     "half_trace": "the half-trace changes too much",
@@ -62,6 +57,24 @@ GUARDED = {
     "corrector": "the corrector goes too far",
     "turn": "the branch turns too sharply",
 }
+
+
+class Frame:
+    """The chart at a point of a branch, the unknowns ``xi`` (n + 1,) of the point and the unit ``tangent`` there."""
+
+    def __init__(self, corrector: Corrector, chart: str, point: Point) -> None:
+        self.corrector, self.chart = corrector, chart_at(corrector.problem, chart, point)
+        self.xi = self.chart.encode(point.x, point.period)
+        self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), point.direction))
+
+    def correct(self, guess: np.ndarray, step: float) -> Attempt:
+        """Newton's method from ``guess`` for the orbit at the arclength ``step`` along the tangent."""
+        return self.corrector.solve(self.chart, guess, self.tangent, self.tangent @ self.xi + step)
+
+    def point(self, attempt: Attempt, index: int, step: float) -> tuple[Point, np.ndarray]:
+        """The point that an attempt has converged to, and the unit tangent there in this chart."""
+        direction = self.corrector.tangent(attempt.xi, self.tangent)
+        return Point.of(self.corrector.problem, attempt, self.chart, direction, index, step), direction
 
 
 class Continuation:
@@ -75,7 +88,7 @@ class Continuation:
     def __init__(
         self, corrector: Corrector, start: Point, control: StepControl, direction: int = 1, step: float | None = None
     ) -> None:
-        self.corrector, self.problem, self.control = corrector, corrector.problem, control
+        self.corrector, self.control = corrector, control
         self.point = start
         if start.tangent is None:
             self.point = replace(start, tangent=first_tangent(corrector, start, direction))
@@ -101,47 +114,39 @@ class Continuation:
         return False
 
     def _next(self) -> Point:
-        last = self.point
-        chart = chart_at(self.problem, self.control.chart, last)
-        xi = chart.encode(last.x, last.period)
-        tangent = unit(np.linalg.solve(chart.derivative(xi), last.direction))
-        attempt, why, knob = None, "no step tried", "nnm.max_newton or nnm.tolerance"
+        last, frame = self.point, Frame(self.corrector, self.control.chart, self.point)
+        residuals, why, knob = "none", "no step tried", "nnm.max_newton or nnm.tolerance"
         while self.step >= self.control.smallest:
-            attempt = self.corrector.solve(chart, xi + self.step * tangent, tangent, tangent @ xi + self.step)
+            attempt = frame.correct(frame.xi + self.step * frame.tangent, self.step)
+            residuals = attempt.residuals
             if not attempt.converged:
                 why, knob = f"no convergence ({attempt.reason})", "nnm.max_newton or nnm.tolerance"
                 self.step *= 0.4
                 continue
-            point, strain, guard = self._judge(chart, xi, tangent, attempt)
+            point, strain, guard = self._judge(frame, attempt)
             if strain <= 1.0:
-                effort = max(strain / 0.7, attempt.newton / 5, 1 / self.control.growth)
+                effort = max(strain / 0.7, attempt.newton / 5, 1 / GROWTH)
                 self.step = min(self.step / effort, self.control.largest)
                 return point
             why, knob = GUARDED[guard], f"nnm.guards.{guard}"
             self.step *= min(max(0.8 / strain, 0.1), 0.7)
-        residuals = attempt.residuals if attempt else "none"
         raise ContinuationError(
             f"step below {self.control.smallest:g} after point {last.index} "
             f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {why}; "
             f"residuals of the last attempt: {residuals}; turn nnm.smallest_step or {knob}"
         )
 
-    def _judge(self, chart: Chart, xi: np.ndarray, tangent: np.ndarray, attempt: Attempt) -> tuple[Point, float, str]:
+    def _judge(self, frame: Frame, attempt: Attempt) -> tuple[Point, float, str]:
         """The corrected point, how far it strains the guards (1 is the bound), and which guard most."""
         last, step, guards = self.point, self.step, self.control.guards
-        direction = tangent_at(self.corrector, attempt.xi, tangent)
-        point = Point.of(
-            self.problem, attempt, chart, chart.derivative(attempt.xi) @ direction, index=last.index + 1, step=step
-        )
-        correction = float(np.linalg.norm(attempt.xi - xi - step * tangent))
+        point, direction = frame.point(attempt, last.index + 1, step)
+        appeared = abs(point.episodes - last.episodes) / guards.contacts
         strains = {
             "half_trace": half_trace_change(last, point) / guards.half_trace,
-            "contacts": abs(point.episodes - last.episodes) / guards.contacts,
-            "corrector": correction / step / guards.corrector,
-            "turn": float(np.arccos(min(direction @ tangent, 1.0))) / guards.turn,
+            "contacts": appeared if appeared > 1 else 0.0,  # one contact more is no reason to slow down
+            "corrector": float(np.linalg.norm(attempt.xi - frame.xi - step * frame.tangent)) / step / guards.corrector,
+            "turn": float(np.arccos(min(direction @ frame.tangent, 1.0))) / guards.turn,
         }
-        if strains["contacts"] <= 1:  # one contact more is no reason to slow down
-            strains["contacts"] = 0.0
         worst = max(strains, key=lambda guard: strains[guard])
         return point, float(strains[worst]), worst
 
@@ -150,8 +155,7 @@ def chart_at(problem: Shooting, name: str, point: Point) -> Chart:
     """The chart called ``name`` at a point; ``auto`` is grazing within 5 % of it and relative elsewhere."""
     if name == "auto":
         gaps = problem.system.gaps(point.x) if problem.map.start == "rest" else np.array([np.inf])
-        clearances = np.array([p.clearance for p in problem.system.contacts])
-        near = len(clearances) > 0 and np.abs(gaps / clearances).min() < 0.05
+        near = np.abs(gaps / problem.system.clearances).min(initial=np.inf) < 0.05
         return (Grazing if near else Relative)(problem.system, point.x, point.period)
     return CHARTS[name](problem.system, point.x, point.period)
 
@@ -161,33 +165,19 @@ def unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def null_vector(matrix: np.ndarray) -> np.ndarray:
-    """Unit null vector (n + 1,) of an (n, n + 1) matrix."""
-    return np.linalg.svd(matrix)[2][-1]
-
-
-def tangent_at(corrector: Corrector, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Unit tangent (n + 1,) in the chart of the last attempt, at its ``xi``, turned towards ``reference``."""
-    direction = null_vector(corrector.matrix(xi))
-    return -direction if direction @ reference < 0 else direction
-
-
 def half_trace_change(a: Point, b: Point) -> float:
     """Distance between the sets of asinh(c) of two points: no half-trace is further from the other set.
 
     Half-traces may meet and turn into a complex pair, so that they have no lasting order. 0 for one degree of
     freedom.
     """
-    distance = np.abs(_squashed(a.half_traces)[:, None] - _squashed(b.half_traces)[None, :])
-    if not distance.size:
-        return 0.0
-    return float(max(distance.min(axis=0).max(), distance.min(axis=1).max()))
 
+    def squashed(c: np.ndarray) -> np.ndarray:
+        size = np.maximum(np.abs(c), np.finfo(float).tiny)
+        return c * (np.arcsinh(size) / size)  # with the number's own phase: asinh itself jumps on the imaginary axis
 
-def _squashed(c: np.ndarray) -> np.ndarray:
-    """asinh of the modulus with the number's own phase: asinh itself jumps on the imaginary axis."""
-    size = np.maximum(np.abs(c), np.finfo(float).tiny)
-    return c * (np.arcsinh(size) / size)
+    distance = np.abs(squashed(a.half_traces)[:, None] - squashed(b.half_traces)[None, :])
+    return float(max(distance.min(axis=axis, initial=np.inf).max(initial=0.0) for axis in (0, 1)))
 
 
 def first_tangent(corrector: Corrector, start: Point, direction: int) -> np.ndarray:

@@ -1,23 +1,22 @@
 """Follow the branches of a case: one by one or shared over ranks, saved as they grow, resumed where they ended."""
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
 from vipetsc.case import NnmCase
-from vipetsc.case.nnm import NnmTable
 from vipetsc.io.folder import BRANCHES, claim_folder, provenance
-from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
+from vipetsc.modes.audit import BranchMonitor, compare, jumps
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
+from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.newmark import Newmark
-from vipetsc.modes.orbit import Dop853Flow, FiniteDifferences, Flow, FlowError
-from vipetsc.modes.point import Point, linear_start
-from vipetsc.modes.samples import compare, resonance, sample_orbit
+from vipetsc.modes.orbit import FiniteDifferences, Flow, FlowError
+from vipetsc.modes.point import Point, linear_start, sample_orbit
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import Locator, switch
 from vipetsc.modes.system import System
@@ -60,42 +59,28 @@ def follow_all(
     return [branch for job in sorted(branches) for branch in branches[job]]
 
 
-def create_corrector(options: NnmTable, system: System) -> Corrector:
-    """Flow, map and solver as the options have them."""
-    flow: Flow = FLOWS[options.flow](system)
-    if options.jacobian == "differences":
-        flow = FiniteDifferences(flow)
-    automatic = "quarter" if system.odd else "half"
-    shooting_map = MAPS[automatic if options.map == "auto" else options.map]
-    return Corrector(Shooting(flow, shooting_map), options.tolerance, max_newton=options.max_newton)
-
-
-def create_control(options: NnmTable) -> StepControl:
-    """Step control as the options have it; a guard of 0 is off."""
-    return StepControl(
-        first=options.first_step,
-        smallest=options.smallest_step,
-        largest=options.largest_step,
-        points=options.points,
-        energy=(options.energy[0], options.energy[1]),
-        frequency=(options.frequency[0], options.frequency[1]),
-        chart=options.chart,
-        guards=Guards(**{k: v if v > 0 else math.inf for k, v in options.guards.model_dump().items()}),
-    )
-
-
-@dataclass
 class Follower:
     """Follows the branches of a case into a folder; ``about`` are attributes of the files."""
 
-    case: NnmCase
-    folder: Path
-    about: dict[str, Any]
-    listener: Listener | None = None
-
-    def __post_init__(self) -> None:
-        self.options, self.system = self.case.nnm, System.from_case(self.case)
-        self.corrector, self.control = create_corrector(self.options, self.system), create_control(self.options)
+    def __init__(self, case: NnmCase, folder: Path, about: dict[str, Any], listener: Listener | None = None) -> None:
+        self.case, self.options, self.folder, self.about, self.listener = case, case.nnm, folder, about, listener
+        options, self.system = case.nnm, System.from_case(case)
+        flow: Flow = FLOWS[options.flow](self.system)
+        if options.jacobian == "differences":
+            flow = FiniteDifferences(flow)
+        automatic = "quarter" if self.system.odd else "half"
+        problem = Shooting(flow, MAPS[automatic if options.map == "auto" else options.map])
+        self.corrector = Corrector(problem, options.tolerance, max_newton=options.max_newton)
+        self.control = StepControl(
+            first=options.first_step,
+            smallest=options.smallest_step,
+            largest=options.largest_step,
+            points=options.points,
+            energy=options.energy,
+            frequency=options.frequency,
+            chart=options.chart,
+            guards=Guards(**{name: bound or math.inf for name, bound in options.guards.model_dump().items()}),
+        )
 
     def follow(self, mode: int, resume: bool = False) -> list[Branch]:
         """The branch of ``mode`` (0-based), then the branches that cross it if the case asks for them."""
@@ -112,13 +97,15 @@ class Follower:
                 down = self._empty(name)
                 self.grow(down, self.corrector, start, self.control, -1)
                 # from the far end towards the start, with the tangents turned round
-                branch.points = [_turned(p) for p in reversed(down.points)]
+                branch.points = [
+                    replace(p, tangent=-p.direction, energy_tangent=-p.energy_tangent) for p in reversed(down.points)
+                ]
                 branch.findings += down.findings
             direction = -1 if options.direction == "down" else 1
             self.grow(branch, self.corrector, start, self.control, direction, save=True)
             self._store_orbits(branch)
-            flows = [FLOWS[flow](self.system) for flow in options.compare]
-            branch.comparisons = [compare(self.corrector, branch.regular(), flow) for flow in flows]
+            for flow in options.compare:
+                branch.comparisons |= compare(self.corrector, branch.regular(), FLOWS[flow](self.system))
         except FAILURES as error:
             branch.ending = f"failed: {error}"
         branch.write(self.folder, self.about)
@@ -148,7 +135,7 @@ class Follower:
         try:
             for point in points:
                 if self.options.locate:
-                    branch.points += [_labelled(p, corrector.problem) for p in locator.between(last, point)]
+                    branch.points += locator.between(last, point)
                 branch.points.append(point)
                 branch.next_step = points.step
                 if self.listener is not None:
@@ -161,7 +148,9 @@ class Follower:
                     branch.write(self.folder, self.about)
                 last = point
         finally:
-            branch.findings += [jump for jump in _jumps(branch, corrector, control) if jump not in branch.findings]
+            branch.findings += [
+                jump for jump in jumps(branch.regular(), corrector, control) if jump not in branch.findings
+            ]
         branch.ending, branch.complete = finding or points.ending, finding is not None or points.finished
 
     def _empty(self, name: str) -> Branch:
@@ -176,12 +165,13 @@ class Follower:
 
     def _store_orbits(self, branch: Branch) -> None:
         """Orbits in the middle of every region, and at the energies asked for."""
-        regular, regions = branch.regular(), branch.regions()
-        pairs = [(region, p) for region, p in zip(regions, branch.points, strict=True) if p.kind == "regular"]
-        groups = [[p for region, p in pairs if region == number] for number in range(5)]
+        regular = [
+            (p, region) for p, region in zip(branch.points, branch.regions(), strict=True) if p.kind == "regular"
+        ]
+        groups = [[p for p, region in regular if region == number] for number in range(5)]
         chosen = [group[len(group) // 2] for group in groups if group]
         for energy in self.options.orbits_at:
-            chosen.append(min(regular, key=lambda p: abs(math.log(p.energy / energy))))
+            chosen.append(min(branch.regular(), key=lambda p: abs(math.log(p.energy / energy))))
         branch.orbits = [(p, sample_orbit(self.corrector.problem, p)) for p in chosen]
 
     def _crossing(self, branch: Branch) -> list[Branch]:
@@ -199,30 +189,3 @@ class Follower:
                 crossing.write(self.folder, self.about)
                 branches.append(crossing)
         return branches
-
-
-def _jumps(branch: Branch, corrector: Corrector, control: StepControl) -> Iterator[str]:
-    """Sentences about steps that jumped to another arc; only suspicious ones are followed again."""
-    regular = branch.regular()
-    for i, why in suspects(regular):
-        a, b = regular[i], regular[i + 1]
-        try:
-            jumped = is_jump(corrector, a, b, control)
-        except (ContinuationError, FlowError):
-            jumped = True
-        if jumped:
-            yield (
-                f"jump between points {a.index} and {b.index} (E = {a.energy:.6g} -> {b.energy:.6g} J, "
-                f"f = {a.frequency:.6g} -> {b.frequency:.6g} Hz): {why}; both satisfy the equations "
-                f"(residuals {a.residual:.0e}, {b.residual:.0e})"
-            )
-
-
-def _turned(point: Point) -> Point:
-    """The same point on the branch followed the other way."""
-    return replace(point, tangent=-point.direction, energy_tangent=-point.energy_tangent)
-
-
-def _labelled(point: Point, problem: Shooting) -> Point:
-    """Energy folds, where tongues begin and end, carry their resonance."""
-    return replace(point, resonance=resonance(problem, point)) if point.kind == "fold-energy" else point

@@ -1,4 +1,4 @@
-"""The compiled flow: DOP853 between contact changes, landing on every change.
+"""A system in compiled form: forces, rates with variational equations, and the first contact change of a step.
 
 The set of closed contacts is frozen inside a step, so the force is smooth there; after each step the gap of every
 contact is searched, and the step is repeated so that it ends on the first change. Contact forces are continuous,
@@ -11,15 +11,12 @@ import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.contact.law import ForceLaw, elastic_force_and_slope
-from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Landing, correct, first_rise, hermite
-from vipetsc.modes.tableau import E3, E5, STAGES, A, B
+from vipetsc.modes.changes import EXTREMUM, NONE, Change, first_rise, hermite
 
-# Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed.
-DONE, STUCK, FULL = range(3)
-# A step below this fraction of the interval means that the flow is stuck.
-SMALLEST_STEP = 1e-15
 CONTACT = np.dtype([("clearance", np.float64), ("stiffness", np.float64), ("exponent", np.float64)])
 SPRING = np.dtype([("quadratic", np.float64), ("cubic", np.float64)])
+# A step below this fraction of the interval means that the flow is stuck.
+SMALLEST_STEP = 1e-15
 
 
 class CompiledSystem(NamedTuple):
@@ -33,47 +30,17 @@ class CompiledSystem(NamedTuple):
     springs: np.ndarray
 
 
-class Tolerances(NamedTuple):
-    """Errors allowed per step, relative to the size of the orbit and of each variation.
+class Step(NamedTuple):
+    """What a step of a system leaves for the search.
 
-    Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian.
+    ``side`` (contacts,) of closed contacts, 1 or -1, 0 for open ones; ``start`` and ``end`` (contacts, 3) hold
+    w, w' and w'' at both ends.
     """
 
-    rtol: float
-    rtol_sensitivity: float
-    omega_ref: float
-
-
-class Stepper(NamedTuple):
-    """What a step reads and writes; ``side`` (contacts,) -1, 0 or 1; states (2n, 1 + m); motions (contacts, 3)."""
-
     system: CompiledSystem
-    tolerances: Tolerances
     side: np.ndarray
-    stages: np.ndarray
+    start: np.ndarray
     end: np.ndarray
-    end_rates: np.ndarray
-    start_motion: np.ndarray
-    end_motion: np.ndarray
-
-
-class Change(NamedTuple):
-    """The first change in a step: its share of the step, the outcome of the search, contact and side."""
-
-    share: float
-    outcome: int
-    contact: int
-    side: int
-
-
-@njit
-def create_stepper(system: CompiledSystem, tolerances: Tolerances, columns: int) -> Stepper:
-    """A stepper for states with ``columns`` - 1 variations; its arrays are not filled."""
-    shape = 2 * system.inverse_mass.size, columns
-    contacts = system.contacts.size
-    side, stages = np.empty(contacts, np.int64), np.empty((STAGES, shape[0], shape[1]))
-    end, end_rates = np.empty(shape), np.empty(shape)
-    return Stepper(system, tolerances, side, stages, end, end_rates, np.empty((contacts, 3)), np.empty((contacts, 3)))
 
 
 @njit
@@ -91,22 +58,6 @@ def spring_force(system: CompiledSystem, s: int, z: float) -> tuple[float, float
 
 
 @njit
-def _add(y: np.ndarray, dy: np.ndarray, row: np.ndarray, force: float, slope: float) -> None:
-    """Add a force along ``row`` to the orbit's accelerations, its slope to the variations'."""
-    n, columns = y.shape[0] // 2, y.shape[1]
-    for i in range(n):
-        if row[i] != 0.0:
-            dy[n + i, 0] -= row[i] * force
-    for j in range(1, columns):
-        z = 0.0
-        for k in range(n):
-            z += row[k] * y[k, j]
-        z *= slope
-        for i in range(n):
-            dy[n + i, j] -= row[i] * z
-
-
-@njit
 def elongation(row: np.ndarray, u: np.ndarray) -> float:
     """Row times displacements (n,)."""
     z = 0.0
@@ -116,181 +67,94 @@ def elongation(row: np.ndarray, u: np.ndarray) -> float:
 
 
 @njit
-def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarray) -> None:
-    """Time derivative ``dy`` of the orbit, column 0, and variations of ``y`` (2n, 1 + m): displacements, velocities."""
-    n, columns = y.shape[0] // 2, y.shape[1]
+def _add(u: np.ndarray, pull: np.ndarray, row: np.ndarray, force: float, slope: float) -> None:
+    for j in range(u.shape[1]):
+        along = force if j == 0 else slope * elongation(row, u[:, j])
+        for i in range(row.size):
+            pull[i, j] -= row[i] * along
+
+
+@njit
+def restore(system: CompiledSystem, side: np.ndarray, u: np.ndarray, pull: np.ndarray) -> None:
+    """Forces that ``pull`` (n, 1 + m) back the orbit, column 0 of ``u`` (n, 1 + m), and its variations, in N."""
+    n, columns = u.shape
     for i in range(n):
-        for j in range(columns):
-            dy[i, j] = y[n + i, j]
-            dy[n + i, j] = 0.0
+        pull[i] = 0.0
         for k in range(n):
             s = system.stiffness[i, k]
             if s != 0.0:
                 for j in range(columns):
-                    dy[n + i, j] -= s * y[k, j]
+                    pull[i, j] -= s * u[k, j]
     for c in range(side.size):
         if side[c] != 0:
-            x = side[c] * elongation(system.rows[c], y[:n, 0]) - system.contacts[c].clearance
+            x = side[c] * elongation(system.rows[c], u[:, 0]) - system.contacts[c].clearance
             force, slope = contact_force(system, c, x)  # past the exit, which is landed on anyway, it is odd
-            _add(y, dy, system.rows[c], side[c] * force, slope)
-    for c in range(system.springs.size):
-        force, slope = spring_force(system, c, elongation(system.spring_rows[c], y[:n, 0]))
-        _add(y, dy, system.spring_rows[c], force, slope)
+            _add(u, pull, system.rows[c], side[c] * force, slope)
+    for s in range(system.springs.size):
+        force, slope = spring_force(system, s, elongation(system.spring_rows[s], u[:, 0]))
+        _add(u, pull, system.spring_rows[s], force, slope)
+
+
+@njit
+def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarray) -> None:
+    """Time derivative ``dy`` of the orbit, column 0, and variations of ``y`` (2n, 1 + m): displacements, velocities."""
+    n, columns = y.shape[0] // 2, y.shape[1]
+    restore(system, side, y[:n], dy[n:])
     for i in range(n):
         for j in range(columns):
+            dy[i, j] = y[n + i, j]
             dy[n + i, j] *= system.inverse_mass[i]
 
 
 @njit
-def relative_motion(system: CompiledSystem, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
-    """w, w' and w'' of every contact into ``motion`` (contacts, 3)."""
+def observe(step: Step, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
+    """Rates ``dy`` of the state ``y``, and w, w' and w'' of every contact into ``motion`` (contacts, 3)."""
+    rates(step.system, step.side, y, dy)
     n = y.shape[0] // 2
     for c in range(motion.shape[0]):
-        motion[c, 0] = elongation(system.rows[c], y[:n, 0])
-        motion[c, 1] = elongation(system.rows[c], y[n:, 0])
-        motion[c, 2] = elongation(system.rows[c], dy[n:, 0])
+        row = step.system.rows[c]
+        motion[c, 0], motion[c, 1] = elongation(row, y[:n, 0]), elongation(row, y[n:, 0])
+        motion[c, 2] = elongation(row, dy[n:, 0])
 
 
 @njit
-def closed_sides(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
-    """The sides on which the contacts of a state are closed, 0 for open ones."""
+def close(system: CompiledSystem, u: np.ndarray, side: np.ndarray) -> None:
+    """The sides on which the contacts are closed at displacements ``u`` (n,), 0 for open ones."""
     for c in range(side.size):
-        w, clearance = elongation(system.rows[c], y[: y.shape[0] // 2, 0]), system.contacts[c].clearance
-        side[c] = 1 if w > clearance else (-1 if w < -clearance else 0)
+        w = elongation(system.rows[c], u)
+        side[c] = np.sign(w) if abs(w) > system.contacts[c].clearance else 0
 
 
 @njit
-def _scaled_error(stepper: Stepper, y: np.ndarray, h: float) -> float:
-    """The new state from the stages, and the largest error of a column over what is allowed."""
-    k, out, tolerances = stepper.stages, stepper.end, stepper.tolerances
-    size, columns = y.shape
-    error = 0.0
-    for j in range(columns):
-        fifth, third, scale = 0.0, 0.0, 0.0
-        for i in range(size):
-            total, e5, e3 = 0.0, 0.0, 0.0
-            for r in range(STAGES):
-                total += B[r] * k[r, i, j]
-                e5 += E5[r] * k[r, i, j]
-                e3 += E3[r] * k[r, i, j]
-            out[i, j] = y[i, j] + h * total
-            unit = 1.0 if i < size // 2 else 1.0 / tolerances.omega_ref
-            fifth = max(fifth, abs(e5) * unit)
-            third = max(third, abs(e3) * unit)
-            scale = max(scale, abs(out[i, j]) * unit, abs(y[i, j]) * unit)
-        if fifth > 0.0:
-            allowed = (tolerances.rtol if j == 0 else tolerances.rtol_sensitivity) * scale
-            error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / allowed)
-    return error
+def begin(system: CompiledSystem, y: np.ndarray) -> Step:
+    """The record of a flow's steps, which begins at the state ``y``."""
+    contacts = system.contacts.size
+    step = Step(system, np.empty(contacts, np.int64), np.empty((contacts, 3)), np.empty((contacts, 3)))
+    close(system, y[: y.shape[0] // 2, 0], step.side)
+    return step
 
 
 @njit
-def step(stepper: Stepper, y: np.ndarray, h: float) -> float:
-    """One step of length ``h`` from ``y``, whose rates are the first stage; returns the scaled error."""
-    k, out = stepper.stages, stepper.end
-    size, columns = y.shape
-    for s in range(1, STAGES):
-        for i in range(size):
-            for j in range(columns):
-                total = 0.0
-                for r in range(s):
-                    total += A[s, r] * k[r, i, j]
-                out[i, j] = y[i, j] + h * total
-        rates(stepper.system, stepper.side, out, k[s])
-    error = _scaled_error(stepper, y, h)
-    rates(stepper.system, stepper.side, out, stepper.end_rates)
-    relative_motion(stepper.system, out, stepper.end_rates, stepper.end_motion)
-    return error
-
-
-@njit
-def gap_of(system: CompiledSystem, side: np.ndarray, c: int, s: int) -> tuple[float, float]:
-    """(sign, offset) of the gap sign w - offset of contact ``c`` on side ``s``, whose rise through zero changes it."""
-    clearance = system.contacts[c].clearance
-    return (float(s), clearance) if side[c] == 0 else (-float(s), -clearance)
-
-
-@njit
-def first_change(stepper: Stepper, h: float) -> Change:
-    """The first change of a contact in the step of length ``h``."""
-    system, side = stepper.system, stepper.side
-    gap = np.empty(6)
-    change = Change(1.0, NONE, -1, 0)
-    for c in range(side.size):
+def first_change(step: Step, h: float) -> Change:
+    """The first change of a contact in a step of length ``h``, with the first attempt at it."""
+    gap, first = np.empty(6), 1.0
+    change = Change(-1, 0, 0.0, 0.0, False, 0.0, h, h, 0)
+    for c in range(step.side.size):
+        clearance = step.system.contacts[c].clearance
         for s in (-1, 1):
-            if side[c] == 0 or side[c] == s:
-                sign, offset = gap_of(system, side, c, s)
-                hermite(stepper.start_motion[c], stepper.end_motion[c], h, sign, offset, gap)
+            if step.side[c] == 0 or step.side[c] == s:
+                sign, offset = (float(s), clearance) if step.side[c] == 0 else (-float(s), -clearance)
+                hermite(step.start[c], step.end[c], h, sign, offset, gap)
                 share, outcome = first_rise(gap)
-                if outcome != NONE and share < change.share:
-                    change = Change(share, outcome, c, s)
+                if outcome != NONE and share < first:
+                    first = share
+                    change = Change(c, s, sign, offset, outcome == EXTREMUM, 0.0, h, share * h, 0)
     return change
 
 
 @njit
-def begin_landing(stepper: Stepper, change: Change, h: float) -> Landing:
-    """The first attempt at a change that was found in a step of length ``h``."""
-    sign, offset = gap_of(stepper.system, stepper.side, change.contact, change.side)
-    return Landing(sign, offset, change.outcome == EXTREMUM, 0.0, h, change.share * h, 0)
-
-
-@njit
-def _land(stepper: Stepper, y: np.ndarray, t: float, h: float, change: Change) -> tuple[float, bool]:
-    """Repeat the step of length ``h`` at time ``t`` so that it ends on a change: its length, whether it is one."""
-    landing = begin_landing(stepper, change, h)
-    for _ in range(MOST_ATTEMPTS):
-        length = landing.length
-        step(stepper, y, length)
-        floor = 1e-15 * h if landing.extremum else 1e-16 * (t + h)
-        landing, outcome = correct(landing, stepper.end_motion[change.contact], floor)
-        if outcome != NONE:
-            break
-    return length, outcome != EXTREMUM
-
-
-@njit
-def flow(
-    system: CompiledSystem, tolerances: Tolerances, y: np.ndarray, duration: float, events: np.ndarray
-) -> tuple[int, int, float, int]:
-    """Advance ``y`` (2n, 1 + m) in place over ``duration`` seconds.
-
-    Returns the outcome (DONE, STUCK or FULL), the number of ``events`` (capacity, 4) filled with time, contact, side
-    and kind (1 onset, -1 separation), the seconds with a contact closed, and the steps taken.
-    """
-    stepper = create_stepper(system, tolerances, y.shape[1])
-    side = stepper.side
-    closed_sides(system, y, side)
-    t, closed, count, steps = 0.0, 0.0, 0, 0
-    largest = 1.0 / tolerances.omega_ref
-    h = min(0.1 * largest, duration)
-    while t < duration:
-        rates(system, side, y, stepper.stages[0])
-        relative_motion(system, y, stepper.stages[0], stepper.start_motion)
-        last = t + h >= duration * (1.0 - 1e-15)
-        if last:
-            h = duration - t
-        elif h < SMALLEST_STEP * duration:
-            return STUCK, count, closed, steps
-        error = step(stepper, y, h)
-        steps += 1
-        if not error < 1.0:
-            h *= max(0.2, 0.9 * error ** (-0.125)) if error < 1e300 else 0.1
-            continue
-        grown = min(largest, h * min(6.0, 0.9 * max(error, 1e-12) ** (-0.125)))
-        change = first_change(stepper, h)
-        changed = False
-        if change.outcome != NONE:
-            h, changed = _land(stepper, y, t, h, change)
-        y[:] = stepper.end
-        closed += h if np.any(side != 0) else 0.0
-        t = duration if last and change.outcome == NONE else t + h
-        h = grown
-        if changed:
-            if count >= events.shape[0]:
-                return FULL, count, closed, steps
-            onset = side[change.contact] == 0
-            events[count, 0], events[count, 1] = t, change.contact
-            events[count, 2], events[count, 3] = change.side, 1 if onset else -1
-            side[change.contact] = change.side if onset else 0
-            count += 1
-    return DONE, count, closed, steps
+def switch(step: Step, change: Change) -> int:
+    """Close or open the contact of a ``change``: 1 for an onset, -1 for a separation."""
+    onset = step.side[change.contact] == 0
+    step.side[change.contact] = change.side if onset else 0
+    return 1 if onset else -1

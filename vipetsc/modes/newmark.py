@@ -7,35 +7,20 @@ Mech. Syst. Signal Process. 23, 2009, App. A). Contacts are met at the ends of s
 import numpy as np
 
 from vipetsc.compiled import njit
-from vipetsc.modes.kernel import CompiledSystem, contact_force, elongation, spring_force
-from vipetsc.modes.orbit import Arc, Flow, FlowError
+from vipetsc.modes.kernel import CompiledSystem, close, restore
+from vipetsc.modes.orbit import Flow, FlowError
 
 STEPS = 2000
 
 
 @njit
-def _add(row: np.ndarray, pull: float, slope: float, force: np.ndarray, tangent: np.ndarray) -> None:
-    for i in range(row.size):
-        force[i] += row[i] * pull
-        for j in range(row.size):
-            tangent[i, j] += slope * row[i] * row[j]
-
-
-@njit
-def _forces(system: CompiledSystem, u: np.ndarray, force: np.ndarray, tangent: np.ndarray) -> None:
+def _forces(system: CompiledSystem, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Restoring forces (n,) in N and tangent stiffness (n, n) in N/m at displacements ``u`` (n,) in m."""
-    for i in range(u.size):
-        force[i] = elongation(system.stiffness[i], u)
-    tangent[:] = system.stiffness
-    for c in range(system.contacts.size):
-        w = elongation(system.rows[c], u)
-        x = abs(w) - system.contacts[c].clearance
-        if x > 0.0:
-            pull, slope = contact_force(system, c, x)
-            _add(system.rows[c], np.sign(w) * pull, slope, force, tangent)
-    for s in range(system.springs.size):
-        pull, slope = spring_force(system, s, elongation(system.spring_rows[s], u))
-        _add(system.spring_rows[s], pull, slope, force, tangent)
+    side, columns = np.empty(system.contacts.size, np.int64), np.hstack((u.reshape(-1, 1), np.eye(u.size)))
+    close(system, u, side)
+    pull = np.empty_like(columns)
+    restore(system, side, columns, pull)
+    return -pull[:, 0], -pull[:, 1:]
 
 
 @njit
@@ -58,44 +43,39 @@ def _matrix(system: CompiledSystem, tangent: np.ndarray, quarter: float) -> np.n
 
 
 @njit
-def _solve_step(
-    system: CompiledSystem, guess: np.ndarray, a: np.ndarray, quarter: float, force: np.ndarray, tangent: np.ndarray
-) -> bool:
+def _solve_step(system: CompiledSystem, guess: np.ndarray, a: np.ndarray, quarter: float) -> tuple[np.ndarray, bool]:
     """Newton's method for the accelerations ``a`` (n,) at a step's end, where u = ``guess`` + h^2/4 a.
 
-    Displacements as unknowns would lose digits to 4/h^2. Leaves the tangent there; returns whether it converged.
+    Displacements as unknowns would lose digits to 4/h^2. Returns the tangent stiffness there, and whether it converged.
     """
     scale, shift = 0.0, a
     for _ in range(60):
-        _forces(system, guess + quarter * a, force, tangent)
+        force, tangent = _forces(system, guess + quarter * a)
         shift = np.linalg.solve(_matrix(system, tangent, quarter), a + force * system.inverse_mass)
         a -= shift
         scale = max(scale, np.abs(a).max())
         if np.abs(shift).max() <= 1e-14 * scale:
             break
-    _forces(system, guess + quarter * a, force, tangent)
-    return np.abs(shift).max() <= 1e-11 * scale
+    return _forces(system, guess + quarter * a)[1], np.abs(shift).max() <= 1e-11 * scale
 
 
 @njit
-def _newmark(system: CompiledSystem, y: np.ndarray, duration: float, steps: int, w: np.ndarray) -> bool:
-    """Advance ``y`` (2n, 1 + m) in place; ``w`` (steps + 1, contacts) is filled; returns whether it converged."""
-    n = y.shape[0] // 2
-    h = duration / steps
+def _newmark(system: CompiledSystem, y: np.ndarray, h: float, path: np.ndarray) -> bool:
+    """Advance ``y`` (2n, 1 + m) in place along the ``path`` (steps + 1, n) in steps of ``h``; whether it converged."""
+    steps, n = path.shape[0] - 1, path.shape[1]
     quarter = 0.25 * h * h
-    force, tangent = np.empty(n), np.empty((n, n))
     u, v = y[:n].copy(), y[n:].copy()
-    _forces(system, u[:, 0].copy(), force, tangent)
+    force, tangent = _forces(system, u[:, 0].copy())
     a = _linear_accelerations(system, tangent, u)
     a[:, 0] = -force * system.inverse_mass
     for step in range(steps + 1):
-        for c in range(w.shape[1]):
-            w[step, c] = elongation(system.rows[c], u[:, 0])
+        path[step] = u[:, 0]
         if step == steps:
             break
         guess = u + h * v + quarter * a
         orbit = a[:, 0].copy()
-        if not _solve_step(system, guess[:, 0].copy(), orbit, quarter, force, tangent):
+        tangent, converged = _solve_step(system, guess[:, 0].copy(), orbit, quarter)
+        if not converged:
             return False
         matrix = _matrix(system, tangent, quarter)
         new = np.linalg.solve(matrix, _linear_accelerations(system, tangent, guess))
@@ -112,18 +92,16 @@ class Newmark(Flow):
 
     name = "newmark"
 
-    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
-        """See ``Flow.arc``; the times of contact changes are ends of steps."""
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
         count = max(round(STEPS * duration / period), 1)
-        y = self.with_variations(start)
-        w = np.empty((count + 1, len(self.system.contacts)))
-        if not _newmark(self.compiled, y, duration, count, w):
+        h, path = duration / count, np.empty((count + 1, self.system.dofs))
+        if not _newmark(self.compiled, y, h, path):
             raise FlowError("Newmark's implicit step does not converge")
-        side = np.sign(w) * (np.abs(w) > self.compiled.contacts["clearance"])
-        events = []
-        for i, c in zip(*np.nonzero(np.diff(side, axis=0)), strict=True):
-            onset = side[i + 1, c] != 0
-            time = (i + 1) * (duration / count)
-            events.append((time, c, side[i + 1, c] if onset else side[i, c], 1 if onset else -1))
-        closed = float(np.any(side[1:] != 0, axis=1).sum() * duration / count) if side.size else 0.0
-        return self.finish(start, y, duration, np.array(events).reshape(-1, 4), closed, count)
+        side = np.sign(path @ self.system.contact_rows.T) * (self.system.gaps(path) > 0)
+        before, after = side[:-1], side[1:]
+        events = [
+            ((i + 1) * h, c, after[i, c] or before[i, c], 1 if after[i, c] else -1)
+            for i, c in zip(*np.nonzero(before != after), strict=True)
+        ]
+        closed = float(np.any(after != 0, axis=1).sum() * duration / count)
+        return y, np.array(events).reshape(-1, 4), closed

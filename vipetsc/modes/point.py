@@ -1,4 +1,4 @@
-"""One point of a branch: a periodic orbit with its energy, stability and contacts."""
+"""One point of a branch: a periodic orbit with its energy, stability and contacts, its samples and its resonance."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -19,8 +19,8 @@ def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
     them is trivial and its left eigenvector is known, so that it is removed exactly.
     """
     root = np.sqrt(problem.system.masses)
-    a, b, c, d = (root[:, None] * block / root for block in arc.blocks())
-    n, quarter = len(root), problem.map.quarter
+    n, quarter, s = len(root), problem.map.quarter, arc.sensitivity
+    a, b, c, d = (root[:, None] * block / root for block in (s[:n, :n], s[:n, n:], s[n:, :n], s[n:, n:]))
     trivial = (arc.start[n:] if problem.map.start == "centre" else arc.acceleration[0]) * root
     if problem.map.fraction == 1.0:  # the whole period needs no mirror image
         product = (a - np.eye(n)) / 2
@@ -93,16 +93,16 @@ class Point:
         problem: Shooting,
         attempt: Attempt,
         chart: Chart,
-        tangent: np.ndarray | None = None,
+        direction: np.ndarray | None = None,
         index: int = 0,
         step: float = 0.0,
     ) -> Self:
-        """The point of a converged attempt."""
+        """The point of a converged attempt in ``chart``, in which ``direction`` is the branch's tangent."""
         x, period = chart.decode(attempt.xi)
-        arc = attempt.arc
-        traces = half_traces(problem, arc)
-        energy_tangent = slope = np.nan
-        if tangent is not None:
+        arc, traces = attempt.arc, half_traces(problem, attempt.arc)
+        tangent, energy_tangent, slope = None, np.nan, np.nan
+        if direction is not None:
+            tangent = chart.derivative(attempt.xi) @ direction
             energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
             slope = float(-tangent[-1] / period**2 / energy_tangent) if energy_tangent else np.inf
         return cls(
@@ -145,3 +145,30 @@ def linear_start(corrector: Corrector, mode: int, energy: float) -> Point:
         why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy"
         raise ValueError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
     return Point.of(problem, attempt, chart)
+
+
+def sample_orbit(problem: Shooting, point: Point, samples: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements in m and velocities in m/s (samples, n) at uniform times, the end of the period left out.
+
+    Only the arc that was shot is integrated; its mirror images make up the period. ``samples`` is a multiple of 4.
+    """
+    states = [problem.arc(point.x, point.period).start]
+    for _ in range(round(problem.map.fraction * samples)):
+        states.append(problem.flow.arc(states[-1], point.period / samples, point.period).end)
+    u, v = np.hsplit(np.array(states), 2)
+    if problem.map.quarter:  # to the centre: odd about it
+        u, v = np.vstack([u, -u[-2::-1]]), np.vstack([v, v[-2::-1]])
+    if len(u) < samples:  # to a rest (or from centre to centre): mirror image about it
+        sign = -1 if problem.map.start == problem.map.end == "centre" else 1
+        u, v = np.vstack([u, sign * u[-2::-1]]), np.vstack([v, -sign * v[-2::-1]])
+    return u[:samples], v[:samples]
+
+
+def resonance(problem: Shooting, point: Point, samples: int = 1024) -> int:
+    """The harmonic k >= 2 that is strongest in the contacts' relative motion (all displacements without contacts).
+
+    On a tongue of a k:1 internal resonance, mode two moves k times while mode one moves once.
+    """
+    u, rows = sample_orbit(problem, point, samples)[0], problem.system.contact_rows
+    size = np.abs(np.fft.rfft(u @ rows.T if len(rows) else u, axis=0)).sum(axis=1)
+    return int(np.argmax(size[2 : samples // 4])) + 2

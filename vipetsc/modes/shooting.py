@@ -1,7 +1,7 @@
 """Shooting: a periodic orbit as a boundary value problem over a part of its period, solved by PETSc's SNES."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from petsc4py import PETSc
 
@@ -120,14 +120,6 @@ class Attempt:
         return self.orbit
 
 
-class Equation(NamedTuple):
-    """What is solved: shooting in a ``chart``, over its size, and row . xi = value."""
-
-    chart: Chart
-    row: np.ndarray
-    value: float
-
-
 class Corrector:
     """Newton's method (PETSc SNES) for the shooting equations of ``problem`` and one more linear row.
 
@@ -141,13 +133,12 @@ class Corrector:
         self.problem, self.tolerance, self.step_tolerance = problem, tolerance, step_tolerance
         size = problem.system.dofs + 1
         self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
-        self._residual = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
-        self._xi = self._residual.duplicate()
-        self._matrix = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
-        self._matrix.setUp()
+        self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
+        matrix = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
+        matrix.setUp()
         snes.setOptionsPrefix("nnm_")
-        snes.setFunction(self._function, self._residual)
-        snes.setJacobian(self._jacobian, self._matrix)
+        snes.setFunction(self._function, self._xi.duplicate())
+        snes.setJacobian(self._jacobian, matrix)
         snes.setTolerances(max_it=max_newton)
         snes.setConvergenceTest(self._test)
         snes.getKSP().setType("preonly")
@@ -156,13 +147,15 @@ class Corrector:
         if not options.hasName("snes_linesearch_type"):
             options["snes_linesearch_type"] = "basic"  # step control is the continuation's business
         snes.setFromOptions()
-        self._equation: Equation | None = None
+        # the current equations: shooting in a chart, over its size, and row . xi = value
+        self._chart: Chart
+        self._row: tuple[np.ndarray, float]
         self._last: tuple[np.ndarray, Arc] | None = None
         self._history: list[float] = []
 
     def solve(self, chart: Chart, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Solve shooting(xi) = 0 and row . xi = value, starting from ``guess`` (n + 1,)."""
-        self._equation, self._last, self._history = Equation(chart, row, value), None, []
+        self._chart, self._row, self._last, self._history = chart, (row, value), None, []
         self._xi.setArray(guess)
         try:
             self._snes.solve(None, self._xi)
@@ -174,28 +167,27 @@ class Corrector:
 
     def matrix(self, xi: np.ndarray) -> np.ndarray:
         """The scaled Jacobian (n, n + 1) of the shooting equations at ``xi``, in the chart of the last attempt."""
-        chart = self._current.chart
-        return self.problem.jacobian(self._arc(xi)) @ chart.derivative(xi) / chart.size
+        return self.problem.jacobian(self._arc(xi)) @ self._chart.derivative(xi) / self._chart.size
 
-    @property
-    def _current(self) -> Equation:
-        assert self._equation is not None
-        return self._equation
+    def tangent(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        """Unit tangent (n + 1,) in the chart of the last attempt, at its ``xi``, turned towards ``reference``."""
+        direction = null_vector(self.matrix(xi))
+        return -direction if direction @ reference < 0 else direction
 
     def _arc(self, xi: np.ndarray) -> Arc:
         if self._last is None or not np.array_equal(self._last[0], xi):
-            self._last = xi.copy(), self.problem.arc(*self._current.chart.decode(xi))
+            self._last = xi.copy(), self.problem.arc(*self._chart.decode(xi))
         return self._last[1]
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        equation, xi = self._current, x.getArray(readonly=True)
-        if not np.all(np.isfinite(xi)) or equation.chart.decode(xi)[1] <= 0:
+        xi, (row, value) = x.getArray(readonly=True), self._row
+        if not np.all(np.isfinite(xi)) or self._chart.decode(xi)[1] <= 0:
             raise FlowError("Newton left the domain: the period is not positive")
-        residual = self.problem.residual(self._arc(xi)) / equation.chart.size
-        f.setArray(np.append(residual, equation.row @ xi - equation.value))
+        residual = self.problem.residual(self._arc(xi)) / self._chart.size
+        f.setArray(np.append(residual, row @ xi - value))
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
-        matrix.getDenseArray()[:] = np.vstack([self.matrix(x.getArray(readonly=True)), self._current.row])
+        matrix.getDenseArray()[:] = np.vstack([self.matrix(x.getArray(readonly=True)), self._row[0]])
         matrix.assemble()
 
     def _test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | bool:
@@ -211,6 +203,11 @@ class Corrector:
         if residual > 1e3 * max(self._history[0], 1e-3):
             return reasons.DIVERGED_DTOL
         return reasons.ITERATING
+
+
+def null_vector(matrix: np.ndarray) -> np.ndarray:
+    """Unit null vector (n + 1,) of an (n, n + 1) matrix."""
+    return np.linalg.svd(matrix)[2][-1]
 
 
 _REASONS = {

@@ -1,47 +1,39 @@
 """Special points between two points of a branch, located and not interpolated, and the branches that cross there."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.modes.chart import Relative
-from vipetsc.modes.continuation import ContinuationError, chart_at, tangent_at, unit
-from vipetsc.modes.point import Point
+from vipetsc.modes.continuation import ContinuationError, Frame, unit
+from vipetsc.modes.point import Point, resonance
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 
-
-@dataclass(frozen=True)
-class SpecialPoint:
-    """A kind of special point: where ``test`` changes sign by more than ``floor`` on both sides."""
-
-    kind: str
-    test: Callable[[Point], float]
-    floor: float = 0.0
+Test = Callable[[Point], float]
 
 
-def special_points(problem: Shooting) -> list[SpecialPoint]:
-    """What can happen on a branch: folds, and half-traces that cross 1, -1 or 0.
+def special_kinds(problem: Shooting) -> list[tuple[str, Test, float]]:
+    """What can happen on a branch: its kind, a test that changes sign there, by more than a floor on both sides.
 
     A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
     doubles the period (the others); 0 doubles the period of quarter-period orbits. Half-traces of one system cross
     +-1 tangentially along narrow tongues, to rounding; crossings below 1e-6 are not told from those.
     """
-    points = [
-        SpecialPoint("fold-energy", lambda p: p.energy_tangent),
-        SpecialPoint("fold-frequency", lambda p: float(p.direction[-1] / p.period)),
-    ]
+
+    def crossing(level: float, i: int) -> Test:
+        return lambda p: float(np.real(p.half_traces[i])) - level
+
     levels = {1.0: "branch-point", -1.0: "symmetry-breaking" if problem.map.quarter else "period-doubling"}
     if problem.map.quarter:
         levels[0.0] = "period-doubling"
-
-    def crossing(level: float, i: int) -> Callable[[Point], float]:
-        return lambda p: float(np.real(p.half_traces[i])) - level
-
-    for level, kind in levels.items():
-        points += [SpecialPoint(kind, crossing(level, i), 1e-6) for i in range(problem.system.dofs - 1)]
-    return points
+    pairs = range(problem.system.dofs - 1)
+    return [
+        ("fold-energy", lambda p: p.energy_tangent, 0.0),
+        ("fold-frequency", lambda p: float(p.direction[-1] / p.period), 0.0),
+        *((kind, crossing(level, i), 1e-6) for level, kind in levels.items() for i in pairs),
+    ]
 
 
 class Locator:
@@ -51,55 +43,51 @@ class Locator:
     """
 
     def __init__(self, corrector: Corrector, chart: str = "relative", grazing: bool = False) -> None:
-        self.corrector, self.chart_name, self.grazing = corrector, chart, grazing
-        self.special = special_points(corrector.problem)
+        self.corrector, self.chart, self.grazing = corrector, chart, grazing
+        self.kinds = special_kinds(corrector.problem)
 
     def between(self, left: Point, right: Point) -> list[Point]:
         """Special points between two consecutive points, in order; their ``index`` is the right one's.
 
-        An energy fold always has a half-trace of 1 and is not reported as a branch point too.
+        An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins or ends the
+        tongue of a ``resonance``.
         """
         points: list[Point] = []
-        segment = _Segment(self.corrector, self.chart_name, left, right)
-        smooth = len(self.corrector.problem.system.springs) > 0
+        segment = _Segment(self.corrector, self.chart, left, right)
+        problem = self.corrector.problem
         touching = sum(p.episodes > 0 for p in (left, right))
-        for special in self.special:
-            if not smooth and touching < (2 if special.kind.startswith("fold") else 1):
+        for kind, test, floor in self.kinds:
+            if not problem.system.springs and touching < (2 if kind.startswith("fold") else 1):
                 continue  # a linear branch has folds of rounding only
-            a, b = special.test(left), special.test(right)
-            if not (a * b < 0 and min(abs(a), abs(b)) > special.floor):
-                continue
-            if special.kind == "branch-point" and any(p.kind == "fold-energy" for p in points):
-                continue
-            points += segment.root(special.kind, special.test)
+            a, b = test(left), test(right)
+            folded = kind == "branch-point" and any(p.kind == "fold-energy" for p in points)
+            if a * b < 0 and min(abs(a), abs(b)) > floor and not folded:
+                points += segment.root(kind, test)
         if self.grazing and left.episodes != right.episodes:
             points += segment.root("grazing", lambda p: 1.0 if p.episodes == right.episodes else -1.0, 1e-11)
-        return sorted(points, key=lambda p: p.step)
+        folds = (replace(p, resonance=resonance(problem, p)) if p.kind == "fold-energy" else p for p in points)
+        return sorted(folds, key=lambda p: p.step)
 
 
 class _Segment:
     """The branch between two points, parametrised by arclength along the left point's tangent."""
 
     def __init__(self, corrector: Corrector, chart: str, left: Point, right: Point) -> None:
-        self.corrector, self.left, self.right = corrector, left, right
-        self.chart = chart_at(corrector.problem, chart, left)
-        self.xi = self.chart.encode(left.x, left.period)
-        self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), left.direction))
-        self.chord = self.chart.encode(right.x, right.period) - self.xi
-        self.length = float(self.tangent @ self.chord)
+        self.left, self.right, self.frame = left, right, Frame(corrector, chart, left)
+        self.chord = self.frame.chart.encode(right.x, right.period) - self.frame.xi
+        self.length = float(self.frame.tangent @ self.chord)
 
     def at(self, arclength: float) -> Point:
         """The point at an arclength; raises ArithmeticError if the corrector fails there."""
-        share = arclength / self.length
+        frame, share = self.frame, arclength / self.length
         # a parabola through both points, tangent at the left one
-        guess = self.xi + arclength * self.tangent + share**2 * (self.chord - self.length * self.tangent)
-        attempt = self.corrector.solve(self.chart, guess, self.tangent, self.tangent @ self.xi + arclength)
+        guess = frame.xi + arclength * frame.tangent + share**2 * (self.chord - self.length * frame.tangent)
+        attempt = frame.correct(guess, arclength)
         if not attempt.converged:
             raise ArithmeticError(attempt.reason)
-        tangent = self.chart.derivative(attempt.xi) @ tangent_at(self.corrector, attempt.xi, self.tangent)
-        return Point.of(self.corrector.problem, attempt, self.chart, tangent, self.right.index, arclength)
+        return frame.point(attempt, self.right.index, arclength)[0]
 
-    def root(self, kind: str, test: Callable[[Point], float], accuracy: float = 1e-14) -> list[Point]:
+    def root(self, kind: str, test: Test, accuracy: float = 1e-14) -> list[Point]:
         """The point where ``test`` vanishes, to ``accuracy`` of the step; none if the corrector fails on the way."""
 
         def value(arclength: float) -> float:
@@ -138,8 +126,8 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
             continue
         along = np.zeros(len(xi))
         if point.tangent is not None:
-            x_later, period_later = point.x + 1e-6 * point.tangent[:-1], point.period + 1e-6 * point.tangent[-1]
-            later = replace(point, x=x_later, period=period_later)
+            x, period = point.x + 1e-6 * point.tangent[:-1], point.period + 1e-6 * point.tangent[-1]
+            later = replace(point, x=x, period=period)
             along = chart.encode(*_re_expressed(old, later, problem)) - xi
         first, second = directions[-2:] @ (directions[-2:].T @ directions[-2:] @ along)
         row = sign * unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
@@ -148,8 +136,7 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
         if not attempt.converged:
             why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.switch_amplitude"
             raise ContinuationError(f"no convergence on the crossing branch at E = {point.energy:.9g} J {why}")
-        tangent = chart.derivative(attempt.xi) @ tangent_at(fresh, attempt.xi, row)
-        return fresh, Point.of(problem, attempt, chart, tangent)
+        return fresh, Point.of(problem, attempt, chart, fresh.tangent(attempt.xi, row))
     where = f"at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz"
     raise ContinuationError(f"no branch crosses {where}: smallest singular values {', '.join(singular)}")
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 from scipy.linalg import eigh
 
-from vipetsc.case.nnm import NnmCase, SystemTable
+from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, UnitCell
 
 
@@ -88,25 +89,17 @@ class System:
     @classmethod
     def from_case(cls, case: NnmCase) -> Self:
         """The system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
-        law = case.contact()
-        if case.nnm.custom is not None:
-            return cls._from_table(case.nnm.custom, law)
-        if case.nnm.system == "reduced":
+        law, table = case.contact(), case.nnm.custom
+        if case.nnm.system == "chain":
+            return cls.from_chain(case.chain(), law)
+        if table is None:
             return cls.reduced(case.lattice.unit_cell(), case.clearance(), law)
-        return cls.from_chain(case.chain(), law)
-
-    @classmethod
-    def _from_table(cls, table: SystemTable, law: Contact) -> Self:
-        """The system of ``[nnm.own]``, whose masses count from 1 and whose ground is 0."""
-
-        def mass(number: int) -> int | None:
-            return number - 1 if number else None
-
+        mass = [None, *range(len(table.masses))]  # the table counts them from 1, and 0 is the ground
         return cls.assemble(
             table.masses,
-            [(mass(s.start), s.end - 1, s.stiffness) for s in table.springs],
-            [ContactPair(mass(p.host), p.resonator - 1, p.clearance, law) for p in table.contacts],
-            [SmoothSpring(mass(s.start), s.end - 1, s.cubic, s.quadratic) for s in table.smooth],
+            [(mass[s.start], s.end - 1, s.stiffness) for s in table.springs],
+            [ContactPair(mass[p.host], p.resonator - 1, p.clearance, law) for p in table.contacts],
+            [SmoothSpring(mass[s.start], s.end - 1, s.cubic, s.quadratic) for s in table.smooth],
         )
 
     @classmethod
@@ -142,6 +135,23 @@ class System:
         """Number of degrees of freedom."""
         return len(self.masses)
 
+    @cached_property
+    def contact_rows(self) -> np.ndarray:
+        """Rows (contacts, n) with w = rows @ u."""
+        rows = [direction(p.host, p.resonator, self.dofs) for p in self.contacts]
+        return np.array(rows).reshape(-1, self.dofs)
+
+    @cached_property
+    def spring_rows(self) -> np.ndarray:
+        """Rows (springs, n) with the smooth springs' elongations z = rows @ u."""
+        rows = [direction(s.start, s.end, self.dofs) for s in self.springs]
+        return np.array(rows).reshape(-1, self.dofs)
+
+    @cached_property
+    def clearances(self) -> np.ndarray:
+        """Clearances (contacts,) in m."""
+        return np.array([p.clearance for p in self.contacts])
+
     @property
     def odd(self) -> bool:
         """Whether all forces change sign with the displacement."""
@@ -161,42 +171,40 @@ class System:
 
     def gaps(self, u: np.ndarray) -> np.ndarray:
         """|w| - clearance in m of every contact at displacements ``u`` (..., n); shape (..., contacts)."""
-        d = contact_directions(self)
-        return np.abs(u @ d.T) - np.array([p.clearance for p in self.contacts])
+        return np.abs(u @ self.contact_rows.T) - self.clearances
 
     def forces(self, u: np.ndarray) -> np.ndarray:
         """Restoring forces (n,) in N at displacements ``u`` (n,) in m."""
         force = self.stiffness @ u
-        for d, pair in zip(contact_directions(self), self.contacts, strict=True):
-            force = force + d * pair.law.force(d @ u, pair.clearance)
-        for s in self.springs:
-            d = direction(s.start, s.end, self.dofs)
-            z = d @ u
-            force = force + d * (s.quadratic * z**2 + s.cubic * z**3)
+        for row, pair in zip(self.contact_rows, self.contacts, strict=True):
+            force = force + row * pair.law.force(row @ u, pair.clearance)
+        for row, s in zip(self.spring_rows, self.springs, strict=True):
+            z = row @ u
+            force = force + row * (s.quadratic * z**2 + s.cubic * z**3)
         return force
 
     def energy(self, u: np.ndarray, v: np.ndarray) -> float:
         """Kinetic and potential energy in J at displacements ``u`` and velocities ``v`` (n,)."""
         total = 0.5 * (self.masses * v) @ v + 0.5 * u @ self.stiffness @ u
-        for d, pair in zip(contact_directions(self), self.contacts, strict=True):
-            total += pair.law.potential(d @ u, pair.clearance)
-        for s in self.springs:
-            z = direction(s.start, s.end, self.dofs) @ u
+        for row, pair in zip(self.contact_rows, self.contacts, strict=True):
+            total += pair.law.potential(row @ u, pair.clearance)
+        for row, s in zip(self.spring_rows, self.springs, strict=True):
+            z = row @ u
             total += s.quadratic * z**3 / 3 + s.cubic * z**4 / 4
         return float(total)
 
     def grazing_energy(self, mode: int) -> float:
         """Energy in J at which linear mode ``mode`` (0-based) first touches a contact; inf if it never does."""
         omega, shapes = self.linear_modes()
-        reach = np.abs(contact_directions(self) @ shapes[:, mode])
-        amplitude = [p.clearance / r for p, r in zip(self.contacts, reach, strict=True) if r > 0]
-        return 0.5 * omega[mode] ** 2 * min(amplitude) ** 2 if amplitude else float("inf")
+        reach = np.abs(self.contact_rows @ shapes[:, mode])
+        amplitude = (self.clearances[reach > 0] / reach[reach > 0]).min(initial=np.inf)
+        return float(0.5 * omega[mode] ** 2 * amplitude**2) if np.isfinite(amplitude) else np.inf
 
     def closed_frequencies(self) -> np.ndarray:
         """Frequencies (n,) in rad/s with every contact closed and no clearance: the bilinear law's limit."""
         stiffness = self.stiffness.copy()
-        for d, pair in zip(contact_directions(self), self.contacts, strict=True):
-            stiffness += pair.law.stiffness * np.outer(d, d)
+        for row, pair in zip(self.contact_rows, self.contacts, strict=True):
+            stiffness += pair.law.stiffness * np.outer(row, row)
         return np.sqrt(eigh(stiffness, np.diag(self.masses), eigvals_only=True))
 
 
@@ -207,9 +215,3 @@ def direction(start: int | None, end: int, dofs: int) -> np.ndarray:
     if start is not None:
         row[start] = -1.0
     return row
-
-
-def contact_directions(system: System) -> np.ndarray:
-    """Rows (contacts, n) with w = rows @ u."""
-    rows = [direction(p.host, p.resonator, system.dofs) for p in system.contacts]
-    return np.array(rows).reshape(len(rows), system.dofs)

@@ -9,8 +9,8 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.modes import kernel
-from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, correct
-from vipetsc.modes.orbit import Arc, Flow, FlowError
+from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
+from vipetsc.modes.orbit import Flow, FlowError
 from vipetsc.modes.system import System
 
 
@@ -26,37 +26,32 @@ class Tsrk(Flow):
 
     def __init__(self, system: System) -> None:
         super().__init__(system)
-        tolerances = kernel.Tolerances(self.rtol, self.rtol_sensitivity, self.omega)
-        self._stepper = kernel.create_stepper(self.compiled, tolerances, 1 + 2 * system.dofs)
-        self._y = PETSc.Vec().createSeq(self._stepper.end.size, comm=PETSc.COMM_SELF)
+        self._shape = 2 * system.dofs, 1 + 2 * system.dofs
+        self._y = PETSc.Vec().createSeq(self._shape[0] * self._shape[1], comm=PETSc.COMM_SELF)
         self._adaptive, self._fixed = self._solver("basic"), self._solver("none")
+        self._record: kernel.Step
 
-    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
-        """See ``Flow.arc``."""
-        y, stepper, side = self.with_variations(start), self._stepper, self._stepper.side
-        kernel.closed_sides(stepper.system, y, side)
-        self._tolerances(start, period)
-        t, h, closed, steps, events = 0.0, 0.05 / self.omega, 0.0, 0, []
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
+        step = self._record = kernel.begin(self.compiled, y)
+        self._set_tolerances(y[:, 0], period)
+        t, h, closed, events, dy = 0.0, 0.05 / self.omega, 0.0, [], np.empty(self._shape)
         while t < duration:
             length, state, h = self._step(self._adaptive, y, min(h, 1 / self.omega, duration - t))
-            steps += 1
             if length < kernel.SMALLEST_STEP * duration and length < duration - t:
                 raise FlowError(f"TSRK's step became too small at {t:.6g} s of {duration:.6g} s")
-            self._observe(y, stepper.start_motion)
-            self._observe(state, stepper.end_motion)
-            change = kernel.first_change(stepper, length)
-            changed = False
-            if change.outcome != NONE:
+            kernel.observe(step, y, dy, step.start)
+            kernel.observe(step, state, dy, step.end)
+            change = kernel.first_change(step, length)
+            changed = change.contact >= 0
+            if changed:
                 length, state, changed = self._land(y, length, change)
-            closed += length if np.any(side) else 0.0
+            closed += length if np.any(step.side) else 0.0
             t = duration if duration - t - length <= 1e-16 * duration else t + length
             y = state
             if changed:
-                onset = side[change.contact] == 0
-                events.append((t, change.contact, change.side, 1 if onset else -1))
-                side[change.contact] = change.side if onset else 0
+                events.append((t, change.contact, change.side, kernel.switch(step, change)))
                 self._adaptive.restartStep()
-        return self.finish(start, y, duration, np.array(events).reshape(-1, 4), closed, steps)
+        return y, np.array(events).reshape(-1, 4), closed
 
     def _solver(self, adapt: str) -> PETSc.TS:
         ts = PETSc.TS().create(PETSc.COMM_SELF)
@@ -74,24 +69,21 @@ class Tsrk(Flow):
         ts.setFromOptions()
         return ts
 
-    def _tolerances(self, start: np.ndarray, period: float) -> None:
+    def _set_tolerances(self, start: np.ndarray, period: float) -> None:
         """Absolute tolerances from the orbit's size; velocities count as displacements over a radian."""
         n = self.system.dofs
         omega = self.omega_ref(period)
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / omega)
         unit = np.repeat([1.0, omega], n)
-        absolute = np.empty(self._stepper.end.shape)
-        absolute[:, 0] = self.rtol * size * unit
+        absolute, relative = np.empty(self._shape), np.full(self._shape, self.rtol_sensitivity)
+        absolute[:, 0], relative[:, 0] = self.rtol * size * unit, self.rtol
         absolute[:, 1:] = self.rtol_sensitivity * unit[:, None] / unit[None, :]
-        relative = np.full(absolute.shape, self.rtol_sensitivity)
-        relative[:, 0] = self.rtol
         rtol, atol = (PETSc.Vec().createWithArray(a.ravel(), comm=PETSc.COMM_SELF) for a in (relative, absolute))
         self._adaptive.setTolerances(rtol=rtol, atol=atol)
 
     def _rates(self, ts: PETSc.TS, t: float, y: PETSc.Vec, dy: PETSc.Vec) -> None:
-        shape = self._stepper.end.shape
-        state = np.array(y.getArray(readonly=True)).reshape(shape)
-        kernel.rates(self._stepper.system, self._stepper.side, state, dy.getArray().reshape(shape))
+        state = np.array(y.getArray(readonly=True)).reshape(self._shape)
+        kernel.rates(self.compiled, self._record.side, state, dy.getArray().reshape(self._shape))
 
     def _step(self, ts: PETSc.TS, y: np.ndarray, h: float) -> tuple[float, np.ndarray, float]:
         """One step from ``y``, of at most ``h``: its length, the new state, the next step's length."""
@@ -102,20 +94,14 @@ class Tsrk(Flow):
         ts.step()
         return ts.getTime(), self._y.getArray().reshape(y.shape).copy(), ts.getTimeStep()
 
-    def _observe(self, y: np.ndarray, motion: np.ndarray) -> None:
-        """(w, w', w'') of every contact into ``motion`` (contacts, 3)."""
-        stepper = self._stepper
-        kernel.rates(stepper.system, stepper.side, y, stepper.end_rates)
-        kernel.relative_motion(stepper.system, y, stepper.end_rates, motion)
-
-    def _land(self, y: np.ndarray, h: float, change: kernel.Change) -> tuple[float, np.ndarray, bool]:
+    def _land(self, y: np.ndarray, h: float, change: Change) -> tuple[float, np.ndarray, bool]:
         """Step from ``y`` exactly onto a change found in a step of length ``h``: length, state, whether it is one."""
-        landing = kernel.begin_landing(self._stepper, change, h)
+        step, dy = self._record, np.empty(self._shape)
         for _ in range(MOST_ATTEMPTS):
-            length = landing.length
+            length = change.length
             _, state, _ = self._step(self._fixed, y, length)
-            self._observe(state, self._stepper.end_motion)
-            landing, outcome = correct(landing, self._stepper.end_motion[change.contact], 2e-16 * h)
+            kernel.observe(step, state, dy, step.end)
+            change, outcome = correct(change, step.end[change.contact], 2e-16 * h)
             if outcome != NONE:
                 return length, state, outcome != EXTREMUM
         raise FlowError(f"TSRK does not land on the change of contact {change.contact + 1}")
