@@ -18,15 +18,14 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
 from vipetsc.modes import dop853
-from vipetsc.modes.branch import Branch
+from vipetsc.modes.branch import Branch, slope_laws, tell_regions
 from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.continuation import Continuation, Guards, StepControl, half_trace_change, unit
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import half_traces, linear_start, multipliers, sample_orbit
-from vipetsc.modes.regions import slope_laws, tell_regions
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
-from vipetsc.modes.special import Locator
+from vipetsc.modes.special import locate
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
 D = 10**-2.75
@@ -381,16 +380,15 @@ def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
     corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
     points = [replace(p, tangent=sign * p.tangent, energy_tangent=sign * p.energy_tangent) for p in short_branch.points]
     points = points[::sign]
-    locator = Locator(corrector)
     turning = [
         (a, b) for a, b in itertools.pairwise(points) if a.energy_tangent * b.energy_tangent < 0 and a.episodes > 0
     ]
     assert len(turning) == 2
     for a, b in turning:
-        (fold,) = (p for p in locator.between(a, b) if p.kind == "fold-energy")
+        (fold,) = (p for p in locate(corrector, a, b) if p.kind == "fold-energy")
         assert abs(fold.energy_tangent) <= 1e-9 * abs(a.energy_tangent)
         assert fold.half_traces[0] == pytest.approx(1, abs=1e-6)
-    kinds = {p.kind for a, b in itertools.pairwise(points[-20:]) for p in locator.between(a, b)}
+    kinds = {p.kind for a, b in itertools.pairwise(points[-20:]) for p in locate(corrector, a, b)}
     assert "fold-energy" not in kinds
 
 

@@ -17,7 +17,7 @@ from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.orbit import FiniteDifferences
 from vipetsc.modes.point import Point, linear_start, resonance
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
-from vipetsc.modes.special import Locator, switch
+from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import SmoothSpring, System
 from vipetsc.modes.tsrk import Tsrk
 
@@ -41,9 +41,8 @@ def follow(system: System, mode: int, start: float, flow=Dop853Flow, shooting: s
     first = linear_start(corrector, mode, start)
     branch = Continuation(corrector, first, StepControl(**{"points": 20000} | control))
     points, special = [branch.point], []
-    locator = Locator(corrector, control.get("chart", "relative"), grazing=True)
     for point in branch:
-        special += locator.between(points[-1], point)
+        special += locate(corrector, points[-1], point, control.get("chart", "relative"), grazing=True)
         points.append(point)
     return corrector, points, special
 

@@ -38,7 +38,7 @@ Narrow tongues of internal resonances lie close together, and a residual cannot 
 that appear or go, the correction over the step and the turn of the tangent; ``audit`` looks for jumps afterwards and
 for a branch that retraces itself.
 
-**Files.** ``follow`` shares the branches of a case over ranks, ``branch`` writes and reads them, ``regions`` tells the
+**Files.** ``follow`` shares the branches of a case over ranks, ``branch`` writes and reads them, tells the
 regions of a backbone and fits their power laws, ``point`` looks closer at single orbits.
 
 A loop of one's own (importing the package loads PETSc)::
@@ -65,6 +65,6 @@ from vipetsc.modes.follow import follow_all
 from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
-from vipetsc.modes.special import Locator, switch
+from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.modes.tsrk import Tsrk

@@ -18,7 +18,7 @@ from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.orbit import FiniteDifferences, Flow, FlowError
 from vipetsc.modes.point import Point, linear_start, sample_orbit
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
-from vipetsc.modes.special import Locator, switch
+from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import System
 from vipetsc.modes.tsrk import Tsrk
 
@@ -126,7 +126,6 @@ class Follower:
         """
         control = replace(control, points=max(control.points - max(len(branch.regular()) - 1, 0), 0))
         points = Continuation(corrector, start, control, direction, branch.next_step or None)
-        locator = Locator(corrector, control.chart, self.options.locate_grazing)
         monitor = BranchMonitor(corrector)
         for point in branch.regular():
             monitor.check(point)
@@ -135,7 +134,7 @@ class Follower:
         try:
             for point in points:
                 if self.options.locate:
-                    branch.points += locator.between(last, point)
+                    branch.points += locate(corrector, last, point, control.chart, self.options.locate_grazing)
                 branch.points.append(point)
                 branch.next_step = points.step
                 if self.listener is not None:

@@ -44,20 +44,6 @@ class Step(NamedTuple):
 
 
 @njit
-def contact_force(system: CompiledSystem, c: int, x: float) -> tuple[float, float]:
-    """Force in N and its slope in N/m of contact ``c`` at the indentation x in m, odd in x."""
-    contact = system.contacts[c]
-    return elastic_force_and_slope(ForceLaw(contact.stiffness, contact.exponent, 0.0, False, 0.0), x)
-
-
-@njit
-def spring_force(system: CompiledSystem, s: int, z: float) -> tuple[float, float]:
-    """Force in N and its slope in N/m of the smooth spring ``s`` at the elongation z in m."""
-    spring = system.springs[s]
-    return (spring.quadratic + spring.cubic * z) * z * z, (2.0 * spring.quadratic + 3.0 * spring.cubic * z) * z
-
-
-@njit
 def elongation(row: np.ndarray, u: np.ndarray) -> float:
     """Row times displacements (n,)."""
     z = 0.0
@@ -87,12 +73,16 @@ def restore(system: CompiledSystem, side: np.ndarray, u: np.ndarray, pull: np.nd
                     pull[i, j] -= s * u[k, j]
     for c in range(side.size):
         if side[c] != 0:
-            x = side[c] * elongation(system.rows[c], u[:, 0]) - system.contacts[c].clearance
-            force, slope = contact_force(system, c, x)  # past the exit, which is landed on anyway, it is odd
-            _add(u, pull, system.rows[c], side[c] * force, slope)
+            contact, row = system.contacts[c], system.rows[c]
+            x = (
+                side[c] * elongation(row, u[:, 0]) - contact.clearance
+            )  # the law is odd past the exit, which is landed on
+            # past the exit, which is landed on anyway, the law is odd
+            force, slope = elastic_force_and_slope(ForceLaw(contact.stiffness, contact.exponent, 0.0, False, 0.0), x)
+            _add(u, pull, row, side[c] * force, slope)
     for s in range(system.springs.size):
-        force, slope = spring_force(system, s, elongation(system.spring_rows[s], u[:, 0]))
-        _add(u, pull, system.spring_rows[s], force, slope)
+        a, b, z = system.springs[s].quadratic, system.springs[s].cubic, elongation(system.spring_rows[s], u[:, 0])
+        _add(u, pull, system.spring_rows[s], (a + b * z) * z * z, (2.0 * a + 3.0 * b * z) * z)
 
 
 @njit

@@ -99,7 +99,9 @@ class Point:
     ) -> Self:
         """The point of a converged attempt in ``chart``, in which ``direction`` is the branch's tangent."""
         x, period = chart.decode(attempt.xi)
-        arc, traces = attempt.arc, half_traces(problem, attempt.arc)
+        arc = attempt.arc
+        assert arc is not None
+        traces = half_traces(problem, arc)
         tangent, energy_tangent, slope = None, np.nan, np.nan
         if direction is not None:
             tangent = chart.derivative(attempt.xi) @ direction

@@ -84,7 +84,7 @@ class Shooting:
         return self.system.energy(x, zero) if self.map.start == "rest" else self.system.energy(zero, x)
 
     def energy_gradient(self, x: np.ndarray) -> np.ndarray:
-        """dE/dx (n,)."""
+        """dE/dx (n,) in J over the unit of ``x``."""
         return self.system.forces(x) if self.map.start == "rest" else self.system.masses * x
 
     def _part(self, section: Section, free: bool) -> slice:
@@ -95,13 +95,13 @@ class Shooting:
 
 @dataclass(eq=False)
 class Attempt:
-    """What a corrector did: ``history`` of residual norms, ``reason`` why it stopped, the last ``xi`` and its orbit."""
+    """What a corrector did: ``history`` of residual norms, ``reason`` why it stopped, last ``xi`` and ``arc``."""
 
     converged: bool
     reason: str
     history: list[float]
     xi: np.ndarray
-    orbit: Arc | None = None
+    arc: Arc | None = None
 
     @property
     def residuals(self) -> str:
@@ -112,12 +112,6 @@ class Attempt:
     def newton(self) -> int:
         """Newton steps taken."""
         return max(len(self.history) - 1, 0)
-
-    @property
-    def arc(self) -> Arc:
-        """The orbit of an attempt that has one."""
-        assert self.orbit is not None
-        return self.orbit
 
 
 class Corrector:

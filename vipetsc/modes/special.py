@@ -36,37 +36,29 @@ def special_kinds(problem: Shooting) -> list[tuple[str, Test, float]]:
     ]
 
 
-class Locator:
-    """Locates the special points inside one step of a branch; ``chart`` as in ``StepControl``.
+def locate(
+    corrector: Corrector, left: Point, right: Point, chart: str = "relative", grazing: bool = False
+) -> list[Point]:
+    """Special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
 
-    With ``grazing`` also every change of the number of contacts, by bisection (some 40 corrections each).
+    ``chart`` as in ``StepControl``; with ``grazing`` also every change of the number of contacts, by bisection (some 40
+    corrections each). An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins
+    or ends the tongue of a ``resonance``.
     """
-
-    def __init__(self, corrector: Corrector, chart: str = "relative", grazing: bool = False) -> None:
-        self.corrector, self.chart, self.grazing = corrector, chart, grazing
-        self.kinds = special_kinds(corrector.problem)
-
-    def between(self, left: Point, right: Point) -> list[Point]:
-        """Special points between two consecutive points, in order; their ``index`` is the right one's.
-
-        An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins or ends the
-        tongue of a ``resonance``.
-        """
-        points: list[Point] = []
-        segment = _Segment(self.corrector, self.chart, left, right)
-        problem = self.corrector.problem
-        touching = sum(p.episodes > 0 for p in (left, right))
-        for kind, test, floor in self.kinds:
-            if not problem.system.springs and touching < (2 if kind.startswith("fold") else 1):
-                continue  # a linear branch has folds of rounding only
-            a, b = test(left), test(right)
-            folded = kind == "branch-point" and any(p.kind == "fold-energy" for p in points)
-            if a * b < 0 and min(abs(a), abs(b)) > floor and not folded:
-                points += segment.root(kind, test)
-        if self.grazing and left.episodes != right.episodes:
-            points += segment.root("grazing", lambda p: 1.0 if p.episodes == right.episodes else -1.0, 1e-11)
-        folds = (replace(p, resonance=resonance(problem, p)) if p.kind == "fold-energy" else p for p in points)
-        return sorted(folds, key=lambda p: p.step)
+    points: list[Point] = []
+    problem, segment = corrector.problem, _Segment(corrector, chart, left, right)
+    touching = sum(p.episodes > 0 for p in (left, right))
+    for kind, test, floor in special_kinds(problem):
+        if not problem.system.springs and touching < (2 if kind.startswith("fold") else 1):
+            continue  # a linear branch has folds of rounding only
+        a, b = test(left), test(right)
+        folded = kind == "branch-point" and any(p.kind == "fold-energy" for p in points)
+        if a * b < 0 and min(abs(a), abs(b)) > floor and not folded:
+            points += segment.root(kind, test)
+    if grazing and left.episodes != right.episodes:
+        points += segment.root("grazing", lambda p: 1.0 if p.episodes == right.episodes else -1.0, 1e-11)
+    folds = (replace(p, resonance=resonance(problem, p)) if p.kind == "fold-energy" else p for p in points)
+    return sorted(folds, key=lambda p: p.step)
 
 
 class _Segment:

@@ -82,8 +82,8 @@ class System:
         masses = np.asarray(list(masses), float)
         stiffness = np.zeros((len(masses), len(masses)))
         for start, end, k in springs:
-            d = direction(start, end, len(masses))
-            stiffness += k * np.outer(d, d)
+            (row,) = elongation_rows([(start, end)], len(masses))
+            stiffness += k * np.outer(row, row)
         return cls(masses, stiffness, tuple(contacts), tuple(smooth))
 
     @classmethod
@@ -138,14 +138,12 @@ class System:
     @cached_property
     def contact_rows(self) -> np.ndarray:
         """Rows (contacts, n) with w = rows @ u."""
-        rows = [direction(p.host, p.resonator, self.dofs) for p in self.contacts]
-        return np.array(rows).reshape(-1, self.dofs)
+        return elongation_rows([(p.host, p.resonator) for p in self.contacts], self.dofs)
 
     @cached_property
     def spring_rows(self) -> np.ndarray:
         """Rows (springs, n) with the smooth springs' elongations z = rows @ u."""
-        rows = [direction(s.start, s.end, self.dofs) for s in self.springs]
-        return np.array(rows).reshape(-1, self.dofs)
+        return elongation_rows([(s.start, s.end) for s in self.springs], self.dofs)
 
     @cached_property
     def clearances(self) -> np.ndarray:
@@ -208,10 +206,11 @@ class System:
         return np.sqrt(eigh(stiffness, np.diag(self.masses), eigvals_only=True))
 
 
-def direction(start: int | None, end: int, dofs: int) -> np.ndarray:
-    """The row (n,) that turns displacements into the elongation u_end - u_start."""
-    row = np.zeros(dofs)
-    row[end] = 1.0
-    if start is not None:
-        row[start] = -1.0
-    return row
+def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray:
+    """Rows (pairs, n) that turn displacements into the elongations u_end - u_start of pairs (start, end)."""
+    rows = np.zeros((len(ends), dofs))
+    for row, (start, end) in zip(rows, ends, strict=True):
+        row[end] = 1.0
+        if start is not None:
+            row[start] = -1.0
+    return rows
