@@ -237,8 +237,7 @@ def test_in_phase_through_the_first_tongues(in_phase):
     """The grazing cascade and the 5:1 and 7:1 resonances, without a jump; grazing at its own energy."""
     corrector, points = in_phase
     points = list(itertools.takewhile(lambda p: p.frequency < 333, points))
-    locator = Locator(corrector, "relative", grazing=True)
-    special = itertools.chain.from_iterable(itertools.starmap(locator.between, itertools.pairwise(points)))
+    special = (p for a, b in itertools.pairwise(points) for p in locate(corrector, a, b, grazing=True))
     graze = next(p for p in special if p.kind == "grazing")
     assert graze.energy == pytest.approx(GRAZING[IN_PHASE], rel=1e-10)
     assert max(p.residual for p in points) <= 1e-11
