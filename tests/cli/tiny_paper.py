@@ -40,7 +40,7 @@ def tiny_plan() -> Plan:
     """All steps of the quick plan in small, a few figures, and claims that are sums over the results."""
     plan = paper_plan(QUICK)
     steps = {step.name: step.changed(*CHANGES[step.name]) for step in plan.steps}
-    return replace(plan, steps=tuple(steps.values()), claims=__spec__.name if __spec__ else __name__)
+    return replace(plan, steps=tuple(steps.values()), measure=measure_claims)
 
 
 def drawing(plan: Plan) -> Plan:
@@ -81,11 +81,6 @@ def measure_claims(root: Path) -> list[Total]:
             text = f"the {key} of the small lattice adds up"
             found.append(Total(name, reading, text, value, {}, "total > 0", verdict, "", "", (f"{step}/ensemble.h5",)))
     return found
-
-
-def write_claims(claims: list[Total], path: Path) -> None:
-    """As the project's own."""
-    path.write_text(json.dumps([vars(claim) for claim in claims], indent=1))
 
 
 def main() -> int:

@@ -158,9 +158,9 @@ def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Every figure and claim of the paper: what is missing is computed, drawn, measured, and put into a report."""
-    from vipetsc.paper.make import make_paper
+    from vipetsc.paper.make import make_paper, plan_table
     from vipetsc.paper.plan import FULL, QUICK, paper_plan
-    from vipetsc.paper.tables import claims_table, plan_table
+    from vipetsc.paper.report import claims_table
 
     plan = paper_plan(QUICK if options.quick else FULL)
     folder = _output(options, "paper-quick" if options.quick else "paper")

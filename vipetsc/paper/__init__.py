@@ -3,5 +3,5 @@
 Tempelman, Vakakis and Matlack, on wavenumber scattering and inter-band targeted energy transfer in phononic lattices
 with local vibro-impacts. ``plan`` gathers the steps (``plan.toml``, case files in ``cases/``), ``figures`` draws the
 figures (``figures.toml``), ``claims`` measures the claims (``claims/claims.toml``); ``make`` makes all of it in one
-folder with ``report``, and ``tables`` prints what is done.
+folder with ``report``.
 """

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from pydantic import TypeAdapter
 
 from vipetsc.case import Case
 from vipetsc.figures.lattice import lattice_page, reduced_model
@@ -99,19 +100,9 @@ def _case(preset: str, reading: str) -> Case:
 
 
 SCHEMATICS: dict[str, Callable[..., Figure]] = {"lattice": lattice, "two_masses": two_masses}
-
-
-def _read_figures() -> tuple[PaperFigure, ...]:
-    tables = tomllib.loads((files("vipetsc.paper") / "figures.toml").read_text(encoding="utf-8"))
-    return tuple(
-        PaperFigure(
-            key, **table | {"claims": tuple(table["claims"]), "parts": tuple(Part(**p) for p in table["parts"])}
-        )
-        for key, table in tables.items()
-    )
-
-
-PAPER_FIGURES = _read_figures()
+_TABLES = tomllib.loads((files("vipetsc.paper") / "figures.toml").read_text(encoding="utf-8"))
+_ROWS = [{"id": key} | table for key, table in _TABLES.items()]
+PAPER_FIGURES = TypeAdapter(tuple[PaperFigure, ...]).validate_python(_ROWS)
 
 # Pattern in the name of a picture's file, and what it says.
 NAMES = (

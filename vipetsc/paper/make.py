@@ -4,9 +4,8 @@ What is made from results is made again when the hash of its inputs changed: the
 their results, the version of the package. ``made.json`` keeps the hashes.
 """
 
-import importlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +13,15 @@ from typing import Any
 
 from mpi4py import MPI
 
-import vipetsc
 from vipetsc.figures import style
 from vipetsc.figures.style import Drawing, draw_each
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import PAPER, claim_folder, provenance
-from vipetsc.paper.figures import TRANSFER
+from vipetsc.paper.claims import write_claims
+from vipetsc.paper.figures import RELATED, TRANSFER
 from vipetsc.paper.plan import Plan
 from vipetsc.paper.report import write_report
-from vipetsc.paper.steps import BRANCHES, DONE, STALE, fingerprint
+from vipetsc.paper.steps import DONE, MISSING, STALE, Step, fingerprint
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
 
@@ -45,7 +44,6 @@ class PaperResult:
     claims: tuple[dict[str, Any], ...]
     complete: bool
     stopped: bool
-    folder: Path
 
 
 def make_paper(
@@ -82,13 +80,17 @@ def make_paper(
     made = _make_steps(part, root, comm, stop, tell)
     drawn: tuple[Path, ...] = ()
     if not comm.allreduce(stop.requested, MPI.LOR):
-        on_root(comm, lambda: _relate(plan, root))
+        on_root(comm, lambda: _relate(plan.folders(root)))
         drawn = draw_paper(part, root, comm, stop, tell)
     if comm.allreduce(stop.requested, MPI.LOR):
-        return PaperResult(made, drawn, (), False, True, root)
+        return PaperResult(made, drawn, (), False, True)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
-    complete = on_root(comm, lambda: all(s.state(root) == DONE and s.without_failure(root) for s in part.steps))
-    return PaperResult(made, drawn, claims, complete, False, root)
+
+    def is_complete(step: Step) -> bool:
+        return step.state(root) == DONE and not step.statistics(root).get("failed")
+
+    complete = on_root(comm, lambda: all(map(is_complete, part.steps)))
+    return PaperResult(made, drawn, claims, complete, False)
 
 
 def _claim(plan: Plan, root: Path) -> None:
@@ -121,10 +123,9 @@ def _make_steps(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell:
     return tuple(made)
 
 
-def _relate(plan: Plan, root: Path) -> None:
+def _relate(folders: Mapping[str, Path]) -> None:
     """Lay the transfer of the four-band lattice over the branches, as far as they are done (``backbone.h5``)."""
-    folders = plan.folders(root)
-    branches = [folders[s.name] for s in plan.steps if s.kind is BRANCHES and s.name in folders]
+    branches = [folders[name] for name in RELATED if name in folders]
     if TRANSFER in folders and branches and not is_related(folders[TRANSFER], branches):
         relate_folders([folders[TRANSFER], *branches])
 
@@ -135,47 +136,35 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: 
     The ranks draw pictures from one count, so that they end together whatever a picture costs; none is begun after
     a request to stop.
     """
-    target = root / "figures"
     folders = on_root(comm, lambda: plan.folders(root))
     record = on_root(comm, lambda: _drop_stale(plan, root))
     if comm.rank == 0:
         tell("figures")
-    on_root(comm, lambda: target.mkdir(exist_ok=True))
     counter = SharedCounter(comm)
 
     def turns() -> Iterator[int]:
         while not stop.requested:
             yield counter.draw()
 
-    stems: dict[str, list[str]] = {figure.id: [] for figure in plan.figures}
-
     def offered() -> Iterator[Drawing]:
         for figure in plan.figures:
+            entry = record["figures"][figure.id]
+            entry["pictures"] = []
             for stem, make in figure.offers(folders):
-                stems[figure.id].append(stem)
+                entry["pictures"].append(stem)
                 yield stem, make
 
     with style.rc_style():
-        mine = draw_each(offered(), target, FORMATS, turns(), plan.note, keep=Path.exists)
+        mine = draw_each(offered(), root / "figures", FORMATS, turns(), plan.note, keep=Path.exists)
     drawn = sorted(path for paths in comm.allgather(mine) for path in paths)
     counter.free()
-    for figure, pictures in stems.items():
-        record["figures"][figure]["pictures"] = pictures
     on_root(comm, lambda: _write_record(root, record))
     return tuple(drawn)
 
 
-def inputs_of(plan: Plan, root: Path) -> dict[str, str]:
-    """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
-    steps = {step.name: step.identity(root) for step in plan.steps if step.state(root) == DONE}
-    version = vipetsc.__version__, plan.note
-    inputs = {f.id: fingerprint(*version, *(n + steps[n] for n in f.steps if n in steps)) for f in plan.figures}
-    return inputs | {"claims": fingerprint(*version, *(name + identity for name, identity in steps.items()))}
-
-
 def _drop_stale(plan: Plan, root: Path) -> Record:
     """Remove pictures of other inputs than those of now, so that every picture that is there is up to date."""
-    record, inputs = read_record(root), inputs_of(plan, root)
+    record, inputs = read_record(root), plan.inputs(root)
     for figure in plan.figures:
         if record["figures"].get(figure.id, {}).get("inputs") != inputs[figure.id]:
             for path in (root / "figures").glob(f"{figure.id}-*"):
@@ -198,12 +187,11 @@ def _write_record(root: Path, record: Record) -> None:
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[str, Any], ...]:
     """``claims.json`` and ``report.html`` as far as their inputs changed; returns the claims."""
-    record, inputs = read_record(root), inputs_of(plan, root)["claims"]
+    record, inputs = read_record(root), plan.inputs(root)["claims"]
     path, report = root / "claims.json", root / "report.html"
     if not path.exists() or record.get("claims") != inputs:
         tell("claims")
-        module = importlib.import_module(plan.claims)
-        module.write_claims(module.measure_claims(root), path)
+        write_claims(plan.measure(root), path)
         record["claims"] = inputs
     text = path.read_text(encoding="utf-8")
     versions = {key: value for key, value in provenance(comm).items() if key.endswith("_version")}
@@ -225,3 +213,25 @@ def duration(seconds: float) -> str:
     if seconds <= 0:
         return "-"
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+def plan_table(plan: Plan, root: Path, ranks: int) -> str:
+    """What is done and what is left of ``plan`` in ``root``: steps with the time they need, figures, claims."""
+    lines, total = [f"{'step':<26}{'state':<10}{'left':>9}  claims"], 0.0
+    for step in plan.steps:
+        left = step.left(root) / ranks
+        total += left
+        lines.append(f"{step.name:<26}{step.state(root):<10}{duration(left):>9}  {' '.join(plan.claims_of(step))}")
+    lines += [f"{'all steps on ' + str(ranks) + (' ranks' if ranks > 1 else ' rank'):<36}{duration(total):>9}", ""]
+    lines.append(f"{'figure':<8}{'paper':<9}{'pictures':<10}{'state':<9}claims      shows")
+    record, inputs = read_record(root)["figures"], plan.inputs(root)
+    for figure in plan.figures:
+        unrecorded = {path.stem for path in (root / "figures").glob(f"{figure.id}-*")}
+        entry = record.get(figure.id, {"inputs": "", "pictures": unrecorded})
+        paths = [root / "figures" / f"{stem}.{kind}" for stem in entry["pictures"] for kind in FORMATS]
+        drawn = sum(path.exists() for path in paths)
+        current = drawn == len(paths) and entry["inputs"] == inputs[figure.id]
+        state = MISSING if not drawn else DONE if current else STALE
+        row = f"{figure.id:<8}{figure.label:<9}{drawn // len(FORMATS):<10}{state:<9}{' '.join(figure.claims):<12}"
+        lines.append(row + figure.title)
+    return "\n".join(lines)

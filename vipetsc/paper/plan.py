@@ -1,15 +1,18 @@
 """What the verb ``paper`` makes: steps, figures and claims, in full or on coarse grids."""
 
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
+import vipetsc
+from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.io.folder import FolderError
+from vipetsc.paper.claims import measure_claims
 from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
-from vipetsc.paper.steps import BRANCHES, DONE, SEARCH, SWEEP, Step
+from vipetsc.paper.steps import DONE, Step, StepCase, fingerprint
 
 FULL, QUICK = "full", "quick"
 CLAIMS = tuple(f"C{number}" for number in range(1, 18))
@@ -18,24 +21,22 @@ COARSE = "quick: coarse grid"
 # Steps that a claim is measured from besides those of the figures that show it.
 FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
 
-RUNS = ("output.figures=false",)  # of all sweeps: the figures of the paper are drawn from all of them together
-
-KINDS = {"sweep": SWEEP, "branches": BRANCHES, "search": SEARCH}
+KINDS: dict[str, type[StepCase]] = {"sweep": Sweep, "branches": NnmCase, "search": DesignCase}
 
 
 @dataclass(frozen=True)
 class Plan:
     """Steps in the order in which they are made, and the figures of the paper.
 
-    ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``claims`` names the module that measures
-    (``measure_claims``, ``write_claims``).
+    ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``measure`` gives the claims (dataclasses) from
+    the folder of all steps.
     """
 
     grid: str
     steps: tuple[Step, ...]
     figures: Sequence[PaperFigure] = PAPER_FIGURES
     note: str = ""
-    claims: str = "vipetsc.paper.claims"
+    measure: Callable[[Path], Sequence[Any]] = measure_claims
 
     def only(self, ids: Iterable[str]) -> Self:
         """The part of the plan that figures and claims need; all of it without ``ids``.
@@ -71,6 +72,13 @@ class Plan:
         claims |= {claim for claim, steps in FURTHER_STEPS.items() if step.name in steps}
         return sorted(claims, key=CLAIMS.index)
 
+    def inputs(self, root: Path) -> dict[str, str]:
+        """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
+        steps = {step.name: step.identity(root) for step in self.steps if step.state(root) == DONE}
+        version = vipetsc.__version__, self.note
+        inputs = {f.id: fingerprint(*version, *(n + steps[n] for n in f.steps if n in steps)) for f in self.figures}
+        return inputs | {"claims": fingerprint(*version, *(name + identity for name, identity in steps.items()))}
+
 
 def paper_plan(grid: str = FULL) -> Plan:
     """The whole paper, from ``plan.toml`` and the case files of the package.
@@ -78,10 +86,12 @@ def paper_plan(grid: str = FULL) -> Plan:
     The quick grid has fewer amplitudes, wavenumbers and sites and leaves out the in-phase branches; both laws and both
     readings stay.
     """
-    folder, coarse = files("vipetsc.paper"), grid == QUICK
+    folder = files("vipetsc.paper")
     steps = []
     for name, row in tomllib.loads((folder / "plan.toml").read_text(encoding="utf-8")).items():
-        kind, file = KINDS[row["kind"]], folder / "cases" / f"{row.get('case', name)}.toml"
-        changes = [*(RUNS if kind is SWEEP else ()), *row.get("changes", ()), *(row.get("quick", ()) if coarse else ())]
-        steps.append(Step(name, kind, Path(str(file)), tuple(changes), row["cost"]))
-    return Plan(grid, tuple(steps), note=COARSE if coarse else "")
+        file = Path(str(folder / "cases" / f"{row.get('case', name)}.toml"))
+        changes = [*row.get("changes", ()), *(row.get("quick", ()) if grid == QUICK else ())]
+        if row["kind"] == "sweep":  # the figures of the paper are drawn from all sweeps together
+            changes.insert(0, "output.figures=false")
+        steps.append(Step(name, KINDS[row["kind"]], file, tuple(changes), row["cost"]))
+    return Plan(grid, tuple(steps), note=COARSE if grid == QUICK else "")

@@ -1,4 +1,4 @@
-"""The report on the paper: one page with everything in it, for a screen of any width and for print."""
+"""What is told of the paper: one page with everything in it, for any screen and for print, and a table of verdicts."""
 
 import base64
 import io
@@ -40,9 +40,7 @@ def write_report(
         lstrip_blocks=True,
     )
     environment.filters |= {"numbers": numbers, "sources": sources, "picture": picture, "describe": describe}
-    rows: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for claim in claims:
-        rows.setdefault(claim["id"], {})[claim["reading"]] = claim
+    rows = by_reading(claims)
     readings = [r for r in READINGS if any(r in row for row in rows.values())]
     verdicts = {r: Counter(row[r]["verdict"] for row in rows.values() if r in row) for r in readings}
     page = environment.get_template("report.html").render(
@@ -83,3 +81,21 @@ def sources(files: Sequence[str]) -> str:
 
 def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
+
+
+def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
+    """Claims in rows, readings in columns, verdicts in words."""
+    readings = list(dict.fromkeys(claim["reading"] for claim in claims))
+    lines = [f"{'':<5}" + "".join(f"{reading:<18}" for reading in readings) + "claim"]
+    for key, row in by_reading(claims).items():
+        verdicts = "".join(f"{row[r]['verdict'] if r in row else '':<18}" for r in readings)
+        lines.append(f"{key:<5}{verdicts}{next(iter(row.values()))['claim']}")
+    return "\n".join(lines)
+
+
+def by_reading(claims: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """The rows of ``claims.json`` by id and reading."""
+    rows: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for claim in claims:
+        rows.setdefault(claim["id"], {})[claim["reading"]] = claim
+    return rows

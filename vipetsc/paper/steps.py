@@ -3,18 +3,18 @@
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from mpi4py import MPI
 
 import h5py
 import numpy as np
 
-from vipetsc.case import CaseFile, DesignCase, NnmCase, Sweep
+from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
 from vipetsc.modes.follow import follow_all, prepare_folder
@@ -24,33 +24,20 @@ from vipetsc.studies.design import search_design
 from vipetsc.studies.sweep import run_sweep
 
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
+StepCase = Sweep | NnmCase | DesignCase
 RELATION = "backbone.h5"  # beside a sweep that is laid over branches
-
-
-class StepKind(NamedTuple):
-    """What differs between steps.
-
-    ``files`` (case) are the names of the results; ``make`` (case, folder, comm, stop, afresh) makes what is missing on
-    all ranks, everything if ``afresh``, and may leave early on ``stop``; ``statistics`` (paths of the results) gives
-    numbers for a report.
-    """
-
-    case: type[CaseFile]
-    files: Callable[[Any], Sequence[str]]
-    make: Callable[[Any, Path, MPI.Comm, StopRequest, bool], object]
-    statistics: Callable[[Sequence[Path]], dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Step:
-    """One case made in ``root/<name>``.
+    """One case made in ``root/<name>``: a sweep, branches or a search.
 
-    ``file`` is the case file, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time in s
-    of all of it (of a member, for sweeps) on a core of the 2020s, used until rates are measured.
+    ``kind`` of case and its ``file``, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time
+    in s of all of it (of a member, for sweeps) on a core of the 2020s, used until rates are measured.
     """
 
     name: str
-    kind: StepKind
+    kind: type[StepCase]
     file: Path
     changes: tuple[str, ...] = ()
     cost: float = 1.0
@@ -64,9 +51,9 @@ class Step:
         return replace(self, changes=(*self.changes, *changes))
 
     @cached_property
-    def case(self) -> Any:
+    def case(self) -> StepCase:
         """The resolved case; raises CaseError."""
-        return self.kind.case.load(self.file, self.changes)
+        return self.kind.load(self.file, self.changes)
 
     @cached_property
     def text(self) -> str:
@@ -75,7 +62,24 @@ class Step:
 
     def results(self, root: Path) -> list[Path]:
         """The files that pictures and claims are made from."""
-        return [self.folder(root) / name for name in self.kind.files(self.case)]
+        names = ["ensemble.h5" if isinstance(self.case, Sweep) else "design.h5"]
+        if isinstance(self.case, NnmCase):
+            system = System.from_case(self.case)
+            names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
+        return [self.folder(root) / name for name in names]
+
+    def make(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
+        """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``."""
+        case, folder = self.case, self.folder(root)
+        begun = on_root(comm, (folder / "case.toml").exists)
+        if isinstance(case, Sweep):
+            run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True)
+        elif isinstance(case, NnmCase):
+            resume = begun and not afresh
+            on_root(comm, lambda: prepare_folder(case, folder, afresh, resume))
+            follow_all(case, folder, comm, resume)
+        else:
+            on_root(comm, lambda: search_design(case, folder, afresh or begun))
 
     def state(self, root: Path) -> str:
         """DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
@@ -99,10 +103,6 @@ class Step:
         """Whether a case in TOML is this step's, in whatever order its keys stand."""
         return tomllib.loads(text) == tomllib.loads(self.text)
 
-    def make(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-        """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``."""
-        self.kind.make(self.case, self.folder(root), comm, stop, afresh)
-
     def identity(self, root: Path) -> str:
         """Hash of the case and of what the results hold."""
         paths = [*self.results(root), self.folder(root) / RELATION]
@@ -113,7 +113,7 @@ class Step:
         state = self.state(root)
         if state == DONE:
             return 0.0
-        if self.kind is not SWEEP:
+        if not isinstance(self.case, Sweep):
             return self.cost
         times = _cpu_times(self.folder(root)) if state == BEGUN else []
         rate = max(float(np.mean(times)), self.cost) if times else self.cost  # measuring a run takes time as well
@@ -121,45 +121,25 @@ class Step:
 
     def statistics(self, root: Path) -> dict[str, Any]:
         """Numbers about the results for a report, once they are there; empty where there are none to tell."""
-        return self.kind.statistics(self.results(root))
-
-    def without_failure(self, root: Path) -> bool:
-        """Whether no member and no branch of the step failed, once it is done."""
-        statistics = self.statistics(root)
-        return not statistics.get("failed") and not any("failed" in e for e in statistics.get("endings", ()))
+        if isinstance(self.case, NnmCase):
+            return _branch_statistics(self.results(root))
+        return _sweep_statistics(self.folder(root)) if isinstance(self.case, Sweep) else {}
 
 
-def fingerprint(*parts: str | bytes) -> str:
-    """One hash of all ``parts``, in this order."""
-    digests = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
-    return hashlib.sha256(" ".join(digests).encode()).hexdigest()
-
-
-def _make_branches(case: NnmCase, folder: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-    resume = not afresh and on_root(comm, (folder / "case.toml").exists)
-    on_root(comm, lambda: prepare_folder(case, folder, afresh, resume))
-    follow_all(case, folder, comm, resume)
-
-
-def _branch_files(case: NnmCase) -> list[str]:
-    system = System.from_case(case)
-    return [f"branch-{system.branch_name(mode - 1)}.h5" for mode in case.nnm.modes]
-
-
-def _sweep_statistics(paths: Sequence[Path]) -> dict[str, Any]:
+def _sweep_statistics(folder: Path) -> dict[str, Any]:
     """Members and how they ended, contact episodes, the largest error of the ledger, CPU time in s."""
-    ensemble = open_ensemble(paths[0].parent)
+    ensemble = open_ensemble(folder)
     status = ensemble["status"].values
     counts = {name: int((status == code).sum()) for code, name in enumerate(("simulated", "scaled", "failed"))}
     return {"members": int(status.size)} | counts | {
         "episodes": int(np.nansum(ensemble["contact_episodes"].values)),
         "ledger": float(np.nanmax(ensemble["ledger_error"].values, initial=0.0)),
-        "cpu": float(sum(_cpu_times(paths[0].parent))),
+        "cpu": float(sum(_cpu_times(folder))),
     }  # fmt: skip
 
 
 def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
-    """Points, largest residual and endings of the branches."""
+    """Points, largest residual and endings of the branches, and how many of them failed."""
     points, residual, endings = 0, 0.0, []
     for path in paths:
         with open_netcdf(path, "branch", ("kind", "residual", "ending")) as branch:
@@ -167,7 +147,8 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
             points += len(regular)
             residual = max(residual, float(regular.max(initial=0.0)))
             endings.append(f"{branch.attrs['name']}: {branch.attrs['ending']}")
-    return {"points": points, "residual": residual, "endings": endings}
+    failed = sum("failed" in ending for ending in endings)
+    return {"points": points, "residual": residual, "endings": endings, "failed": failed}
 
 
 def _cpu_times(folder: Path) -> list[float]:
@@ -177,18 +158,7 @@ def _cpu_times(folder: Path) -> list[float]:
     return [0.0 if "scaled_from" in s else float(s.get("cpu_seconds", 0.0)) for s in statistics]
 
 
-SWEEP = StepKind(
-    Sweep,
-    lambda case: ("ensemble.h5",),
-    lambda case, folder, comm, stop, afresh: run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True),
-    _sweep_statistics,
-)
-BRANCHES = StepKind(NnmCase, _branch_files, _make_branches, _branch_statistics)
-SEARCH = StepKind(
-    DesignCase,
-    lambda case: ("design.h5",),
-    lambda case, folder, comm, stop, afresh: on_root(
-        comm, lambda: search_design(case, folder, afresh or (folder / "case.toml").exists())
-    ),
-    lambda paths: {},
-)
+def fingerprint(*parts: str | bytes) -> str:
+    """One hash of all ``parts``, in this order."""
+    digests = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
+    return hashlib.sha256(" ".join(digests).encode()).hexdigest()
