@@ -12,7 +12,7 @@ from vipetsc.figures.registry import draw, draw_bands, figure_names
 from vipetsc.figures.style import new_figure, rc_style
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.spectra import kinetic_energy
-from vipetsc.studies.reanalyse import measure_run
+from vipetsc.studies.sweep import measure_run
 
 NT, CELLS, INTERVAL = 240, 24, 2e-4
 ENERGIES = ("kinetic", "spring", "contact", "work", "dissipated")

@@ -11,7 +11,7 @@ import xarray
 from tests.conftest import datasets, small_case
 from vipetsc import Case, simulate
 from vipetsc.dynamics.ts import integrator
-from vipetsc.studies.reanalyse import measure_run
+from vipetsc.studies.sweep import measure_run
 
 
 def test_every_file_opens_in_xarray_with_units(folder):

@@ -65,7 +65,7 @@ def draw_source(
 
 
 def _prepare_run(folder: Path) -> None:
-    from vipetsc.studies.reanalyse import is_measured, measure_run
+    from vipetsc.studies.sweep import is_measured, measure_run
 
     run = folder / "run.h5"
     if not run.exists():

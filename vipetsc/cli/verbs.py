@@ -48,7 +48,7 @@ def _output(options: argparse.Namespace, name: str) -> Path:
 def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """One simulation, its analysis and pictures."""
     from vipetsc.dynamics import simulate
-    from vipetsc.studies.reanalyse import measure_run
+    from vipetsc.studies.sweep import measure_run
 
     case = _load(Case, options, comm)
     for warning in on_root(comm, case.warnings):
@@ -143,7 +143,7 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
-    from vipetsc.studies.reanalyse import reanalyse_folders
+    from vipetsc.studies.sweep import reanalyse_folders
 
     echo_paths(comm, reanalyse_folders(options.path, comm))
     return DONE

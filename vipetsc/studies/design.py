@@ -1,6 +1,7 @@
 """The (lambda, eta) search of the supplement: a case in, ``design.h5`` out."""
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from vipetsc.lattice.search import COSTS, Search, search, signed_deflection, uni
 PAPER = 0.1, 0.5  # the (lambda, eta) that the paper takes
 UNITS = {"deflection": "1", "group_velocity": "cells/s", "weighted": "cells/s"}
 GRID, OPTIMUM = "reading lambda eta", "reading cost"
+BEST = "optimum_lambda", "optimum_eta", "optimum_value"
 
 # Dimensions, units and description of every variable.
 LAYOUT = {
@@ -44,8 +46,6 @@ LAYOUT = {
     "optimum_deflection": (f"{OPTIMUM} wavenumber band", "1", "|u3 - u2| sign(-u2 u3) on each band at the optimum"),
 }
 
-Searches = Mapping[Reading, Search]
-
 
 def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> str:
     """Search the grid of ``case`` in each of its readings; writes ``design.h5``, returns a table of the optima.
@@ -58,61 +58,56 @@ def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> 
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
     lam, eta = options.lam.values(), options.eta.values()
     searches = {reading: search(reading, lam, eta, wavenumber) for reading in options.readings}
-    paper = {reading: search(reading, *PAPER, wavenumber) for reading in options.readings}
+    values = _grids(searches)
+    values |= _optima(searches, values)
+    paper = (search(reading, *PAPER, wavenumber) for reading in options.readings)
+    values["paper_value"] = np.array([[result.cost(name).item() for name in COSTS] for result in paper])
     about = provenance(MPI.COMM_SELF) | {"case": case.to_toml()}
     if options.eta.last == 1:
         about["left_out"] = "eta = 1: the host mass m (1 - eta) vanishes"
-    write_netcdf(folder / "design.h5", xr.Dataset(tabulated(LAYOUT, _values(searches, paper)), attrs=about))
-    return _table(searches, paper)
+    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    write_netcdf(folder / "design.h5", data)
+    return _table(data)
 
 
-def _values(searches: Searches, paper: Searches) -> dict[str, Any]:
-    """Bands and costs over the grid, and where each cost is largest with the Bloch vectors there.
-
-    Optima are NaN in a reading in which no cell is out of phase.
-    """
+def _grids(searches: Mapping[Reading, Search]) -> dict[str, Any]:
+    """Bands and costs over the grid."""
     first = next(iter(searches.values()))
-    *_, points, masses = first.frequency.shape
-    bands = np.arange(1, masses + 1)
+    bands = np.arange(1, first.frequency.shape[-1] + 1)
     values: dict[str, Any] = {"reading": list(searches), "lambda": first.lam, "eta": first.eta, "cost": list(COSTS)}
     values |= {"wavenumber": first.wavenumber, "band": bands, "dof": bands}
     for name in ("frequency", "signed_deflection", "speed", "out_of_phase"):
         values[name] = np.stack([getattr(result, name) for result in searches.values()])
     values["out_of_phase"] = values["out_of_phase"].astype(np.int8)
-    values |= {name: np.stack([result.cost(name) for result in searches.values()]) for name in COSTS}
-    values["paper_value"] = np.array([[result.cost(name).item() for name in COSTS] for result in paper.values()])
-    shapes = {
-        "lambda": (),
-        "eta": (),
-        "value": (),
-        "amplitude": (points, masses, masses),
-        "deflection": (points, masses),
-    }
-    optima = {name: np.full((len(searches), len(COSTS), *shape), np.nan) for name, shape in shapes.items()}
+    return values | {name: np.stack([result.cost(name) for result in searches.values()]) for name in COSTS}
+
+
+def _optima(searches: Mapping[Reading, Search], grids: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Where each cost is largest, and the Bloch vectors there; NaN in a reading in which no cell is out of phase."""
+    dims = {name: dims.split() for name, (dims, *_) in LAYOUT.items() if name.startswith("optimum_")}
+    optima = {name: np.full([len(grids[dim]) for dim in dims[name]], np.nan) for name in dims}
     for i, (reading, result) in enumerate(searches.items()):
         for j, name in enumerate(COSTS):
             best = result.optimum(name)
             if best is not None:
                 cell = four_band(reading, best.lam, best.eta)
                 point = bloch(cell, result.wavenumber)
-                optima["lambda"][i, j], optima["eta"][i, j], optima["value"][i, j] = best.lam, best.eta, best.value
-                optima["amplitude"][i, j] = np.abs(unit_vectors(point))
-                optima["deflection"][i, j] = signed_deflection(cell, point)
-    return values | {f"optimum_{name}": array for name, array in optima.items()}
+                at_best = best.lam, best.eta, best.value, np.abs(unit_vectors(point)), signed_deflection(cell, point)
+                for array, value in zip(optima.values(), at_best, strict=True):
+                    array[i, j] = value
+    return optima
 
 
-def _table(searches: Searches, paper: Searches) -> str:
+def _table(data: xr.Dataset) -> str:
     """The optima in words and numbers, one line a reading and cost."""
-    first = next(iter(searches.values()))
+    sizes = data.sizes
     lines = [
-        f"four-band cell, {first.lam.size} x {first.eta.size} cells, {first.wavenumber.size} wavenumbers;"
+        f"four-band cell, {sizes['lambda']} x {sizes['eta']} cells, {sizes['wavenumber']} wavenumbers;"
         " u2 and u3 out of phase on band 2 at every wavenumber",
         f"reading     cost            lambda     eta      value  at ({PAPER[0]:g}, {PAPER[1]:g})  unit",
     ]
-    for reading, result in searches.items():
-        for name in COSTS:
-            best = result.optimum(name)
-            optimum = f"{best.lam:8.4g}{best.eta:8.4g}{best.value:11.5g}" if best else "    none is out of phase   "
-            at_paper = paper[reading].cost(name).item()
-            lines.append(f"{reading:<12}{name:<14}{optimum}{at_paper:14.5g}  {UNITS[name]}")
+    for (i, reading), (j, cost) in product(enumerate(data["reading"].values), enumerate(COSTS)):
+        lam, eta, value, paper = (data[name].values[i, j] for name in (*BEST, "paper_value"))
+        optimum = "    none is out of phase   " if np.isnan(value) else f"{lam:8.4g}{eta:8.4g}{value:11.5g}"
+        lines.append(f"{reading:<12}{cost:<14}{optimum}{paper:14.5g}  {UNITS[cost]}")
     return "\n".join(lines)

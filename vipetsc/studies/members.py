@@ -32,10 +32,7 @@ from vipetsc.studies.analysis import FULL, REDUCED, analyse
 # exceeds the sampled envelope by less than the rest for any burst of a few cycles.
 MARGIN = 0.9
 
-MEASURES = {"entropy": "entropy", "transfer": "bands"}
-"""What ``analyse`` calls the measures of ``[sweep] measures``."""
-
-
+MEASURES = {"entropy": "entropy", "transfer": "bands"}  # what ``analyse`` calls those of ``[sweep] measures``
 LAYOUT = {
     "cell": ("cell", "1", "cell, counted from 1"),
     "envelope": ("cell", "m", "largest relative displacement at 1 N"),
@@ -72,18 +69,13 @@ class MemberStore:
         """Where the linear run of ``case`` belongs."""
         return self.folder / "linear" / case_id(linear_case(case))
 
-    def wave(self, case: Case) -> xr.Dataset | None:
-        """The linear wave of ``case``; None if it has not been made."""
+    def wave(self, case: Case, current: bool = False) -> xr.Dataset | None:
+        """The linear wave of ``case``; None if it has not been made, by this version of the package if ``current``."""
         path = self.linear_folder(case) / "wave.h5"
         if not path.exists():
             return None
         with open_netcdf(path, "linear wave", ("envelope", "arrival")) as file:
-            return file.load()
-
-    def has_wave(self, case: Case) -> bool:
-        """Whether the linear wave of ``case`` has been made by this version of the package."""
-        wave = self.wave(case)
-        return wave is not None and wave.attrs.get("vipetsc_version") == vipetsc.__version__
+            return file.load() if not current or file.attrs.get("vipetsc_version") == vipetsc.__version__ else None
 
     def make_linear(self, case: Case) -> None:
         """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if it does not come out."""

@@ -1,4 +1,7 @@
-"""Every member of a sweep, over all ranks: linear runs first, then the longest; resumes, and goes on past failures."""
+"""Every member of a sweep, over all ranks: linear runs first, then the longest; resumes, and goes on past failures.
+
+The measures of runs already made, of one or of all members of a sweep whose fields were kept, are taken anew here too.
+"""
 
 import json
 import time
@@ -10,13 +13,18 @@ from typing import TypeVar
 from mpi4py import MPI
 
 import numpy as np
+import xarray as xr
 
-from vipetsc.case import Sweep, SweepMember
+import vipetsc
+from vipetsc.case import Case, Sweep, SweepMember
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import SWEEP, claim_folder
+from vipetsc.io.folder import SWEEP, FolderError, claim_folder
+from vipetsc.io.netcdf import open_netcdf, write_netcdf
+from vipetsc.io.read import open_run
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_every_rank, on_root
+from vipetsc.studies.analysis import analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS, Outcome, assemble
-from vipetsc.studies.members import MemberStore, StoppedError, reached
+from vipetsc.studies.members import MemberStore, StoppedError, arrival_at, reached
 
 FORMAT_VERSION = 1
 # What a member may raise and leave the others to go on: the machine's limits, a solver's or a file's refusal.
@@ -78,10 +86,15 @@ def run_sweep(
     missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_complete(case, current=True)])
     source = {key: store.linear_folder(cases[key]) for key in missing}
     linear = {source[key]: cases[key] for key in missing}
-    absent = on_root(comm, lambda: [path for path, case in linear.items() if not store.has_wave(case)])
+
+    def current_waves() -> dict[Path, xr.Dataset]:
+        stored = {path: store.wave(case, current=True) for path, case in linear.items()}
+        return {path: wave for path, wave in stored.items() if wave is not None}
+
+    ready = on_root(comm, current_waves)
+    absent = [path for path in linear if path not in ready]
     failures = pool.share(absent, lambda path: store.make_linear(linear[path]), None)
-    ready = on_root(comm, lambda: [path for path, case in linear.items() if store.has_wave(case)])
-    waves = on_every_rank(comm, lambda: {p: wave for p in ready if (wave := store.wave(linear[p])) is not None})
+    waves = on_root(comm, current_waves)
 
     def cost(key: str) -> float:
         """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
@@ -145,11 +158,16 @@ class TaskPool:
             number = self.team.bcast(drawn.draw() if leader else None)
             if number >= len(jobs):
                 break
-            begin = time.perf_counter()
+            job, begin = jobs[number], time.perf_counter()
             try:
-                reasons[jobs[number]] = self._reason(work, jobs[number])
+                work(job)
+                reasons[job] = ""
             except StoppedError:
                 break
+            except FAILURES as error:
+                if self.team.size > 1:  # ranks that meet in a member cannot go on without one of theirs: all end
+                    raise
+                reasons[job] = str(error) if isinstance(error, RuntimeError) else f"{type(error).__name__}: {error}"
             finally:
                 self.busy += time.perf_counter() - begin
             done = ended.draw(1 if leader else 0)
@@ -162,13 +180,62 @@ class TaskPool:
         ended.free()
         return {job: reason for share in everything for job, reason in share.items()}
 
-    def _reason(self, work: Callable[[Job], None], job: Job) -> str:
-        """Do ``job``; returns why it failed, "" if it did not."""
-        if self.team.size > 1:  # ranks that meet in a member cannot go on without one of theirs: all end
-            work(job)
-            return ""
+
+def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
+    """Measure the runs in ``paths`` (folders of runs or sweeps, or ``run.h5``); returns the files written.
+
+    The runs are shared over the ranks of ``comm``. Members of a sweep that kept no fields stay as they are; the
+    sweep's ensemble is put together anew.
+
+    Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
+    """
+    runs = on_root(comm, lambda: [folder for path in paths for folder in _run_folders(path)])
+
+    def has_fields(folder: Path) -> bool:
+        with open_run(folder / "run.h5") as run:
+            return "velocity" in run or not (folder.parent / "index.json").exists()
+
+    def reassemble(folder: Path) -> Path:
+        plan = Sweep.load(folder / "case.toml")
+        if not all(conclude(plan, plan.members(), MemberStore(folder, plan.options), {})):
+            raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
+        return folder / "ensemble.h5"
+
+    share = filter(has_fields, runs[comm.rank :: comm.size])
+    measured = on_every_rank(comm, lambda: [measure_run(folder) for folder in share])
+    written = sorted(path for paths in comm.allgather(measured) for path in paths)
+    return written + on_root(comm, lambda: [reassemble(path) for path in paths if (path / "index.json").exists()])
+
+
+def _run_folders(path: Path) -> list[Path]:
+    """The folders of the runs in ``path``, every one checked; raises FolderError."""
+    folder = path.parent if path.name == "run.h5" else path
+    sweep = (folder / "index.json").exists()
+    folders = [run.parent for run in sorted(folder.glob("*/run.h5"))] if sweep else [folder]
+    if not sweep and not (folder / "run.h5").exists():
+        raise FolderError(f"{path}: holds no run.h5; the folder of a finished run or sweep is needed")
+    for one in folders:
         try:
-            work(job)
-        except FAILURES as error:
-            return f"{type(error).__name__}: {error}" if not isinstance(error, RuntimeError) else str(error)
-        return ""
+            open_run(one / "run.h5").close()
+        except (OSError, ValueError, KeyError) as error:
+            raise FolderError(f"{one / 'run.h5'}: is not a run of vipetsc ({error})") from None
+    return folders
+
+
+def measure_run(folder: Path) -> Path:
+    """Write ``folder/analysis.h5`` and return its path; a sweep knows when the wave arrives. Raises as ``open_run``."""
+    with open_run(folder / "run.h5") as run:
+        case = Case.of(run)
+        wave = MemberStore(folder.parent).wave(case)
+        write_netcdf(folder / "analysis.h5", analyse(run, arrival=None if wave is None else arrival_at(wave, case)))
+    return folder / "analysis.h5"
+
+
+def is_measured(folder: Path) -> bool:
+    """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
+    with open_run(folder / "run.h5") as run:
+        if not (folder / "analysis.h5").exists():
+            return False
+        expected = {key: run.attrs.get(key) for key in ("case", "status")} | {"vipetsc_version": vipetsc.__version__}
+        with open_netcdf(folder / "analysis.h5", "analysis") as analysis:
+            return all(analysis.attrs.get(key) == value for key, value in expected.items())
