@@ -22,8 +22,7 @@ import pytest
 from tests.cli.tiny_paper import DRAWN, tiny_plan
 from tests.conftest import clean_environment
 from vipetsc.paper.figures import PAPER_FIGURES
-from vipetsc.paper.plan import CLAIMS, paper_plan
-from vipetsc.paper.steps import DONE
+from vipetsc.paper.plan import CLAIMS, DONE, paper_plan
 
 ROOT = Path(__file__).parents[2]
 

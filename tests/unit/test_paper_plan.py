@@ -15,8 +15,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import make
 from vipetsc.paper.figures import TRANSFER
 from vipetsc.paper.make import read_record
-from vipetsc.paper.plan import CLAIMS, FULL, Plan, paper_plan
-from vipetsc.paper.steps import DONE, MISSING, RELATION, STALE, fingerprint
+from vipetsc.paper.plan import CLAIMS, DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
 from vipetsc.studies.design import search_design
 
 ROOT = Path(__file__).parents[2]

@@ -19,9 +19,8 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import PAPER, claim_folder, provenance
 from vipetsc.paper.claims import write_claims
 from vipetsc.paper.figures import RELATED, TRANSFER
-from vipetsc.paper.plan import Plan
+from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, Step, fingerprint
 from vipetsc.paper.report import write_report
-from vipetsc.paper.steps import DONE, MISSING, STALE, Step, fingerprint
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
 
