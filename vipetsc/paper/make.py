@@ -59,20 +59,11 @@ def make_paper(
     Leaves ``<step>/`` for every step, ``figures/`` (PNG and PDF), ``claims.json`` and ``report.html``. A call that
     was stopped or killed is gone on with by the next one; one with nothing to do takes seconds.
 
-    Parameters
-    ----------
-    only
-        Ids of figures and claims: only the steps and figures that they need are made, and the claims measured and
-        the report written from all that is there.
-    tell
-        Called on rank 0 with what is about to be done.
+    ``only``, ids of figures and claims, makes only the steps and figures that they need; the claims are measured and
+    the report is written from all that is there. ``tell`` is called on rank 0 with what is about to be done.
 
-    Raises
-    ------
-    FolderError
-        If ``root`` holds the paper on another grid, or something else, or for an unknown id.
-    CaseError
-        If a case file cannot be used.
+    Raises FolderError if ``root`` holds the paper on another grid, or something else, or for an unknown id, CaseError
+    if a case file cannot be used.
     """
     root, stop, part = Path(root), stop or StopRequest(), plan.only(only)
     on_root(comm, lambda: _claim(plan, root))
@@ -199,7 +190,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[
         tell("report")
         stems = {key: entry["pictures"] for key, entry in record["figures"].items()}
         paths = [[root / "figures" / f"{stem}.png" for stem in stems.get(f.id, ())] for f in plan.figures]
-        pictures = [(f, [path for path in ps if path.exists()]) for f, ps in zip(plan.figures, paths, strict=True)]
+        pictures = [(f, list(filter(Path.exists, ps))) for f, ps in zip(plan.figures, paths, strict=True)]
         statistics = {step.name: step.statistics(root) for step in plan.steps if step.state(root) == DONE}
         write_report(report, plan.note, json.loads(text), pictures, statistics, versions)
         record["report"] = inputs

@@ -32,17 +32,12 @@ def write_report(
     From the rows of ``claims.json``, the pictures (PNG) of every figure, numbers about the steps by name, and versions;
     ``note`` is not empty for coarse grids.
     """
-    environment = Environment(
-        loader=PackageLoader("vipetsc.paper", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.loader = PackageLoader("vipetsc.paper", ".")
     environment.filters |= {"numbers": numbers, "sources": sources, "picture": picture, "describe": describe}
     rows = by_reading(claims)
-    readings = [r for r in READINGS if any(r in row for row in rows.values())]
-    verdicts = {r: Counter(row[r]["verdict"] for row in rows.values() if r in row) for r in readings}
+    readings = [r for r in READINGS if any(claim["reading"] == r for claim in claims)]
+    verdicts = {r: Counter(claim["verdict"] for claim in claims if claim["reading"] == r) for r in readings}
     page = environment.get_template("report.html").render(
         note=note,
         pictures=pictures,
