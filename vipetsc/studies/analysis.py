@@ -73,23 +73,12 @@ LAYOUT = {
 
 
 def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | None = None) -> xr.Dataset:
-    """Measure a run.
+    """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
-    Parameters
-    ----------
-    run
-        A run, open or in memory, with its case in the attribute ``case``.
-    measures
-        Which of ``FULL``; "maps" are the space-time maps of what else is named.
-    arrival
-        The paper's t_hat in s, the time of the largest host velocity at the first site in the linear run. By
-        default it is estimated from the group velocity: half the burst and the way to the site.
-
-    Returns
-    -------
-    xarray.Dataset
-        The content of ``analysis.h5``. What the run cannot give (no sites, a single cell) is left out and named in
-        the attribute ``left_out``.
+    Of ``FULL`` those ``measures`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
+    paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
+    estimated from the group velocity: half the burst and the way to the site. What the run cannot give (no sites, a
+    single cell) is left out and named in the attribute ``left_out``.
     """
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
     about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}

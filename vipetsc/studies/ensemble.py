@@ -22,18 +22,17 @@ STATUS = ("complete", "scaled", "failed")
 AMPLITUDE = "drive.amplitude"
 FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
 
-# Units and description of what is known of a member: statistics of its run, scalars and lists of its analysis.
+# Further dimension, units and description of what is known of a member: statistics of its run, then of its analysis.
 STATISTICS = {
-    "contact_episodes": ("1", "contact episodes"),
-    "dissipated_fraction": ("1", "dissipated energy over the drive's work"),
-    "work": ("J", "work done by the drive"),
-    "ledger_error": ("1", "largest error of the energy ledger over the work"),
+    "contact_episodes": ("", "1", "contact episodes"),
+    "dissipated_fraction": ("", "1", "dissipated energy over the drive's work"),
+    "work": ("", "J", "work done by the drive"),
+    "ledger_error": ("", "1", "largest error of the energy ledger over the work"),
 }
-MEASURES = {name: LAYOUT[name][1:] for name in (*FITTED, "entropy/error")}
-LISTS = {
-    "entropy/history": ("bit", "entropy of a snapshot"),
-    "entropy/snapshot": ("s", "time of a snapshot"),
-    "bands/share": ("1", "mean share of a pass band or gap after the wave's arrival"),
+MEASURES = {name: LAYOUT[name] for name in (*FITTED, "entropy/error")} | {
+    "entropy/history": ("snapshot", "bit", "entropy of a snapshot"),
+    "entropy/snapshot": ("snapshot", "s", "time of a snapshot"),
+    "bands/share": ("part", "1", "mean share of a pass band or gap after the wave's arrival"),
 }
 UNITS = {
     AMPLITUDE: "N",
@@ -85,46 +84,45 @@ def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Out
     status = np.array([outcome.status for outcome in outcomes], np.int8).reshape(plan.shape)
     flags = {"flag_values": np.arange(len(STATUS), dtype=np.int8), "flag_meanings": " ".join(STATUS)}
     data["status"] = variable(dims, status, "1", "how the member ended", **flags)
-    for name, about in (STATISTICS | MEASURES).items():
-        table = _table(rows, name, plan.shape)
-        if name in STATISTICS or not np.isnan(table).all():
-            data[name] = variable(dims, table, *about)
-    history, time, share = (_table(rows, name, plan.shape) for name in LISTS)
-    if history.ndim > len(dims):
-        number = np.arange(history.shape[-1])
-        data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
-        data["entropy/history"] = variable((*dims, "snapshot"), history, *LISTS["entropy/history"])
-        data["entropy/time"] = variable((*dims, "snapshot"), time, *LISTS["entropy/snapshot"])
     parts = {row["parts"] for row in rows if "parts" in row}
-    if len(parts) == 1:  # cells whose bands overlap differently have no common parts
-        number = np.arange(1, share.shape[-1] + 1)
+    for name, (further, *texts) in (STATISTICS | MEASURES).items():
+        table = _table(rows, name, plan.shape)
+        if further == "part" and len(parts) != 1:  # cells whose bands overlap differently have no common parts
+            continue
+        if name in STATISTICS or table.ndim > len(dims) or not np.isnan(table).all():
+            data[name] = variable((*dims, *further.split()), table, *texts)
+    if "entropy/history" in data:
+        number = np.arange(data["entropy/history"].shape[-1])
+        data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
+        data["entropy/time"] = data.pop("entropy/snapshot")
+    if "bands/share" in data:
+        data["bands/share"].attrs["parts"] = list(parts.pop())
+        number = np.arange(1, data["bands/share"].shape[-1] + 1)
         data["part"] = variable("part", number, "1", "part of the frequency axis")
-        data["bands/share"] = variable((*dims, "part"), share, *LISTS["bands/share"], parts=list(parts.pop()))
     failed = [f"{m.index}: {o.reason}" for m, o in zip(members, outcomes, strict=True) if o.status == FAILED]
-    version = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
-    attributes = version | {"case": plan.to_toml(), "failed": failed}
-    write_netcdf(folder / "ensemble.h5", xr.Dataset(data | _fits(plan, data), attrs=attributes))
+    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
+    about |= {"case": plan.to_toml(), "failed": failed}
+    write_netcdf(folder / "ensemble.h5", xr.Dataset(data | _fits(plan, data), attrs=about))
     return folder / "ensemble.h5"
 
 
 def _rows(members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> list[dict[str, Any]]:
     """What is known of every member by name; empty for those that failed. Equal members are read once."""
-    measures: dict[str, dict[str, Any]] = {"": {}}
-    rows = []
-    for member, outcome in zip(members, outcomes, strict=True):
-        statistics = outcome.statistics
-        identity = "" if outcome.status == FAILED else member.id
+    measures: dict[str, dict[str, Any]] = {}
+    rows: list[dict[str, Any]] = []
+    for identity, outcome in zip((member.id for member in members), outcomes, strict=True):
+        if outcome.status == FAILED:
+            rows.append({})
+            continue
         if identity not in measures:
             # With h5py, since a sweep may have thousands of members and xarray takes 30 ms to open a file.
             with h5py.File(folder / identity / "analysis.h5") as file:
-                row = {name: file[name][()] for name in (*MEASURES, *LISTS) if name in file}
+                row = {name: file[name][()] for name in MEASURES if name in file}
                 row |= {"parts": tuple(file["bands/energy"].attrs["parts"])} if "bands/share" in row else {}
                 measures[identity] = row
-        row = {}
-        if identity:
-            work = statistics["work"]
-            row = {"contact_episodes": statistics["episodes"], "ledger_error": statistics["ledger_error"], "work": work}
-            row["dissipated_fraction"] = statistics["dissipated"] / work if work else np.nan
+        known = outcome.statistics
+        row = {"contact_episodes": known["episodes"], "ledger_error": known["ledger_error"], "work": known["work"]}
+        row["dissipated_fraction"] = known["dissipated"] / known["work"] if known["work"] else np.nan
         rows.append(measures[identity] | row)
     return rows
 
@@ -141,8 +139,8 @@ def _table(rows: Sequence[dict[str, Any]], name: str, shape: tuple[int, ...]) ->
 
 def _fits(plan: Sweep, data: Variables) -> Variables:
     """Power laws over the amplitude from the peak on; entropies are normalised to [.01, 1] first, as the paper's."""
-    axis = next((axis for axis in plan.axes if AMPLITUDE in axis.keys), None)
     fits: Variables = {}
+    axis = next((axis for axis in plan.axes if AMPLITUDE in axis.keys), None)
     if axis is None:
         return fits
     along = plan.axes.index(axis)

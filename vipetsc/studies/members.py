@@ -80,7 +80,7 @@ class MemberStore:
     def make_linear(self, case: Case) -> None:
         """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if it does not come out."""
         linear, memory = linear_case(case), RunMemory(self.team)
-        self._check(simulate(linear, memory, self.team, stop=self.stop))
+        self._simulate(linear, memory)
 
         def measure() -> None:
             folder, run = self.linear_folder(case), memory.dataset
@@ -120,8 +120,7 @@ class MemberStore:
 
         begun, memory = on_root(self.team, is_begun), RunMemory(self.team)
         simulated, output = (case, folder) if whole else (_gathered(case, "velocity"), memory)
-        result = simulate(simulated, output, self.team, force=not begun, resume=begun, stop=self.stop)
-        self._check(result)
+        result = self._simulate(simulated, output, force=not begun, resume=begun)
 
         def measure() -> None:
             folder.mkdir(exist_ok=True)
@@ -135,12 +134,13 @@ class MemberStore:
 
         on_root(self.team, measure)
 
-    @staticmethod
-    def _check(result: Result) -> None:
+    def _simulate(self, case: Case, output: Path | RunMemory, **options: Any) -> Result:
+        result = simulate(case, output, self.team, stop=self.stop, **options)
         if result.resumable:
             raise StoppedError
         if not result.complete:
             raise RuntimeError(result.sentence)
+        return result
 
     def _scale(self, case: Case, folder: Path, wave: xr.Dataset) -> None:
         """The member from its linear run: fields go with the amplitude, energies with its square."""
@@ -151,18 +151,18 @@ class MemberStore:
             with open_run(source / "run.h5") as run:
                 if not shared.exists():
                     write_netcdf(shared, analyse(with_sites(run, case), self.measures, arrival_at(wave, case)))
-                with open_netcdf(shared, "analysis") as analysis:
-                    self._linear[shared] = run.drop_vars("velocity").load(), analysis.load()
+                with open_netcdf(shared, "analysis") as file:
+                    self._linear[shared] = run.drop_vars("velocity").load(), file.load()
         linear, measured = self._linear[shared]
         run = scaled(with_sites(linear, case), factor)
         statistics = json.loads(run.attrs["statistics"]) | {"episodes": 0, "scaled_from": source.name}
         statistics |= {"work": float(run["energy/work"][-1]), "dissipated": 0.0}
-        about = {"status": "complete: scaled from the linear run", "complete": True, "statistics": statistics}
-        summary = provenance(self.team) | about
+        status = "complete: scaled from the linear run"
+        summary = provenance(self.team) | {"status": status, "complete": True, "statistics": statistics}
         folder.mkdir(exist_ok=True)
         write_netcdf(folder / "run.h5", _keeping(run.assign_attrs(summary), case))
-        about = {"case": case.to_toml(), "status": summary["status"]}
-        write_netcdf(folder / "analysis.h5", scaled(measured, factor).assign_attrs(about))
+        analysis = scaled(measured, factor).assign_attrs(case=case.to_toml(), status=status)
+        write_netcdf(folder / "analysis.h5", analysis)
         self._finish(folder, case, summary)
 
     def _finish(self, folder: Path, case: Case, summary: dict[str, Any]) -> None:
@@ -208,10 +208,10 @@ def reached(wave: xr.Dataset, case: Case) -> np.ndarray:
     return np.asarray(abs(case.drive.amplitude) * envelope / np.asarray(case.contacts.clearance or [], float))
 
 
-def arrival_at(wave: xr.Dataset, case: Case) -> float | None:
-    """The paper's t_hat in s, when the wave is largest at the first site of ``case``; None without sites."""
+def arrival_at(wave: xr.Dataset | None, case: Case) -> float | None:
+    """The paper's t_hat in s, when the wave is largest at the first site of ``case``; None without wave or sites."""
     cell = leading_cell(case)
-    return float(wave["arrival"][cell - 1]) if cell else None
+    return float(wave["arrival"][cell - 1]) if wave is not None and cell else None
 
 
 def leading_cell(case: Case) -> int:
@@ -232,13 +232,10 @@ def linear_case(case: Case) -> Case:
 def with_sites(linear: xr.Dataset, case: Case) -> xr.Dataset:
     """The ``linear`` run as a run of ``case`` under 1 N whose sites nothing touches."""
     sites = np.asarray(case.contacts.sites, np.int64)
-    values = {
-        "site": ("site", np.arange(1, len(sites) + 1)),
-        "sites/cell": ("site", sites),
-        "sites/clearance": ("site", np.asarray(case.contacts.clearance or [], float)),
-        "energy/dissipated_by_site": (("time", "site"), np.zeros((linear.sizes["time"], len(sites)))),
-    }
-    variables = {name: (*item, linear[name].attrs) for name, item in values.items()}
+    values: dict[str, Any] = {"site": np.arange(1, len(sites) + 1), "sites/cell": sites}
+    values["sites/clearance"] = np.asarray(case.contacts.clearance or [], float)
+    values["energy/dissipated_by_site"] = np.zeros((linear.sizes["time"], len(sites)))
+    variables = {name: (linear[name].dims, value, linear[name].attrs) for name, value in values.items()}
     unit = Case.from_table(case.model_dump(by_alias=True, exclude_none=True), ["drive.amplitude=1.0"])
     return linear.drop_dims("site").assign(variables).assign_attrs(case=unit.to_toml())
 

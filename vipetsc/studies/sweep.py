@@ -226,8 +226,8 @@ def measure_run(folder: Path) -> Path:
     """Write ``folder/analysis.h5`` and return its path; a sweep knows when the wave arrives. Raises as ``open_run``."""
     with open_run(folder / "run.h5") as run:
         case = Case.of(run)
-        wave = MemberStore(folder.parent).wave(case)
-        write_netcdf(folder / "analysis.h5", analyse(run, arrival=None if wave is None else arrival_at(wave, case)))
+        arrival = arrival_at(MemberStore(folder.parent).wave(case), case)
+        write_netcdf(folder / "analysis.h5", analyse(run, arrival=arrival))
     return folder / "analysis.h5"
 
 
