@@ -6,9 +6,8 @@ gaps, and the inter-band targeted energy transfer. The measures themselves stand
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,7 +15,7 @@ from scipy import fft
 
 import vipetsc
 from vipetsc import spectra
-from vipetsc.case import Case, Model
+from vipetsc.case import Case
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
@@ -84,7 +83,7 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
     about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}
     if "velocity" not in run:
         return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
-    record = _Record.of(run)
+    record = _Record(run)
     nt, cells = record.velocity.shape[:2]
     step = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
     values: dict[str, Any] = {"time": record.time, "cell": record.cells}
@@ -108,7 +107,6 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
     return data.isel(time=slice(None, None, step))
 
 
-@dataclass
 class _Record:
     """What the measures need of a run, and what they tell besides their values: attributes, and what is left out.
 
@@ -116,23 +114,15 @@ class _Record:
     ``site``, the leading one's cell, as numbers from 1. ``attributes`` are those of variables, of groups under "".
     """
 
-    model: Model
-    masses: np.ndarray
-    velocity: Any
-    time: np.ndarray
-    interval: float
-    cells: np.ndarray
-    site: int | None
-    attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, run: xr.Dataset) -> Self:
+    def __init__(self, run: xr.Dataset) -> None:
         field, leading = run["velocity"], leading_site(run)
-        velocity = _StoredField(field) if field.nbytes > IN_MEMORY else field.values
-        site = None if leading is None else int(run["sites/cell"].values[leading])
-        model, interval, cells = Case.of(run).model(), field_interval(run), run["cell"].values
-        return cls(model, np.asarray(model.chain.cell.masses), velocity, field_time(run), interval, cells, site)
+        self.model = Case.of(run).model()
+        self.masses = np.asarray(self.model.chain.cell.masses)
+        self.velocity: Any = _StoredField(field) if field.nbytes > IN_MEMORY else field.values
+        self.time, self.interval, self.cells = field_time(run), field_interval(run), run["cell"].values
+        self.site = None if leading is None else int(run["sites/cell"].values[leading])
+        self.attributes: dict[str, dict[str, Any]] = {}
+        self.left_out: list[str] = []
 
     @cached_property
     def kinetic(self) -> np.ndarray:

@@ -99,19 +99,11 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
 
     The paper's three steps: the lattice's energy is scaled so that the ``initiation`` energy (J) falls on the
     transition from region I to II; the slope is divided by a scalar s; the linear transfer ``floor`` is added.
-    s makes the sum over the fitted points of [ln(slope/s + floor) - ln(ibtet)]^2 least.
+    s makes the sum over the fitted points of [ln(slope/s + floor) - ln(ibtet)]^2 least. Raises as ``log_slope``.
 
-    Returns
-    -------
-    xarray.Dataset
-        ``energy``, ``ibtet`` and ``fitted`` of ``LAYOUT``, energies rising, with the ``branch``. Attributes, unless
-        there are too few points to fit: the ``divisor`` s in Hz/J, the transfer's power law (``factor``, ``exponent``
-        with the ends of its 95 % interval, ``r2_adjusted``), and ``slope_exponent`` at the fitted energies.
-
-    Raises
-    ------
-    ValueError
-        For a branch without region III.
+    Returns ``energy``, ``ibtet`` and ``fitted`` of ``LAYOUT``, energies rising, with the ``branch``. Attributes, unless
+    there are too few points to fit: the ``divisor`` s in Hz/J, the transfer's power law (``factor``, ``exponent`` with
+    the ends of its 95 % interval, ``r2_adjusted``), and ``slope_exponent`` at the fitted energies.
     """
     valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
     order = np.argsort(work[valid], kind="stable")
@@ -158,7 +150,7 @@ def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
         return None
     slopes, folder = [read_slope(branch / BRANCH) for branch in branches], Path(ensemble.attrs["folder"])
     related: dict[str, xr.Dataset] = {}
-    left_out = []
+    left_out: list[str] = []
     for curve, member in curves(ensemble):
         case = Case.load(member / "case.toml")
         sites = len(np.asarray(case.contacts.sites))
@@ -183,13 +175,13 @@ def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
 def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], folder: Path) -> xr.Dataset | str:
     """One curve beside the branch that suits it best, or why there is none."""
     of_law = [slope for slope in slopes if slope.attrs["law"] == case.contacts.law]
-    of_law.sort(key=lambda slope: slope.attrs["reading"] != case.lattice.reading)
     untouched = curve["ibtet"].values[curve["contact_episodes"].values == 0]
     if not of_law:
         return f"no branch of the law {case.contacts.law}"
     if not untouched.size:
         return "no member without contact"
-    slope, initiation, floor = of_law[0], initiation_of(folder, case), float(untouched.mean())
+    slope = min(of_law, key=lambda slope: slope.attrs["reading"] != case.lattice.reading)
+    initiation, floor = initiation_of(folder, case), float(untouched.mean())
     aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
     if "exponent" not in aligned.attrs:
         return f"{int(aligned['fitted'].sum())} points in region III behind the peak"

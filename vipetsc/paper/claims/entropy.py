@@ -1,9 +1,9 @@
 """C7-C9: the wavenumber entropy of the diatomic lattice against amplitude (the paper's section II.C)."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
+import xarray as xr
 
 from vipetsc.paper.claims.criteria import ABRUPT, FEWEST, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
 from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence, Measurement, MissingEvidence
@@ -13,7 +13,6 @@ AVERAGES = "energy_weighted", "masked", "joint"
 FIT = "points", "r2_log_log", "r2_nonlinear", "exponent", "exponent_low", "exponent_high"
 
 
-@dataclass(frozen=True)
 class EntropyDecay:
     """The entropy of one number of ``sites`` at one wavenumber, and the power laws of its fall from the peak on.
 
@@ -21,13 +20,12 @@ class EntropyDecay:
     fit; the ``exponent`` of the line has a 95 % interval of ``half_width`` to either side.
     """
 
-    sites: int
-    curve: AmplitudeCurve
-    points: int
-    r2: float
-    best: float
-    exponent: float
-    half_width: float
+    def __init__(self, members: xr.Dataset, average: str) -> None:
+        self.sites, self.curve = int(members["sites"]), AmplitudeCurve.of(members, f"entropy/{average}")
+        fit = {name: members[f"fits/entropy/{average}/{name}"].item() for name in FIT}
+        self.points, self.r2, self.exponent = int(np.nan_to_num(fit["points"])), fit["r2_log_log"], fit["exponent"]
+        self.best = float(np.fmax(self.r2, fit["r2_nonlinear"]))
+        self.half_width = (fit["exponent_high"] - fit["exponent_low"]) / 2
 
     def reaches(self, r2: float, bound: float) -> bool:
         """Whether ``r2``, one of the fits', reaches ``bound`` over enough points."""
@@ -43,17 +41,10 @@ class EntropyDecay:
 def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: float) -> list[EntropyDecay]:
     """The configurations of a sweep with one ``average`` of the entropy; raises MissingEvidence."""
     ensemble = evidence.ensemble(step)
-    prefix = f"fits/entropy/{average}"
-    if f"{prefix}/points" not in ensemble or "sites" not in ensemble.coords:
+    if f"fits/entropy/{average}/points" not in ensemble or "sites" not in ensemble.coords:
         raise MissingEvidence(f"{step} holds no fits of the entropy over the numbers of sites")
-    configurations = []
-    for sites in map(int, ensemble["sites"].values):
-        members = evidence.select(step, reading, **wanted, sites=sites)
-        curve = AmplitudeCurve.of(members, f"entropy/{average}")
-        points, r2, r2_nonlinear, exponent, low, high = (members[f"{prefix}/{name}"].item() for name in FIT)
-        points, best = int(np.nan_to_num(points)), float(np.fmax(r2, r2_nonlinear))
-        configurations.append(EntropyDecay(sites, curve, points, r2, best, exponent, (high - low) / 2))
-    return configurations
+    configurations = (evidence.select(step, reading, **wanted, sites=int(n)) for n in ensemble["sites"].values)
+    return [EntropyDecay(members, average) for members in configurations]
 
 
 def _share(flags: Iterable[bool]) -> float:
@@ -68,17 +59,14 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     several = [c.curve for c in spread if c.sites >= SEVERAL]
     behind = [c.normalised.interpolate(HIGH) if c.peak_amplitude < HIGH else np.nan for c in several]
     fit = f"adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
+    abrupt = _share(c.normalised.growth_ratio(QUIET, 0.5) <= ABRUPT for c in curves)
+    in_place = _share(PEAK[0] <= c.peak_amplitude <= PEAK[1] for c in curves)
+    highest = float(np.max(behind)) if behind else None
     result.value |= {
         "floor of the normalised entropy": float(quiet.max()) if quiet.size else None,
-        "share of configurations with an abrupt rise": _share(
-            c.normalised.growth_ratio(QUIET, 0.5) <= ABRUPT for c in curves
-        ),
-        f"share of configurations with the peak at {PEAK[0]:g} to {PEAK[1]:g} N": _share(
-            PEAK[0] <= c.peak_amplitude <= PEAK[1] for c in curves
-        ),
-        f"normalised entropy at {HIGH:g} N behind the peak, {SEVERAL} sites or more": (
-            float(np.max(behind)) if behind else None
-        ),
+        "share of configurations with an abrupt rise": abrupt,
+        f"share of configurations with the peak at {PEAK[0]:g} to {PEAK[1]:g} N": in_place,
+        f"normalised entropy at {HIGH:g} N behind the peak, {SEVERAL} sites or more": highest,
         f"share of configurations of spread sites with {fit}": _share(c.reaches(c.r2, STRAIGHT) for c in spread),
     }
     _list_fits(result, spread, "spread")
@@ -95,10 +83,10 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.value["smallest amplitude with contact (N)"] = min(onsets, default=None)
     late = [c for c in curves if c.peak_amplitude > PEAK[1]]
     if late:
+        first, fewest = min(c.peak_amplitude for c in late), min(c.points for c in spread)
         result.reasons.append(
-            f"{len(late)} of {len(spread)} configurations peak only from"
-            f" {min(c.peak_amplitude for c in late):.3g} N on, so that as few as {min(c.points for c in spread)} of"
-            f" {len(late[0].amplitude)} amplitudes are left for a power law"
+            f"{len(late)} of {len(spread)} configurations peak only from {first:.3g} N on, so that as few as {fewest}"
+            f" of {len(late[0].amplitude)} amplitudes are left for a power law"
         )
     weak = [f"{c.sites} ({c.r2:.3f})" for c in spread if c.r2 < STRAIGHT]
     if weak:
@@ -140,10 +128,8 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.uncertainty["fewest points of a fit"] = min(c.points for c in primary)
     late = sum(c.curve.peak >= len(c.curve.amplitude) - 3 for c in primary)
     if late:
-        result.reasons.append(
-            f"{late} of {len(primary)} curves have their peak among the three largest amplitudes: too few points are"
-            " left for a power law"
-        )
+        text = f"{late} of {len(primary)} curves have their peak among the three largest amplitudes"
+        result.reasons.append(f"{text}: too few points are left for a power law")
     weak = sum(c.sites == 1 and not c.reaches(c.best, STRAIGHT_EVERYWHERE) for c in primary)
     if weak:
         result.reasons.append(f"one site falls short at {weak} of {len(wavenumbers)} wavenumbers")
@@ -178,7 +164,5 @@ def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.uncertainty["configurations"] = len(configurations)
     late = sum(peak >= HIGH for peak in peaks)
     if late:
-        result.reasons.append(
-            f"{late} of {len(configurations)} configurations have their peak at {HIGH:g} N or above: nothing is behind"
-            " it"
-        )
+        text = f"{late} of {len(peaks)} configurations have their peak at {HIGH:g} N or above: nothing is behind it"
+        result.reasons.append(text)

@@ -109,17 +109,15 @@ class AmplitudeCurve:
 
         Up to the peak; NaN if none is so low before it.
         """
-        before = np.nonzero(self.value[: self.peak + 1] <= low)[0]
-        above = np.nonzero(self.value[: self.peak + 1] >= high)[0]
+        value = self.value[: self.peak + 1]
+        before, above = np.nonzero(value <= low)[0], np.nonzero(value >= high)[0]
         if not before.size or not above.size:
             return float("nan")
-        first = above[above > before[-1]][0]
-        return float(self.amplitude[first] / self.amplitude[before[-1]])
+        return float(self.amplitude[above[above > before[-1]][0]] / self.amplitude[before[-1]])
 
     def interpolate(self, amplitude: float) -> float:
         """The value at ``amplitude`` in N, interpolated over its logarithm; NaN beyond the ends."""
-        x = np.log(self.amplitude)
-        return float(np.interp(np.log(amplitude), x, self.value, left=np.nan, right=np.nan))
+        return float(np.interp(np.log(amplitude), np.log(self.amplitude), self.value, left=np.nan, right=np.nan))
 
 
 class Evidence(ExitStack):
@@ -160,18 +158,16 @@ class Evidence(ExitStack):
 
         Of an axis that is not named the first value is taken.
         """
-        ensemble = self.ensemble(step)
+        ensemble, wanted = self.ensemble(step), {"reading": reading} | wanted
         only = tomllib.loads(ensemble.attrs["case"]).get("lattice", {}).get("reading", "calibrated")
-        if "reading" in ensemble.coords:
-            wanted = {"reading": reading} | wanted
-        elif only != reading:
+        swept = "reading" in ensemble.coords
+        if not swept and only != reading:
             raise MissingEvidence(f"{step} has the reading {only!r} alone")
         try:
-            members = select(ensemble, **wanted)
+            members = select(ensemble, **{k: v for k, v in wanted.items() if swept or k != "reading"})
         except KeyError:
-            named = ({"reading": reading} | wanted).items()
-            values = ", ".join(f"{k} = {v:.6g}" if isinstance(v, float) else f"{k} = {v}" for k, v in named)
-            raise MissingEvidence(f"{step} has no members with {values}") from None
+            values = (f"{k} = {v:.6g}" if isinstance(v, float) else f"{k} = {v}" for k, v in wanted.items())
+            raise MissingEvidence(f"{step} has no members with {', '.join(values)}") from None
         if "amplitude" not in axes(members):
             raise MissingEvidence(f"{step} holds no members over the amplitude")
         return members.isel({axis: 0 for axis in axes(members) if axis != "amplitude"}).sortby("amplitude")
@@ -186,6 +182,6 @@ class Evidence(ExitStack):
             if folder is None or not (folder / "analysis.h5").exists():
                 raise MissingEvidence(f"{step}: the member at {member['amplitude']:g} N failed or is missing")
             analysis = self.open(step, folder.name, "analysis.h5", needs=needs)
-            case = Case.load(folder / "case.toml")
-            runs.append(MeasuredRun(case, folder, analysis, int(member["contact_episodes"])))
+            episodes = int(member["contact_episodes"])
+            runs.append(MeasuredRun(Case.load(folder / "case.toml"), folder, analysis, episodes))
         return runs

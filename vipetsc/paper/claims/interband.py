@@ -16,11 +16,12 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
         raise MissingEvidence(f"design has no reading {reading}")
     row, weighted = readings.index(reading), costs.index("weighted")
     lam, eta = search["lambda"].values, search["eta"].values
-    names = ("out_of_phase", "weighted", "optimum_lambda", "optimum_eta", "optimum_value", "paper_value")
-    phase, cost, best_lam, best_eta, best, paper = (search[name].values[row] for name in names)
+    phase, cost, best, paper = (
+        search[name].values[row] for name in ("out_of_phase", "weighted", "optimum_value", "paper_value")
+    )
     for i, name in enumerate(costs):
-        result.value[f"lambda at the optimum, {name}"] = float(best_lam[i])
-        result.value[f"eta at the optimum, {name}"] = float(best_eta[i])
+        for symbol in ("lambda", "eta"):
+            result.value[f"{symbol} at the optimum, {name}"] = float(search[f"optimum_{symbol}"].values[row, i])
     # The paper searched a coarse grid; a finer one has its optimum beside.
     rows, columns = _on_grid(lam), _on_grid(eta)
     coarse = np.where(phase, cost, -np.inf)[np.ix_(rows, columns)]
@@ -99,10 +100,8 @@ def bands_sum(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.uncertainty["runs"] = max(map(len, errors.values()))
     result.figure = f"band_energies-hertz-{reading}-5-sites-30-cycles-{middle:.4g}N"
     beat = max(errors["mean error at an instant after the drive, largest of the runs"])
-    result.reasons.append(
-        "the parts are orthogonal over time, not at an instant: their sum beats about the total"
-        f" by {100 * beat:.2g} % on the average in the worst run"
-    )
+    text = "the parts are orthogonal over time, not at an instant: their sum beats about the total"
+    result.reasons.append(f"{text} by {100 * beat:.2g} % on the average in the worst run")
 
 
 def split_errors(run: MeasuredRun) -> dict[str, float]:
@@ -129,13 +128,12 @@ def split_errors(run: MeasuredRun) -> dict[str, float]:
     counted = np.isin(np.atleast_1d(run.analysis["bands/energy"].attrs["parts"]), COUNTED)
     over_period = np.abs(mean_parts[inner] / mean_total[inner] - 1)
     at_instants = np.abs(parts[after] - total[after]) / total[after]
+    beside_spectrum = np.abs(share - spectrum / spectrum.sum())
     return {
         "largest error of the mean over the record": abs(parts.mean() / total.mean() - 1),
         "mean error over a period of the drive, largest of the runs": over_period.mean(),
         "largest share outside the paper's bands and gaps": share[~counted].sum(),
-        "largest difference of a part's share from that in the space-time spectrum": (
-            np.abs(share - spectrum / spectrum.sum()).max()
-        ),
+        "largest difference of a part's share from that in the space-time spectrum": beside_spectrum.max(),
         "mean error at an instant after the drive, largest of the runs": at_instants.mean(),
     }
 

@@ -1,8 +1,5 @@
 """C1-C6: what the diatomic lattice does at low, medium and high amplitude (the paper's section II.B)."""
 
-from dataclasses import dataclass
-from typing import Self
-
 import numpy as np
 
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
@@ -15,44 +12,27 @@ STEP = "scattering-amplitudes"
 OPTICAL = 2  # the band that the paper drives
 
 
-@dataclass(frozen=True)
 class AmplitudeTriple:
-    """The runs at low, medium and high amplitude, and the wave they drive.
+    """The ``runs`` at ``low``, ``medium`` and ``high`` amplitude, and the wave they drive; raises MissingEvidence.
 
     ``wavenumber`` in rad/cell, ``speed`` in cells/s; ``lobe`` (rad/cell) is the half-width of the burst's main
     lobe, 2 Om/(Nc v_g); ``duration`` of the burst in s; ``distance`` in cells to the first site.
     """
 
-    low: MeasuredRun
-    medium: MeasuredRun
-    high: MeasuredRun
-    wavenumber: float
-    speed: float
-    lobe: float
-    duration: float
-    distance: int
-
-    @classmethod
-    def of(cls, evidence: Evidence, reading: str, *needs: str) -> Self:
-        """The lowest, the middle and the highest amplitude; raises MissingEvidence."""
+    def __init__(self, evidence: Evidence, reading: str, *needs: str) -> None:
         runs = evidence.runs(STEP, reading, *needs)
         if len(runs) < 3:
             raise MissingEvidence(f"{STEP} has {len(runs)} amplitudes; low, medium and high are needed")
-        model = runs[0].case.model()
+        self.low, self.medium, self.high = runs[0], runs[len(runs) // 2], runs[-1]
+        self.runs = {"low": self.low, "medium": self.medium, "high": self.high}
+        model = self.low.case.model()
         drive, sites = model.drive, np.asarray(model.chain.sites)
         waves = [wave for wave in waves_at(model.chain.cell, drive.frequency) if wave[0] == OPTICAL]
         if not waves or not sites.size:
             raise MissingEvidence(f"{STEP}: the drive excites no wave of band {OPTICAL}, or the lattice has no sites")
-        _, wavenumber, speed = waves[0]
-        lobe = 2 * drive.frequency / (drive.cycles * speed)
-        distance = int(np.min(np.abs(sites - model.drive_cell)))
-        triple = runs[0], runs[len(runs) // 2], runs[-1]
-        return cls(*triple, wavenumber, speed, lobe, drive.duration, distance)
-
-    @property
-    def runs(self) -> dict[str, MeasuredRun]:
-        """The three runs by name."""
-        return {"low": self.low, "medium": self.medium, "high": self.high}
+        _, self.wavenumber, self.speed = waves[0]
+        self.lobe = 2 * drive.frequency / (drive.cycles * self.speed)
+        self.duration, self.distance = drive.duration, int(np.min(np.abs(sites - model.drive_cell)))
 
     def new_share(self, run: MeasuredRun) -> tuple[float, float]:
         """Share of the kinetic energy outside the main lobe, and its deviation over time.
@@ -69,17 +49,16 @@ class AmplitudeTriple:
         """Add a reason if the medium amplitude makes no contact: from where on there is one."""
         if self.medium.episodes:
             return
-        text = f"{self.medium.amplitude:g} N makes no contact"
-        onset = self.medium.onset
+        onset, because = self.medium.onset, "makes no contact"
         if np.isfinite(onset):
             result.value["first contact (N)"] = onset
-            text = f"{self.medium.amplitude:g} N is below first contact at {onset:.3g} N"
-        result.reasons.append(f"{text}: the lattice is linear there")
+            because = f"is below first contact at {onset:.3g} N"
+        result.reasons.append(f"{self.medium.amplitude:g} N {because}: the lattice is linear there")
 
 
 def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C1: distance of the linear run's spectral ridge from the optical branch, in bins (Fig. 2)."""
-    triple = AmplitudeTriple.of(evidence, reading, "dispersion")
+    triple = AmplitudeTriple(evidence, reading, "dispersion")
     if triple.low.episodes:
         raise MissingEvidence(f"the run at {triple.low.amplitude:g} N is not linear: {triple.low.episodes} contacts")
     spectrum = Dispersion(*triple.low.arrays("wavenumber", "frequency", "dispersion"))
@@ -94,16 +73,13 @@ def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None
         "wavenumber of the drive on the optical branch (rad/cell)": triple.wavenumber,
         "ridge's mean distance (bins)": distance.mean(),
     }
-    result.uncertainty |= {
-        "frequency bin (rad/s)": frequency_bin,
-        "wavenumber bin (rad/cell)": wavenumber_bin,
-        "points of the ridge": len(wavenumber),
-    }
+    result.uncertainty |= {"frequency bin (rad/s)": frequency_bin, "wavenumber bin (rad/cell)": wavenumber_bin}
+    result.uncertainty["points of the ridge"] = len(wavenumber)
 
 
 def linear_content(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C2: share of the energy that changes its wavenumber between drive and far end at low amplitude (Fig. 2)."""
-    triple = AmplitudeTriple.of(evidence, reading, "wavenumber_content")
+    triple = AmplitudeTriple(evidence, reading, "wavenumber_content")
     model = triple.low.case.model()
     time, content = triple.low.arrays("time", "wavenumber_content")
     fastest = max_group_velocity(model.chain.cell, OPTICAL)[2]
@@ -119,7 +95,7 @@ def linear_content(evidence: Evidence, reading: str, result: Measurement) -> Non
 
 def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C3: shares at new wavenumbers and beside the Bloch branches at medium amplitude (Figs. 2, 3)."""
-    triple = AmplitudeTriple.of(evidence, reading, "wavenumber_content", "dispersion")
+    triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "dispersion")
     (low, _), (medium, deviation) = triple.new_share(triple.low), triple.new_share(triple.medium)
     result.value |= {
         "share at new wavenumbers, medium amplitude": medium,
@@ -143,7 +119,7 @@ def _branch_share(run: MeasuredRun) -> float:
 
 def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C4: new wavenumbers at high over medium amplitude, and the share reflected (Figs. 2, 3)."""
-    triple = AmplitudeTriple.of(evidence, reading, "wavenumber_content", "kinetic_energy")
+    triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "kinetic_energy")
     new = {name: triple.new_share(run) for name, run in triple.runs.items()}
     for name, run in triple.runs.items():
         shares = {"share at new wavenumbers": new[name]}
@@ -177,7 +153,7 @@ def _reflected_share(triple: AmplitudeTriple, run: MeasuredRun) -> tuple[float, 
 
 def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C5: share of the packet in its own wavenumber bins before it meets a site (Fig. 4)."""
-    triple = AmplitudeTriple.of(evidence, reading, "wavenumber_content", "partition")
+    triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "partition")
     arrival = triple.distance / max_group_velocity(triple.low.case.unit_cell(), OPTICAL)[2]
     first, last = NATIVE[0] - 1, NATIVE[-1]
     shares = []
@@ -198,7 +174,7 @@ def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 def reconstruction(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C6: error of the kinetic energy of the bins' summed velocities (App. A, Fig. A1)."""
-    triple = AmplitudeTriple.of(evidence, reading, "partition")
+    triple = AmplitudeTriple(evidence, reading, "partition")
     largest, cross = [], []
     for name, run in triple.runs.items():
         snapshot, error, share = run.arrays("partition/snapshot", "partition/error", "partition/cross_share")
