@@ -16,6 +16,7 @@ from vipetsc.figures.study import read_sweeps
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.transfer import closing_error
 from vipetsc.figures.transfer_curves import transfer_curves
+from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
 from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
 from vipetsc.studies.sweep import run_sweep
@@ -85,6 +86,12 @@ def panel(figure, text):
     """The axes whose title holds ``text``."""
     (found,) = [a for a in figure.axes if text in a.get_title(loc="left")]
     return found
+
+
+def test_a_relation_says_what_its_values_are(reduced):
+    with open_netcdf(reduced / "backbone.h5", "relation") as relation:
+        assert {"energy", "ibtet", "fitted"} <= {str(name).rpartition("/")[2] for name in relation.variables}
+        assert all(item.attrs["units"] and item.attrs["long_name"] for item in relation.variables.values())
 
 
 def test_ibtet_shows_the_ensembles_values(reduced):

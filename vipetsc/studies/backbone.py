@@ -111,7 +111,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     at = log_slope(energy, *(branch[f"branch/{name}"].values for name in ("energy", "slope", "region")))
     fitted = np.isfinite(at) & (np.arange(len(energy)) >= np.argmax(ibtet))
     values = {"energy": energy, "ibtet": ibtet, "fitted": fitted.astype(np.int8)}
-    aligned = xr.merge([xr.Dataset(tabulated(LAYOUT, values)), branch], combine_attrs="drop")
+    aligned = xr.merge([xr.Dataset(tabulated(LAYOUT, values)), branch], combine_attrs="override")
     if fitted.sum() < FEWEST:
         return aligned
     at, measured = at[fitted], np.log(ibtet[fitted])
@@ -168,7 +168,7 @@ def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
     about |= {"left_out": left_out, "sources": _sources(folder, branches)}
     about |= {f"{name}/{key}": value for name, data in related.items() for key, value in data.attrs.items()}
     groups = [data.rename({key: f"{name}/{key}" for key in data.variables}) for name, data in related.items()]
-    write_netcdf(folder / "backbone.h5", xr.merge(groups, combine_attrs="drop").assign_attrs(about))
+    write_netcdf(folder / "backbone.h5", xr.merge([xr.Dataset(attrs=about), *groups], combine_attrs="override"))
     return folder / "backbone.h5" if related else None
 
 
