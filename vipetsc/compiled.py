@@ -19,8 +19,6 @@ import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-config: Any = numba.config
-
 HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
 
 
@@ -30,9 +28,8 @@ def njit(function: Function, /) -> Function: ...
 def njit(*signature: str, **options: Any) -> Callable[[Function], Function]: ...
 def njit(*signature: Any, **options: Any) -> Any:
     """``numba.njit`` with a cache; without a signature, it compiles at the first call."""
-    if signature and callable(signature[0]):
-        return _decorator(numba.njit)(signature[0])
-    return _decorator(numba.njit, *signature, **options)
+    bare = signature and callable(signature[0])
+    return _decorator(numba.njit)(signature[0]) if bare else _decorator(numba.njit, *signature, **options)
 
 
 def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -51,6 +48,7 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
 @contextmanager
 def _cache_folder() -> Iterator[None]:
     """Have numba keep what is compiled meanwhile in ``kernel_cache``; a NUMBA_CACHE_DIR stays the parent."""
+    config: Any = numba.config
     chosen = config.CACHE_DIR
     config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, chosen))
     try:
@@ -65,11 +63,10 @@ def kernel_cache(package: Path, chosen: str = "") -> Path:
 
     It is in ``chosen``, else in the package, else (a package that may not be written to) in the user's cache.
     """
-    digest = hashlib.sha256()
-    for path in kernel_sources(package):
-        digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+    named = (str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() for path in kernel_sources(package))
+    digest = hashlib.sha256(b"".join(named)).hexdigest()
     parent = package / "__pycache__" if os.access(package, os.W_OK) else Path.home() / ".cache" / package.name
-    return Path(chosen or parent) / f"kernels-{digest.hexdigest()[:16]}"
+    return Path(chosen or parent) / f"kernels-{digest[:16]}"
 
 
 def kernel_sources(package: Path) -> list[Path]:

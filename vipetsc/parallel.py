@@ -26,11 +26,9 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         if comm.rank and getattr(error, "from_root", False):
             time.sleep(2)  # rank 0 raised the same: its message is enough, and it ends this rank
         where = f"rank {comm.rank}: " if comm.size > 1 else ""
-        if isinstance(error, OSError):
-            # A full disk or a missing right is the machine's matter: the trace would hide the message.
-            logger.critical("vipetsc: %s%s", where, error)
-        else:
-            logger.critical("vipetsc: %s%s", where, "".join(traceback.format_exception(kind, error, trace)).rstrip())
+        # A full disk or a missing right is the machine's matter: the trace would hide the message.
+        lines = [str(error)] if isinstance(error, OSError) else traceback.format_exception(kind, error, trace)
+        logger.critical("vipetsc: %s%s", where, "".join(lines).rstrip())
         sys.stdout.flush()
         if comm.size > 1:
             comm.Abort(1)
@@ -42,35 +40,28 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
-    value, error = None, None
-    if comm.rank == 0:
-        try:
-            value = function()
-        except Exception as caught:
-            error = caught
-    value, error = comm.bcast((value, error))
-    if error is not None:
-        raise _from_root(error)
-    return cast(T, value)
+    value, error = comm.bcast(_attempt(function) if comm.rank == 0 else None)
+    return _agreed(value, error)
 
 
 def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
-    value, error = None, None
+    value, error = _attempt(function)
+    return _agreed(value, next((e for e in comm.allgather(error) if e is not None), None))
+
+
+def _attempt(function: Callable[[], T]) -> tuple[T | None, Exception | None]:
     try:
-        value = function()
-    except Exception as caught:
-        error = caught
-    for first in comm.allgather(error):
-        if first is not None:
-            raise _from_root(first)
+        return function(), None
+    except Exception as error:
+        return None, error
+
+
+def _agreed(value: T | None, error: Exception | None) -> T:
+    if error is not None:
+        error.from_root = True  # type: ignore[attr-defined]  # rank 0 raises it as well, and reports it for all
+        raise error
     return cast(T, value)
-
-
-def _from_root(error: Exception) -> Exception:
-    """``error``, marked as one that rank 0 raises as well, which reports it for all."""
-    error.from_root = True  # type: ignore[attr-defined]
-    return error
 
 
 class SharedCounter:
@@ -113,12 +104,12 @@ class StopRequest:
 
 
 class Progress:
-    """How far a run is, on rank 0: a bar on a terminal, otherwise a line of the log every ``interval`` seconds."""
+    """How far a run is, on rank 0: a bar on a terminal, otherwise a line of the log every five seconds."""
 
-    def __init__(self, comm: MPI.Comm, total: float, unit: str, interval: float = 5.0, show: bool = True) -> None:
-        self._total, self._unit, self._interval = total, unit, interval
+    def __init__(self, comm: MPI.Comm, total: float, unit: str, show: bool = True) -> None:
+        self._total, self._unit = total, unit
         self._begin = self._last = time.monotonic()
-        self._done = self._first = 0.0
+        self._first = 0.0
         self._show = show and comm.rank == 0
         terminal = self._show and sys.stderr.isatty()
         layout = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
@@ -126,19 +117,16 @@ class Progress:
 
     def start_at(self, done: float) -> None:
         """Count from ``done``, where a resumed run begins."""
-        self._first = self._done = done
+        self._first = done
         if self._bar is not None:
             self._bar.update(done)
 
     def update(self, done: float) -> None:
         """Report that ``done`` of the total is reached."""
-        if not self._show:
-            return
         now = time.monotonic()
         if self._bar is not None:
-            self._bar.update(done - self._done)
-            self._done = done
-        elif now - self._last >= self._interval:
+            self._bar.update(done - self._bar.n)
+        elif self._show and now - self._last >= 5.0:
             rate = (done - self._first) / (now - self._begin)
             left = (self._total - done) / rate if rate > 0 else float("inf")
             share = f"{100 * done / self._total:3.0f} %  {done:.4g} of {self._total:.4g} {self._unit}"

@@ -103,15 +103,10 @@ class Case(CaseFile):
             atol = small, small * drive.frequency
         else:
             atol = (1e-9 * abs(drive.amplitude) if time.atol == "paper" else time.atol,) * 2
+        stiffness = contacts.stiffness or 0.0
         return Model(
             chain=chain,
-            contact=Contact(
-                law=contacts.law,
-                stiffness=contacts.stiffness or 0.0,
-                restitution=contacts.restitution,
-                adhesion=contacts.adhesion,
-                approach_floor=contacts.approach_floor,
-            ),
+            contact=Contact(contacts.law, stiffness, contacts.restitution, contacts.adhesion, contacts.approach_floor),
             drive=burst,
             drive_cell=drive.cell - 1,
             drive_mass=drive.mass - 1,
@@ -128,10 +123,8 @@ class Case(CaseFile):
         """What is allowed but likely not meant, one sentence each."""
         model, sentences = self.model(), []
         if not waves_at(model.chain.cell, model.drive.frequency):
-            sentences.append(
-                f"drive.frequency = {model.drive.frequency:.6g} rad/s lies in no pass band, so the wave is"
-                " evanescent; see the verb `bands`"
-            )
+            outside = f"drive.frequency = {model.drive.frequency:.6g} rad/s lies in no pass band"
+            sentences.append(f"{outside}, so the wave is evanescent; see the verb `bands`")
         if model.end <= model.drive.duration:
             sentences.append(f"time.end = {model.end:.6g} s comes before the burst is over")
         return sentences

@@ -13,6 +13,8 @@ from vipetsc.lattice.cell import UnitCell
 Ends = Literal["fixed", "free", "periodic"]
 Envelope = Literal["paper", "hann"]
 
+LONGEST = 400  # cells whose linear response is solved for
+
 
 @dataclass(frozen=True)
 class ToneBurst:
@@ -81,14 +83,14 @@ class Chain:
         """Masses (cells dofs,) in kg, ordered cell by cell."""
         return np.tile(np.asarray(self.cell.masses), self.cells)
 
-    def wave_scale(self, drive: ToneBurst, cell: int = 0, mass: int = 0, longest: int = 400) -> float:
+    def wave_scale(self, drive: ToneBurst, cell: int = 0, mass: int = 0) -> float:
         """Displacement amplitude in m of the linear wave that ``drive`` makes; velocity is Om times that.
 
         The largest steady response to the burst's peak force at the complex frequency Om (1 - i/Nc), whose
         imaginary part stands for the finite burst. Scales exactly with the drive's amplitude. A lattice
-        longer than ``longest`` is cut there: the wave is evanescent at that frequency.
+        longer than LONGEST cells is cut there: the wave is evanescent at that frequency.
         """
-        cut = Chain(self.cell, min(self.cells, longest), self.ends)
+        cut = Chain(self.cell, min(self.cells, LONGEST), self.ends)
         driven = cell if cell < cut.cells // 2 else max(cut.cells - (self.cells - cell), 0)
         omega = drive.frequency * (1 - 1j / drive.cycles)
         dynamic = cut.stiffness_matrix() - diags(cut.masses() * omega**2)

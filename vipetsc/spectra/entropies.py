@@ -21,6 +21,7 @@ from vipetsc.compiled import njit
 from vipetsc.spectra.wavelet import padded_length, transform_filters
 
 NODES = 60
+KC = 12.0  # centre wavenumber of the wavelets
 CHUNK = 4  # snapshots that are transformed together
 GROUP = 4  # nodes that are filtered together
 FLOOR = 0.01
@@ -40,13 +41,13 @@ class Entropy:
     weight: np.ndarray
     snapshot: np.ndarray
     energy_weighted: float
-    masked: float
     joint: float
+    masked: float
     error: float
 
 
-def entropy(velocity: np.ndarray, start: int = 0, *, kc: float = 12.0, nodes: int = NODES) -> Entropy:
-    """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the ``nodes`` wavenumbers i pi/nodes, i = 1, 2, ...
+def entropy(velocity: np.ndarray, start: int = 0) -> Entropy:
+    """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
 
     ``velocity`` may be an HDF5 dataset: a few snapshots at a time are read. ``start`` is the sample of the linear
     wave's arrival at the first site. Raises ValueError if no sample comes from there on, or one is not finite.
@@ -54,13 +55,18 @@ def entropy(velocity: np.ndarray, start: int = 0, *, kc: float = 12.0, nodes: in
     nt = len(velocity)
     if not 0 <= start < nt:
         raise ValueError(f"start = {start}: outside the {nt} samples")
-    local, weight = local_entropy(velocity, kc=kc, nodes=nodes)
-    snapshot, joint = _over_cells(local, weight)
-    masked, error = _masked(local[start:], weight[start:])
-    return Entropy(local, weight, snapshot, float(snapshot[start:].mean()), masked, float(joint[start:].mean()), error)
+    local, weight = local_entropy(velocity)
+    # Eqs. (b) and (c) over the cells of each snapshot.
+    largest = weight.max(axis=1, keepdims=True)
+    share = np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0)
+    share /= np.maximum(share.sum(axis=1, keepdims=True), 1.0)
+    snapshot = np.einsum("tc,tc->t", share, local)
+    position = -np.sum(share * np.log2(share, out=np.zeros_like(share), where=share > 0), axis=1)
+    means = float(snapshot[start:].mean()), float((snapshot + position)[start:].mean())
+    return Entropy(local, weight, snapshot, *means, *_masked(local[start:], weight[start:]))
 
 
-def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES) -> tuple[np.ndarray, np.ndarray]:
+def local_entropy(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """H (t, cell) in bits and W (t, cell) of ``velocity`` (t, cell), a few snapshots at a time.
 
     Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude.
@@ -76,7 +82,7 @@ def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES)
         exponent = np.frexp(largest)[1]
         signal = np.ldexp(signal, -exponent[:, None])
         total, s_log_s = np.zeros(signal.shape), np.zeros(signal.shape)
-        for length, groups in _octaves(cells, kc, nodes):
+        for length, groups in _octaves(cells):
             spectrum = fft.rfft(signal, length)
             for low, filters in groups:
                 x = np.empty((len(signal), len(filters), length), dtype=complex)
@@ -88,18 +94,18 @@ def local_entropy(velocity: np.ndarray, *, kc: float = 12.0, nodes: int = NODES)
 
 
 @lru_cache(maxsize=8)
-def _octaves(cells: int, kc: float, nodes: int) -> list[tuple[int, list[tuple[int, np.ndarray]]]]:
+def _octaves(cells: int) -> list[tuple[int, list[tuple[int, np.ndarray]]]]:
     """For each octave of nodes the padded length, which its lowest node sets, and its filters.
 
     The filters come in groups: the first row of the band where any of them lets something through, and their rows
     (kappa, band) from there on.
     """
-    kappa = np.pi * np.arange(1, nodes + 1) / nodes
+    kappa = np.pi * np.arange(1, NODES + 1) / NODES
     octaves = []
-    for number in range(int(np.log2(nodes)) + 1):
+    for number in range(int(np.log2(NODES)) + 1):
         some = kappa[2**number - 1 : 2 ** (number + 1) - 1]
-        length, groups = padded_length(cells, kc, some[0]), []
-        filters = transform_filters(some, kc, length)
+        length, groups = padded_length(cells, KC, some[0]), []
+        filters = transform_filters(some, KC, length)
         for first in range(0, len(some), GROUP):
             group = filters[first : first + GROUP]
             inside = np.flatnonzero(group.max(axis=0) > np.finfo(float).eps * group.max())
@@ -161,16 +167,6 @@ def _entropies(weight: np.ndarray, s_log_s: np.ndarray, local: np.ndarray) -> No
                 local[t, c] = max(np.log2(w) - s_log_s[t, c] / w, 0.0)
             else:
                 weight[t, c] = local[t, c] = 0.0
-
-
-def _over_cells(local: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The energy-weighted mean (t) of Eq. (b) and the joint entropy (t) of Eq. (c)."""
-    largest = weight.max(axis=1, keepdims=True)
-    share = np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0)
-    share /= np.maximum(share.sum(axis=1, keepdims=True), 1.0)
-    mean = np.einsum("tc,tc->t", share, local)
-    position = -np.sum(share * np.log2(share, out=np.zeros_like(share), where=share > 0), axis=1)
-    return mean, mean + position
 
 
 def _masked(local: np.ndarray, weight: np.ndarray) -> tuple[float, float]:

@@ -201,12 +201,7 @@ def _share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 
 def partition(
-    velocity: np.ndarray,
-    masses: ArrayLike,
-    kc: float = 6.0,
-    normalisation: Normalisation = "analytic",
-    *,
-    fields: bool = False,
+    velocity: np.ndarray, masses: ArrayLike, normalisation: Normalisation = "analytic", fields: bool = False
 ) -> Partition:
     """Partition the kinetic energy of ``velocity``, (t, cell) or (t, cell, dof) in m/s, by wavenumber bins.
 
@@ -217,7 +212,7 @@ def partition(
     nt, cells = velocity.shape[:2]
     if mass_list.shape != (velocity.shape[2:] or (1,)):
         raise ValueError(f"masses: {len(mass_list)} given for velocities of shape {velocity.shape}")
-    bank = filter_bank(cells, kc, normalisation)
+    bank = filter_bank(cells, normalisation=normalisation)
     energy, kinetic, reconstructed = np.zeros((BINS, nt)), np.zeros(nt), np.zeros(nt)
     field = np.zeros((BINS, nt, cells)) if fields else None
     for first in range(0, nt, CHUNK):
