@@ -98,14 +98,13 @@ class CaseFile(Section):
         """The resolved case of a parsed table; raises CaseError with everything that is wrong."""
         table, problems = with_overrides(table, overrides)
         valid = ("name", *SECTIONS)
-        problems += [unknown_key(key, table[key], valid) for key in table if key not in valid]
+        problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
         if not isinstance(name, str) or not name:
             problems.append(Problem("name", name, "must be a non-empty string"))
         fields, wrong = cls.read(table)
-        problems += wrong
-        if problems:
-            raise CaseError(problems, source)
+        if problems + wrong:
+            raise CaseError(problems + wrong, source)
         return cls(name=name, **fields)
 
     @classmethod
@@ -138,21 +137,19 @@ def read_toml(path: str | Path) -> Table:
     """The table in a TOML file, named after the file if it has no name; raises CaseError."""
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return {"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         remedy = f"{error.strerror}; a case file (TOML) is needed"
-        raise CaseError([Problem(str(path), None, remedy)]) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaseError([Problem(str(path), None, f"not a TOML file ({error})")]) from None
-    return {"name": path.stem} | table
+        remedy = f"not a TOML file ({error})"
+    raise CaseError([Problem(str(path), None, remedy)])
 
 
-def unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
+def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
     """The problem of a key that is not one of ``valid``, with the nearest one that is."""
-    *parents, key = path.split(".")
+    parents, dot, key = path.rpartition(".")
     near = difflib.get_close_matches(key, list(valid), n=1, cutoff=0.5)
-    prefix = "".join(f"{p}." for p in parents)
-    remedy = f"did you mean {prefix}{near[0]}?" if near else f"valid keys: {', '.join(sorted(valid))}"
+    remedy = f"did you mean {parents}{dot}{near[0]}?" if near else f"valid keys: {', '.join(sorted(valid))}"
     return Problem(path, value, f"unknown key; {remedy}")
 
 
@@ -195,11 +192,10 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
         return kind(**table), []
     except ValidationError as error:
         problems: dict[str, Problem] = {}
-        invalid = set()
         for item in error.errors(include_url=False):
-            invalid.add(item["loc"][0])
             problem = _problem_of(kind, name, dict(item))
             problems.setdefault(problem.key, problem)
+        invalid = {item["loc"][0] for item in error.errors()}
         section, _ = read_section(kind, {k: v for k, v in table.items() if k not in invalid}, name)
         return section, list(problems.values())
 
@@ -209,12 +205,10 @@ def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem
     # Pydantic puts the branches of a union that it tried into the path: "float", "list[int]", "Span".
     branch = re.compile(r"int|float|str|bool|Span|ClearanceSpan|.*\[.*|constrained.*")
     keys = [part for part in item["loc"] if isinstance(part, int) or not branch.fullmatch(part)]
-    path = name
-    for part in keys:
-        path += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
+    path = name + "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in keys)
     if item["type"] == "extra_forbidden":
         fields = _section_at(kind, keys[:-1]).model_fields
-        return unknown_key(path, item["input"], [field.alias or key for key, field in fields.items()])
+        return _unknown_key(path, item["input"], [field.alias or key for key, field in fields.items()])
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     value = None if item["type"] == "missing" else item["input"]
     choices = item.get("ctx", {}).get("expected")

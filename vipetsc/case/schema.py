@@ -16,7 +16,7 @@ Method = Literal["2a", "3bs", "5f", "5dp", "5bs", "6vr", "7vr", "8vr"]
 
 def number(value: Any) -> Any:
     """Wavenumbers may be written as multiples of pi: "5pi/9"."""
-    match = isinstance(value, str) and re.fullmatch(r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*(\d+))?\s*", value)
+    match = isinstance(value, str) and re.fullmatch(r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*", value)
     if not match:
         return value
     return float(match[1] or 1) * np.pi / float(match[2] or 1)

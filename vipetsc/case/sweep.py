@@ -1,7 +1,6 @@
 """Many cases from one: the section ``[sweep]`` of a case file, and the members it stands for."""
 
 import copy
-import itertools
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -15,8 +14,6 @@ from pydantic import Field
 from vipetsc.case.case import Case, case_id
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.schema import number
-
-RANGES = ("log", "linear")
 
 
 class SweepTable(Section):
@@ -39,9 +36,6 @@ class Axis:
 
     keys: tuple[str, ...]
     values: tuple[tuple[Any, ...], ...]
-
-    def __len__(self) -> int:
-        return len(self.values[0])
 
 
 @dataclass(frozen=True)
@@ -80,7 +74,7 @@ class Sweep(CaseFile):
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
         values: dict[str, tuple[Any, ...]] = {}
-        for key, value in _leaves("", varying):
+        for key, value in _leaves(varying):
             try:
                 values[key] = _values(value)
             except ValueError as error:
@@ -94,7 +88,7 @@ class Sweep(CaseFile):
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of values on every axis."""
-        return tuple(len(axis) for axis in self.axes)
+        return tuple(len(axis.values[0]) for axis in self.axes)
 
     def to_toml(self) -> str:
         """The sweep as TOML, every range written out; reading it back gives the same sweep."""
@@ -106,15 +100,15 @@ class Sweep(CaseFile):
 
     def members(self) -> list[SweepMember]:
         """All members in the order of the axes, the last varying fastest; raises CaseError if none is valid."""
-        members, first = [], None
-        for index in itertools.product(*(range(n) for n in self.shape)):
+        members, errors = [], []
+        for index in np.ndindex(self.shape):
             try:
                 members.append(SweepMember(index, self._case_at(index)))
             except CaseError as error:
-                first = first or error
+                errors.append(error)
                 members.append(SweepMember(index, None, "; ".join(map(str, error.problems))))
-        if first and not any(m.case for m in members):
-            raise CaseError(first.problems, self.name)
+        if len(errors) == len(members):
+            raise CaseError(errors[0].problems, self.name)
         return members
 
     def _case_at(self, index: tuple[int, ...]) -> Case:
@@ -138,14 +132,13 @@ class Sweep(CaseFile):
         return {key: key.replace(".", "_") if name in common else name for key, name in short.items()}
 
 
-def _leaves(path: str, tree: Table) -> Iterator[tuple[str, Any]]:
+def _leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
     """Every key with its value, as "a.b.c"; a range is one value."""
     for key, value in tree.items():
-        inner = f"{path}.{key}" if path else key
-        if isinstance(value, dict) and not any(kind in value for kind in RANGES):
-            yield from _leaves(inner, value)
+        if isinstance(value, dict) and not value.keys() & {"log", "linear"}:
+            yield from _leaves(value, f"{path}{key}.")
         else:
-            yield inner, value
+            yield path + key, value
 
 
 def _values(value: Any) -> tuple[Any, ...]:
@@ -171,13 +164,12 @@ def _axes(values: dict[str, tuple[Any, ...]], groups: list[list[str]]) -> tuple[
     problems: list[Problem] = []
     group_of: dict[str, tuple[str, ...]] = {}
     for group in groups:
-        missing = [key for key in group if key not in values]
         lengths = {key: len(values[key]) for key in group if key in values}
-        if missing:
+        if missing := [key for key in group if key not in values]:
             problems.append(Problem("sweep.zip", missing, f"not among the keys that vary: {', '.join(values)}"))
         elif len(set(lengths.values())) > 1:
             problems.append(Problem("sweep.zip", lengths, "keys that vary together need as many values each"))
-        elif any(key in group_of for key in group):
+        elif group_of.keys() & set(group):
             problems.append(Problem("sweep.zip", group, "a key can be in one group only"))
         group_of |= dict.fromkeys(group, tuple(group))
     if problems:
