@@ -196,6 +196,8 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     """The checks as a table, and whether all is well; all ranks must call it."""
     from petsc4py import PETSc
 
+    from vipetsc.dynamics.ts import native
+
     scalar = np.dtype(PETSc.ScalarType)
     parallel = "yes" if comm.size > 1 else "under mpirun"
     # Name, value (None if it is missing), remedy.
@@ -206,31 +208,21 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
         ("mpirun", shutil.which("mpirun"), "apt install openmpi-bin"),
     ]  # fmt: skip
     for module in MODULES:
+        try:
+            version = str(getattr(importlib.import_module(module), "__version__", "yes"))
+        except ImportError:
+            version = None
         remedy = f"pip install --constraint scripts/constraints.txt {module.replace('_', '-')}"
-        checks.append((module, _version(module), remedy))
+        checks.append((module, version, remedy))
     rows = [(name.replace("_version", ""), str(value)) for name, value in provenance(comm).items()]
     rows += [(name, f"MISSING: {remedy}" if value is None else value) for name, value, remedy in checks]
-    rows.append(("native right-hand side", _native()))
+    try:
+        native.compile_callback()
+        rows.append(("native right-hand side", "yes"))
+    except (AttributeError, OSError) as error:
+        rows.append(("native right-hand side", f"no, the Python one is used ({error})"))
     hosts = comm.allgather(MPI.Get_processor_name())
     rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
     healthy = all(value is not None for _, value, _ in checks)
     verdict = "all is well" if healthy else "something is missing, see above"
     return f"{table(rows)}\n{verdict}", healthy
-
-
-def _version(module: str) -> str | None:
-    try:
-        return str(getattr(importlib.import_module(module), "__version__", "yes"))
-    except ImportError:
-        return None
-
-
-def _native() -> str:
-    """Whether the compiled right-hand side can be registered with PETSc."""
-    from vipetsc.dynamics.ts import native
-
-    try:
-        native.compile_callback()
-    except (AttributeError, OSError) as error:
-        return f"no, the Python one is used ({error})"
-    return "yes"

@@ -57,9 +57,8 @@ class UnitCell:
         """
         ends = []
         for s in self.springs:
-            offset = 1 if s.next_cell else 0
-            ends.append((s.start, offset, s.end, s.stiffness))
-            ends.append((s.end, -offset, s.start, s.stiffness))
+            offset = int(s.next_cell)
+            ends += [(s.start, offset, s.end, s.stiffness), (s.end, -offset, s.start, s.stiffness)]
         return sorted(ends, key=lambda c: c[0])
 
     def stiffness_matrix(self, kappa: ArrayLike) -> np.ndarray:
@@ -83,18 +82,16 @@ def cell_problems(
 
     Messages count masses from 1, as case files do.
     """
-    n = len(masses)
-    problems = []
-    for i, m in enumerate(masses):
-        if not (np.isfinite(m) and m > 0):
-            problems.append((f"masses[{i + 1}]", f"mass {m!r} must be positive (kg)"))
-    for i, s in enumerate(springs):
-        key = f"springs[{i + 1}]"
-        if not (np.isfinite(s.stiffness) and s.stiffness > 0):
+    n, problems = len(masses), []
+    for i, m in enumerate(masses, 1):
+        if not 0 < m < np.inf:
+            problems.append((f"masses[{i}]", f"mass {m!r} must be positive (kg)"))
+    for i, s in enumerate(springs, 1):
+        key = f"springs[{i}]"
+        if not 0 < s.stiffness < np.inf:
             problems.append((f"{key}.stiffness", f"stiffness {s.stiffness!r} must be positive (N/m)"))
-        for end in (s.start, s.end):
-            if not 0 <= end < n:
-                problems.append((key, f"mass {end + 1} is not one of the cell's {n}"))
+        outside = [end for end in (s.start, s.end) if not 0 <= end < n]
+        problems += [(key, f"mass {end + 1} is not one of the cell's {n}") for end in outside]
         if s.start == s.end and not s.next_cell:
             problems.append((key, f"joins mass {s.start + 1} to itself; did you mean next_cell = true?"))
     for name, index in (("host", host), ("resonator", resonator)):

@@ -5,6 +5,7 @@ record is continued by its mirror image (a cosine transform): it then has no jum
 start, which would leak about 1e-4 of the driven band's energy into all the others.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -40,20 +41,17 @@ class Parts:
                 merged.append((low, max(high, band.high), (*numbers, band.number)))
             else:
                 merged.append((band.low, band.high, (band.number,)))
-        edges = [0.0]
-        names: list[str] = []
-        inside: list[tuple[int, ...]] = []
         # Rounding leaves the first band of a free lattice a hair above zero; nothing is below it.
         tiny = 1e-6 * merged[-1][1]
+        parts: list[tuple[float, str, tuple[int, ...]]] = []  # upper edge, name, bands
+        below, number = 0.0, itertools.count(1)
         for low, high, numbers in merged:
-            if low > edges[-1] + tiny:
-                edges.append(low)
-                names.append(f"gap {sum(n.startswith('gap') for n in names) + 1}")
-                inside.append(())
-            edges.append(high)
-            names.append(f"band {'+'.join(map(str, sorted(numbers)))}")
-            inside.append(numbers)
-        return cls(np.array([*edges, np.inf]), (*names, "above"), (*inside, ()))
+            if low > below + tiny:
+                parts.append((low, f"gap {next(number)}", ()))
+            parts.append((high, f"band {'+'.join(map(str, sorted(numbers)))}", numbers))
+            below = high
+        edges, names, bands_inside = zip(*parts, (np.inf, "above", ()), strict=True)
+        return cls(np.array([0.0, *edges]), names, bands_inside)
 
     def above(self, frequency: float) -> np.ndarray:
         """Which parts (part) are pass bands above the one driven at ``frequency`` (rad/s)."""

@@ -27,12 +27,10 @@ class Dispersion:
 
     def folded(self) -> "Dispersion":
         """The same with kappa and -kappa added up, on [0, pi]."""
-        length = len(self.wavenumber)
-        half = length // 2 + 1
-        positive = (length - 1) // 2  # row of kappa = 0 in ascending order over (-pi, pi]
-        energy = self.energy[positive:].copy()
-        energy[1 : positive + 1] += self.energy[:positive][::-1]
-        return Dispersion(self.wavenumber[positive : positive + half], self.frequency, energy)
+        zero = (len(self.wavenumber) - 1) // 2  # row of kappa = 0 in ascending order over (-pi, pi]
+        energy = self.energy[zero:].copy()
+        energy[1 : zero + 1] += self.energy[:zero][::-1]
+        return Dispersion(self.wavenumber[zero:], self.frequency, energy)
 
 
 def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
