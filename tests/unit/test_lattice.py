@@ -16,10 +16,8 @@ from vipetsc.lattice import (
     diatomic,
     four_band,
     gaps,
-    log_clearances,
     max_group_velocity,
     pass_bands,
-    spread_sites,
     waves_at,
 )
 from vipetsc.lattice.cell import cell_problems
@@ -152,13 +150,6 @@ def test_cell_problems_are_all_named():
     with pytest.raises(ValueError, match="must be positive"):
         UnitCell((1.0, 0.0), (Spring(0, 1, 1.0, True),), 0, 1)
     assert cell_problems(diatomic().masses, diatomic().springs, 0, 1) == []
-
-
-def test_sites_and_clearances():
-    assert [c + 1 for c in spread_sites(75, 200, 5)] == [75, 106, 138, 169, 200]
-    clearances = log_clearances(10**-2.65, 10**-2.75, 5)
-    assert clearances[0] == pytest.approx(10**-2.65)
-    assert np.allclose(np.diff(np.log10(clearances)), -0.025)
 
 
 @pytest.mark.parametrize(("envelope", "peak"), [("paper", 2.0), ("hann", 1.0)])

@@ -26,7 +26,6 @@ def test_an_exact_law_is_recovered(exponent, factor, count):
         assert fit.points == count
         assert fit.exponent == pytest.approx(exponent, abs=1e-9)
         assert fit.factor == pytest.approx(factor, rel=1e-8)
-        assert fit(x) == pytest.approx(factor * x**exponent, rel=1e-8)
         if abs(exponent) > 0.01:
             assert fit.r2_adjusted == pytest.approx(1, abs=1e-9)
         assert fit.exponent_interval[0] <= fit.exponent <= fit.exponent_interval[1]
@@ -48,10 +47,11 @@ def test_the_line_has_the_textbook_statistics():
 def test_the_nonlinear_fit_is_least_in_squares():
     y = scattered()
     fit = power_law(X, y, "nonlinear")
-    least = np.sum((y - fit(X)) ** 2)
+    fitted = fit.factor * X**fit.exponent
+    least = np.sum((y - fitted) ** 2)
     for factor, shift in ((1.001, 0), (0.999, 0), (1, 1e-3), (1, -1e-3)):
         assert np.sum((y - factor * fit.factor * X ** (fit.exponent + shift)) ** 2) > least
-    jacobian = np.stack([X**fit.exponent, fit(X) * np.log(X)], axis=1)
+    jacobian = np.stack([X**fit.exponent, fitted * np.log(X)], axis=1)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * least / (len(X) - 2)
     half = stats.t.ppf(0.975, len(X) - 2) * np.sqrt(np.diag(covariance))
     assert fit.factor_interval == pytest.approx((fit.factor - half[0], fit.factor + half[0]), rel=1e-5)

@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.reading import Problem, Table
-from vipetsc.case.schema import ClearanceSpan, ContactsTable, LatticeTable, Span
-from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
-from vipetsc.lattice.cell import UnitCell, cell_problems
-from vipetsc.lattice.chain import log_clearances, spread_sites
-from vipetsc.lattice.contact import contact_stiffness
+from vipetsc.case.schema import ContactsTable, LatticeTable, Span
+from vipetsc.lattice import UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice.cell import cell_problems
 from vipetsc.lattice.presets import PRESETS
 
 # A key of a case file takes the place of these keys of the preset.
@@ -59,17 +57,20 @@ def site_cells(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
         return [sites.first + (sites.spacing or 1) * i for i in range(sites.count)]
     else:
         first, last, count = sites.first, sites.last, sites.count
-    return [c + 1 for c in spread_sites(first, last, count)]
+    return [int(cell) for cell in np.round(np.linspace(first, last, count))]
 
 
 def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> list[float]:
-    """Clearances in m of ``count`` sites; the preset's where none are given."""
+    """Clearances in m of ``count`` sites, log-spaced over a span; the preset's where none are given."""
     given = contacts.clearance
-    if given is None:
-        return list(PRESETS[str(lattice.preset)].clearances(count)) if count else []
-    if isinstance(given, ClearanceSpan):
-        return list(log_clearances(given.first, given.last, count))
-    return [given] * count if isinstance(given, float) else list(given)
+    if isinstance(given, list):
+        return given
+    if isinstance(given, float):
+        return [given] * count
+    if given is None and count == 0:
+        return []
+    first, last = (given.first, given.last) if given else PRESETS[str(lattice.preset)].clearance_span(count)
+    return [float(clearance) for clearance in np.geomspace(first, last, count)]
 
 
 def check_lattice(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:

@@ -39,17 +39,7 @@ def draw_source(
     ``names`` are figures of the kind ``source``. Returns the files written, on rank 0. Raises FolderError for folders
     that hold nothing to draw, and for a figure that does not exist.
     """
-    from vipetsc.figures.registry import draw, figure_names
-
-    def prepare() -> None:
-        try:
-            figure_names(source, names)
-        except KeyError as error:
-            raise FolderError(f"--fig: {error.args[0]}") from None
-        if source == "run":
-            _prepare_run(folders[0])
-        elif source == "sweep":
-            _prepare_sweeps(folders)
+    from vipetsc.figures.registry import draw
 
     def draw_share() -> list[Path]:
         try:
@@ -59,29 +49,35 @@ def draw_source(
                 raise
             raise FolderError(f"{folders[0] / _NOT_OURS[source]} of vipetsc ({error})") from None
 
-    on_root(comm, prepare)
+    on_root(comm, lambda: _prepare(source, folders, names))
     drawn = on_every_rank(comm, draw_share)
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
 
 
-def _prepare_run(folder: Path) -> None:
-    from vipetsc.studies.sweep import is_measured, measure_run
+def _prepare(source: str, folders: Sequence[Path], names: list[str] | None) -> None:
+    """Check what is to be drawn, and measure what is missing or older than its run; on one rank."""
+    from vipetsc.figures.registry import figure_names
 
-    run = folder / "run.h5"
-    if not run.exists():
-        raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
     try:
-        measured = is_measured(folder)
-    except (OSError, ValueError, KeyError) as error:
-        raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
-    if not measured:
-        measure_run(folder)
+        figure_names(source, names)
+    except KeyError as error:
+        raise FolderError(f"--fig: {error.args[0]}") from None
+    if source == "sweep":
+        from vipetsc.studies.backbone import relate_folders
 
+        for folder in folders:
+            if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
+                raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
+        relate_folders(folders)
+    elif source == "run":
+        from vipetsc.studies.sweep import is_measured, measure_run
 
-def _prepare_sweeps(folders: Sequence[Path]) -> None:
-    from vipetsc.studies.backbone import relate_folders
-
-    for folder in folders:
-        if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
-            raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
-    relate_folders(folders)
+        run = folders[0] / "run.h5"
+        if not run.exists():
+            raise FolderError(f"{folders[0]}: holds no run.h5; a finished run's folder is needed")
+        try:
+            measured = is_measured(folders[0])
+        except (OSError, ValueError, KeyError) as error:
+            raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
+        if not measured:
+            measure_run(folders[0])

@@ -2,5 +2,5 @@
 
 from vipetsc.lattice.bands import Band, BlochPoint, bloch, gaps, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
-from vipetsc.lattice.chain import Chain, ToneBurst, log_clearances, spread_sites
+from vipetsc.lattice.chain import Chain, ToneBurst
 from vipetsc.lattice.contact import Contact, contact_stiffness

@@ -98,13 +98,3 @@ class Chain:
         force[driven * self.cell.dofs + mass] = 1.0
         response = float(np.abs(spsolve(dynamic.tocsc(), force)).max())
         return response * 2 * abs(drive.window_amplitude)
-
-
-def spread_sites(first: float, last: float, count: int) -> tuple[int, ...]:
-    """``count`` evenly spaced sites as 0-based cells, from the 1-based positions ``first`` to ``last``."""
-    return tuple(int(c) - 1 for c in np.round(np.linspace(first, last, count)))
-
-
-def log_clearances(first: float, last: float, count: int) -> tuple[float, ...]:
-    """``count`` clearances in m, log-spaced from the leading site's ``first`` to ``last``."""
-    return tuple(float(c) for c in np.geomspace(first, last, count))

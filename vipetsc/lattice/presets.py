@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from vipetsc.lattice.cell import UnitCell, diatomic, four_band
-from vipetsc.lattice.chain import log_clearances
 
 
 @dataclass(frozen=True)
@@ -22,10 +21,6 @@ class Preset:
     drive: dict[str, Any]
     site_span: Callable[[int, int], tuple[float, float]]
     clearance_span: Callable[[int], tuple[float, float]]
-
-    def clearances(self, count: int) -> tuple[float, ...]:
-        """The paper's clearances in m for ``count`` sites."""
-        return log_clearances(*self.clearance_span(count), count)
 
 
 CONTACTS: dict[str, Any] = {"law": "hertz", "radius": 0.005, "poisson": 0.3, "restitution": 0.7, "sites": 5}

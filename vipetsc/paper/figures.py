@@ -92,7 +92,7 @@ def two_masses(reading: str) -> Figure:
     inner = [s.stiffness for s in cell.springs if {s.start, s.end} == {cell.host, cell.resonator}]
     # Half of the total of springs that are held at their middles, as the paper shares them out.
     outer = [s.stiffness for s in cell.springs if cell.host in (s.start, s.end) and s.stiffness not in inner]
-    return reduced_model(masses, (sum(outer), sum(inner)), PRESETS["four-band"].clearances(1)[0])
+    return reduced_model(masses, (sum(outer), sum(inner)), PRESETS["four-band"].clearance_span(1)[0])
 
 
 def _case(preset: str, reading: str) -> Case:

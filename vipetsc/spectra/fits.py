@@ -31,10 +31,6 @@ class PowerLaw:
     exponent_interval: tuple[float, float]
     points: int
 
-    def __call__(self, x: ArrayLike) -> np.ndarray:
-        """The law at ``x``."""
-        return np.asarray(self.factor * np.asarray(x, dtype=float) ** self.exponent)
-
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
     """1 - (1 - R^2)(n - 1)/(n - 2) of a fit with two parameters, a constant among them; NaN if y is constant."""
