@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from scipy.integrate import DOP853
 
 from vipetsc.case import CaseError
-from vipetsc.case.nnm import NnmCase
+from vipetsc.case.nnm import Guards, NnmCase
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
 from vipetsc.modes import dop853
+from vipetsc.modes.audit import sampled
 from vipetsc.modes.branch import Branch, slope_laws, tell_regions
 from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
-from vipetsc.modes.continuation import Continuation, Guards, StepControl, half_trace_change, unit
+from vipetsc.modes.continuation import Continuation, StepControl, half_trace_change, unit
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import half_traces, linear_start, multipliers, sample_orbit
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
@@ -344,8 +345,8 @@ def short_branch() -> Branch:
     start = linear_start(corrector, 1, 0.02)
     growing = Continuation(corrector, start, StepControl(points=400, energy=(0, 1e4)))
     points = [growing.point, *growing]
-    orbit = sample_orbit(corrector.problem, points[-1], 40)
-    return Branch("out-of-phase", "name = 'x'", 2, points, 0.1, True, "done", ["a", "b"], [(points[-1], orbit)])
+    orbits = sampled(corrector.problem, points[-1:])
+    return Branch("out-of-phase", "name = 'x'", 2, points, 0.1, True, "done", ["a", "b"], orbits)
 
 
 def test_steps_have_the_arclength_that_they_say(short_branch):

@@ -8,13 +8,14 @@ import itertools
 import numpy as np
 import pytest
 
+from vipetsc.case.nnm import Guards
 from vipetsc.lattice import Chain, Contact, contact_stiffness, four_band
 from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
 from vipetsc.modes.chart import Relative
-from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
+from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl
 from vipetsc.modes.dop853 import Dop853Flow
+from vipetsc.modes.flow import FiniteDifferences
 from vipetsc.modes.newmark import Newmark
-from vipetsc.modes.orbit import FiniteDifferences
 from vipetsc.modes.point import Point, linear_start, resonance
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import locate, switch
@@ -302,7 +303,7 @@ def test_both_directions_give_the_same_curve():
 def test_without_guards_the_branch_jumps_and_the_detector_says_so():
     corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
     start = linear_start(corrector, IN_PHASE, 3e-3)
-    control = StepControl(points=150, guards=Guards(*[np.inf] * 4))
+    control = StepControl(points=150, guards=Guards(half_trace=0, contacts=0, corrector=0, turn=0))
     points = [start, *Continuation(corrector, start, control)]
     assert max(p.residual for p in points) <= 1e-12  # no residual tells
     found = [(i, why) for i, why in suspects(points) if is_jump(corrector, points[i], points[i + 1], control)]

@@ -49,8 +49,13 @@ class SystemTable(Section):
     contacts: list[PairTable] = Field([])
 
 
-class GuardsTable(Section):
-    """Bounds on one step, see ``continuation.Guards``; 0 switches one off."""
+class Guards(Section):
+    """Bounds on one step that keep a branch from jumping to another arc; 0 switches one off.
+
+    Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc, length of the
+    correction over the step's length, angle in rad between consecutive tangents. Residuals cannot tell a jump: both
+    arcs satisfy the equations to rounding.
+    """
 
     half_trace: Annotated[float, Field(ge=0)] = 0.5
     contacts: Annotated[int, Field(ge=0)] = 1
@@ -92,7 +97,7 @@ class NnmTable(Section):
     switch: list[Literal["symmetry-breaking", "period-doubling", "branch-point"]] = Field([])
     switch_points: int = Field(100, ge=1)
     switch_amplitude: Positive = 1e-3
-    guards: GuardsTable = GuardsTable()
+    guards: Guards = Guards()
 
 
 class NnmCase(CaseFile):

@@ -3,7 +3,7 @@ r"""Nonlinear normal modes of conservative systems with contacts: their branches
 The system is M u'' + K u + f(u) = 0 with masses in contact pairs and smooth springs (``system``); a nonlinear normal
 mode is a family of periodic orbits that begins at a linear mode (Kerschen et al. 2009; Rosenberg's in the odd case).
 
-**Shooting.** ``orbit`` gives the flow phi_t of an initial state and its derivative S = d phi_t/d y0; ``shooting`` asks
+**Shooting.** ``flow`` gives the flow phi_t of an initial state and its derivative S = d phi_t/d y0; ``shooting`` asks
 for initial values x and the period T. The flow is reversible, t -> -t with v -> -v, so that an orbit that is at rest
 (v = 0) twice, at 0 and T/2, is periodic: half a period is enough, with the n unknowns u(0) and the n equations
 v(T/2; u0, 0) = 0. If f is odd the orbit u(t + T/2) = -u(t) passes the centre u = 0 at T/4: a quarter is enough,
@@ -34,7 +34,7 @@ that an arclength means something) the next one solves H(xi) = 0 and t . (xi - x
 SNES. The tangent is the null vector of dH/dxi. Charts scale: ``relative`` (gaps over the clearance), ``logarithmic``,
 ``grazing`` (a root of w - D in place of w: an orbit that starts on its largest |w| depends on w - D through one).
 Narrow tongues of internal resonances lie close together, and a residual cannot tell a jump from one arc to another.
-``continuation.Guards`` therefore bound, per step, the change of asinh(c) of each half-trace, the number of contacts
+``Guards`` therefore bound, per step, the change of asinh(c) of each half-trace, the number of contacts
 that appear or go, the correction over the step and the turn of the tangent; ``audit`` looks for jumps afterwards and
 for a branch that retraces itself.
 
@@ -58,8 +58,9 @@ J. R. Dormand and P. J. Prince, A family of embedded Runge-Kutta formulae, J. Co
 E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 2nd ed., Springer 1993.
 """
 
+from vipetsc.case.nnm import Guards
 from vipetsc.modes.branch import Branch
-from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
+from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.follow import follow_all
 from vipetsc.modes.newmark import Newmark

@@ -1,16 +1,16 @@
-"""Is a branch one branch, whatever the flow? Jumps, retracing and the return to the linear mode; comparisons."""
+"""A branch seen closer: jumps, retracing and the return to the linear mode; its orbits, by its and by other flows."""
 
 import itertools
 from collections.abc import Iterator
 
 import numpy as np
-import xarray as xr
 
-from vipetsc.io.netcdf import variable
+from vipetsc.case.nnm import Guards
+from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.chart import Relative
-from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl, chart_at, half_trace_change
-from vipetsc.modes.orbit import Flow, FlowError
-from vipetsc.modes.point import Point
+from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl, chart_at, half_trace_change
+from vipetsc.modes.flow import Flow, FlowError
+from vipetsc.modes.point import Point, sample_orbit
 from vipetsc.modes.shooting import Corrector, Shooting
 
 
@@ -105,7 +105,22 @@ class BranchMonitor:
         return f"retraces itself: {where}, backwards" if along < 0 else f"closed on itself: {where}"
 
 
-def compare(reference: Corrector, points: list[Point], flow: Flow) -> dict[str, xr.Variable]:
+def sampled(problem: Shooting, points: list[Point]) -> Variables:
+    """The orbits of ``points`` as variables of the branch's file."""
+    displacement, velocity = zip(*(sample_orbit(problem, p) for p in points), strict=True)
+    samples, axes = len(displacement[0]), ("orbit", "phase", "dof")
+    return {
+        "orbit": variable("orbit", np.arange(len(points)), "1", "stored orbit"),
+        "phase": variable("phase", np.arange(samples) / samples, "1", "time over the period"),
+        "orbits/energy": variable("orbit", [p.energy for p in points], "J", "energy"),
+        "orbits/period": variable("orbit", [p.period for p in points], "s", "period"),
+        "orbits/number": variable("orbit", [p.index for p in points], "1", "number of the regular point"),
+        "orbits/displacement": variable(axes, displacement, "m", "displacement"),
+        "orbits/velocity": variable(axes, velocity, "m/s", "velocity"),
+    }
+
+
+def compare(reference: Corrector, points: list[Point], flow: Flow) -> Variables:
     """What ``flow`` gives on every fourth of ``points``, as variables of the branch's file; NaN where it fails.
 
     The points are corrected keeping the first contact's w (or the largest displacement): at the same energy or

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.io.atomic import write_text
-from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
+from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
 from vipetsc.modes.point import Point
 from vipetsc.spectra import power_law
 
@@ -49,7 +49,8 @@ MOST = float(np.exp(500.0))
 class Branch:
     """Points of a branch, special points in their places; ``next_step`` and ``case`` allow to go on later.
 
-    ``findings`` are sentences about the branch: jumps, retracing, return to the linear mode.
+    ``findings`` are sentences about the branch: jumps, retracing, return to the linear mode; ``extra`` are further
+    variables of its file: orbits, comparisons with other flows.
     """
 
     name: str
@@ -60,8 +61,7 @@ class Branch:
     complete: bool = False
     ending: str = "not finished"
     findings: list[str] = field(default_factory=list)
-    orbits: list[tuple[Point, tuple[np.ndarray, np.ndarray]]] = field(default_factory=list)
-    comparisons: dict[str, xr.Variable] = field(default_factory=dict)
+    extra: Variables = field(default_factory=dict)
 
     def regular(self) -> list[Point]:
         """The points of the continuation itself."""
@@ -98,9 +98,8 @@ class Branch:
         names = ["energy", "frequency", "period", *(f"x{i + 1}" for i in range(self.dofs)), *traces]
         table.writerow([*names, "multiplier_max", "slope", "contacts", "region", "kind"])
         for p, region in zip(self.points, self.regions(), strict=True):
-            numbers = [p.energy, p.frequency, p.period, *p.x.tolist(), *p.half_traces.tolist()]
-            numbers += [p.multiplier, float(p.slope)]
-            table.writerow([*map(repr, numbers), p.episodes, int(region), p.kind])
+            numbers = [p.energy, p.frequency, p.period, *p.x.tolist(), *p.half_traces.tolist(), p.multiplier, p.slope]
+            table.writerow([*map(repr, numbers), p.episodes, region, p.kind])
         return text.getvalue()
 
     def to_dataset(self) -> xr.Dataset:
@@ -128,23 +127,7 @@ class Branch:
             data[stored] = variable("point", self.column(name), units, text)
         attributes = {"name": self.name, "case": self.case, "complete": int(self.complete), "ending": self.ending}
         attributes |= {"next_step": self.next_step, "findings": "\n".join(self.findings), "fits": self.fits()}
-        return xr.Dataset(data | self._orbit_variables() | self.comparisons, attrs=attributes)
-
-    def _orbit_variables(self) -> dict[str, xr.Variable]:
-        if not self.orbits:
-            return {}
-        points, orbits = zip(*self.orbits, strict=True)
-        displacement, velocity = zip(*orbits, strict=True)
-        samples, axes = len(displacement[0]), ("orbit", "phase", "dof")
-        return {
-            "orbit": variable("orbit", np.arange(len(points)), "1", "stored orbit"),
-            "phase": variable("phase", np.arange(samples) / samples, "1", "time over the period"),
-            "orbits/energy": variable("orbit", [p.energy for p in points], "J", "energy"),
-            "orbits/period": variable("orbit", [p.period for p in points], "s", "period"),
-            "orbits/number": variable("orbit", [p.index for p in points], "1", "number of the regular point"),
-            "orbits/displacement": variable(axes, displacement, "m", "displacement"),
-            "orbits/velocity": variable(axes, velocity, "m/s", "velocity"),
-        }
+        return xr.Dataset(data | self.extra, attrs=attributes)
 
     @classmethod
     def read(cls, path: Path) -> Self:

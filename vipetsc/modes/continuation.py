@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vipetsc.case.nnm import Guards
 from vipetsc.modes.chart import CHARTS, Chart, Grazing, Relative
 from vipetsc.modes.point import Point
 from vipetsc.modes.shooting import Attempt, Corrector, Shooting, null_vector
@@ -12,21 +13,6 @@ from vipetsc.modes.shooting import Attempt, Corrector, Shooting, null_vector
 
 class ContinuationError(RuntimeError):
     """The branch cannot go on; the message says where, why, and which option to turn."""
-
-
-@dataclass(frozen=True)
-class Guards:
-    """Bounds on one step that keep a branch from jumping to another arc; infinity switches one off.
-
-    Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc, length of the
-    correction over the step's length, angle in rad between consecutive tangents. Residuals cannot tell a jump: both
-    arcs satisfy the equations to rounding.
-    """
-
-    half_trace: float = 0.5
-    contacts: float = 1
-    corrector: float = 0.05
-    turn: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -88,8 +74,7 @@ class Continuation:
     def __init__(
         self, corrector: Corrector, start: Point, control: StepControl, direction: int = 1, step: float | None = None
     ) -> None:
-        self.corrector, self.control = corrector, control
-        self.point = start
+        self.corrector, self.control, self.point = corrector, control, start
         if start.tangent is None:
             self.point = replace(start, tangent=first_tangent(corrector, start, direction))
         self.step = control.first if step is None else step
@@ -125,7 +110,7 @@ class Continuation:
                 continue
             point, strain, guard = self._judge(frame, attempt)
             if strain <= 1.0:
-                effort = max(strain / 0.7, attempt.newton / 5, 1 / GROWTH)
+                effort = max(strain / 0.7, point.newton / 5, 1 / GROWTH)
                 self.step = min(self.step / effort, self.control.largest)
                 return point
             why, knob = GUARDED[guard], f"nnm.guards.{guard}"
@@ -138,17 +123,19 @@ class Continuation:
 
     def _judge(self, frame: Frame, attempt: Attempt) -> tuple[Point, float, str]:
         """The corrected point, how far it strains the guards (1 is the bound), and which guard most."""
-        last, step, guards = self.point, self.step, self.control.guards
+        last, step = self.point, self.step
         point, direction = frame.point(attempt, last.index + 1, step)
-        appeared = abs(point.episodes - last.episodes) / guards.contacts
-        strains = {
-            "half_trace": half_trace_change(last, point) / guards.half_trace,
-            "contacts": appeared if appeared > 1 else 0.0,  # one contact more is no reason to slow down
-            "corrector": float(np.linalg.norm(attempt.xi - frame.xi - step * frame.tangent)) / step / guards.corrector,
-            "turn": float(np.arccos(min(direction @ frame.tangent, 1.0))) / guards.turn,
+        changes = {
+            "half_trace": half_trace_change(last, point),
+            "contacts": abs(point.episodes - last.episodes),
+            "corrector": float(np.linalg.norm(attempt.xi - frame.xi - step * frame.tangent)) / step,
+            "turn": float(np.arccos(min(direction @ frame.tangent, 1.0))),
         }
+        strains = {guard: change / (getattr(self.control.guards, guard) or np.inf) for guard, change in changes.items()}
+        if strains["contacts"] <= 1:  # one contact more is no reason to slow down
+            strains["contacts"] = 0.0
         worst = max(strains, key=lambda guard: strains[guard])
-        return point, float(strains[worst]), worst
+        return point, strains[worst], worst
 
 
 def chart_at(problem: Shooting, name: str, point: Point) -> Chart:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import njit
-from vipetsc.modes import kernel
+from vipetsc.modes import flow
 from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
-from vipetsc.modes.orbit import Flow, FlowError
+from vipetsc.modes.flow import Flow, FlowError
 
 # Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed.
 DONE, STUCK, FULL = range(3)
@@ -62,7 +62,7 @@ class Stepper(NamedTuple):
     displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian.
     """
 
-    step: kernel.Step
+    step: flow.Step
     rtol: float
     rtol_sensitivity: float
     omega_ref: float
@@ -108,9 +108,9 @@ def _advance(stepper: Stepper, y: np.ndarray, h: float) -> float:
                 for r in range(s):
                     total += A[s, r] * k[r, i, j]
                 out[i, j] = y[i, j] + h * total
-        kernel.rates(step.system, step.side, out, k[s])
+        flow.rates(step.system, step.side, out, k[s])
     error = _scaled_error(stepper, y, h)
-    kernel.observe(step, out, stepper.end_rates, step.end)
+    flow.observe(step, out, stepper.end_rates, step.end)
     return error
 
 
@@ -138,18 +138,18 @@ def _flow(stepper: Stepper, y: np.ndarray, duration: float, events: np.ndarray) 
     t, closed, count = 0.0, 0.0, 0
     h = min(0.1 * largest, duration)
     while t < duration:
-        kernel.observe(step, y, stepper.stages[0], step.start)
+        flow.observe(step, y, stepper.stages[0], step.start)
         last = t + h >= duration * (1.0 - 1e-15)
         if last:
             h = duration - t
-        elif h < kernel.SMALLEST_STEP * duration:
+        elif h < flow.SMALLEST_STEP * duration:
             return STUCK, count, closed
         error = _advance(stepper, y, h)
         if not error < 1.0:
             h *= max(0.2, 0.9 * error ** (-0.125)) if error < 1e300 else 0.1
             continue
         grown = min(largest, h * min(6.0, 0.9 * max(error, 1e-12) ** (-0.125)))
-        change = kernel.first_change(step, h)
+        change = flow.first_change(step, h)
         changed = change.contact >= 0
         if changed:
             h, changed = _land(stepper, y, t, h, change)
@@ -161,7 +161,7 @@ def _flow(stepper: Stepper, y: np.ndarray, duration: float, events: np.ndarray) 
             if count >= events.shape[0]:
                 return FULL, count, closed
             events[count, 0], events[count, 1] = t, change.contact
-            events[count, 2], events[count, 3] = change.side, kernel.switch(step, change)
+            events[count, 2], events[count, 3] = change.side, flow.switch(step, change)
             count += 1
     return DONE, count, closed
 
@@ -174,7 +174,7 @@ class Dop853Flow(Flow):
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
         events, stages = np.empty((MOST_CHANGES, 4)), np.empty((STAGES, *y.shape))
         allowed = self.rtol, self.rtol_sensitivity, self.omega_ref(period)
-        stepper = Stepper(kernel.begin(self.compiled, y), *allowed, stages, np.empty_like(y), np.empty_like(y))
+        stepper = Stepper(flow.begin(self.compiled, y), *allowed, stages, np.empty_like(y), np.empty_like(y))
         outcome, count, closed = _flow(stepper, y, duration, events)
         if outcome != DONE:
             why = {STUCK: "the step became too small", FULL: f"more than {MOST_CHANGES} contact changes"}

@@ -10,13 +10,13 @@ from mpi4py import MPI
 
 from vipetsc.case import NnmCase
 from vipetsc.io.folder import BRANCHES, claim_folder, provenance
-from vipetsc.modes.audit import BranchMonitor, compare, jumps
+from vipetsc.modes.audit import BranchMonitor, compare, jumps, sampled
 from vipetsc.modes.branch import Branch
-from vipetsc.modes.continuation import Continuation, ContinuationError, Guards, StepControl
+from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl
 from vipetsc.modes.dop853 import Dop853Flow
+from vipetsc.modes.flow import FiniteDifferences, Flow, FlowError
 from vipetsc.modes.newmark import Newmark
-from vipetsc.modes.orbit import FiniteDifferences, Flow, FlowError
-from vipetsc.modes.point import Point, linear_start, sample_orbit
+from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.shooting import MAPS, Corrector, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import System
@@ -79,7 +79,7 @@ class Follower:
             energy=options.energy,
             frequency=options.frequency,
             chart=options.chart,
-            guards=Guards(**{name: bound or math.inf for name, bound in options.guards.model_dump().items()}),
+            guards=options.guards,
         )
 
     def follow(self, mode: int, resume: bool = False) -> list[Branch]:
@@ -103,9 +103,9 @@ class Follower:
                 branch.findings += down.findings
             direction = -1 if options.direction == "down" else 1
             self.grow(branch, self.corrector, start, self.control, direction, save=True)
-            self._store_orbits(branch)
+            branch.extra = sampled(self.corrector.problem, self._typical(branch))
             for flow in options.compare:
-                branch.comparisons |= compare(self.corrector, branch.regular(), FLOWS[flow](self.system))
+                branch.extra |= compare(self.corrector, branch.regular(), FLOWS[flow](self.system))
         except FAILURES as error:
             branch.ending = f"failed: {error}"
         branch.write(self.folder, self.about)
@@ -162,16 +162,16 @@ class Follower:
         energy = graze / 100 if math.isfinite(graze) else 1e-3
         return linear_start(self.corrector, mode, max(energy, self.options.energy[0] * 1.001))
 
-    def _store_orbits(self, branch: Branch) -> None:
-        """Orbits in the middle of every region, and at the energies asked for."""
-        regular = [
-            (p, region) for p, region in zip(branch.points, branch.regions(), strict=True) if p.kind == "regular"
-        ]
-        groups = [[p for p, region in regular if region == number] for number in range(5)]
+    def _typical(self, branch: Branch) -> list[Point]:
+        """The regular points in the middle of every region, and at the energies asked for."""
+        groups: list[list[Point]] = [[] for _ in range(5)]
+        for point, region in zip(branch.points, branch.regions(), strict=True):
+            if point.kind == "regular":
+                groups[region].append(point)
         chosen = [group[len(group) // 2] for group in groups if group]
         for energy in self.options.orbits_at:
             chosen.append(min(branch.regular(), key=lambda p: abs(math.log(p.energy / energy))))
-        branch.orbits = [(p, sample_orbit(self.corrector.problem, p)) for p in chosen]
+        return chosen
 
     def _crossing(self, branch: Branch) -> list[Branch]:
         """The branches that cross ``branch`` at the kinds of special points asked for."""

@@ -7,8 +7,7 @@ Mech. Syst. Signal Process. 23, 2009, App. A). Contacts are met at the ends of s
 import numpy as np
 
 from vipetsc.compiled import njit
-from vipetsc.modes.kernel import CompiledSystem, close, restore
-from vipetsc.modes.orbit import Flow, FlowError
+from vipetsc.modes.flow import CompiledSystem, Flow, FlowError, close, restore
 
 STEPS = 2000
 

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from vipetsc.modes.chart import Chart, Relative
-from vipetsc.modes.orbit import Arc
+from vipetsc.modes.flow import Arc
 from vipetsc.modes.shooting import Attempt, Corrector, Shooting
 
 
@@ -116,7 +116,7 @@ class Point:
             multiplier=float(np.abs(multipliers(traces, problem.map.quarter)).max(initial=1.0)),
             episodes=arc.episodes,
             closed=arc.closed / arc.duration,
-            newton=attempt.newton,
+            newton=len(attempt.history) - 1,
             tangent=tangent,
             slope=slope,
             energy_tangent=energy_tangent,
@@ -128,10 +128,7 @@ class Point:
 def linear_start(corrector: Corrector, mode: int, energy: float) -> Point:
     """The periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
 
-    Raises
-    ------
-    ValueError
-        If the mode has no stiffness, or Newton does not converge from the linear mode at that energy.
+    Raises ValueError if the mode has no stiffness, or Newton does not converge from the linear mode at that energy.
     """
     problem = corrector.problem
     omega, shapes = problem.system.linear_modes()

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.modes.chart import Chart
-from vipetsc.modes.orbit import Arc, Flow, FlowError
+from vipetsc.modes.flow import Arc, Flow, FlowError
 
 Section = Literal["rest", "centre"]
 
@@ -33,13 +33,10 @@ class ShootingMap:
 
 
 MAPS = {
-    m.name: m
-    for m in (
-        ShootingMap("quarter", "rest", "centre", 0.25),
-        ShootingMap("half", "rest", "rest", 0.5),
-        ShootingMap("whole", "rest", "rest", 1.0),
-        ShootingMap("half-centre", "centre", "centre", 0.5),
-    )
+    "quarter": ShootingMap("quarter", "rest", "centre", 0.25),
+    "half": ShootingMap("half", "rest", "rest", 0.5),
+    "whole": ShootingMap("whole", "rest", "rest", 1.0),
+    "half-centre": ShootingMap("half-centre", "centre", "centre", 0.5),
 }
 
 
@@ -47,11 +44,7 @@ class Shooting:
     """Periodic orbits of ``flow.system``: initial values x (n,) and period are sought.
 
     x are displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre.
-
-    Raises
-    ------
-    ValueError
-        If the map needs an odd system and the system is not.
+    Raises ValueError if the map needs an odd system and the system is not.
     """
 
     def __init__(self, flow: Flow, shooting_map: ShootingMap) -> None:
@@ -107,11 +100,6 @@ class Attempt:
     def residuals(self) -> str:
         """The history as text."""
         return " ".join(f"{r:.1e}" for r in self.history)
-
-    @property
-    def newton(self) -> int:
-        """Newton steps taken."""
-        return max(len(self.history) - 1, 0)
 
 
 class Corrector:

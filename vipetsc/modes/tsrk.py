@@ -8,9 +8,9 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from vipetsc.modes import kernel
+from vipetsc.modes import flow
 from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
-from vipetsc.modes.orbit import Flow, FlowError
+from vipetsc.modes.flow import Flow, FlowError
 from vipetsc.modes.system import System
 
 
@@ -29,19 +29,19 @@ class Tsrk(Flow):
         self._shape = 2 * system.dofs, 1 + 2 * system.dofs
         self._y = PETSc.Vec().createSeq(self._shape[0] * self._shape[1], comm=PETSc.COMM_SELF)
         self._adaptive, self._fixed = self._solver("basic"), self._solver("none")
-        self._record: kernel.Step
+        self._record: flow.Step
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
-        step = self._record = kernel.begin(self.compiled, y)
+        step = self._record = flow.begin(self.compiled, y)
         self._set_tolerances(y[:, 0], period)
         t, h, closed, events, dy = 0.0, 0.05 / self.omega, 0.0, [], np.empty(self._shape)
         while t < duration:
             length, state, h = self._step(self._adaptive, y, min(h, 1 / self.omega, duration - t))
-            if length < kernel.SMALLEST_STEP * duration and length < duration - t:
+            if length < flow.SMALLEST_STEP * duration and length < duration - t:
                 raise FlowError(f"TSRK's step became too small at {t:.6g} s of {duration:.6g} s")
-            kernel.observe(step, y, dy, step.start)
-            kernel.observe(step, state, dy, step.end)
-            change = kernel.first_change(step, length)
+            flow.observe(step, y, dy, step.start)
+            flow.observe(step, state, dy, step.end)
+            change = flow.first_change(step, length)
             changed = change.contact >= 0
             if changed:
                 length, state, changed = self._land(y, length, change)
@@ -49,7 +49,7 @@ class Tsrk(Flow):
             t = duration if duration - t - length <= 1e-16 * duration else t + length
             y = state
             if changed:
-                events.append((t, change.contact, change.side, kernel.switch(step, change)))
+                events.append((t, change.contact, change.side, flow.switch(step, change)))
                 self._adaptive.restartStep()
         return y, np.array(events).reshape(-1, 4), closed
 
@@ -83,7 +83,7 @@ class Tsrk(Flow):
 
     def _rates(self, ts: PETSc.TS, t: float, y: PETSc.Vec, dy: PETSc.Vec) -> None:
         state = np.array(y.getArray(readonly=True)).reshape(self._shape)
-        kernel.rates(self.compiled, self._record.side, state, dy.getArray().reshape(self._shape))
+        flow.rates(self.compiled, self._record.side, state, dy.getArray().reshape(self._shape))
 
     def _step(self, ts: PETSc.TS, y: np.ndarray, h: float) -> tuple[float, np.ndarray, float]:
         """One step from ``y``, of at most ``h``: its length, the new state, the next step's length."""
@@ -100,7 +100,7 @@ class Tsrk(Flow):
         for _ in range(MOST_ATTEMPTS):
             length = change.length
             _, state, _ = self._step(self._fixed, y, length)
-            kernel.observe(step, state, dy, step.end)
+            flow.observe(step, state, dy, step.end)
             change, outcome = correct(change, step.end[change.contact], 2e-16 * h)
             if outcome != NONE:
                 return length, state, outcome != EXTREMUM
