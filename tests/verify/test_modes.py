@@ -122,7 +122,7 @@ def test_bilinear_folds_and_stability(bilinear):
         elif not first <= p.index <= second:
             assert p.multiplier == pytest.approx(1, abs=1e-6)
     # the folds do not depend on how the branch is stepped
-    _, _, again = follow(reduced(), OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.1), largest=0.05, chart="relative")
+    _, _, again = follow(reduced(), OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.1), largest_step=0.05, chart="relative")
     for fold, other in zip(folds, of_kind(again, "fold-energy"), strict=True):
         assert other.energy == pytest.approx(fold.energy, rel=1e-9)
         assert other.frequency == pytest.approx(fold.frequency, rel=1e-8)
@@ -384,7 +384,7 @@ def test_failure_says_where_why_and_what_to_turn():
     start = linear_start(corrector, OUT_OF_PHASE, 2.9e-2)
     points = []
     with pytest.raises(ContinuationError) as caught:
-        for point in Continuation(corrector, start, StepControl(smallest=1e-6, first=1e-2)):
+        for point in Continuation(corrector, start, StepControl(smallest_step=1e-6, first_step=1e-2)):
             points.append(point)
     text = str(caught.value)
     assert points

@@ -34,8 +34,8 @@ def is_jump(corrector: Corrector, left: Point, right: Point, control: StepContro
     chart = chart_at(corrector.problem, "relative", left)
     origin, goal = chart.encode(left.x, left.period), chart.encode(right.x, right.period)
     reach = float(np.linalg.norm(goal - origin))
-    largest, last = reach / 4, origin
-    guarded = StepControl(first=min(control.first, largest), smallest=control.smallest, largest=largest, points=400)
+    last, first = origin, min(control.first_step, reach / 4)
+    guarded = StepControl(first, control.smallest_step, largest_step=reach / 4, points=400)
     for point in Continuation(corrector, left, guarded):
         here = chart.encode(point.x, point.period)
         share, missed, length = (float(a[0]) for a in _nearest(goal, last[None, :], here[None, :]))

@@ -19,14 +19,14 @@ class ContinuationError(RuntimeError):
 class StepControl:
     """How a branch is followed.
 
-    ``first``, ``smallest`` and ``largest`` steps are in units of the chart (relative changes); the branch ends
-    outside ``energy`` (J), outside ``frequency`` (Hz) or after ``points`` points. ``chart`` is ``relative``,
-    ``logarithmic``, ``grazing`` or ``auto`` (grazing near a contact at the arc's start, relative elsewhere).
+    Steps are in units of the chart (relative changes); the branch ends outside ``energy`` (J), outside ``frequency``
+    (Hz) or after ``points`` points. ``chart`` is ``relative``, ``logarithmic``, ``grazing`` or ``auto`` (grazing near a
+    contact at the arc's start, relative elsewhere). The names are those of the case's section [nnm].
     """
 
-    first: float = 1e-3
-    smallest: float = 1e-13
-    largest: float = 0.1
+    first_step: float = 1e-3
+    smallest_step: float = 1e-13
+    largest_step: float = 0.1
     points: int = 5000
     energy: Sequence[float] = (0.0, np.inf)
     frequency: Sequence[float] = (0.0, np.inf)
@@ -77,7 +77,7 @@ class Continuation:
         self.corrector, self.control, self.point = corrector, control, start
         if start.tangent is None:
             self.point = replace(start, tangent=first_tangent(corrector, start, direction))
-        self.step = control.first if step is None else step
+        self.step = control.first_step if step is None else step
         self.ending, self.finished = "not finished", False
 
     def __iter__(self) -> Iterator[Point]:
@@ -101,7 +101,7 @@ class Continuation:
     def _next(self) -> Point:
         last, frame = self.point, Frame(self.corrector, self.control.chart, self.point)
         residuals, why, knob = "none", "no step tried", "nnm.max_newton or nnm.tolerance"
-        while self.step >= self.control.smallest:
+        while self.step >= self.control.smallest_step:
             attempt = frame.correct(frame.xi + self.step * frame.tangent, self.step)
             residuals = attempt.residuals
             if not attempt.converged:
@@ -111,12 +111,12 @@ class Continuation:
             point, strain, guard = self._judge(frame, attempt)
             if strain <= 1.0:
                 effort = max(strain / 0.7, point.newton / 5, 1 / GROWTH)
-                self.step = min(self.step / effort, self.control.largest)
+                self.step = min(self.step / effort, self.control.largest_step)
                 return point
             why, knob = GUARDED[guard], f"nnm.guards.{guard}"
             self.step *= min(max(0.8 / strain, 0.1), 0.7)
         raise ContinuationError(
-            f"step below {self.control.smallest:g} after point {last.index} "
+            f"step below {self.control.smallest_step:g} after point {last.index} "
             f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {why}; "
             f"residuals of the last attempt: {residuals}; turn nnm.smallest_step or {knob}"
         )

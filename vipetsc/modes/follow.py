@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,16 +71,7 @@ class Follower:
         automatic = "quarter" if self.system.odd else "half"
         problem = Shooting(flow, MAPS[automatic if options.map == "auto" else options.map])
         self.corrector = Corrector(problem, options.tolerance, max_newton=options.max_newton)
-        self.control = StepControl(
-            first=options.first_step,
-            smallest=options.smallest_step,
-            largest=options.largest_step,
-            points=options.points,
-            energy=options.energy,
-            frequency=options.frequency,
-            chart=options.chart,
-            guards=options.guards,
-        )
+        self.control = StepControl(**{f.name: getattr(options, f.name) for f in fields(StepControl)})
 
     def follow(self, mode: int, resume: bool = False) -> list[Branch]:
         """The branch of ``mode`` (0-based), then the branches that cross it if the case asks for them."""

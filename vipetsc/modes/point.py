@@ -14,9 +14,8 @@ def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
     """Half-traces c (n - 1,) = (mu + 1/mu)/2 of the basic map's multipliers, the trivial pair left out.
 
     The basic map is the half period (seen with the sign reversed) for the quarter-period map and the period for the
-    others. With S = [[A, B], [C, D]] in mass-normalised coordinates and its mirror image after the end, it has the
-    diagonal block I + 2 B^T C (I - 2 D^T A for a quarter period), whose eigenvalues are the half-traces. One of
-    them is trivial and its left eigenvector is known, so that it is removed exactly.
+    others; its diagonal block is derived in the package's docstring. The left eigenvector of its trivial eigenvalue is
+    known, so that it is removed exactly.
     """
     root = np.sqrt(problem.system.masses)
     n, quarter, s = len(root), problem.map.quarter, arc.sensitivity

@@ -11,6 +11,8 @@ from vipetsc.modes.chart import Chart
 from vipetsc.modes.flow import Arc, Flow, FlowError
 
 Section = Literal["rest", "centre"]
+# A Newton step below this, in unknowns of order one, is rounding.
+STEP_TOLERANCE = 1e-14
 
 
 @dataclass(frozen=True)
@@ -105,14 +107,12 @@ class Attempt:
 class Corrector:
     """Newton's method (PETSc SNES) for the shooting equations of ``problem`` and one more linear row.
 
-    It ends at a scaled residual of ``tolerance``, after a step (of unknowns of order one) below ``step_tolerance``,
+    It ends at a scaled residual of ``tolerance``, after a step (of unknowns of order one) below ``STEP_TOLERANCE``,
     where rounding allows no more, or after ``max_newton`` steps. PETSc options: ``-nnm_snes_monitor`` and the like.
     """
 
-    def __init__(
-        self, problem: Shooting, tolerance: float = 1e-13, step_tolerance: float = 1e-14, max_newton: int = 7
-    ) -> None:
-        self.problem, self.tolerance, self.step_tolerance = problem, tolerance, step_tolerance
+    def __init__(self, problem: Shooting, tolerance: float = 1e-13, max_newton: int = 7) -> None:
+        self.problem, self.tolerance = problem, tolerance
         size = problem.system.dofs + 1
         self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
         self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
@@ -180,7 +180,7 @@ class Corrector:
             return reasons.DIVERGED_FNORM_NAN
         if residual <= self.tolerance:
             return reasons.CONVERGED_FNORM_ABS
-        if iteration and step <= self.step_tolerance:
+        if iteration and step <= STEP_TOLERANCE:
             return reasons.CONVERGED_SNORM_RELATIVE
         if residual > 1e3 * max(self._history[0], 1e-3):
             return reasons.DIVERGED_DTOL

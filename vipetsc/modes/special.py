@@ -116,14 +116,11 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
         singular.append(f"{name} {values[-1] / values[0]:.1e}")
         if values[-1] > 1e-5 * values[0]:
             continue
-        along = np.zeros(len(xi))
-        if point.tangent is not None:
-            x, period = point.x + 1e-6 * point.tangent[:-1], point.period + 1e-6 * point.tangent[-1]
-            later = replace(point, x=x, period=period)
-            along = chart.encode(*_re_expressed(old, later, problem)) - xi
+        x, period = point.x + 1e-6 * point.direction[:-1], point.period + 1e-6 * point.direction[-1]
+        along = chart.encode(*_re_expressed(old, replace(point, x=x, period=period), problem)) - xi
         first, second = directions[-2:] @ (directions[-2:].T @ directions[-2:] @ along)
         row = sign * unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
-        fresh = Corrector(problem, corrector.tolerance, corrector.step_tolerance)
+        fresh = Corrector(problem, corrector.tolerance)
         attempt = fresh.solve(chart, xi + amplitude * row, row, row @ xi + amplitude)
         if not attempt.converged:
             why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.switch_amplitude"
