@@ -5,12 +5,11 @@ from itertools import cycle
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import KAPPA, draw_map, panel_title
+from vipetsc.figures.panels import KAPPA, colour_bar, draw_map, panel_title
 
 WEIGHTED = 2  # index of the weighted cost
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
@@ -23,8 +22,7 @@ HEADROOM = 1.9  # frequencies are shown up to this many times the best cell's hi
 def deflections(search: xr.Dataset) -> Figure:
     """Bloch displacements of the masses and the resonator's deflection on each band at the weighted optimum."""
     optimum, kappa = search.isel(cost=WEIGHTED), search["wavenumber"].values / np.pi
-    figure = style.new_figure(style.PAGE, 1.1 + 1.55 * search.sizes["reading"])
-    grid = figure.subplots(search.sizes["reading"], search.sizes["band"], sharex=True, sharey=True, squeeze=False)
+    figure, grid = _grid(search, search.sizes["band"], 1.1, 1.55, KAPPA)
     for (i, j), axes in np.ndenumerate(grid):
         cell = optimum.isel(reading=i, band=j)
         u, w = cell["optimum_amplitude"].values, cell["optimum_deflection"].values
@@ -40,7 +38,6 @@ def deflections(search: xr.Dataset) -> Figure:
             best = f"λ = {cell['optimum_lambda'].item():.3g}, η = {cell['optimum_eta'].item():.3g}"
             axes.set_ylabel(f"{cell['reading'].item().capitalize()}\n{best}\n|u| (unit norm)")
     grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
-    figure.supxlabel(KAPPA, fontsize=8)
     figure.get_layout_engine().set(rect=(0, 0, 1, 1 - 0.22 / figure.get_figheight()))
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="upper center", ncols=5)
     return figure
@@ -52,8 +49,8 @@ def cost_maps(search: xr.Dataset) -> Figure:
     Cells whose host and resonator are not out of phase all along the second band are veiled.
     """
     lam, eta = search["lambda"].values, search["eta"].values
-    figure = style.new_figure(style.PAGE, 0.6 + 2.1 * search.sizes["reading"])
-    grid = figure.subplots(search.sizes["reading"], search.sizes["cost"], sharex=True, sharey=True, squeeze=False)
+    xlabel = "λ  (pale: $u_2$ and $u_3$ are not out of phase all along band 2)"
+    figure, grid = _grid(search, search.sizes["cost"], 0.6, 2.1, xlabel)
     for (i, j), axes in np.ndenumerate(grid):
         of_reading, cost = search.isel(reading=i), str(search["cost"].values[j])
         feasible, values = of_reading["out_of_phase"].values.T.astype(bool), of_reading[cost].values.T
@@ -64,28 +61,24 @@ def cost_maps(search: xr.Dataset) -> Figure:
         veil = np.ma.masked_where(feasible, np.zeros(feasible.shape))
         axes.imshow(veil, extent=image.get_extent(), origin="lower", aspect="auto", alpha=0.75,
                     cmap=ListedColormap([style.PALE]), interpolation="nearest")  # fmt: skip
-        figure.colorbar(image, ax=axes, label=LABELS[cost], pad=0.02)
+        colour_bar(figure, image, axes, LABELS[cost], pad=0.02, extend="neither")
         best = tuple(of_reading[f"optimum_{name}"].values[j] for name in SYMBOLS)
         if np.isnan(best).any():
             panel_title(axes, f"{TITLES[cost]}: none is out of phase")
         else:
             axes.plot(*best, "s", color="red", mec="white", mew=0.6, ms=5, clip_on=False, zorder=5)
             panel_title(axes, f"{TITLES[cost]}: ({best[0]:.3g}, {best[1]:.3g})")
-            _inset(axes, of_reading.sel({"lambda": best[0], "eta": best[1]}, method="nearest"))
+            # The dispersion of the best cell, in the corner where cells are veiled.
+            cell = of_reading.sel({"lambda": best[0], "eta": best[1]}, method="nearest")
+            inset = axes.inset_axes((0.5, 0.1, 0.46, 0.46))
+            for branch, colour in zip(cell["frequency"].values.T / 1e3, cycle(style.SERIES), strict=False):
+                inset.plot(cell["wavenumber"].values / np.pi, branch, color=colour, lw=0.8)
+            inset.set(xlim=(0, 1), ylim=(0, None), xticks=(), yticks=())
+            inset.set_xlabel("κ", labelpad=1, fontsize=6.5)
+            inset.set_ylabel("ω", labelpad=1, fontsize=6.5)
         if j == 0:
             axes.set_ylabel(f"{of_reading['reading'].item().capitalize()}\nη")
-    figure.supxlabel("λ  (pale: $u_2$ and $u_3$ are not out of phase all along band 2)", fontsize=8)
     return figure
-
-
-def _inset(axes: Axes, cell: xr.Dataset) -> None:
-    """The dispersion of a ``cell`` of the search, in the corner where cells are veiled."""
-    inset = axes.inset_axes((0.5, 0.1, 0.46, 0.46))
-    for branch, colour in zip(cell["frequency"].values.T / 1e3, cycle(style.SERIES), strict=False):
-        inset.plot(cell["wavenumber"].values / np.pi, branch, color=colour, lw=0.8)
-    inset.set(xlim=(0, 1), ylim=(0, None), xticks=(), yticks=())
-    inset.set_xlabel("κ", labelpad=1, fontsize=6.5)
-    inset.set_ylabel("ω", labelpad=1, fontsize=6.5)
 
 
 def dispersion_against_lambda(search: xr.Dataset) -> Figure:
@@ -103,11 +96,13 @@ def _dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
     kappa, values = search["wavenumber"].values / np.pi, search[along].values
     plasma, norm = mpl.colormaps["plasma"], Normalize(values[0], values[-1] + 0.08 * (values[-1] - values[0]))
     lines = np.unique(np.round(np.linspace(0, len(values) - 1, min(LINES, len(values)))).astype(int))
-    figure = style.new_figure(style.PAGE, 0.6 + 2.0 * search.sizes["reading"])
-    grid = figure.subplots(search.sizes["reading"], 3, sharex=True, sharey=True, squeeze=False)
+    figure, grid = _grid(search, 3, 0.6, 2.0, KAPPA)
     for i, row in enumerate(grid):
         of_reading = search.isel(reading=i)
-        best = _best(of_reading)
+        optimum = {name: of_reading[f"optimum_{name}"].values[WEIGHTED] for name in SYMBOLS}
+        best = {name: int(np.abs(of_reading[name].values - value).argmin()) for name, value in optimum.items()}
+        if np.isnan(list(optimum.values())).any():
+            best = {name: of_reading.sizes[name] // 2 for name in SYMBOLS}
         top = HEADROOM * float(of_reading["frequency"].isel(best).max()) / 1e3
         last = search.sizes[other] - 1
         middle = best[other] if 0 < best[other] < last else last // 2
@@ -121,15 +116,14 @@ def _dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
                 axes.set_title(f"up to {frequency.max():.3g} krad/s ↑", loc="right", pad=3, fontsize=6.5)
         row[0].set(ylabel=f"{of_reading['reading'].item().capitalize()}\nω (krad/s)", ylim=(0, top))
     grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
-    figure.supxlabel(KAPPA, fontsize=8)
     shades = mpl.cm.ScalarMappable(Normalize(values[0], values[-1]), ListedColormap(plasma(np.linspace(0, 0.93, 256))))
-    figure.colorbar(shades, ax=grid, label=SYMBOLS[along], pad=0.01)
+    colour_bar(figure, shades, grid.flat, SYMBOLS[along], extend="neither")
     return figure
 
 
-def _best(of_reading: xr.Dataset) -> dict[str, int]:
-    """Indices (lambda, eta) of the cell at the weighted optimum; the middle of the grid if there is none."""
-    best = {name: of_reading[f"optimum_{name}"].values[WEIGHTED] for name in SYMBOLS}
-    if np.isnan(list(best.values())).any():
-        return {name: of_reading.sizes[name] // 2 for name in SYMBOLS}
-    return {name: int(np.abs(of_reading[name].values - value).argmin()) for name, value in best.items()}
+def _grid(search: xr.Dataset, columns: int, margin: float, height: float, xlabel: str) -> tuple[Figure, np.ndarray]:
+    """A page with a row of panels, ``height`` inches each, for every reading; ``xlabel`` stands below all."""
+    rows = search.sizes["reading"]
+    figure = style.new_figure(style.PAGE, margin + height * rows)
+    figure.supxlabel(xlabel, fontsize=8)
+    return figure, figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
