@@ -41,7 +41,7 @@ def test_a_map_shows_every_value_at_its_coordinates(axes):
 
 def test_colours_follow_the_data(axes):
     for largest in (1e-9, 2.0, 3e7):
-        norm = panels.log_norm(largest, 3)
+        norm = panels.log_norm(largest, 0.5 * largest, decades=3)
         assert (norm.vmin, norm.vmax) == pytest.approx((1e-3 * largest, largest))
     assert panels.log_norm(0.0).vmax == panels.log_norm(np.nan).vmax == 1.0
 

@@ -12,9 +12,8 @@ from matplotlib.image import imread
 
 from vipetsc.case import Case, Sweep
 from vipetsc.figures.entropy import AVERAGES, COLOURS
-from vipetsc.figures.partition import bin_colours, shown_bins
 from vipetsc.figures.registry import FIGURES, draw
-from vipetsc.figures.scattering import KC, LEAST_WEIGHT
+from vipetsc.figures.scattering import KC, LEAST_WEIGHT, bin_colours, shown_bins
 from vipetsc.figures.study import Wave, in_pi, series_of
 from vipetsc.figures.style import GREY, rc_style
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members

@@ -2,13 +2,12 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
@@ -138,14 +137,16 @@ def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> 
             lower.set_axis_off()
             continue
         for name, label in AVERAGES.items():
-            if name != average:
-                _faint(upper, row, name, label, color=COLOURS[name], lw=0.6, alpha=0.5)
+            other = EntropyCurve.of(row, name)
+            if other and name != average:
+                upper.plot(other.amplitude, other.value, color=COLOURS[name], lw=0.6, alpha=0.5, label=label)
         _points(upper, curve, average, 2.2)
         same = [name for name in axes_of(ensemble) if name not in ("reading", AMPLITUDE)]
-        for other in _rows(ensemble) if "reading" in axes_of(ensemble) else ():
-            if other["reading"] != row["reading"] and all(other[name] == row[name] for name in same):
-                label = f"{other['reading'].item()} reading"
-                _faint(lower, other, average, label, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)))
+        for alike in _rows(ensemble) if "reading" in axes_of(ensemble) else ():
+            other = EntropyCurve.of(alike, average)
+            if other and alike["reading"] != row["reading"] and all(alike[name] == row[name] for name in same):
+                label = f"{alike['reading'].item()} reading"
+                lower.plot(other.amplitude, other.value, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)), label=label)
         _log_panel(lower, curve, average, 2.2, 6.0)
         upper.set(xlim=(0, 1.04 * curve.amplitude[-1]), ylim=(-0.05, 1.45))
     label_outer(grid, "A (N)", "Normalised entropy")
@@ -199,13 +200,6 @@ def _panels(
     return figure, grid
 
 
-def _faint(axes: Axes, row: xr.Dataset, average: str, label: str, **line: Any) -> None:
-    """A curve to compare with, if the row has one."""
-    curve = EntropyCurve.of(row, average)
-    if curve:
-        axes.plot(curve.amplitude, curve.value, label=label, **line)
-
-
 def _points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
     pale = tuple(0.5 + 0.5 * np.array(to_rgb(COLOURS[average])))
     axes.errorbar(
@@ -230,6 +224,7 @@ def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float, fonts
 
 
 def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figure:
+    """Images of H(t) over amplitude, dashed where averages over time begin, dotted where contact begins."""
     columns = min(len(configurations), MOST_COLUMNS)
     rows = -(-len(configurations) // columns)
     width = max(style.PAGE * columns / MOST_COLUMNS, style.COLUMN)
@@ -239,7 +234,16 @@ def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figu
     shown = [(row, _start_of_averages(row)) for row in configurations]
     norm = percentile_norm(row["entropy/history"].where(row["entropy/time"] >= start) for row, start in shown)
     for axes, (row, start) in zip(grid.flat, shown, strict=False):
-        image = _image(axes, row, norm)
+        times, history, amplitude = (row[name].values for name in ("entropy/time", "entropy/history", AMPLITUDE))
+        time = times[np.argmax(np.isfinite(times).sum(axis=1))]
+        finite = np.isfinite(time)
+        time, history = time[finite], history[:, finite]
+        image = axes.pcolormesh(time, amplitude, history, norm=norm, shading="nearest", rasterized=True)
+        axes.set(yscale="log", xlim=time[[0, -1]])
+        touched = row["contact_episodes"].values > 0
+        if touched.any() and not touched.all():
+            first = int(np.argmax(touched))
+            axes.axhline(np.sqrt(amplitude[first - 1] * amplitude[first]), color="white", lw=0.8, ls=":")
         if start > 0:
             axes.axvline(start, color="white", lw=0.7, ls="--")
         panel_title(axes, _row_title(row, ensemble))
@@ -248,21 +252,6 @@ def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figu
     label_outer(grid, "Time (s)", "Amplitude A (N)")
     panels.colour_bar(figure, image, grid.flat, "H(t) (bit)", extend="both")
     return figure
-
-
-def _image(axes: Axes, row: xr.Dataset, norm: Normalize) -> QuadMesh:
-    """The image of H(t) over amplitude, dotted where contact begins."""
-    times, history, amplitude = (row[name].values for name in ("entropy/time", "entropy/history", AMPLITUDE))
-    time = times[np.argmax(np.isfinite(times).sum(axis=1))]
-    finite = np.isfinite(time)
-    options = {"norm": norm, "cmap": "viridis", "shading": "nearest", "rasterized": True}
-    image = axes.pcolormesh(time[finite], amplitude, history[:, finite], **options)
-    axes.set(yscale="log", xlim=time[finite][[0, -1]])
-    touched = row["contact_episodes"].values > 0
-    if touched.any() and not touched.all():
-        first = int(np.argmax(touched))
-        axes.axhline(np.sqrt(amplitude[first - 1] * amplitude[first]), color="white", lw=0.8, ls=":")
-    return image
 
 
 def _start_of_averages(row: xr.Dataset) -> float:

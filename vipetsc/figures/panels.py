@@ -11,6 +11,7 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.image import AxesImage
+from numpy.typing import ArrayLike
 
 from vipetsc.figures import style
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
@@ -41,11 +42,10 @@ def empty_figure(reason: str) -> Figure:
     return figure
 
 
-def block_means(values: np.ndarray, rows: int = PIXELS, columns: int = PIXELS) -> np.ndarray:
-    """Means over blocks of ``values`` (row, column), so that at most ``rows`` x ``columns`` are left."""
-    for axis, most in ((0, rows), (1, columns)):
-        length = values.shape[axis]
-        block = -(-length // most)
+def block_means(values: np.ndarray) -> np.ndarray:
+    """Means over blocks of ``values`` (row, column), so that at most ``PIXELS`` rows and columns are left."""
+    for axis, length in enumerate(values.shape):
+        block = -(-length // PIXELS)
         if block > 1:
             starts = np.arange(0, length, block)
             sizes = np.diff(np.append(starts, length))
@@ -53,8 +53,9 @@ def block_means(values: np.ndarray, rows: int = PIXELS, columns: int = PIXELS) -
     return values
 
 
-def log_norm(largest: float, decades: float = DECADES) -> LogNorm:
-    """Logarithmic colours over ``decades`` below ``largest``, below 1 for a field that vanishes."""
+def log_norm(*fields: ArrayLike, decades: float = DECADES) -> LogNorm:
+    """Logarithmic colours over ``decades`` below the largest value of the ``fields``, below 1 where they vanish."""
+    largest = max(float(np.max(np.asarray(field))) for field in fields)
     top = largest if np.isfinite(largest) and largest > 0 else 1.0
     return LogNorm(top * 10.0**-decades, top, clip=True)
 
@@ -77,11 +78,13 @@ def draw_map(
     return axes.imshow(block_means(values), norm=norm, cmap=cmap, **options)
 
 
-def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, cmap: str = "inferno") -> AxesImage:
-    """Map of ``field`` (t, cell), time to the right; the coordinates name the axes."""
+def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, run: xr.Dataset | None = None) -> AxesImage:
+    """Map of ``field`` (t, cell), time to the right, with the sites of its ``run`` marked."""
     time, cells = (field[dim].values for dim in field.dims)
-    image = draw_map(axes, time, cells, field.values.T, norm, cmap)
+    image = draw_map(axes, time, cells, field.values.T, norm)
     axes.set(xlabel="Time (s)", ylabel="Cell")
+    if run is not None:
+        mark_sites(axes, run)
     return image
 
 

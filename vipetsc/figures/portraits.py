@@ -50,8 +50,14 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         (u[:, r], v[:, r], "(b) Resonator", "u_r"),
         (u[:, r] - u[:, h], v[:, r] - v[:, h], "(c) Relative motion", "w"),
     )
+    before = int(np.searchsorted(time, first))
     for axes, (x, y, title, symbol) in zip(panels, portraits, strict=True):
-        after = _trajectory(axes, 1e3 * x, y, time, first, norm)
+        points = np.stack([1e3 * x, y], axis=1)
+        segments = list(np.stack([points[:-1], points[1:]], axis=1)[before:])
+        after = LineCollection(segments, array=time[before:-1], norm=norm, cmap="viridis", lw=0.4, rasterized=True)
+        axes.add_collection(after)
+        axes.plot(*points[: before + 1].T, color=style.GREY, lw=0.4, rasterized=True)
+        _centred_limits(axes, points[:, 0], points[:, 1], 1.06)
         axes.set(xlabel=f"${symbol}$ (mm)", ylabel=rf"$\dot{{{symbol}}}$ (m/s)")
         panel_title(axes, f"{title}, cell {cell}")
     relative = panels[2]
@@ -75,20 +81,6 @@ def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray,
     fine = np.interp(np.arange((len(time) - 1) * REFINE + 1) / REFINE, np.arange(len(time)), time)
     motion = CubicHermiteSpline(time, u, v, axis=0)
     return motion(fine), motion(fine, 1), fine
-
-
-def _trajectory(
-    axes: Axes, x: np.ndarray, y: np.ndarray, time: np.ndarray, first: float, norm: Normalize
-) -> LineCollection:
-    """The motion ``x``, ``y`` (t): grey up to the ``first`` contact, in the colours of ``norm`` from there."""
-    before = int(np.searchsorted(time, first))
-    points = np.stack([x, y], axis=1)
-    segments = np.stack([points[:-1], points[1:]], axis=1)[before:]
-    lines = LineCollection(list(segments), array=time[before:-1], norm=norm, cmap="viridis", lw=0.4, rasterized=True)
-    axes.add_collection(lines)
-    axes.plot(x[: before + 1], y[: before + 1], color=style.GREY, lw=0.4, rasterized=True)
-    _centred_limits(axes, x, y, 1.06)
-    return lines
 
 
 def _centred_limits(axes: Axes, x: np.ndarray, y: np.ndarray, margin: float) -> None:

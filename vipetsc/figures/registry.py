@@ -8,18 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vipetsc.figures import (
-    backbone,
-    design,
-    entropy,
-    lattice,
-    partition,
-    portraits,
-    runs,
-    scattering,
-    transfer,
-    transfer_curves,
-)  # fmt: skip
+from vipetsc.figures import backbone, design, entropy, lattice, portraits, runs, scattering, transfer, transfer_curves
 from vipetsc.figures.study import read_sweeps, table
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.io.netcdf import open_netcdf
@@ -46,11 +35,12 @@ def _specs(source: str, *functions: Callable[..., Any], measure: str = "") -> di
 
 
 # The dearest of a run first, so that ranks which share the work finish together.
-FIGURES: dict[str, FigureSpec] = {
+FIGURES = {
     **_specs(RUN, runs.spacetime, runs.dispersion, portraits.phase, lattice.unit_cell, runs.impacts, runs.ledger),
-    **_specs(SWEEP, scattering.amplitudes, scattering.wavelets, scattering.entropy_maps, measure="entropy"),
-    **_specs(SWEEP, partition.partition, partition.partition_explained, partition.reconstruction, measure="entropy"),
-    **_specs(SWEEP, entropy.entropy, entropy.entropy_all, entropy.entropy_history, measure="entropy"),
+    **_specs(SWEEP, scattering.amplitudes, scattering.wavelets, scattering.partition, measure="entropy"),
+    **_specs(SWEEP, scattering.partition_explained, scattering.reconstruction, measure="entropy"),
+    **_specs(SWEEP, entropy.entropy, entropy.entropy_all, measure="entropy"),
+    **_specs(SWEEP, scattering.entropy_maps, entropy.entropy_history, measure="entropy"),
     **_specs(SWEEP, transfer.transfer, transfer.transfer_dispersions, transfer.band_energies, measure="transfer"),
     **_specs(SWEEP, transfer_curves.ibtet, transfer_curves.ibtet_backbone, measure="transfer"),
     **_specs(SWEEP, portraits.phase_regimes, measure="transfer"),
@@ -83,7 +73,7 @@ def draw(
     formats: Sequence[str] = ("png",),
     share: tuple[int, int] = (0, 1),
 ) -> list[Path]:
-    """Draw what the ``folders`` hold into ``figures/`` of the first of them.
+    """Draw what the ``folders`` hold into ``figures/`` of the first of them; returns the files, each complete.
 
     Parameters
     ----------
@@ -94,11 +84,6 @@ def draw(
         Which figures; by default all that the data allow.
     share
         (rank, size): draw every ``size``-th picture from ``rank`` on, so that ranks can share the work.
-
-    Returns
-    -------
-    list of Path
-        The files written, each complete.
 
     Raises
     ------

@@ -31,14 +31,13 @@ def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         left.plot(time, energy[:, 0], color=style.BLUE, lw=0.6)
         left.set(xlabel="Time (s)", ylabel=f"Kinetic energy of cell {cells[0]} (J)", xlim=time[[0, -1]])
     else:
-        image = panels.space_time_map(left, energy, panels.log_norm(float(energy.max())))
+        image = panels.space_time_map(left, energy, panels.log_norm(energy), run)
         panels.colour_bar(figure, image, left, "Kinetic energy of a cell (J)", pad=0.02)
-        panels.mark_sites(left, run)
         if len(panels.recorded_sites(run)):
             left.legend(loc="upper left", labelcolor="white", handletextpad=0.3)
     for axes in right:
         content = analysis["wavenumber_content"].load()
-        image = panels.content_map(axes, content, panels.log_norm(float(content.max()), 4))
+        image = panels.content_map(axes, content, panels.log_norm(content, decades=4))
         axes.set(xlabel="Time (s)", ylabel=KAPPA, ylim=(0, content["wavenumber"][-1] / np.pi))
         panel_title(left, "(a) Kinetic energy")
         panel_title(axes, "(b) Wavenumber content")
@@ -54,7 +53,7 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     model = Case.of(run).model()
     cell = model.chain.cell
     spectra = panels.below_cutoff(analysis, cell, [name for name in measured if name != "dispersion"] or measured)
-    norm = panels.log_norm(max(float(s.max()) for s in spectra.values()))
+    norm = panels.log_norm(*spectra.values())
 
     figure = style.new_figure(style.PAGE if len(spectra) > 1 else 5.0, 3.2)
     widths = [1.0] * len(spectra) + [0.55]
@@ -94,7 +93,7 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     figure = style.new_figure(style.PAGE, min(1.3 + 0.24 * len(sites), 4.5))
     raster, bars = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
     speed = np.abs(velocity)
-    norm = panels.log_norm(speed.max(), 2)
+    norm = panels.log_norm(speed, decades=2)
     for sign, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
         at = side == sign
         image = raster.scatter(onset[at], site[at] + shift, 14, speed[at], marker=marker, lw=0, norm=norm,

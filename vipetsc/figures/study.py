@@ -24,7 +24,6 @@ AMPLITUDE = "amplitude"
 LEVELS = ("Low", "Medium", "High")
 T = TypeVar("T")
 
-
 Sweeps = Sequence[xr.Dataset]
 """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`."""
 
@@ -89,28 +88,16 @@ class Wave(NamedTuple):
         return cls(waves[0][0], float(waves[0][1]), abs(float(waves[0][2]))) if waves else cls(0, np.nan, np.nan)
 
 
-@dataclass(frozen=True)
-class AmplitudeSeries:
-    """One configuration at a low, a medium and a high amplitude.
+class AmplitudeSeries(NamedTuple):
+    """One configuration at a low, a medium and a high amplitude; ``wave`` is the linear one at the drive's frequency.
 
-    ``suffix`` tells it from the others of the sweeps; ``varied`` are the values of what else the sweep varies.
+    ``suffix`` tells it from others of the sweeps; its ``title`` has reading, sites, wavenumber and what else varies.
     """
 
     suffix: str
+    title: str
     runs: tuple[MeasuredRun, ...]
-    varied: tuple[str, ...] = ()
-
-    @cached_property
-    def wave(self) -> Wave:
-        """The linear wave at the drive's frequency."""
-        return Wave.of(self.runs[0].case)
-
-    @property
-    def title(self) -> str:
-        """Reading, sites and wavenumber, and what else the sweep varies."""
-        case = self.runs[0].case
-        parts = [f"{case.lattice.reading.capitalize()} reading", *self.varied, counted(len(sites_of(case)), "site")]
-        return ", ".join(parts + ([f"κ* = {in_pi(self.wave.wavenumber)}"] if self.wave.band else []))
+    wave: Wave
 
     def headings(self, row: int | None = None) -> Iterator[tuple[str, MeasuredRun, str]]:
         """For each column of a figure: the tag of its panel in a ``row``, such as "(a.ii)", the run, its heading."""
@@ -162,10 +149,12 @@ def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
         with ExitStack() as stack:
             runs = tuple(stack.enter_context(MeasuredRun.open(folder)) for _, folder in triple)
             if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
-                first = triple[0][0]
+                first, case = triple[0][0], runs[0].case
+                wave = Wave.of(case)
                 others = [name for name in axes(ensemble) if name not in (AMPLITUDE, "reading", "wavenumber", "sites")]
-                varied = tuple(_in_words(first, name, " ") for name in others)
-                yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), runs, varied)
+                title = [f"{case.lattice.reading.capitalize()} reading", *(_in_words(first, n, " ") for n in others)]
+                title += [counted(len(sites_of(case)), "site"), *[f"κ* = {in_pi(wave.wavenumber)}"][: wave.band]]
+                yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), ", ".join(title), runs, wave)
 
 
 def _triples(ensemble: xr.Dataset) -> list[list[tuple[xr.Dataset, Path]]]:

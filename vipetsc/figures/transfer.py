@@ -39,16 +39,23 @@ def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
 
 def nine_panels(member: MeasuredRun) -> Figure:
     """(a) All energy, (b-e) that of every pass band, (f, g) both segments, (h, i) spectra of two cells."""
-    run = member.run
+    run, cell = member.run, member.model.chain.cell
     velocity = run["velocity"].values
     figure = style.new_figure(style.PAGE, 7.6, Labels.of(member.case).member, left=True)
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
     letters = iter(ascii_lowercase)
     _space_time(upper, member, velocity, letters)
-    _dispersions(middle, member, letters)
-    cells = INPUT_CELL, member.model.chain.cells // 2
-    for axes, cell in zip(lower.subplots(1, 2, sharey=True), cells, strict=True):
-        index = nearest_cell(run, cell)
+    spectra, maps = panels.below_cutoff(member.analysis, cell, list(SEGMENTS)), middle.subplots(1, 2, sharey=True)
+    norm = panels.log_norm(*spectra.values())
+    for axes, (name, (label, colour)) in zip(maps, SEGMENTS.items(), strict=True):
+        image = panels.dispersion_map(axes, spectra[name], norm, cell)
+        axes.set_xlabel(KAPPA)
+        panel_title(axes, f"({next(letters)}) {label}")
+        axes.plot([0.03, 0.03], [0.03, 0.97], color=colour, lw=2.2, transform=axes.transAxes)
+    maps[0].set_ylabel("Frequency ω (krad/s)")
+    panels.colour_bar(middle, image, maps, "Energy per bin (J)")
+    shown = INPUT_CELL, member.model.chain.cells // 2
+    for axes, index in zip(lower.subplots(1, 2, sharey=True), (nearest_cell(run, n) for n in shown), strict=True):
         _spectra(axes, member, velocity[:, index])
         panel_title(axes, f"({next(letters)}) Velocity spectra, cell {run['cell'].values[index]}")
         axes.label_outer()
@@ -56,57 +63,38 @@ def nine_panels(member: MeasuredRun) -> Figure:
 
 
 def _space_time(page: SubFigure, member: MeasuredRun, velocity: np.ndarray, letters: Iterator[str]) -> None:
-    run, cell = member.run, member.model.chain.cell
-    parts = Parts.of(pass_bands(cell))
+    """Kinetic energy of all frequencies beside that of each pass band, to one scale; segments and sites marked."""
+    run, cell, energy = member.run, member.model.chain.cell, member.analysis["kinetic_energy"]
+    parts, cells, time = Parts.of(pass_bands(cell)), run["cell"].values, field_time(run)
     bands = [p for p, inside in enumerate(parts.bands) if inside]
     columns = -(-len(bands) // 2)
     grid = page.add_gridspec(2, 1 + columns, width_ratios=(1.35, *[1.0] * columns))
     whole = page.add_subplot(grid[:, 0])
-    energy = member.analysis["kinetic_energy"]
-    norm = panels.log_norm(float(energy.max()))
+    norm = panels.log_norm(energy)
     image = panels.space_time_map(whole, energy, norm)
     panel_title(whole, f"({next(letters)}) Kinetic energy")
-    _mark_segments(whole, member)
-    maps, cells, time = [whole], run["cell"].values, field_time(run)
+    maps = [whole]
     for i, p in enumerate(bands):
         axes = page.add_subplot(grid[i // columns, 1 + i % columns], sharex=whole, sharey=whole)
         part = part_kinetic_energy(velocity, cell.masses, field_interval(run), *parts.edges[p : p + 2])
         panels.draw_map(axes, time, cells, part.T, norm)
         panel_title(axes, f"({next(letters)}) {parts.names[p].capitalize()}")
-        axes.tick_params(labelleft=False, labelbottom=i // columns == 1)
-        if i // columns == 1:
-            axes.set_xlabel("Time (s)")
+        axes.set_xlabel("Time (s)")
+        axes.label_outer()
         maps.append(axes)
     whole.set(ylim=(cells[0] - 0.5, cells[-1] + 0.5), xlim=time[[0, -1]])
     panels.colour_bar(page, image, maps, "Kinetic energy of a cell (J)", aspect=35)
 
-
-def _mark_segments(axes: Axes, member: MeasuredRun) -> None:
-    """Bars along the left edge over the cells before and behind the first site, triangles at the sites."""
-    across, sites = axes.get_yaxis_transform(), member.run["sites/cell"].values
-    first, (low, high) = sites[leading_site(member.run)], member.run["cell"].values[[0, -1]]
-    spans = ((low, first - 1), (first + 1, high))
-    if member.model.drive_cell + 1 > first:
-        spans = spans[::-1]
-    for (name, colour), (a, b) in zip(SEGMENTS.values(), spans, strict=True):
-        axes.plot([0.02, 0.02], [a + 1, b - 1], color=colour, lw=2.2, solid_capstyle="butt", transform=across)
-        axes.text(0.045, 0.5 * (a + b), name.split()[0].lower(), color=colour, rotation=90, va="center",
-                  fontsize=7, transform=across)  # fmt: skip
-    axes.plot(np.full(len(sites), 0.985), sites, "<", color="white", mec=style.BLACK, mew=0.3, ms=3.5, transform=across)
-
-
-def _dispersions(page: SubFigure, member: MeasuredRun, letters: Iterator[str]) -> None:
-    cell = member.model.chain.cell
-    spectra = panels.below_cutoff(member.analysis, cell, list(SEGMENTS))
-    norm = panels.log_norm(max(float(s.max()) for s in spectra.values()))
-    maps = page.subplots(1, 2, sharey=True)
-    for axes, (name, (label, colour)) in zip(maps, SEGMENTS.items(), strict=True):
-        image = panels.dispersion_map(axes, spectra[name], norm, cell)
-        axes.set_xlabel(KAPPA)
-        panel_title(axes, f"({next(letters)}) {label}")
-        axes.plot([0.03, 0.03], [0.03, 0.97], color=colour, lw=2.2, transform=axes.transAxes)
-    maps[0].set_ylabel("Frequency ω (krad/s)")
-    panels.colour_bar(page, image, maps, "Energy per bin (J)")
+    across, sites = whole.get_yaxis_transform(), run["sites/cell"].values
+    first = sites[leading_site(run)]
+    spans = (cells[0], first - 1), (first + 1, cells[-1])
+    in_order = spans if member.model.drive_cell + 1 <= first else spans[::-1]
+    for (name, colour), (low, high) in zip(SEGMENTS.values(), in_order, strict=True):
+        whole.plot([0.02, 0.02], [low + 1, high - 1], color=colour, lw=2.2, solid_capstyle="butt", transform=across)
+        whole.text(0.045, 0.5 * (low + high), name.split()[0].lower(), color=colour, rotation=90, va="center",
+                   fontsize=7, transform=across)  # fmt: skip
+    edge = np.full(len(sites), 0.985)
+    whole.plot(edge, sites, "<", color="white", mec=style.BLACK, mew=0.3, ms=3.5, transform=across)
 
 
 def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
@@ -159,7 +147,7 @@ def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
             cell = member.model.chain.cell
             energy = panels.below_cutoff(member.analysis, cell, ["dispersion"])["dispersion"]
             energy = energy / (float(energy.max()) or 1.0)
-            image = panels.dispersion_map(axes, energy, panels.log_norm(1.0), cell)
+            image = panels.dispersion_map(axes, energy, panels.log_norm(energy), cell)
             transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
         panel_title(axes, f"({'abcdef'[i]}.{j + 1}) {laws[i].capitalize()}, {amplitudes[j]:.4g} N")
         axes.text(0.03, 0.41, transferred, color="white", fontsize=6.5, transform=axes.transAxes)
@@ -185,11 +173,13 @@ def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndar
     drive is what an energy of a part means. NaN where the total is below 1e-3 of its largest.
     """
     samples = max(min(samples, len(total)), 1)
-    window = np.full(samples, 1.0 / samples)
-    whole = np.convolve(total, window, "valid")
-    error = np.abs(np.convolve(parts.sum(axis=0), window, "valid") - whole)
+    together, whole = (_running_mean(energy, samples) for energy in (parts.sum(axis=0), total))
     above_threshold = whole > LEAST_SHARE * whole.max()
-    return np.divide(error, whole, out=np.full_like(whole, np.nan), where=above_threshold)
+    return np.divide(np.abs(together - whole), whole, out=np.full_like(whole, np.nan), where=above_threshold)
+
+
+def _running_mean(values: np.ndarray, samples: int) -> np.ndarray:
+    return np.convolve(values, np.full(samples, 1.0 / samples), "valid")
 
 
 def energies_over_time(member: MeasuredRun) -> Figure:
@@ -198,10 +188,8 @@ def energies_over_time(member: MeasuredRun) -> Figure:
     time, parts, total = (analysis[name].values for name in ("time", "bands/energy", "bands/total"))
     names = list(np.atleast_1d(analysis["bands/energy"].attrs["parts"]))
     samples = max(round(2 * np.pi / member.model.drive.frequency / (time[1] - time[0])), 1)
-    time, mean_total, mean_sum, *mean_parts = (
-        np.convolve(values, np.full(samples, 1.0 / samples), "valid")
-        for values in (time, total, parts.sum(axis=0), *parts)
-    )
+    means = (_running_mean(values, samples) for values in (time, total, parts.sum(axis=0), *parts))
+    time, mean_total, mean_sum, *mean_parts = means
     figure = style.new_figure(style.PAGE * 0.8, 4.2, Labels.of(member.case).member, left=True)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1))
     for line, name, part in zip(_lines(names), names, mean_parts, strict=True):

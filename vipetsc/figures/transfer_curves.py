@@ -94,29 +94,26 @@ def _page(reading: str, of_reading: Sequence[TransferCurve]) -> Figure:
         for row, axes in enumerate((linear, logarithmic)):
             _draw(axes, of_law, kinds)
             panel_title(axes, f"({'ab'[column % 2]}.{row + 1}) {law.capitalize()}, {reading}")
-        _inset(linear, of_law, kinds)
         linear.set(xlim=(0, None), ylim=(0, None))
         logarithmic.set(xscale="log", yscale="log", ylim=(None, 6.0))
         logarithmic.legend(loc="upper right", fontsize=6)
+
+        # The curves about their peaks: a ring round the largest value of each, and what it is.
+        inset = linear.inset_axes([0.40, 0.30, 0.57, 0.64])
+        _draw(inset, of_law, kinds, size=1.8)
+        nearest = min(c.amplitude[np.nonzero(c.ibtet > 0.1 * c.ibtet[c.peak])[0][0]] for c in of_law)
+        peaks = [(c.amplitude[c.peak], c.ibtet[c.peak]) for c in of_law]
+        right, top = np.max(peaks, axis=0)
+        inset.set(xlim=(0.0, max(10 * nearest, 2 * right)), ylim=(0, 1.18 * top))
+        inset.tick_params(labelsize=6, pad=1.5)
+        for line, (curve, (amplitude, largest)) in enumerate(zip(of_law, peaks, strict=True)):
+            colour, _ = kinds[Labels.of(curve.case).configuration]
+            inset.plot(amplitude, largest, "o", mfc="none", mec=colour, ms=6, mew=0.7)
+            inset.text(0.97, 0.95 - 0.11 * line, f"largest: {largest:.3f} at {amplitude:.3g} N", ha="right", va="top",
+                       fontsize=6, color=colour, transform=inset.transAxes)  # fmt: skip
     for row in grid:
         label_outer(row[None], "Amplitude of the drive (N)", "Inter-band transfer (1)")
     return figure
-
-
-def _inset(axes: Axes, of_law: Sequence[TransferCurve], kinds: dict[str, tuple[str, str]]) -> None:
-    """The curves about their peaks: a ring round the largest value of each, and what it is."""
-    inset = axes.inset_axes([0.40, 0.30, 0.57, 0.64])
-    _draw(inset, of_law, kinds, size=1.8)
-    nearest = min(c.amplitude[np.nonzero(c.ibtet > 0.1 * c.ibtet[c.peak])[0][0]] for c in of_law)
-    inset.set(xlim=(0.0, max(10 * nearest, 2 * max(c.amplitude[c.peak] for c in of_law))))
-    inset.set_ylim(0, 1.18 * max(c.ibtet[c.peak] for c in of_law))
-    inset.tick_params(labelsize=6, pad=1.5)
-    for line, curve in enumerate(of_law):
-        colour, _ = kinds[Labels.of(curve.case).configuration]
-        amplitude, largest = curve.amplitude[curve.peak], curve.ibtet[curve.peak]
-        inset.plot(amplitude, largest, "o", mfc="none", mec=colour, ms=6, mew=0.7)
-        inset.text(0.97, 0.95 - 0.11 * line, f"largest: {largest:.3f} at {amplitude:.3g} N", ha="right", va="top",
-                   fontsize=6, color=colour, transform=inset.transAxes)  # fmt: skip
 
 
 def _draw(axes: Axes, shown: Sequence[TransferCurve], kinds: dict[str, tuple[str, str]], size: float = 2.2) -> None:
@@ -133,23 +130,21 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
     """Every reading and configuration of ``backbone.h5``, laws in columns; one made of another sweep is passed over."""
     for ensemble in sweeps:
         path = Path(ensemble.attrs["folder"]) / "backbone.h5"
-        aligned = _aligned_curves(path, ensemble.attrs["case"]) if path.exists() else []
+        if not path.exists():
+            continue
+        groups: dict[str, dict[str, Any]] = {}
+        with open_netcdf(path, "backbone", ("case",)) as file:
+            variables = ((name, variable.values) for name, variable in file.variables.items())
+            if file.attrs["case"] != ensemble.attrs["case"]:
+                continue
+            for name, value in (*file.attrs.items(), *variables):
+                group, _, rest = str(name).partition("/")
+                if rest:
+                    groups.setdefault(group, {})[rest] = value
+        aligned = [AlignedCurve(Case.from_toml(values["case"]), values) for values in groups.values()]
         ylabel = "Inter-band transfer, normalised slope (1)"
         for name, columns in grouped(aligned, lambda curve: Labels.of(curve.case).page_stem).items():
             yield name, partial(columns_of_laws, columns, 4.0, 3.0, ylabel, _superposition)
-
-
-def _aligned_curves(path: Path, sweep: str) -> list[AlignedCurve]:
-    """The curves in ``path``; none if it was made of another sweep than that of the case file's text ``sweep``."""
-    with open_netcdf(path, "backbone", ("case",)) as file:
-        if file.attrs["case"] != sweep:
-            return []
-        groups: dict[str, dict[str, Any]] = {}
-        for name, value in [*file.attrs.items(), *((n, v.values) for n, v in file.variables.items())]:
-            group, _, rest = str(name).partition("/")
-            if rest:
-                groups.setdefault(group, {})[rest] = value
-    return [AlignedCurve(Case.from_toml(values["case"]), values) for values in groups.values()]
 
 
 def _superposition(axes: Axes, aligned: AlignedCurve) -> str:
