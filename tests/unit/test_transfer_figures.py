@@ -110,8 +110,9 @@ def test_floor_is_that_of_members_without_contact(reduced):
     found = list(transfer_curves(read_sweeps([reduced])))
     assert [c.case.contacts.law for c in found] == ["hertz", "bilinear"]
     for curve in found:
-        assert curve.floor == pytest.approx(curve.ibtet[0], rel=1e-9)
-        assert curve.peak == int(np.argmax(curve.ibtet)) and curve.peak > 1
+        transfer, peak = curve.data["ibtet"].values, curve.data["peak"]
+        assert curve.data["floor"] == pytest.approx(transfer[0], rel=1e-9)
+        assert peak == int(np.argmax(transfer)) and peak > 1
 
 
 def test_shares_are_the_ensembles_and_sum_to_one(reduced):

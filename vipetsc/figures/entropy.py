@@ -42,7 +42,7 @@ class EntropyCurve(NamedTuple):
 
     @classmethod
     def of(cls, row: xr.Dataset, average: str) -> Self | None:
-        """The curve of an average; None where fewer than two members came out, or all alike."""
+        """The curve of an average; None where fewer than two members came out, or all are equal."""
         value, error = row[f"entropy/{average}"].values, row["entropy/error"].values
         valid = np.isfinite(value)
         if valid.sum() < 2 or np.ptp(value[valid]) == 0:
@@ -142,10 +142,10 @@ def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> 
                 upper.plot(other.amplitude, other.value, color=COLOURS[name], lw=0.6, alpha=0.5, label=label)
         _points(upper, curve, average, 2.2)
         same = [name for name in axes_of(ensemble) if name not in ("reading", AMPLITUDE)]
-        for alike in _rows(ensemble) if "reading" in axes_of(ensemble) else ():
-            other = EntropyCurve.of(alike, average)
-            if other and alike["reading"] != row["reading"] and all(alike[name] == row[name] for name in same):
-                label = f"{alike['reading'].item()} reading"
+        for other_row in _rows(ensemble) if "reading" in axes_of(ensemble) else ():
+            other = EntropyCurve.of(other_row, average)
+            if other and other_row["reading"] != row["reading"] and all(other_row[name] == row[name] for name in same):
+                label = f"{other_row['reading'].item()} reading"
                 lower.plot(other.amplitude, other.value, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)), label=label)
         _log_panel(lower, curve, average, 2.2, 6.0)
         upper.set(xlim=(0, 1.04 * curve.amplitude[-1]), ylim=(-0.05, 1.45))

@@ -19,7 +19,7 @@ from vipetsc.figures import style
 from vipetsc.figures.panels import empty_figure, note, panel_title, recorded_sites
 from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
 from vipetsc.figures.style import Drawing
-from vipetsc.figures.transfer_curves import TransferCurve, transfer_curves
+from vipetsc.figures.transfer_curves import Curve, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site
 
 REFINE = 4  # points drawn for each sample
@@ -130,7 +130,7 @@ def _settings(case: Case) -> str:
     return f"{case.contacts.law}-{Labels.of(case).page_stem}"
 
 
-def _page(folders: Sequence[Path], curve: TransferCurve | None) -> Figure:
+def _page(folders: Sequence[Path], curve: Curve | None) -> Figure:
     motions = sorted(map(ContactMotion.read, folders), key=lambda motion: motion.case.drive.amplitude)
     case = motions[0].case
     columns = -(-len(motions) // 2)
@@ -140,7 +140,7 @@ def _page(folders: Sequence[Path], curve: TransferCurve | None) -> Figure:
     left, right = figure.subfigures(1, 2, width_ratios=(1, 0.62 * columns))
     transfer, panels = left.subplots(), right.subplots(2, columns, squeeze=False).ravel()
     if curve is not None:
-        transfer.plot(curve.amplitude, curve.ibtet, "-o", color=style.GREY, ms=2, lw=0.7)
+        transfer.plot(curve.data["amplitude"], curve.data["ibtet"], "-o", color=style.GREY, ms=2, lw=0.7)
     for number, (axes, motion) in enumerate(zip(panels, motions, strict=False), 1):
         point = motion.case.drive.amplitude, motion.ibtet
         transfer.plot(*point, "o", color=style.RED, ms=4, zorder=3)

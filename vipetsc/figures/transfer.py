@@ -16,7 +16,7 @@ from vipetsc.figures import panels, style
 from vipetsc.figures.panels import KAPPA, panel_title
 from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, transfer_members
 from vipetsc.figures.style import Drawing
-from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
+from vipetsc.figures.transfer_curves import Curve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import TAPER, Parts, part_kinetic_energy, taper
@@ -213,19 +213,19 @@ def energies_over_time(member: MeasuredRun) -> Figure:
     return figure
 
 
-def shares(curves: Sequence[TransferCurve]) -> Figure:
+def shares(curves: Sequence[Curve]) -> Figure:
     """Mean share of every part after the wave's arrival against the amplitude; a column a law."""
     figure = columns_of_laws(curves, 4.6, 2.7, "Mean share of the energy (1)", _shares)
     figure.axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
     return figure
 
 
-def _shares(axes: Axes, curve: TransferCurve) -> str:
+def _shares(axes: Axes, curve: Curve) -> str:
     share = curve.data["bands/share"]
     names = list(np.atleast_1d(share.attrs["parts"]))
     for line, name, part in zip(_lines(names), names, share.values.T, strict=True):
-        axes.plot(curve.amplitude, np.maximum(part, 1e-300), label=name, **line)
-    axes.plot(curve.amplitude, share.values.sum(axis=1), color=style.BLACK, lw=0.6, ls=":", label="sum")
+        axes.plot(curve.data["amplitude"], np.maximum(part, 1e-300), label=name, **line)
+    axes.plot(curve.data["amplitude"], share.values.sum(axis=1), color=style.BLACK, lw=0.6, ls=":", label="sum")
     axes.set(xscale="log", yscale="log", ylim=(10.0**-SHARE_DECADES, 2), xlabel="Amplitude of the drive (N)")
     return Labels.of(curve.case).law
 

@@ -1,12 +1,11 @@
 """Inter-band transfer against the amplitude (paper, Fig. 9) and against the slope of a branch (Figs. 12, S7, S8)."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -22,42 +21,26 @@ LINES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.P
 FEWEST = 6  # amplitudes that make a curve
 
 
-class TransferCurve(NamedTuple):
-    """The measures of one law, reading and configuration over rising amplitude; ``case`` stands for them.
+class Curve(NamedTuple):
+    """What was measured of one law, reading and configuration, by name; ``case`` stands for its members."""
 
-    ``amplitude`` of the drive in N; ``ibtet`` is NaN where a member failed; ``peak`` is the index of its largest;
-    ``floor`` the transfer without any contact, NaN if every member touches.
+    case: Case
+    data: Mapping[Any, Any]
+
+
+def transfer_curves(sweeps: Sweeps) -> Iterator[Curve]:
+    """The curves over rising amplitude of all sweeps with at least ``FEWEST`` amplitudes whose transfer is known.
+
+    ``peak`` is the index of the largest "ibtet", ``floor`` the transfer without any contact, NaN if all members touch.
     """
-
-    case: Case
-    data: xr.Dataset
-    amplitude: np.ndarray
-    ibtet: np.ndarray
-    peak: int
-    floor: float
-
-
-class AlignedCurve(NamedTuple):
-    """A transfer curve in the energies of a branch: a group of ``backbone.h5``, its values and attributes by name."""
-
-    case: Case
-    values: dict[str, Any]
-
-
-Curve = TypeVar("Curve", TransferCurve, AlignedCurve)
-
-
-def transfer_curves(sweeps: Sweeps) -> Iterator[TransferCurve]:
-    """The curves of all sweeps with at least ``FEWEST`` amplitudes whose transfer is known."""
     for ensemble in sweeps:
         for row, folder in curves(ensemble, AMPLITUDE) if "ibtet" in ensemble else ():
             case, data = Case.load(folder / "case.toml"), row.sortby(AMPLITUDE)
             transfer = data["ibtet"].values
             if sites_of(case) and np.isfinite(transfer).sum() >= FEWEST:
                 untouched = transfer[data["contact_episodes"].values == 0]
-                floor = float(untouched.mean()) if untouched.size else np.nan
-                peak = int(np.nanargmax(transfer))
-                yield TransferCurve(case, data, data[AMPLITUDE].values, transfer, peak, floor)
+                floor = untouched.mean() if untouched.size else np.nan
+                yield Curve(case, data.assign(floor=floor, peak=int(np.nanargmax(transfer))))
 
 
 def columns_of_laws(
@@ -83,7 +66,7 @@ def ibtet(sweeps: Sweeps) -> Iterator[Drawing]:
         yield reading, partial(_page, reading, of_reading)
 
 
-def _page(reading: str, of_reading: Sequence[TransferCurve]) -> Figure:
+def _page(reading: str, of_reading: Sequence[Curve]) -> Figure:
     laws = sorted({c.case.contacts.law for c in of_reading}, reverse=True)
     kinds = dict(zip(dict.fromkeys(Labels.of(c.case).configuration for c in of_reading), LINES * 5, strict=False))
     figure = style.new_figure(style.PAGE if len(laws) > 1 else style.COLUMN, 4.6)
@@ -101,8 +84,11 @@ def _page(reading: str, of_reading: Sequence[TransferCurve]) -> Figure:
         # The curves about their peaks: a ring round the largest value of each, and what it is.
         inset = linear.inset_axes([0.40, 0.30, 0.57, 0.64])
         _draw(inset, of_law, kinds, size=1.8)
-        nearest = min(c.amplitude[np.nonzero(c.ibtet > 0.1 * c.ibtet[c.peak])[0][0]] for c in of_law)
-        peaks = [(c.amplitude[c.peak], c.ibtet[c.peak]) for c in of_law]
+        peaks = [tuple(float(c.data[name][c.data["peak"]]) for name in (AMPLITUDE, "ibtet")) for c in of_law]
+        nearest = min(
+            float(c.data[AMPLITUDE][c.data["ibtet"] > 0.1 * largest][0])
+            for c, (_, largest) in zip(of_law, peaks, strict=True)
+        )
         right, top = np.max(peaks, axis=0)
         inset.set(xlim=(0.0, max(10 * nearest, 2 * right)), ylim=(0, 1.18 * top))
         inset.tick_params(labelsize=6, pad=1.5)
@@ -116,14 +102,14 @@ def _page(reading: str, of_reading: Sequence[TransferCurve]) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, shown: Sequence[TransferCurve], kinds: dict[str, tuple[str, str]], size: float = 2.2) -> None:
+def _draw(axes: Axes, shown: Sequence[Curve], kinds: dict[str, tuple[str, str]], size: float = 2.2) -> None:
     """The curves, each with its floor dashed; ``kinds`` has colour and mark by configuration."""
     for curve in shown:
         kind = Labels.of(curve.case).configuration
         colour, mark = kinds[kind]
-        axes.plot(curve.amplitude, curve.ibtet, color=colour, marker=mark, ms=size, lw=0.7, label=kind)
-        if np.isfinite(curve.floor):
-            axes.axhline(curve.floor, color=colour, lw=0.6, ls=(0, (4, 3)), zorder=1)
+        axes.plot(curve.data[AMPLITUDE], curve.data["ibtet"], color=colour, marker=mark, ms=size, lw=0.7, label=kind)
+        if np.isfinite(curve.data["floor"]):
+            axes.axhline(float(curve.data["floor"]), color=colour, lw=0.6, ls=(0, (4, 3)), zorder=1)
 
 
 def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
@@ -141,15 +127,15 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
                 group, _, rest = str(name).partition("/")
                 if rest:
                     groups.setdefault(group, {})[rest] = value
-        aligned = [AlignedCurve(Case.from_toml(values["case"]), values) for values in groups.values()]
+        aligned = [Curve(Case.from_toml(values["case"]), values) for values in groups.values()]
         ylabel = "Inter-band transfer, normalised slope (1)"
         for name, columns in grouped(aligned, lambda curve: Labels.of(curve.case).page_stem).items():
             yield name, partial(columns_of_laws, columns, 4.0, 3.0, ylabel, _superposition)
 
 
-def _superposition(axes: Axes, aligned: AlignedCurve) -> str:
+def _superposition(axes: Axes, aligned: Curve) -> str:
     """Points of the lattice, red where fitted; slope over the divisor dashed, with the floor grey; the law green."""
-    curve = aligned.values
+    curve = aligned.data
     energy, transfer, fitted = curve["energy"], curve["ibtet"], curve["fitted"].astype(bool)
     branch, slope, region = (curve[f"branch/{name}"] for name in ("energy", "slope", "region"))
     grazing, floor = curve["grazing_energy"], curve["floor"]
