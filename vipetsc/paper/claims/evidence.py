@@ -2,7 +2,7 @@
 
 import tomllib
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -37,19 +37,16 @@ class Measurement:
     figure: str = ""
 
 
-@dataclass(frozen=True)
 class MeasuredRun:
-    """A member of a sweep whose fields were kept: its case, folder, ``analysis.h5`` and number of contacts."""
+    """A member of a sweep whose fields were kept: its case, folder, ``analysis.h5`` and number of contacts.
 
-    case: Case
-    folder: Path
-    analysis: xr.Dataset
-    episodes: int
+    ``amplitude`` is that of the drive in N.
+    """
 
-    @property
-    def amplitude(self) -> float:
-        """Amplitude of the drive in N."""
-        return self.case.drive.amplitude
+    def __init__(self, folder: Path, analysis: xr.Dataset, episodes: int) -> None:
+        self.folder, self.analysis, self.episodes = folder, analysis, episodes
+        self.case = Case.load(folder / "case.toml")
+        self.amplitude = self.case.drive.amplitude
 
     @property
     def onset(self) -> float:
@@ -64,13 +61,16 @@ class MeasuredRun:
         return tuple(self.analysis[name].values for name in names)
 
 
-@dataclass(frozen=True)
 class AmplitudeCurve:
-    """A measure over rising ``amplitude`` (point) in N, without failed members, and the contact ``episodes``."""
+    """A measure over rising ``amplitude`` (point) in N, without failed members, and the contact ``episodes``.
 
-    amplitude: np.ndarray
-    value: np.ndarray
-    episodes: np.ndarray
+    ``untouched`` (point) tells where there is no contact, ``peak`` is the index of the largest value.
+    """
+
+    def __init__(self, amplitude: np.ndarray, value: np.ndarray, episodes: np.ndarray) -> None:
+        self.amplitude, self.value, self.episodes = amplitude, value, episodes
+        self.untouched, self.peak = episodes == 0, int(np.argmax(value))
+        self.peak_amplitude = float(amplitude[self.peak])
 
     @classmethod
     def of(cls, members: xr.Dataset, name: str) -> Self:
@@ -84,25 +84,10 @@ class AmplitudeCurve:
         return cls(valid["amplitude"].values, valid[name].values, valid["contact_episodes"].values)
 
     @property
-    def untouched(self) -> np.ndarray:
-        """Which points (point) have no contact."""
-        return self.episodes == 0
-
-    @property
-    def peak(self) -> int:
-        """Index of the largest value."""
-        return int(np.argmax(self.value))
-
-    @property
-    def peak_amplitude(self) -> float:
-        """Amplitude in N of the largest value."""
-        return float(self.amplitude[self.peak])
-
-    @property
     def normalised(self) -> Self:
         """The same with values on [.01, 1], as the paper's; NaN if they are all equal."""
         value = normalised(self.value) if np.ptp(self.value) > 0 else np.full(len(self.value), np.nan)
-        return replace(self, value=value)
+        return type(self)(self.amplitude, value, self.episodes)
 
     def growth_ratio(self, low: float, high: float) -> float:
         """Ratio of the amplitudes between which the values grow: from the last <= ``low`` to the first >= ``high``.
@@ -182,6 +167,5 @@ class Evidence(ExitStack):
             if folder is None or not (folder / "analysis.h5").exists():
                 raise MissingEvidence(f"{step}: the member at {member['amplitude']:g} N failed or is missing")
             analysis = self.open(step, folder.name, "analysis.h5", needs=needs)
-            episodes = int(member["contact_episodes"])
-            runs.append(MeasuredRun(Case.load(folder / "case.toml"), folder, analysis, episodes))
+            runs.append(MeasuredRun(folder, analysis, int(member["contact_episodes"])))
         return runs
