@@ -109,6 +109,8 @@ def test_a_rise_is_measured_between_neighbouring_amplitudes(steps, ratio):
 def test_a_growth_ends_at_the_first_value_that_is_high_enough():
     curve = AmplitudeCurve(np.array([1.0, 2.0, 4.0, 8.0, 16.0]), np.array([0.3, 0.01, 0.6, 0.8, 1.0]), np.zeros(5))
     assert curve.growth_ratio(0.1, 0.5) == 2.0
+    late = AmplitudeCurve(np.array([1.0, 2.0, 8.0, 9.0]), np.array([0.01, 1.0, 0.05, 0.6]), np.zeros(4))
+    assert late.growth_ratio(0.1, 0.5) == 2.0  # what comes after the peak is no rise to it
 
 
 # The table of thresholds, as SPEC.md has them: lines "claim | quantity | comparison | threshold"; * for both laws
@@ -335,11 +337,20 @@ def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
 
 
 def test_entropies_that_only_rise_do_not_decay(tmp_path):
-    put_entropies(tmp_path, ["5pi/9"], lambda case: 1 + 0.1 * case.drive.amplitude, lambda case: 0.1, neighbours=False)
+    put_entropies(
+        tmp_path,
+        ["5pi/9"],
+        lambda case: 1 + 0.1 * case.drive.amplitude,
+        lambda case: 1 / case.drive.amplitude,
+        neighbours=False,
+    )
     found = measure("C8", tmp_path)
     assert found.verdict == FAILS and "three largest amplitudes" in found.reason
     partly = measure("C7", tmp_path)
     assert partly.verdict in (FAILS, IN_PART) and "scattering-neighbours/ensemble.h5 is missing" in partly.reason
+    bars = measure("C9", tmp_path)
+    assert bars.value["share of configurations with larger error bars from 10 N on than at the peak"] == 0
+    assert "6 of 6 configurations have their peak at 10 N or above: nothing is behind it" in bars.reason
 
 
 @pytest.mark.parametrize("c7, c8, verdicts", [(0.951, 0.901, (HOLDS, HOLDS)), (0.949, 0.899, (IN_PART, IN_PART))])
@@ -352,6 +363,18 @@ def test_fits_on_either_side_of_their_thresholds(tmp_path, c7, c8, verdicts):
                     for fit in ("r2_log_log", "r2_nonlinear"):
                         file[f"fits/entropy/{average}/{fit}"][...] = r2
         assert measure(claim, tmp_path).verdict == expected
+
+
+@pytest.mark.parametrize("line, nonlinear", [(0.95, 0.5), (0.5, 0.95), (np.nan, 0.95)])
+def test_the_better_fit_counts_at_every_wavenumber(tmp_path, line, nonlinear):
+    put_entropies(tmp_path, ["5pi/9"], lambda case: law(case.drive.amplitude), lambda case: 0.1, neighbours=False)
+    with h5py.File(tmp_path / "scattering" / "ensemble.h5", "r+") as file:
+        file["fits/entropy/energy_weighted/r2_log_log"][...] = line
+        file["fits/entropy/energy_weighted/r2_nonlinear"][...] = nonlinear
+    found = measure("C8", tmp_path)
+    fit = "share of curves with adjusted R^2 >= 0.9 over 4 points or more"
+    assert found.verdict == HOLDS and found.value[fit] == 1
+    assert found.value[f"{fit}, log-log line alone"] == (line > 0.9)
 
 
 def test_fits_of_three_points_do_not_count(tmp_path):
