@@ -12,25 +12,26 @@ from scipy.linalg import expm
 from tests.conftest import small_case
 from vipetsc.contact.law import CLOSED, Contacts, ForceLaw, create_contacts
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.cluster import group_dofs
-from vipetsc.dynamics.propagator.collocation import EXIT, NODES, ONSET, PLAIN, collocation
-from vipetsc.dynamics.propagator.forces import _dof_tables
-from vipetsc.dynamics.propagator.free_motion import active_clusters, apply_impulses, evaluate, shift
-from vipetsc.dynamics.propagator.halo import HaloRegions
-from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.propagator.stencil import apply_propagator, create_stencil
-from vipetsc.dynamics.propagator.substep import (
+from vipetsc.dynamics.propagator.collocation import (
+    EXIT,
     HISTORY,
+    NODES,
+    ONSET,
+    PLAIN,
     SUBSTEP_STATE,
-    ClusterMotion,
-    ClusterRecord,
+    Cluster,
     Substep,
     Trial,
     accumulate_moments,
     collocate,
+    collocation,
     error_ratio,
     update_taylor,
 )
+from vipetsc.dynamics.propagator.forces import create_dof_tables, group_dofs
+from vipetsc.dynamics.propagator.free_motion import apply_impulses, evaluate, expand_free_motion, shift
+from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, gather
 from vipetsc.dynamics.records import Burst
 
 ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
@@ -57,7 +58,8 @@ def parts(ends: str, interval: float, tolerance: float, sites=(5, 6, 12)):
 def fetch(layout: Layout, halo: HaloRegions, state: np.ndarray) -> None:
     vector = layout.create_vector()
     vector.array[: state.size] = state.ravel()
-    halo.fetch(vector, state)
+    halo.exchange(vector)
+    gather(halo.record, state)
     vector.destroy()
 
 
@@ -73,7 +75,7 @@ def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, toleran
         state, out = np.zeros((rows, n)), np.empty((rows, n))
         state.ravel()[column] = 1.0
         fetch(layout, halo, state)
-        apply_propagator(stencil, state, halo.columns, out)
+        apply_propagator(stencil, state, halo.record.columns, out)
         matrix[:, column] = out.ravel()
     half = rows * n // 2
     scale = np.where(np.arange(rows * n) < half, series.omega_max_h / interval, 1.0)  # a velocity counts as omega u
@@ -95,14 +97,15 @@ def test_the_bound_keeps_below_every_tolerance(interval):
 def test_free_motion_and_impulses_are_the_exponential(ends):
     model, layout, series, halo = parts(ends, 3e-4, 1e-15, sites=(1, 12, 24))
     groups = group_dofs(model, series.reach)
-    tables = _dof_tables(model, groups, layout, series, halo)
+    tables = create_dof_tables(groups, model, layout, series, halo)
     halo.bind_columns()
     d, n = layout.dofs, layout.cells
     state = np.random.default_rng(5).normal(size=(2 * d, n)) * np.repeat([1e-4, 0.1], d)[:, None]
     fetch(layout, halo, state)
     dofs = [dof for group in groups for dof in group]
     taylor = np.zeros((len(dofs), 2 * series.terms))
-    active_clusters(tables, halo.columns, taylor, np.zeros(len(groups), np.int64))
+    for c in range(len(groups)):
+        expand_free_motion(tables, c, halo.record.columns, taylor)
     for s in (0.3, 1.0):
         exact = (exponential(series.chain, s * series.interval) @ state.ravel()).reshape(2 * d, n)
         for i, dof in enumerate(dofs):
@@ -125,17 +128,15 @@ def test_clusters_that_cannot_touch_are_left_alone():
     model, layout, series, halo = parts("fixed", 1e-4, 1e-14, sites=(4, 12, 20))
     groups = group_dofs(model, series.reach)
     assert [[dof.site for dof in group] for group in groups] == [[-1], [0], [1], [2]]
-    tables = _dof_tables(model, groups, layout, series, halo)
+    tables = create_dof_tables(groups, model, layout, series, halo)
     halo.bind_columns()
-    tables.clearance[0] = np.inf  # the drive is over
-    taylor, active = np.zeros((4, 2 * series.terms)), np.zeros(4, np.int64)
+    taylor = np.zeros((4, 2 * series.terms))
     state = np.zeros((2 * layout.dofs, layout.cells))
     resonator, clearance = model.chain.cell.resonator, model.chain.clearances[1]
     for reached, expected in ((0.9 * clearance, []), (1.001 * clearance, [2]), (np.nan, [2])):
         state[resonator, 11] = reached
         fetch(layout, halo, state)
-        count = active_clusters(tables, halo.columns, taylor, active)
-        assert active[:count].tolist() == expected
+        assert [c for c in range(4) if expand_free_motion(tables, c, halo.record.columns, taylor)] == expected
 
 
 def test_dofs_within_reach_are_grouped_across_a_periodic_end():
@@ -172,8 +173,8 @@ def test_nodes_have_the_order_of_gauss_and_follow_roots():
     np.testing.assert_allclose(table.tail @ legendre, [0, 1], atol=1e-13)
 
 
-def oscillator(damping: float = 0.0) -> tuple[ClusterRecord, ClusterMotion, float]:
-    """A mass on the stop x >= 0 (clearance 1, bilinear): x = v sin(rate t)/rate; the record, its motion, the rate."""
+def oscillator(damping: float = 0.0) -> tuple[Cluster, float]:
+    """A mass on the stop x >= 0 (clearance 1, bilinear): x = v sin(rate t)/rate; and the rate."""
     mass, h, speed, rate = 0.02, 1e-4, 0.5, 3e4
     contact = small_case(contacts={"law": "bilinear"}).model().contact
     law = ForceLaw(mass * rate**2, 1.0, damping, False, 0.0)
@@ -181,53 +182,52 @@ def oscillator(damping: float = 0.0) -> tuple[ClusterRecord, ClusterMotion, floa
     contacts.sites["mode"], contacts.sites["approach"] = CLOSED, speed
     burst = Burst(0.0, 1.0, 1.0, 0.0)
     response = np.full((1, 1, 1), h**2 / mass)
-    record = ClusterRecord(contacts, burst, response, collocation(2), h, 1.0, 1.0, 1e-10, 1e-12)
-    state = np.zeros(1, SUBSTEP_STATE)
-    taylor = np.array([[1.0, speed * h]])
-    motion = ClusterMotion(
-        taylor, np.zeros((1, 3)), np.zeros((1, 2)), np.zeros(1), np.zeros(1, HISTORY), state
+    cluster = Cluster(
+        contacts, burst, response, collocation(2), h, 1.0, 1e-10, 1e-12,
+        taylor=np.array([[1.0, speed * h]]), site_motion=np.zeros((1, 3)), moments=np.zeros((1, 2)),
+        energy=np.zeros(1), history=np.zeros(1, HISTORY), state=np.zeros(1, SUBSTEP_STATE),
     )  # fmt: skip
-    return record, motion, rate
+    return cluster, rate
 
 
-def one_substep(record: ClusterRecord, motion: ClusterMotion, substep: Substep) -> Trial:
-    trial = Trial(np.array([0]), *np.zeros((3, 1, NODES)), np.zeros((1, 2)), np.zeros((1, 3)))
-    assert collocate(record, motion, trial, substep)
-    update_taylor(record, motion, trial, substep)
-    accumulate_moments(record, motion, trial, substep)
+def one_substep(cluster: Cluster, substep: Substep) -> Trial:
+    trial = Trial(np.array([0]), np.array([0]), *np.zeros((3, 1, NODES)), np.zeros((1, 2)), np.zeros((1, 3)))
+    assert collocate(cluster, trial, substep)
+    update_taylor(cluster, trial, substep)
+    accumulate_moments(cluster, trial, substep)
     return trial
 
 
 @pytest.mark.parametrize("kind", [PLAIN, ONSET, EXIT])
 def test_a_linear_contact_is_an_oscillator(kind):
-    record, motion, rate = oscillator()
-    mass, speed, h = 0.02, 0.5, record.interval
-    trial = one_substep(record, motion, Substep(kind, 0.3))
+    cluster, rate = oscillator()
+    mass, speed, h = 0.02, 0.5, cluster.interval
+    trial = one_substep(cluster, Substep(kind, 0.3))
     phase = rate * 0.3 * h
     assert trial.taylor[0, 0] - 1 == pytest.approx(speed / rate * np.sin(phase), rel=1e-9)
     assert trial.taylor[0, 1] / h == pytest.approx(speed * np.cos(phase), rel=1e-10)
     # The moments are those of the force about the end of the step; the first one is the momentum it took.
-    assert motion.moments[0, 0] == pytest.approx(mass * speed * (np.cos(phase) - 1), rel=1e-9)
+    assert cluster.moments[0, 0] == pytest.approx(mass * speed * (np.cos(phase) - 1), rel=1e-9)
     t = np.linspace(0, 0.3 * h, 20001)
     force = -mass * rate * speed * np.sin(rate * t)
-    assert motion.moments[0, 1] == pytest.approx(trapezoid(force * (1 - t / h), t), rel=1e-7)
-    assert motion.energy[0] == 0.0
+    assert cluster.moments[0, 1] == pytest.approx(trapezoid(force * (1 - t / h), t), rel=1e-7)
+    assert cluster.energy[0] == 0.0
 
 
 def test_damping_takes_the_energy_that_is_booked():
-    record, motion, rate = oscillator(damping=0.3)
+    cluster, rate = oscillator(damping=0.3)
     mass, speed = 0.02, 0.5
-    trial = one_substep(record, motion, Substep(PLAIN, 0.3))
-    x, v = trial.taylor[0, 0] - 1, trial.taylor[0, 1] / record.interval
+    trial = one_substep(cluster, Substep(PLAIN, 0.3))
+    x, v = trial.taylor[0, 0] - 1, trial.taylor[0, 1] / cluster.interval
     lost = 0.5 * mass * (speed**2 - v**2 - (rate * x) ** 2)
-    assert motion.energy[0] == pytest.approx(lost, rel=1e-9)
+    assert cluster.energy[0] == pytest.approx(lost, rel=1e-9)
     assert lost > 1e-2 * mass * speed**2
 
 
 def test_the_error_estimate_falls_as_the_order_says():
     ratios = []
     for length in (0.8, 0.4):
-        record, motion, _ = oscillator()
-        ratios.append(error_ratio(record, one_substep(record, motion, Substep(PLAIN, length)), length))
+        cluster, _ = oscillator()
+        ratios.append(error_ratio(cluster, one_substep(cluster, Substep(PLAIN, length)), length))
     # The last two coefficients fall as h^6 and h^7, times the length.
     assert 6 < np.log2(ratios[0] / ratios[1]) < 8.5

@@ -3,19 +3,18 @@
 Sec. 2 to 4 of the derivation in the package's docstring.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.law import CLOSED, FREE, contact_force
 from vipetsc.contact.search import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
-from vipetsc.dynamics.propagator.collocation import EXIT, NODES, ONSET, PLAIN
-from vipetsc.dynamics.propagator.free_motion import ROUNDING, first_onset, shift
-from vipetsc.dynamics.propagator.substep import (
-    ClusterMotion,
-    ClusterRecord,
+from vipetsc.dynamics.propagator.collocation import (
+    EXIT,
+    NODES,
+    ONSET,
+    PLAIN,
+    Cluster,
     Substep,
     Trial,
     accumulate_moments,
@@ -24,11 +23,14 @@ from vipetsc.dynamics.propagator.substep import (
     evaluate_site_motion,
     update_taylor,
 )
+from vipetsc.dynamics.propagator.free_motion import ROUNDING, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, or without progress.
 DONE, CHANGED, FAILED = range(3)
 
 MOST_SUBSTEPS = 20_000
+# Longest substeps in radians of the fastest oscillation: searched for changes; only driven.
+SEARCHED, DRIVEN = 0.4, 1.25
 # Longest substep of a contact in ages of the contact.
 MOST_AGES = 1.5
 # Share of a step that is too short for anything to happen.
@@ -43,88 +45,74 @@ CUT = 0.4
 
 
 @njit(error_model="numpy")
-def _advance_freely(cluster: ClusterRecord, motion: ClusterMotion) -> int:
+def _advance_freely(cluster: Cluster) -> int:
     """Go to the first onset, or to the end of the step, while no force acts."""
-    state = motion.state[0]
+    state = cluster.state[0]
     rest, first = 1.0 - state.position, 2.0
     for i in range(cluster.contacts.sites.size):
-        first = min(first, first_onset(motion.taylor[i], cluster.contacts.sites[i].clearance, rest))
+        first = min(first, first_onset(cluster.taylor[i], cluster.contacts.sites[i].clearance, rest))
     if first > rest:
         state.position = 1.0
         return DONE
-    shift(motion.taylor, first, motion.taylor)
+    shift(cluster.taylor, first, cluster.taylor)
     state.position += first
-    evaluate_site_motion(cluster, state, motion.taylor, motion.site_motion)
+    evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
     state.landings += 1
     return CHANGED
 
 
 @njit(error_model="numpy", inline="always")
-def _active_dofs(cluster: ClusterRecord, motion: ClusterMotion) -> np.ndarray:
-    """The DoFs on which a force acts: sites in contact, then the driven mass."""
-    state, sites, dofs = motion.state[0], cluster.contacts.sites, motion.taylor.shape[0]
-    active, count = np.empty(dofs, np.int64), 0
-    for i in range(dofs):
-        if (sites[i].mode != FREE) if i < sites.size else (state.position < state.drive_end):
-            active[count] = i
-            count += 1
-    return active[:count]
-
-
-@njit(error_model="numpy", inline="always")
-def _choose_substep(cluster: ClusterRecord, motion: ClusterMotion, active: np.ndarray) -> Substep:
+def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     """The next substep: as long as its error allows, not beyond the drive's end, short while a contact is young."""
-    state, sites = motion.state[0], cluster.contacts.sites
-    length = min(1.0 - state.position, cluster.longest)
-    if active[-1] == sites.size:
+    state, sites = cluster.state[0], cluster.contacts.sites
+    fastest = cluster.omega_max_h
+    if cluster.taylor.shape[0] > sites.size:
+        fastest += cluster.burst.frequency * (1.0 + 1.0 / cluster.burst.cycles) * cluster.interval
+    length = min(1.0 - state.position, (SEARCHED if sites.size > 0 else DRIVEN) / fastest)
+    if trial.active.size > trial.closed.size:
         length = min(length, state.drive_end - state.position)
-    if active[0] < sites.size:
+    if trial.closed.size > 0:
         length = min(length, state.length)
     longest = length
-    for i in range(sites.size):
+    for i in trial.closed:
         # A young contact's force goes as the root of its age.
         if cluster.contacts.law.exponent != 1.0 and abs(sites[i].mode) == CLOSED:
-            age = (state.begin - motion.history[i].onset) / cluster.interval + state.position
-            if age * cluster.interval <= 1e-7 * motion.history[i].duration:
+            age = (state.begin - cluster.history[i].onset) / cluster.interval + state.position
+            if age * cluster.interval <= 1e-7 * cluster.history[i].duration:
                 return Substep(ONSET, longest)
             length = min(length, MOST_AGES * age)
     return Substep(PLAIN, length)
 
 
 @njit(error_model="numpy", inline="always")
-def _try_substep(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep) -> bool:
+def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     """Leave the end of a substep in ``trial``; whether it could be collocated."""
-    if not collocate(cluster, motion, trial, substep):
+    if not collocate(cluster, trial, substep):
         return False
-    update_taylor(cluster, motion, trial, substep)
-    state = motion.state[0]
+    update_taylor(cluster, trial, substep)
+    state = cluster.state[0]
     state.position += substep.length
-    evaluate_site_motion(cluster, state, trial.taylor, trial.site_motion)
+    evaluate_site_motion(cluster, trial.taylor, trial.site_motion)
     state.position -= substep.length
     return True
 
 
 @njit(error_model="numpy")
-def _land(
-    cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep, change: Change
-) -> tuple[float, bool]:
-    """Repeat a substep so that it ends on a ``change``; the length taken, and whether the change was met.
-
-    A near miss may turn out to be none. A negative length could not be taken.
-    """
+def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> tuple[float, bool]:
+    """Repeat a substep to end on a ``change``; the length taken, negative if it could not be, whether it was met."""
     contacts, site, h = cluster.contacts, change.site, cluster.interval
     landing = begin_landing(change.share, substep.length)
     while True:
         if landing.length <= ROUNDING:
-            begin = switching(contacts, site, change.function, motion.site_motion[site])
+            begin = switching(contacts, site, change.function, cluster.site_motion[site])
             return 0.0, begin.value > begin.tolerance or (begin.value >= -begin.tolerance and begin.rate > 0.0)
-        if not _try_substep(cluster, motion, trial, Substep(substep.kind, landing.length)):
+        if not _try_substep(cluster, trial, Substep(substep.kind, landing.length)):
             return -landing.length, False
         end = switching(contacts, site, change.function, trial.site_motion[site])
         # Landings come to the rounding of w where Newton's steps still help.
         landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, 1e-4 * end.tolerance)
         if outcome == SEARCH:
-            share = first_change(contacts, motion.site_motion, trial.site_motion, h * landing.length).share
+            share = first_change(contacts, cluster.site_motion, trial.site_motion, h * landing.length).share
             if share > 1.0:
                 return landing.length, False
             landing = shorten(landing, share)
@@ -133,15 +121,13 @@ def _land(
 
 
 @njit(error_model="numpy", inline="always")
-def _search_and_land(
-    cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep
-) -> tuple[Substep, bool]:
-    """Search a substep just tried for a change and land on the first one: the substep taken, whether it was met.
+def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[Substep, bool]:
+    """Search a substep just tried and land on its first change: the substep taken, whether the change was met.
 
     A substep of negative length was rejected; ``state.length`` has the next one to try.
     """
-    state = motion.state[0]
-    change = first_change(cluster.contacts, motion.site_motion, trial.site_motion, cluster.interval * substep.length)
+    state = cluster.state[0]
+    change = first_change(cluster.contacts, cluster.site_motion, trial.site_motion, cluster.interval * substep.length)
     if change.share > 1.0:
         return substep, False
     separates = (
@@ -155,7 +141,7 @@ def _search_and_land(
         return Substep(ONSET, -1.0), False
     kind = EXIT if separates else substep.kind
     state.landings += 1
-    taken, landed = _land(cluster, motion, trial, Substep(kind, substep.length), change)
+    taken, landed = _land(cluster, trial, Substep(kind, substep.length), change)
     if taken < 0.0:
         state.rejected += 1
         state.length = -CUT * taken
@@ -163,36 +149,24 @@ def _search_and_land(
 
 
 @njit(error_model="numpy", inline="always")
-def _control_length(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, taken: float, landed: bool) -> bool:
+def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) -> bool:
     """Set the next substep's length by the error of the one ``taken``; whether that is small enough."""
-    state = motion.state[0]
+    state = cluster.state[0]
     ratio = error_ratio(cluster, trial, taken)
     factor = min(max(0.9 * (1.0 / max(ratio, 1e-30)) ** (1.0 / ORDER), LEAST_GROWTH), MOST_GROWTH)
     if ratio > 1.0 and taken > SHORTEST:
         state.rejected += 1
         state.length = factor * taken
         return False
-    if not landed and trial.active[0] < cluster.contacts.sites.size:
+    if not landed and trial.closed.size > 0:
         state.length = max(factor * taken, state.length if taken < state.length else 0.0)
     return True
 
 
-@njit(error_model="numpy", inline="always")
-def _accept(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, substep: Substep) -> None:
-    """Take a substep as done."""
-    accumulate_moments(cluster, motion, trial, substep)
-    for i in trial.active:
-        if i < cluster.contacts.sites.size:
-            _update_extremes(cluster, motion, trial, i, cluster.interval * substep.length)
-    motion.state[0].position += substep.length
-    motion.taylor[:] = trial.taylor
-    motion.site_motion[:] = trial.site_motion
-
-
 @njit(error_model="numpy")
-def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial, i: int, seconds: float) -> None:
+def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> None:
     """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
-    start, end, history = motion.site_motion[i], trial.site_motion[i], motion.history[i]
+    start, end, history = cluster.site_motion[i], trial.site_motion[i], cluster.history[i]
     side = 1.0 if cluster.contacts.sites[i].mode > 0 else -1.0
     depth = max(side * start[0], side * end[0]) - cluster.contacts.sites[i].clearance
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
@@ -202,40 +176,37 @@ def _update_extremes(cluster: ClusterRecord, motion: ClusterMotion, trial: Trial
     smallest = min(smallest, inside.min())
     if inside.max() > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
         # A turn lies inside.
-        depth, force, smallest = extremes(cluster.contacts, i, motion.site_motion, trial.site_motion, seconds)
+        depth, force, smallest = extremes(cluster.contacts, i, cluster.site_motion, trial.site_motion, seconds)
     history.indentation = max(history.indentation, depth)
     history.force = max(history.force, force)
     history.smallest_force = min(history.smallest_force, smallest)
 
 
 @njit(error_model="numpy")
-def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float) -> int:
-    """Advance a cluster in the step that begins at ``begin`` in s, to the first change of modes or to the step's end.
+def advance_cluster(cluster: Cluster) -> int:
+    """Advance a cluster to the first change of modes or to the step's end.
 
-    Returns ``DONE``, ``CHANGED`` (``motion`` is that after it) or ``FAILED``.
+    Returns ``DONE``, ``CHANGED`` (``cluster`` stands behind it) or ``FAILED``.
     """
-    state, blind = motion.state[0], False
-    if begin != state.begin:
-        state.begin, state.position = begin, 0.0
-        state.drive_end = (cluster.burst.duration - begin) / cluster.interval
-        motion.moments[:] = 0.0
-    dofs = motion.taylor.shape[0]
+    state, blind, sites, dofs = cluster.state[0], False, cluster.contacts.sites, cluster.taylor.shape[0]
     force, w, v = np.zeros((dofs, NODES)), np.zeros((dofs, NODES)), np.zeros((dofs, NODES))
-    taylor, site_motion = np.empty_like(motion.taylor), np.empty_like(motion.site_motion)
+    taylor, site_motion = np.empty_like(cluster.taylor), np.empty_like(cluster.site_motion)
     for _ in range(MOST_SUBSTEPS):
         if 1.0 - state.position <= ROUNDING:
             state.position = 1.0
             return DONE
-        active = _active_dofs(cluster, motion)
+        closed = np.flatnonzero(sites["mode"] != FREE)
+        is_driven = dofs > sites.size and state.position < state.drive_end
+        active = np.append(closed, sites.size) if is_driven else closed
         if active.size == 0:
-            return _advance_freely(cluster, motion)
-        trial = Trial(active, force, w, v, taylor, site_motion)
-        evaluate_site_motion(cluster, state, motion.taylor, motion.site_motion)
-        substep = _choose_substep(cluster, motion, active)
+            return _advance_freely(cluster)
+        trial = Trial(active, closed, force, w, v, taylor, site_motion)
+        evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
+        substep = _choose_substep(cluster, trial)
         if blind:
             substep = Substep(substep.kind, min(substep.length, BLIND))
         state.substeps += 1
-        if not _try_substep(cluster, motion, trial, substep):
+        if not _try_substep(cluster, trial, substep):
             state.rejected += 1
             state.length = CUT * substep.length
             if substep.length < ROUNDING:
@@ -243,16 +214,21 @@ def advance_cluster(cluster: ClusterRecord, motion: ClusterMotion, begin: float)
             continue
         landed = False
         if not blind:
-            substep, landed = _search_and_land(cluster, motion, trial, substep)
+            substep, landed = _search_and_land(cluster, trial, substep)
             if substep.length < 0.0:
                 continue
         # A change at the very start that is none: past it.
         blind = substep.length == 0.0 and not landed
         if substep.length > 0.0:
             # Judged only now: a force continued beyond its end is no smooth function.
-            if not _control_length(cluster, motion, trial, substep.length, landed):
+            if not _control_length(cluster, trial, substep.length, landed):
                 continue
-            _accept(cluster, motion, trial, substep)
+            accumulate_moments(cluster, trial, substep)
+            for i in trial.closed:
+                _update_extremes(cluster, trial, i, cluster.interval * substep.length)
+            state.position += substep.length
+            cluster.taylor[:] = taylor
+            cluster.site_motion[:] = site_motion
         if landed:
             return CHANGED
     return FAILED

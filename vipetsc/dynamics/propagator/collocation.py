@@ -1,26 +1,42 @@
-"""Collocation of forces at Gauss nodes of a substep, for three ways in which the nodes lie in time.
+"""Collocation of the forces in a substep of a cluster, and what they leave: motion, error estimate, moments.
 
-With Hertz's law a force begins and ends as the power 3/2 of time. Nodes laid out evenly in the root of the time
-since the onset, or before the separation, see a smooth function: ``ONSET`` and ``EXIT`` beside ``PLAIN``.
+Sec. 3 and 5 of the derivation in the package's docstring. With Hertz's law a force begins and ends as the power 3/2 of
+time. Nodes laid out evenly in the root of the time since the onset, or before the separation, see a smooth function:
+``ONSET`` and ``EXIT`` beside ``PLAIN``.
 """
-
-from __future__ import annotations
 
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legval
+from scipy.special import binom
+
+from vipetsc.compiled import njit
+from vipetsc.contact.law import Contacts, contact_force
+from vipetsc.dynamics.propagator.free_motion import evaluate, shift
+from vipetsc.dynamics.propagator.series import MOST_TERMS
+from vipetsc.dynamics.records import Burst, drive_force
 
 NODES = 8
 PLAIN, ONSET, EXIT = range(3)
 
-# Share of the substep at xi in [0, 1], and its slope.
-_SHARES = {
-    PLAIN: (lambda x: x, lambda x: np.ones_like(x)),
-    ONSET: (lambda x: x * x, lambda x: 2 * x),
-    EXIT: (lambda x: x * (2 - x), lambda x: 2 - 2 * x),
-}
+MOST_SWEEPS = 60
+# Responses smaller than this, beside the first one, are left out.
+SMALLEST_RESPONSE = 1e-18
+# Share of the estimated error (interpolation of the force) that the end of a substep is left with.
+SUPERCONVERGENCE = 0.02
+BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
+
+SUBSTEP_STATE = np.dtype(
+    [("begin", float), ("position", float), ("length", float), ("drive_end", float)]
+    + [(name, np.int64) for name in ("substeps", "rejected", "landings", "switches")]
+)
+"""Where a cluster stands: the step's begin in s; in shares of the step the position, the next substep's length and the
+end of the drive; counts of substeps, of rejected ones, of landings and of switches of a site's mode."""
+
+HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
+"""A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
 
 
 class Collocation(NamedTuple):
@@ -37,6 +53,11 @@ class Collocation(NamedTuple):
     tail: np.ndarray
 
 
+def _lay_out(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Share of the substep (3, ...) at ``x`` in [0, 1] for each kind of nodes, and its slope."""
+    return np.stack([x, x * x, x * (2 - x)]), np.stack([np.ones_like(x), 2 * x, 2 - 2 * x])
+
+
 @lru_cache
 def collocation(powers: int) -> Collocation:
     """Tables for the powers 0 to ``powers`` - 1."""
@@ -45,26 +66,229 @@ def collocation(powers: int) -> Collocation:
     # Exact for all products: degree 2 powers + NODES + 1.
     fine, fine_weight = leggauss(powers + NODES)
     fine, fine_weight = (1 + fine) / 2, fine_weight / 2
-    share = np.stack([f(x) for f, _ in _SHARES.values()])
-    weight = np.stack([w * slope(x) for _, slope in _SHARES.values()])
-    table = np.empty((3, powers, NODES, NODES))
-    for kind, (f, slope) in _SHARES.items():
-        at = x[:, None] * fine  # (node j, fine)
-        lag = f(x)[:, None] - f(at)
-        lagrange = _lagrange(x, at) * (slope(at) * fine_weight * x[:, None])  # (node k, node j, fine)
-        power = np.ones_like(lag)
-        for p in range(powers):
-            table[kind, p] = np.einsum("jf,kjf->kj", power, lagrange)
-            power = power * lag
+    at = x[:, None] * fine  # (node j, fine)
+    (share, slope), (share_at, slope_at) = _lay_out(x), _lay_out(at)
+    lagrange = np.stack([np.prod([(at - a) / (b - a) for a in x if a != b], axis=0) for b in x])  # (node k, j, fine)
+    integrand = lagrange * (slope_at * fine_weight * x[:, None])[:, None]
+    lag = share[:, :, None] - share_at
+    power, table = np.ones_like(lag), []
+    for _ in range(powers):
+        table.append(np.einsum("tjf,tkjf->tkj", power, integrand))
+        power = power * lag
     tail = np.stack([(2 * k + 1) * w * legval(2 * x - 1, np.eye(NODES)[k]) for k in (NODES - 2, NODES - 1)])
-    return Collocation(share, weight, table, tail)
+    return Collocation(share, w * slope, np.stack(table, axis=1), tail)
 
 
-def _lagrange(x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Lagrange polynomials (node, ...) of the nodes ``x`` at the points ``at``."""
-    values = np.ones((x.size, *at.shape))
-    for k in range(x.size):
-        for i in range(x.size):
-            if i != k:
-                values[k] *= (at - x[i]) / (x[k] - x[i])
-    return values
+class Cluster(NamedTuple):
+    """A cluster, or all that a rank feels one after another: constants, and what changes as it is advanced.
+
+    The DoFs of a cluster are its sites, those of ``contacts``, and where it is in reach the driven mass with the
+    ``burst``. ``response`` (dof, dof of the same cluster, term) is the motion of one after an impulse on another, times
+    H; ``interval`` is H in s, ``atol`` in m/s. ``taylor`` (dof, 2 term) holds the series of the free motion about the
+    present position, ``site_motion`` (dof, 3) w, w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those
+    of the step's forces about its end, ``energy`` (dof,) in J what sites dissipated and the work of the drive;
+    ``history`` (dof,) is of dtype ``HISTORY``, ``state`` (cluster,) of dtype ``SUBSTEP_STATE``.
+    """
+
+    contacts: Contacts
+    burst: Burst
+    response: np.ndarray
+    nodes: Collocation
+    interval: float
+    omega_max_h: float
+    rtol: float
+    atol: float
+    taylor: np.ndarray
+    site_motion: np.ndarray
+    moments: np.ndarray
+    energy: np.ndarray
+    history: np.ndarray
+    state: np.ndarray
+
+
+class Substep(NamedTuple):
+    """A substep: how its nodes lie, its length as a share of the step."""
+
+    kind: int
+    length: float
+
+
+class Trial(NamedTuple):
+    """A substep that has been computed but not yet taken.
+
+    Forces act on the DoFs ``active``, of which those ``closed`` are sites. ``force`` in N, ``w`` in m and ``v`` in m/s
+    (dof, node) at its nodes; at its end ``taylor`` and ``site_motion`` as in ``Cluster``.
+    """
+
+    active: np.ndarray
+    closed: np.ndarray
+    force: np.ndarray
+    w: np.ndarray
+    v: np.ndarray
+    taylor: np.ndarray
+    site_motion: np.ndarray
+
+
+@njit(error_model="numpy")
+def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
+    """``out`` (site, 3) = w, w', w'' of every site at the present position, where the series is ``taylor``."""
+    state, sites, h = cluster.state[0], cluster.contacts.sites.size, cluster.interval
+    forces = np.zeros(taylor.shape[0])
+    for i in range(sites):
+        out[i, 0], out[i, 1] = taylor[i, 0], taylor[i, 1] / h
+        forces[i] = -contact_force(cluster.contacts, i, out[i, 0], out[i, 1])[0]
+    if forces.size > sites:
+        forces[sites] = drive_force(cluster.burst, state.begin + state.position * h)
+    for i in range(sites):
+        acceleration = 2.0 * taylor[i, 2]
+        for j in range(forces.size):
+            acceleration += cluster.response[i, j, 0] * forces[j]
+        out[i, 2] = acceleration / (h * h)
+
+
+@njit(error_model="numpy")
+def _node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
+    """Fill (node k, node) with what DoF ``j``'s force at node k adds to w, w' of DoF ``i``; whether it reaches it."""
+    reaches = False
+    power, size = substep.length, 1.0
+    for m in range(cluster.response.shape[2]):
+        g = cluster.response[i, j, m]
+        if g != 0.0:
+            reaches = True
+            by_w, by_v = g * power * substep.length, g * power * (2 * m + 1) / cluster.interval
+            for k in range(NODES):
+                for node in range(NODES):
+                    to_w[k, node] += by_w * cluster.nodes.powers[substep.kind, 2 * m + 1, k, node]
+                    to_v[k, node] += by_v * cluster.nodes.powers[substep.kind, 2 * m, k, node]
+        power *= substep.length * substep.length
+        size *= (cluster.omega_max_h * substep.length) ** 2 / ((2 * m + 2) * (2 * m + 3))
+        if size < SMALLEST_RESPONSE:
+            break
+    return reaches
+
+
+@njit(error_model="numpy")
+def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
+    """Solve for the force and motion of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
+
+    Picard's iteration, which begins with the forces that ``trial`` holds.
+    """
+    state, contacts, h, active, n = (
+        cluster.state[0],
+        cluster.contacts,
+        cluster.interval,
+        trial.active,
+        trial.active.size,
+    )
+    free_w, free_v = np.empty((n, NODES)), np.empty((n, NODES))
+    for a in range(n):
+        for node in range(NODES):
+            at = substep.length * cluster.nodes.share[substep.kind, node]
+            free_w[a, node], slope = evaluate(cluster.taylor[active[a]], at)
+            free_v[a, node] = slope / h
+            if active[a] == contacts.sites.size:
+                trial.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
+    to_w, to_v = np.zeros((n, n, NODES, NODES)), np.zeros((n, n, NODES, NODES))
+    reaches = np.zeros((n, n), np.bool_)
+    for a in range(n):
+        for b in range(n):
+            reaches[a, b] = _node_responses(cluster, substep, active[a], active[b], to_w[a, b], to_v[a, b])
+    w, v, last = np.empty(NODES), np.empty(NODES), np.inf
+    for _ in range(MOST_SWEEPS):
+        change = 0.0
+        for a in range(n):
+            w[:] = free_w[a]
+            v[:] = free_v[a]
+            for b in range(n):
+                if reaches[a, b]:
+                    for k in range(NODES):
+                        force = trial.force[active[b], k]
+                        for node in range(NODES):
+                            w[node] += to_w[a, b, k, node] * force
+                            v[node] += to_v[a, b, k, node] * force
+            change = max(change, _replace(contacts, active[a], w, v, trial))
+        if change < 1e-15 or (change < 1e-13 and change >= last):
+            return True
+        if change == np.inf:
+            break
+        last = change
+        for i in trial.closed:
+            for node in range(NODES):
+                trial.force[i, node] = -contact_force(contacts, i, trial.w[i, node], trial.v[i, node])[0]
+    trial.force[: contacts.sites.size] = 0.0
+    return False
+
+
+@njit(error_model="numpy")
+def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
+    """Put the motion of DoF ``i`` at the nodes into ``trial``; largest change of a site's, inf if it is not finite."""
+    change = 0.0
+    for node in range(NODES):
+        if not abs(w[node]) + abs(v[node]) < np.inf:
+            return np.inf
+        if i < contacts.sites.size:
+            site = contacts.sites[i]
+            change = max(change, abs(w[node] - trial.w[i, node]) / site.clearance)
+            change = max(change, abs(v[node] - trial.v[i, node]) / (abs(v[node]) + abs(site.approach)))
+        trial.w[i, node], trial.v[i, node] = w[node], v[node]
+    return change
+
+
+@njit(error_model="numpy")
+def update_taylor(cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """The series of all DoFs' free motion after a substep in which the forces of ``trial`` acted, into ``trial``."""
+    shift(cluster.taylor, substep.length, trial.taylor)
+    dofs, _, terms = cluster.response.shape
+    moments, series = np.empty(2 * terms), np.empty((terms, 2 * terms))
+    for source in trial.active:
+        moments[:] = 0.0
+        for node in range(NODES):
+            amount = substep.length * cluster.nodes.weight[substep.kind, node] * trial.force[source, node]
+            lag = substep.length * (1.0 - cluster.nodes.share[substep.kind, node])
+            for k in range(2 * terms):
+                moments[k] += amount
+                amount *= lag
+        for m in range(terms):
+            for k in range(2 * m + 2):
+                series[m, k] = BINOMIALS[2 * m + 1, k] * moments[2 * m + 1 - k]
+        for i in range(dofs):
+            for m in range(terms):
+                g = cluster.response[i, source, m]
+                if g != 0.0:
+                    for k in range(2 * m + 2):
+                        trial.taylor[i, k] += g * series[m, k]
+
+
+@njit(error_model="numpy")
+def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
+    """Estimated error of a substep over the allowed one, by the forces' last two Legendre coefficients."""
+    worst = 0.0
+    for i in trial.closed:
+        last = 0.0
+        for row in range(2):
+            coefficient = 0.0
+            for node in range(NODES):
+                coefficient += cluster.nodes.tail[row, node] * trial.force[i, node]
+            last += abs(coefficient)
+        allowed = cluster.rtol * abs(cluster.contacts.sites[i].approach) + cluster.atol
+        error = SUPERCONVERGENCE * last * length * cluster.response[i, i, 0] / cluster.interval
+        worst = max(worst, error / allowed)
+    return worst
+
+
+@njit(error_model="numpy")
+def accumulate_moments(cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """Add a substep's forces to the moments about the step's end, and their work to the energies."""
+    h, position = cluster.interval, cluster.state[0].position
+    for i in trial.active:
+        for node in range(NODES):
+            duration = h * substep.length * cluster.nodes.weight[substep.kind, node]
+            power = trial.force[i, node] * trial.v[i, node]
+            if i < cluster.contacts.sites.size:
+                power = contact_force(cluster.contacts, i, trial.w[i, node], trial.v[i, node])[1]
+            cluster.energy[i] += duration * power
+            rest = 1.0 - position - substep.length * cluster.nodes.share[substep.kind, node]
+            amount = duration * trial.force[i, node]
+            for k in range(cluster.moments.shape[1]):
+                cluster.moments[i, k] += amount
+                amount *= rest

@@ -1,9 +1,8 @@
 """The engine of exact linear steps; the package's docstring has the method."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -11,22 +10,28 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
+from vipetsc.compiled import njit
 from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.cluster import group_dofs
-from vipetsc.dynamics.propagator.forces import Forces
-from vipetsc.dynamics.propagator.halo import HaloRegions
+from vipetsc.dynamics.propagator.advance import DONE, FAILED, advance_cluster
+from vipetsc.dynamics.propagator.collocation import Cluster
+from vipetsc.dynamics.propagator.forces import Forces, group_dofs, select_cluster
+from vipetsc.dynamics.propagator.free_motion import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.series import LARGEST_OMEGA_H, StepSeries
-from vipetsc.dynamics.propagator.stencil import apply_propagator, create_stencil
+from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, gather
 from vipetsc.parallel import StopRequest
 
 # Steps a sample interval may be cut into.
 MOST_PARTS = 16
 # Sites of one cluster beyond which plain time stepping costs less.
 MOST_SITES = 32
+# Changes of one cluster in one step beyond which it counts as stalled.
+MOST_CHANGES = 20_000
 # Rough costs that decide the step's length, in us: a step, a cell in it, a sample's contacts per site of a cluster.
 STEP_COST, CELL_COST, SITE_COST = 20.0, 0.03, 10.0
+# What steps hand over; CHANGED and FAILED are those of ``advance_cluster``.
+ARRIVED, STEPPED = 3, 4
 
 
 @lru_cache(maxsize=4)
@@ -53,6 +58,61 @@ def step_series(model: Model) -> StepSeries | None:
     return best
 
 
+class States(NamedTuple):
+    """Two states that steps read and write in turn.
+
+    ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, ``ghosts`` the
+    neighbouring ones, the last columns of the halo. ``steps`` were taken before; a sample interval in s has ``parts``.
+    """
+
+    components: np.ndarray
+    owned: int
+    ghosts: int
+    steps: int
+    parts: int
+    sample_interval: float
+
+
+@njit(error_model="numpy")
+def take_steps(
+    states: States, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster
+) -> Iterator[tuple[int, int, float]]:
+    """Take linear steps, and hand over to Python where it is needed: why, for which cluster, and the time in s.
+
+    ``ARRIVED``: the state is complete. ``STEPPED``: a step is done, cells of other ranks are to be fetched.
+    ``CHANGED``: sites of a cluster are to be switched. ``FAILED``: the contacts of a cluster cannot be followed.
+    """
+    rows, owned, steps = halo.columns.shape[0], states.owned, states.steps
+    while True:
+        state, out = states.components[steps % 2], states.components[1 - steps % 2]
+        cells, next_cells = state[: rows * owned].reshape(rows, owned), out[: rows * owned].reshape(rows, owned)
+        begin = steps // states.parts * states.sample_interval + steps % states.parts * clusters.interval
+        gather(halo, cells)
+        ghosts = halo.columns[: rows // 2, halo.columns.shape[1] - states.ghosts :]
+        state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
+        yield ARRIVED, -1, begin
+        apply_propagator(stencil, cells, halo.columns, next_cells)
+        for c in range(clusters.state.size):
+            may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
+            is_driven = dofs.first[c + 1] - 1 == dofs.driven and begin < clusters.burst.duration
+            if not (may_touch or is_driven):
+                continue
+            cluster = select_cluster(clusters, dofs, c)
+            stand = cluster.state[0]
+            stand.begin, stand.position = begin, 0.0
+            stand.drive_end = (clusters.burst.duration - begin) / clusters.interval
+            cluster.moments[:] = 0.0
+            for change in range(MOST_CHANGES):
+                outcome = advance_cluster(cluster)
+                if outcome == DONE:
+                    break
+                now = begin + cluster.state[0].position * clusters.interval
+                yield (outcome if change < MOST_CHANGES - 1 else FAILED), c, now
+            apply_impulses(dofs, dofs.first[c], cluster.moments, next_cells)
+        steps += 1
+        yield STEPPED, -1, begin
+
+
 class Propagator(Engine):
     """Advances a lattice from sample to sample; see ``Engine``."""
 
@@ -65,20 +125,29 @@ class Propagator(Engine):
         self._layout, self._stop = layout, stop or StopRequest()
         self._interval = model.sample_interval
         self._parts = round(model.sample_interval / series.interval)
-        self.steps, self.time = 0, 0.0
-        neighbours = [cell for cell in layout.neighbours() if cell is not None]
-        d, n = layout.dofs, layout.owned
-        # Two states in turn: each step reads one and writes the other.
-        self._arrays = [np.zeros(layout.size + d * len(neighbours)) for _ in range(2)]
-        self._states = [layout.create_vector(a) for a in self._arrays]
-        self._cells = [a[: 2 * d * n].reshape(2 * d, n) for a in self._arrays]
-        self._now = 0
         self._halo = HaloRegions(layout)
         self._forces = Forces(model, layout, series, self._halo)
         self._stencil = create_stencil(series, layout, self._halo)
-        self._ghosts = [self._halo.add(cell, 1) for cell in neighbours]
+        ghosts = [self._halo.add(cell, 1) for cell in layout.neighbours() if cell is not None]
         self._halo.bind_columns()
+        self._components = np.zeros((2, layout.size + layout.dofs * len(ghosts)))
+        self._states = [layout.create_vector(components) for components in self._components]
         self._status = np.zeros(2)
+        self._start(0)
+
+    def _start(self, steps: int) -> None:
+        """Go on from the state after so many ``steps``."""
+        self.steps = steps
+        layout, forces = self._layout, self._forces
+        ghosts = (self._components.shape[1] - layout.size) // layout.dofs
+        states = States(self._components, layout.owned, ghosts, steps, self._parts, self._interval)
+        self._events = take_steps(states, self._stencil, self._halo.record, forces.dofs, forces.clusters)
+        self._arrive()
+
+    def _arrive(self) -> None:
+        """Complete the state with what other ranks have."""
+        self._halo.exchange(self.state)
+        _, _, self.time = next(self._events)
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
@@ -101,46 +170,36 @@ class Propagator(Engine):
     @property
     def state(self) -> PETSc.Vec:
         """The state at ``time``, as ``Layout`` orders it."""
-        return self._states[self._now]
+        return self._states[self.steps % 2]
 
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s, a multiple of the sample interval; see ``Engine``."""
-        failure = None
         last = round(target / self._interval) * self._parts
-        while self.steps < last and failure is None:
-            try:
-                self._step()
-            except StalledError as error:
-                failure = error
+        while self.steps < last:
+            failure = self._step()
             # Any rank's failure or request counts on all.
             self._status[:] = self._stop.requested, failure is not None
             self._layout.comm.Allreduce(MPI.IN_PLACE, self._status, MPI.MAX)
             if self._status[1]:
-                raise failure or StalledError("contacts on another rank")
+                raise StalledError(failure or "contacts on another rank")
+            self.steps += 1
+            self._arrive()
         return not self._status[0]
 
-    def _step(self) -> None:
-        old, new = self._now, 1 - self._now
-        apply_propagator(self._stencil, self._cells[old], self._halo.columns, self._cells[new])
-        self._forces.act(self.time, self._cells[new])
-        self._now = new
-        self._refresh(self.steps + 1)
-
-    def _refresh(self, steps: int) -> None:
-        """Bring the time, the halo, the ledger's components and the ghosts up to date with a state after ``steps``."""
-        whole, rest = divmod(steps, self._parts)
-        self.steps, self.time = steps, whole * self._interval + rest * self.series.interval
-        layout, array = self._layout, self._arrays[self._now]
-        self._halo.fetch(self.state, self._cells[self._now])
-        array[2 * layout.dofs * layout.owned : layout.size] = self._forces.ledger
-        d, at = layout.dofs, layout.size
-        for column in self._ghosts:
-            array[at : at + d] = self._halo.columns[:d, column]
-            at += d
+    def _step(self) -> str | None:
+        """Take a step; why it could not be taken, or None."""
+        for event, cluster, now in self._events:
+            if event == STEPPED:
+                break
+            if event == FAILED:
+                sites = ", ".join(str(site + 1) for site in self._forces.trackers[cluster].numbers)
+                return f"the contacts of sites {sites} at {now:.9g} s"
+            self._forces.switch(cluster, now)
+        return None
 
     def take_episodes(self, unfinished: bool = False) -> list[Episode]:
         """See ``Engine``."""
-        return [episode for cluster in self._forces.clusters for episode in cluster.take_episodes(unfinished)]
+        return self._forces.take_episodes(unfinished)
 
     def statistics(self) -> dict[str, Any]:
         """Linear steps and what the clusters did, the step and its band."""
@@ -156,14 +215,15 @@ class Propagator(Engine):
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs to go on with the same bits, this rank's share."""
-        state = self._arrays[self._now][: self._layout.size].copy()
+        state = self._components[self.steps % 2, : self._layout.size].copy()
         return {"state": state, "steps": np.array(self.steps)} | self._forces.checkpoint()
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Go back to a checkpoint."""
-        self._arrays[self._now][: self._layout.size] = checkpoint["state"]
+        steps = int(checkpoint["steps"])
+        self._components[steps % 2, : self._layout.size] = checkpoint["state"]
         self._forces.restore(checkpoint)
-        self._refresh(int(checkpoint["steps"]))
+        self._start(steps)
 
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""

@@ -1,8 +1,10 @@
-"""Forces on the lattice within linear steps: all clusters that a rank's cells feel, and what they do to the cells."""
+"""Clusters: contact sites, and the driven mass, that feel one another within one linear step; their records and log.
 
-from __future__ import annotations
+Sec. 5 and 6 of the derivation in the package's docstring.
+"""
 
-from itertools import pairwise
+from dataclasses import dataclass
+from itertools import chain, compress
 from math import factorial
 from typing import Any
 
@@ -11,87 +13,176 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.tracker import LIMITS
+from vipetsc.compiled import njit
+from vipetsc.contact.changes import Extremes
+from vipetsc.contact.law import Contacts, create_contacts
+from vipetsc.contact.tracker import LIMITS, Episode, ImpactTracker
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.cluster import Cluster, ContactDof, group_dofs
-from vipetsc.dynamics.propagator.free_motion import DofTables, active_clusters, apply_impulses
-from vipetsc.dynamics.propagator.halo import HaloRegions
+from vipetsc.dynamics.propagator.advance import ORDER
+from vipetsc.dynamics.propagator.collocation import HISTORY, SUBSTEP_STATE, Cluster, collocation
+from vipetsc.dynamics.propagator.free_motion import DofTables
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.propagator.substep import HISTORY, SUBSTEP_STATE, ClusterMotion
+from vipetsc.dynamics.propagator.stencil import HaloRegions
+from vipetsc.dynamics.records import create_burst
 
+# A contact's first substep as a share of its duration at a tolerance of 1e-6.
+FIRST_SUBSTEP = 0.1
 # What clusters count.
 COUNTS = ("substeps", "rejected", "landings", "switches")
 
 
+@dataclass(frozen=True)
+class ContactDof:
+    """One relative displacement of a lattice: of a contact pair, ``site`` (0-based), or of the driven mass, site -1.
+
+    ``form`` (mass,) weighs the displacements of ``cell``; ``clearance`` is in m.
+    """
+
+    cell: int
+    site: int
+    form: tuple[float, ...]
+    clearance: float = np.inf
+
+
+def group_dofs(model: Model, reach: int) -> list[list[ContactDof]]:
+    """Groups of DoFs of which each is within ``reach`` cells of another, in the lattice's order.
+
+    In each group the sites come first, in their own order, then the driven mass.
+    """
+    cell, cells = model.chain.cell, model.chain.cells
+    unit = np.eye(cell.dofs)
+    pair, sites = (
+        tuple(unit[cell.resonator] - unit[cell.host]),
+        zip(model.chain.sites, model.chain.clearances, strict=True),
+    )
+    dofs = [ContactDof(c, i, pair, clearance) for i, (c, clearance) in enumerate(sites)]
+    dofs.append(ContactDof(model.drive_cell, -1, tuple(unit[model.drive_mass])))
+    groups: list[list[ContactDof]] = []
+    for dof in sorted(dofs, key=lambda dof: dof.cell):
+        if groups and dof.cell - groups[-1][-1].cell <= reach:
+            groups[-1].append(dof)
+        else:
+            groups.append([dof])
+    joined = model.chain.ends == "periodic" and len(groups) > 1
+    if joined and groups[0][0].cell + cells - groups[-1][-1].cell <= reach:
+        groups[0] = groups.pop() + groups[0]
+    return [sorted(group, key=lambda dof: (dof.site < 0, dof.site)) for group in groups]
+
+
+@njit(error_model="numpy")
+def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
+    """Cluster ``c`` of all: the same constants, views of its arrays."""
+    first, stop = dofs.first[c], dofs.first[c + 1]
+    sites = stop - 1 if stop - 1 == dofs.driven else stop
+    return Cluster(
+        Contacts(clusters.contacts.law, clusters.contacts.sites[first:sites]),
+        clusters.burst,
+        clusters.response[first:stop],
+        clusters.nodes,
+        clusters.interval,
+        clusters.omega_max_h,
+        clusters.rtol,
+        clusters.atol,
+        clusters.taylor[first:stop],
+        clusters.site_motion[first:sites],
+        clusters.moments[first:stop],
+        clusters.energy[first:stop],
+        clusters.history[first:stop],
+        clusters.state[c : c + 1],
+    )
+
+
 class Forces:
-    """Clusters of contact sites and the drive; adds to ``halo`` the cells whose motion they need."""
+    """Clusters that a rank's cells feel; adds to ``halo`` the cells whose motion they need.
+
+    Every rank that a cluster reaches does the same sums on the same numbers; the one that owns its first cell logs it.
+    """
 
     def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
-        self._comm, self._halo = layout.comm, halo
+        self._comm = layout.comm
         groups = [group for group in group_dofs(model, series.reach)
                   if any((_owned_cells(dof.cell, series.reach, layout) >= 0).any() for dof in group)]  # fmt: skip
-        self._dofs = _dof_tables(model, groups, layout, series, halo)
-        count = len(self._dofs.column)
-        state = np.zeros(len(groups), SUBSTEP_STATE)
-        state["begin"], state["length"] = np.nan, 1.0
-        shape = (count, 2 * series.terms)
-        self._motion = ClusterMotion(
-            np.zeros(shape), np.zeros((count, 3)), np.zeros(shape), np.zeros(count), np.zeros(count, HISTORY), state
+        self.dofs = create_dof_tables(groups, model, layout, series, halo)
+        count, terms = len(self.dofs.column), series.terms
+        self.clusters = Cluster(
+            contacts=create_contacts(model.contact, [dof.clearance for group in groups for dof in group]),
+            burst=create_burst(model.drive),
+            response=_responses(groups, self.dofs, layout, series),
+            nodes=collocation(2 * terms),
+            interval=series.interval,
+            omega_max_h=series.omega_max_h,
+            rtol=model.rtol,
+            atol=model.atol[1],
+            taylor=np.zeros((count, 2 * terms)),
+            site_motion=np.zeros((count, 3)),
+            moments=np.zeros((count, 2 * terms)),
+            energy=np.zeros(count),
+            history=np.zeros(count, HISTORY),
+            state=np.zeros(len(groups), SUBSTEP_STATE),
         )
-        self._active = np.zeros(len(groups), np.int64)
-        self._of_cluster = [slice(a, b) for a, b in pairwise(self._dofs.first.tolist())]
-        self.clusters = []
-        for i, (group, span) in enumerate(zip(groups, self._of_cluster, strict=True)):
-            motion = ClusterMotion._make([*(array[span] for array in self._motion[:-1]), state[i : i + 1]])
-            response = _responses(group, self._dofs, span, layout, series)
-            logs = layout.start <= group[0].cell < layout.stop
-            self.clusters.append(Cluster(model, group, series, response, motion, logs))
-        numbers = {dof.site: i for i, dof in enumerate(dof for group in groups for dof in group)}
-        self._ledger = [numbers[site] for site in ((-1,) if layout.owns_drive else ()) + layout.sites]
-        self._drive_end = model.drive.duration
-        self._driven = slice(numbers.get(-1, count), numbers.get(-1, count) + 1)
-        self._saved = {"energy": self._motion.energy, "history": self._motion.history, "clusters": state}
+        self.clusters.state["length"] = 1.0
+        self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
+        self._logs = [layout.start <= group[0].cell < layout.stop for group in groups]
+        self._clusters = [select_cluster(self.clusters, self.dofs, c) for c in range(len(groups))]
+        self.trackers = []
+        for group, cluster in zip(groups, self._clusters, strict=True):
+            sites = [dof.site for dof in group if dof.site >= 0]
+            self.trackers.append(ImpactTracker(cluster.contacts, sites, model.chain.cell.reduced_mass))
+            self.trackers[-1].start = cluster.site_motion
 
-    @property
-    def ledger(self) -> np.ndarray:
-        """The rank's work and dissipated energies in J, in the state's order."""
-        return self._motion.energy[self._ledger]
+    def switch(self, c: int, now: float) -> None:
+        """Switch the sites of cluster ``c`` that have landed, ``now`` in s; sets the length of the next substep."""
+        tracker, cluster = self.trackers[c], self._clusters[c]
+        self._update_episodes(c)
+        before = set(tracker.open)
+        cluster.state["switches"] += tracker.switch(now, cluster.energy)
+        for site in set(tracker.open) - before:
+            duration = tracker.duration(abs(float(tracker.contacts.sites["approach"][site])))
+            cluster.history[site] = now, duration, 0.0, 0.0, 0.0
+            first = self._first_substep * duration / cluster.interval
+            cluster.state["length"] = min(cluster.state["length"][0], first)
+        if not tracker.open:
+            cluster.state["length"] = 1.0
 
-    def act(self, begin: float, out: np.ndarray) -> None:
-        """Add to the owned cells ``out`` (2 dof, cell) what forces do in the step that begins at ``begin`` in s.
+    def _update_episodes(self, c: int) -> None:
+        for site, episode in self.trackers[c].open.items():
+            _, _, *extremes = self._clusters[c].history[site].tolist()
+            self.trackers[c].update_episode(site, episode, Extremes(*extremes))
 
-        The halo holds the state then. Raises StalledError.
-        """
-        dofs = self._dofs
-        # A site in contact reaches its clearance anyway; the drive must be asked for.
-        dofs.clearance[self._driven] = -np.inf if begin < self._drive_end else np.inf
-        count = active_clusters(dofs, self._halo.columns, self._motion.taylor, self._active)
-        for i in self._active[:count].tolist():
-            self.clusters[i].advance(begin)
-            apply_impulses(dofs, dofs.first[i], self._motion.moments[self._of_cluster[i]], out)
+    def take_episodes(self, unfinished: bool) -> list[Episode]:
+        """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
+        episodes = []
+        for c, (tracker, cluster) in enumerate(zip(self.trackers, self._clusters, strict=True)):
+            if unfinished:
+                self._update_episodes(c)
+            closed = tracker.take_episodes(cluster.energy, unfinished)
+            episodes += closed if self._logs[c] else []
+        return episodes
 
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
-        logs = [cluster.logs for cluster in self.clusters]
-        limits = [list(cluster.tracker.counts.values()) for cluster in self.clusters if cluster.logs]
-        total = np.array([*(self._motion.state[name][logs].sum() for name in COUNTS),
+        limits = [list(tracker.counts.values()) for tracker in compress(self.trackers, self._logs)]
+        total = np.array([*(self.clusters.state[name][self._logs].sum() for name in COUNTS),
                           *np.array(limits, np.int64).reshape(-1, len(LIMITS)).sum(axis=0)])  # fmt: skip
         self._comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         return dict(zip((*COUNTS, *LIMITS), total.tolist(), strict=True))
 
+    def _saved(self) -> dict[str, np.ndarray]:
+        return {"energy": self.clusters.energy, "history": self.clusters.history, "clusters": self.clusters.state}
+
     def checkpoint(self) -> dict[str, np.ndarray]:
         """All that a resumed run needs."""
-        trackers = [cluster.tracker.checkpoint() for cluster in self.clusters]
-        logs = {f"cluster-{i}-{name}": array for i, arrays in enumerate(trackers) for name, array in arrays.items()}
-        return logs | {name: array.copy() for name, array in self._saved.items()}
+        logs = {f"cluster-{c}-{name}": array for c, tracker in enumerate(self.trackers)
+                for name, array in tracker.checkpoint().items()}  # fmt: skip
+        return logs | {name: array.copy() for name, array in self._saved().items()}
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Go back to a checkpoint."""
-        for name, array in self._saved.items():
+        for name, array in self._saved().items():
             array[:] = checkpoint[name]
-        for i, cluster in enumerate(self.clusters):
-            prefix = f"cluster-{i}-"
-            cluster.tracker.restore({k.removeprefix(prefix): v for k, v in checkpoint.items() if k.startswith(prefix)})
+        for c, tracker in enumerate(self.trackers):
+            prefix = f"cluster-{c}-"
+            tracker.restore({k.removeprefix(prefix): v for k, v in checkpoint.items() if k.startswith(prefix)})
 
 
 def _unwrapped(cell: int, near: int, layout: Layout) -> int:
@@ -106,44 +197,46 @@ def _owned_cells(cell: int, reach: int, layout: Layout) -> np.ndarray:
     return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
 
 
-def _dof_tables(
-    model: Model, groups: list[list[ContactDof]], layout: Layout, series: StepSeries, halo: HaloRegions
+def create_dof_tables(
+    groups: list[list[ContactDof]], model: Model, layout: Layout, series: StepSeries, halo: HaloRegions
 ) -> DofTables:
     """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
-    r, chain = series.reach, model.chain
-    columns: list[int] = []
+    r, dofs, columns = series.reach, list(chain.from_iterable(groups)), []
     for group in groups:
         cells = [_unwrapped(dof.cell, group[0].cell, layout) for dof in group]
         column = halo.add(min(cells) - r, max(cells) - min(cells) + 2 * r + 1)
         columns += [column + cell - min(cells) for cell in cells]
-    dofs = [dof for group in groups for dof in group]
     # DoFs away from the ends share their rows.
     keys = [(None if series.is_interior(dof.cell) else dof.cell, dof.form) for dof in dofs]
     rows = {}
     for key, dof in dict(zip(keys, dofs, strict=True)).items():
         around = series.rows(dof.cell, dof.cell - r, 2 * r + 1).astype(float)
         rows[key] = np.einsum("i,imjc->jcm", np.array(dof.form), around)
-    clearances = [chain.clearances[dof.site] if dof.site >= 0 else np.inf for dof in dofs]
+    numbers = {dof.site: i for i, dof in enumerate(dofs)}
     return DofTables(
         column=np.array(columns, np.int64),
         owned=np.array([_owned_cells(dof.cell, r, layout) for dof in dofs], np.int64).reshape(-1, 2 * r + 1),
         table=np.array([list(rows).index(key) for key in keys], np.int64),
-        rows=np.array(list(rows.values())).reshape(len(rows), chain.cell.dofs, 2 * r + 1, series.terms),
+        rows=np.array(list(rows.values())).reshape(len(rows), layout.dofs, 2 * r + 1, series.terms),
         factors=np.array([series.interval ** (k % 2) / factorial(k) for k in range(2 * series.terms)]),
-        inverse_masses=1 / np.asarray(chain.cell.masses),
-        clearance=np.array(clearances) * (1 - 1e-9),  # an onset within rounding of the clearance is one
+        inverse_masses=1 / np.asarray(model.chain.cell.masses),
+        # An onset within rounding of the clearance is one.
+        clearance=np.array([dof.clearance for dof in dofs]) * (1 - 1e-9),
+        driven=numbers.get(-1, -1),
         first=np.cumsum([0, *map(len, groups)]),
+        ledger=np.array([numbers[site] for site in ((-1,) if layout.owns_drive else ()) + layout.sites], np.int64),
     )
 
 
-def _responses(group: list[ContactDof], dofs: DofTables, span: slice, layout: Layout, series: StepSeries) -> np.ndarray:
-    """Motion (dof, dof, term) of each DoF of a ``group`` after an impulse on each, times H, in powers 2 m + 1 of s."""
+def _responses(groups: list[list[ContactDof]], dofs: DofTables, layout: Layout, series: StepSeries) -> np.ndarray:
+    """Motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H, in powers 2 m + 1 of s."""
     factors = dofs.factors[1::2] * series.interval
-    response = np.zeros((len(group), len(group), series.terms))
-    for i, rows in enumerate(dofs.rows[dofs.table[span]]):
-        for j, source in enumerate(group):
-            offset = _unwrapped(source.cell, group[i].cell, layout) - group[i].cell
-            if abs(offset) <= series.reach:
-                weights = dofs.inverse_masses * source.form
-                response[i, j] = factors * (weights @ rows[:, series.reach + offset])
+    response = np.zeros((len(dofs.column), max(map(len, groups), default=0), series.terms))
+    for group, first in zip(groups, dofs.first[:-1], strict=True):
+        for i, target in enumerate(group, first):
+            for j, source in enumerate(group):
+                offset = _unwrapped(source.cell, target.cell, layout) - target.cell
+                if abs(offset) <= series.reach:
+                    weights = dofs.inverse_masses * source.form
+                    response[i, j] = factors * (weights @ dofs.rows[dofs.table[i], :, series.reach + offset])
     return response

@@ -3,8 +3,6 @@
 Both directions use the same rows, by Maxwell's reciprocity: sec. 2 and 5 of the derivation in the package's docstring.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -22,8 +20,8 @@ class DofTables(NamedTuple):
     ``column`` (dof,) is the first column in the halo of the cells that a DoF reaches, ``owned`` (dof, cell) which of
     the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
     mass, cell, term); ``factors`` (2 term,) are H^(k mod 2)/k!; ``inverse_masses`` (mass,) are in 1/kg. ``clearance``
-    (dof,) in m is that of a site; of the driven mass -inf while the drive lasts, inf later. The DoFs of cluster c are
-    ``first[c]`` to ``first[c + 1]``.
+    (dof,) in m is that of a site, inf for the DoF ``driven``, the driven mass (-1 where it is out of reach). The DoFs
+    of cluster c are ``first[c]`` to ``first[c + 1]``, those with an energy in the rank's ledger are in ``ledger``.
     """
 
     column: np.ndarray
@@ -33,48 +31,36 @@ class DofTables(NamedTuple):
     factors: np.ndarray
     inverse_masses: np.ndarray
     clearance: np.ndarray
+    driven: int
     first: np.ndarray
+    ledger: np.ndarray
 
 
 @njit(error_model="numpy")
-def taylor_coefficients(dofs: DofTables, dof: int, columns: np.ndarray, taylor: np.ndarray) -> float:
-    """Coefficients ``taylor`` (2 term,) in m of a DoF's free motion in powers of t/H; returns a bound on |motion|.
+def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
+    """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a site may reach its clearance.
 
-    ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
+    Coefficients in m go into ``taylor`` (dof, 2 term); ``columns`` (2 mass, column) hold the lattice's state at the
+    beginning of the step.
     """
-    rows, first = dofs.rows[dofs.table[dof]], dofs.column[dof]
-    masses, width, terms = rows.shape
-    even, odd = np.zeros(terms), np.zeros(terms)
-    for j in range(masses):
-        for k in range(width):
-            u, v = columns[j, first + k], columns[masses + j, first + k]
-            row = rows[j, k]
-            for m in range(terms):
-                even[m] += u * row[m]
-                odd[m] += v * row[m]
-    bound = 0.0
-    for m in range(terms):
-        taylor[2 * m] = even[m] * dofs.factors[2 * m]
-        taylor[2 * m + 1] = odd[m] * dofs.factors[2 * m + 1]
-        bound += abs(taylor[2 * m]) + abs(taylor[2 * m + 1])
-    return bound
-
-
-@njit(error_model="numpy")
-def active_clusters(dofs: DofTables, columns: np.ndarray, taylor: np.ndarray, active: np.ndarray) -> int:
-    """Find the clusters with a DoF whose free motion may reach its clearance; returns how many.
-
-    Fills ``taylor`` (dof, 2 term) of all DoFs and puts the clusters' numbers into ``active`` (cluster,).
-    """
-    count = 0
-    for cluster in range(active.size):
-        is_active = False
-        for dof in range(dofs.first[cluster], dofs.first[cluster + 1]):
-            is_active |= not taylor_coefficients(dofs, dof, columns, taylor[dof]) < dofs.clearance[dof]
-        if is_active:
-            active[count] = cluster
-            count += 1
-    return count
+    _, masses, width, terms = dofs.rows.shape
+    even, odd, may_touch = np.empty(terms), np.empty(terms), False
+    for i in range(dofs.first[c], dofs.first[c + 1]):
+        rows, first, bound = dofs.rows[dofs.table[i]], dofs.column[i], 0.0
+        even[:] = odd[:] = 0.0
+        for j in range(masses):
+            for k in range(width):
+                u, v = columns[j, first + k], columns[masses + j, first + k]
+                row = rows[j, k]
+                for m in range(terms):
+                    even[m] += u * row[m]
+                    odd[m] += v * row[m]
+        for m in range(terms):
+            taylor[i, 2 * m] = even[m] * dofs.factors[2 * m]
+            taylor[i, 2 * m + 1] = odd[m] * dofs.factors[2 * m + 1]
+            bound += abs(taylor[i, 2 * m]) + abs(taylor[i, 2 * m + 1])
+        may_touch |= not bound < dofs.clearance[i]
+    return may_touch
 
 
 @njit(error_model="numpy")

@@ -3,29 +3,17 @@
 Sec. 1 of the derivation in the package's docstring.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
 
 import numpy as np
 
-from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.chain import Chain
 
 # Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
 LARGEST_OMEGA_H = 3.2
 MOST_TERMS = 24
-
-
-def frequency_bound(cell: UnitCell) -> float:
-    """Bound in rad/s on the frequencies of any lattice of ``cell``, by Gershgorin's circles."""
-    root = 1 / np.sqrt(np.asarray(cell.masses))
-    rows = np.zeros(cell.dofs)
-    for mass, _, other, stiffness in cell.couplings():
-        rows[mass] += stiffness * root[mass] * (root[mass] + root[other])
-    return float(np.sqrt(rows.max()))
 
 
 @dataclass(frozen=True)
@@ -43,16 +31,18 @@ class StepSeries:
 
     @cached_property
     def omega_max_h(self) -> float:
-        """Bound on omega H of the lattice's modes."""
-        return frequency_bound(self.chain.cell) * self.interval
+        """Bound on omega H of the modes of any lattice of this cell, by Gershgorin's circles."""
+        cell = self.chain.cell
+        root = 1 / np.sqrt(np.asarray(cell.masses))
+        rows = np.zeros(cell.dofs)
+        for mass, _, other, stiffness in cell.couplings():
+            rows[mass] += stiffness * root[mass] * (root[mass] + root[other])
+        return float(np.sqrt(rows.max())) * self.interval
 
     @cached_property
     def terms(self) -> int:
         """Number of powers of K in the series, the zeroth included."""
-        terms = 1
-        while terms < MOST_TERMS and self._remainder(terms) > self.tolerance / 4:
-            terms += 1
-        return terms
+        return next((m for m in range(1, MOST_TERMS) if self._remainder(m) <= self.tolerance / 4), MOST_TERMS)
 
     def _remainder(self, terms: int) -> float:
         """Largest velocity that the series of so many terms leaves out, of one of unit velocity amplitude."""
@@ -70,36 +60,33 @@ class StepSeries:
         return self._powers(self._width, 2 * self._width + 1)
 
     @cached_property
+    def _share(self) -> np.ndarray:
+        """Magnitudes of P's entries (2 dof, 2 dof, cell) for it, a velocity counted as omega times a displacement."""
+        n, omega = self.chain.cell.dofs, self.omega_max_h / self.interval
+        share = np.abs(self.stencil(self._interior))
+        share[:n, n:] *= omega
+        share[n:, :n] /= omega
+        return share
+
+    def _beyond(self, distance: int) -> float:
+        """Largest sum of these magnitudes over the cells further away than ``distance``."""
+        is_beyond = np.abs(np.arange(-self._width, self._width + 1)) > distance
+        return float(self._share.sum(axis=1)[:, is_beyond].sum(axis=1).max())
+
+    @cached_property
     def reach(self) -> int:
         """Cells each way beyond which the propagator's entries sum to less than the tolerance."""
-        share, distance = self._far_entries()
-        beyond = np.array([share[:, distance > r].sum(axis=1).max() for r in range(self._width + 1)])
-        return max(int(np.argmax(beyond <= self.tolerance / 2)), 1)
+        return next(r for r in range(1, self._width + 1) if self._beyond(r) <= self.tolerance / 2)
+
+    @property
+    def _middle(self) -> slice:
+        return slice(self._width - self.reach, self._width + self.reach + 1)
 
     @cached_property
     def truncation(self) -> float:
         """Bound on the relative error of one step: entries left out and the remainder of the series."""
-        share, distance = self._far_entries()
-        stencil = self.interior()
-        small = np.where(self.significant(stencil), 0.0, self._share(stencil)).sum(axis=(1, 2)).max()
-        return float(share[:, distance > self.reach].sum(axis=1).max() + small + self._remainder(self.terms))
-
-    def _far_entries(self) -> tuple[np.ndarray, np.ndarray]:
-        """Magnitudes of P's rows (2 dof, cell), summed over the state of each cell, and the cells' distances."""
-        return self._share(self.stencil(self._interior)).sum(axis=1), np.abs(np.arange(-self._width, self._width + 1))
-
-    def significant(self, stencil: np.ndarray) -> np.ndarray:
-        """Which of P's entries are worth their cost."""
-        return self._share(stencil) > 1e-3 * self.tolerance
-
-    def _share(self, stencil: np.ndarray) -> np.ndarray:
-        """Magnitudes of P's entries between states in which a velocity counts as omega times a displacement."""
-        n = self.chain.cell.dofs
-        scale = np.ones((2 * n, 2 * n, 1))
-        omega = self.omega_max_h / self.interval
-        scale[:n, n:] *= omega
-        scale[n:, :n] /= omega
-        return np.abs(stencil) * scale
+        small = np.where(self.interior() == 0.0, self._share[:, :, self._middle], 0.0).sum(axis=(1, 2)).max()
+        return self._beyond(self.reach) + float(small) + self._remainder(self.terms)
 
     def _powers(self, cell: int, width: int, free_left: bool = False, free_right: bool = False) -> np.ndarray:
         """Rows (dof, term, dof, width) of the masses of ``cell`` on a chain of ``width`` cells.
@@ -110,16 +97,13 @@ class StepSeries:
         masses = np.asarray(unit.masses, np.longdouble)[:, None]
         squared = np.longdouble(self.interval) ** 2
         form = np.zeros((d, d, width), np.longdouble)
-        form[np.arange(d), np.arange(d), cell] = 1
+        form[:, :, cell] = np.eye(d)
         rows = [form]
         for _ in range(self.terms - 1):
-            u = form / masses
-            form = np.zeros_like(u)
+            u = np.pad(form / masses, ((0, 0), (0, 0), (1, 1)))
+            form = np.zeros_like(form)
             for mass, offset, other, stiffness in unit.couplings():
-                neighbour = np.zeros_like(u[:, other])
-                inside = slice(max(-offset, 0), width - max(offset, 0))
-                neighbour[:, inside] = u[:, other, max(offset, 0) : width - max(-offset, 0)]
-                force = neighbour - u[:, mass]
+                force = u[:, other, 1 + offset : 1 + offset + width] - u[:, mass, 1:-1]
                 if offset < 0 and free_left:
                     force[:, 0] = 0
                 if offset > 0 and free_right:
@@ -165,9 +149,9 @@ class StepSeries:
         return p.astype(float)
 
     def interior(self) -> np.ndarray:
-        """P's rows (2 dof, 2 dof, 2 reach + 1) of a cell at least ``reach`` away from both ends."""
-        middle = slice(self._width - self.reach, self._width + self.reach + 1)
-        return self.stencil(self._interior)[:, :, middle]
+        """P's rows (2 dof, 2 dof, 2 reach + 1) of a cell at least ``reach`` from both ends; small entries are zero."""
+        is_small = self._share <= 1e-3 * self.tolerance
+        return np.where(is_small, 0.0, self.stencil(self._interior))[:, :, self._middle]
 
     def end(self, right: bool) -> np.ndarray:
         """P's rows (cell, 2 dof, 2 dof, 2 reach) of the first or last ``reach`` cells, over twice as many cells."""

@@ -1,24 +1,95 @@
-"""P(H) on a rank's cells: one stencil for the interior, rows of their own for the cells near the lattice's ends.
+"""P(H) on a rank's cells, and the cells of this and other ranks that a step reads.
 
-States are arrays (2 dof, cell), displacements before velocities. Every sum runs in an order that depends on the cell
-alone, so that results have the same bits on any partition.
+One stencil serves the interior, rows of their own the cells near the lattice's ends. States are arrays (2 dof, cell),
+displacements before velocities. Every sum runs in an order that depends on the cell alone, so that results have the
+same bits on any partition.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
+
+from petsc4py import PETSc
 
 import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.halo import HaloRegions
 from vipetsc.dynamics.propagator.series import StepSeries
 
 # Cells in one pass: what a pass reads stays in the first-level cache.
 CHUNK = 512
 # Terms that one pass over a chunk adds.
 GROUP = 8
+
+
+class Halo(NamedTuple):
+    """Copies of ranges of cells side by side in ``columns`` (2 dof, column).
+
+    ``sources`` (column,) number the rank's own cells and, behind them, those of other ranks in ``fetched`` (2 dof,
+    cell).
+    """
+
+    columns: np.ndarray
+    fetched: np.ndarray
+    sources: np.ndarray
+
+
+class HaloRegions:
+    """Ranges of cells that a rank reads.
+
+    ``add`` the ranges and call ``bind_columns`` once; after every step, ``exchange`` and then ``gather`` fill the
+    ``record``. Cells beyond an end of a lattice that is not periodic are replaced by its last one.
+    """
+
+    record: Halo
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._ranges: list[np.ndarray] = [np.zeros(0, int)]
+        self._scatter: PETSc.Scatter | None = None
+
+    def add(self, first: int, count: int) -> int:
+        """Add ``count`` cells from ``first`` on; returns the column of the first one."""
+        self._ranges.append(np.arange(first, first + count))
+        return sum(map(len, self._ranges[:-1]))
+
+    def bind_columns(self) -> None:
+        """Give every cell of the ranges its column and its source; all ranks must call it."""
+        layout, rows, cells = self._layout, 2 * self._layout.dofs, np.concatenate(self._ranges)
+        cells = cells % layout.cells if layout.periodic else np.clip(cells, 0, layout.cells - 1)
+        owned = (cells >= layout.start) & (cells < layout.stop)
+        others = np.unique(cells[~owned])
+        sources = np.where(owned, cells - layout.start, layout.owned + np.searchsorted(others, cells))
+        self.record = Halo(np.zeros((rows, len(cells))), np.zeros((rows, len(others))), sources)
+        if layout.comm.allreduce(len(others)):
+            # By component, as the rows of ``fetched`` are.
+            indices = np.array([layout.state_indices(int(cell)) for cell in others], PETSc.IntType)
+            wanted = PETSc.IS().createGeneral(indices.reshape(-1, rows).T.ravel(), comm=layout.comm)
+            self._vector = PETSc.Vec().createWithArray(self.record.fetched, comm=PETSc.COMM_SELF)
+            like = layout.create_vector()
+            self._scatter = PETSc.Scatter().create(like, wanted, self._vector, None)
+            like.destroy()
+            wanted.destroy()
+
+    def exchange(self, state: PETSc.Vec) -> None:
+        """Fetch the other ranks' cells of ``state``; collective."""
+        if self._scatter is not None:
+            self._scatter.scatter(state, self._vector, PETSc.InsertMode.INSERT_VALUES)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        if self._scatter is not None:
+            self._scatter.destroy()
+            self._vector.destroy()
+
+
+@njit(error_model="numpy")
+def gather(halo: Halo, owned: np.ndarray) -> None:
+    """Bring the columns up to date with the rank's cells ``owned`` (2 dof, cell) and those fetched."""
+    count = owned.shape[1]
+    for i in range(owned.shape[0]):
+        for k in range(halo.sources.size):
+            c = halo.sources[k]
+            halo.columns[i, k] = owned[i, c] if c < count else halo.fetched[i, c - count]
 
 
 class Stencil(NamedTuple):
@@ -68,15 +139,13 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
 
 def _interior_terms(series: StepSeries) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The starts, rows, offsets and values of ``Stencil``."""
-    entries = series.interior()
-    significant = series.significant(entries)
     starts, rows, offsets, values = [0], [], [], []
-    for entry, is_term in zip(entries, significant, strict=True):
-        row, column = np.nonzero(is_term)
+    for entry in series.interior():
+        row, column = np.nonzero(entry)
         padding = [0] * (-len(row) % GROUP)
         rows += row.tolist() + padding
         offsets += (column - series.reach).tolist() + padding
-        values += entry[is_term].tolist() + padding
+        values += entry[row, column].tolist() + padding
         starts.append(len(rows))
     return np.array(starts), np.array(rows), np.array(offsets), np.array(values, float)
 
@@ -119,7 +188,4 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
                 value = columns[i, column + k]
                 for o in range(total.size):
                     total[o] += value * rows[i, k, o]
-        reach = rows.shape[1] // 2
-        for i in range(out.shape[0]):
-            for k in range(count):
-                out[i, at + k] = total[i * reach + first + k]
+        out[:, at : at + count] = total.reshape(out.shape[0], -1)[:, first : first + count]
