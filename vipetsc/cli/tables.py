@@ -72,10 +72,8 @@ def sweep_table(result: "SweepResult") -> str:
         ("ranks busy", ", ".join(f"{100 * share:.0f} %" for share in result.busy)),
     ]
     missing = sum(outcome is None for outcome in result.outcomes)
-    if missing:
-        rows.append(("missing", f"{missing}; stopped on request, the same command goes on"))
-    else:
-        rows.append(("leaves", str(result.folder / "ensemble.h5")))
+    left = ("missing", f"{missing}; stopped on request, the same command goes on")
+    rows.append(left if missing else ("leaves", str(result.folder / "ensemble.h5")))
     members = json.loads((result.folder / "index.json").read_text(encoding="utf-8"))["members"]
     failures = [row for row in members if row["status"] == "failed"]
     rows += [("failed", f"member {row['place']}: {row['reason']}") for row in failures[:10]]
