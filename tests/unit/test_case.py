@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from vipetsc.case import Case, CaseError, DesignCase, case_id
 from vipetsc.case.resolve import _round_down
+from vipetsc.lattice import Contact
 
 PLAIN = {
     "name": "plain",
@@ -50,6 +51,8 @@ def test_the_builtin_case_is_the_papers():
     assert model.speed == pytest.approx(428.7, abs=0.05)
     assert model.end == pytest.approx(2 * np.pi * 30 / 1023.2717 + 300 / 428.682, rel=1e-6)
     assert model.samples == 4421
+    assert model.scale == pytest.approx(2.42261e-3, rel=1e-5)
+    assert model.contact == Contact("hertz", case.contacts.stiffness, 0.7, "allow", 0.0)
 
 
 @pytest.mark.parametrize(("preset", "count", "sites"), [("four-band", 1, [100]), ("diatomic", 1, [150])])
@@ -148,6 +151,7 @@ def test_eta_stays_below_one():
         ("drive.cell=301", "drive.cell"),
         ("drive.mass=5", "drive.mass"),
         ("drive.wavenumber=4.0", "drive.wavenumber"),
+        ("drive.wavenumber=pi/0", "drive.wavenumber"),
         ("lattice.cells=1", "lattice.cells"),
         ("lattice.eta=1.5", "lattice.eta"),
         ("time.rtol=0", "time.rtol"),
@@ -162,6 +166,17 @@ def test_impossible_values_name_their_key(override, key):
     found = problems({"lattice": {"preset": "four-band"}}, override)
     assert key in found
     assert len(found) == 1 or override.startswith("drive.wavenumber")
+
+
+def test_what_does_not_fit_together_is_named():
+    assert "shorter than one sample" in problems({"time": {"end": 1e-5, "sample_interval": 1e-4}})["time.end"]
+    assert "give one of" in problems({"drive": {"frequency": 900.0, "band": 2}})["drive.band"]
+    springs = [{"start": 1, "end": 2, "stiffness": 1.0, "next_cell": True}]
+    found = problems({"lattice": {"cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}}})
+    assert list(found) == ["drive.frequency"]
+    assert "give one of" in found["drive.frequency"]
+    with pytest.raises(CaseError, match=r"must be above design\.eta\.first = 0\.1"):
+        DesignCase.builtin(["design.eta.last=0.05"])
 
 
 def test_a_cell_of_ones_own_is_checked_whole():

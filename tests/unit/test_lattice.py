@@ -150,6 +150,8 @@ def test_cell_problems_are_all_named():
     with pytest.raises(ValueError, match="must be positive"):
         UnitCell((1.0, 0.0), (Spring(0, 1, 1.0, True),), 0, 1)
     assert cell_problems(diatomic().masses, diatomic().springs, 0, 1) == []
+    endless = cell_problems((1.0, np.inf), (Spring(0, 1, np.inf, True),), 0, 1)
+    assert [key for key, _ in endless] == ["masses[2]", "springs[1].stiffness"]
 
 
 @pytest.mark.parametrize(("envelope", "peak"), [("paper", 2.0), ("hann", 1.0)])
@@ -179,6 +181,7 @@ def test_force_is_the_slope_of_the_potential(law):
     h = 1e-8
     slope = (contact.potential(w + h, d) - contact.potential(w - h, d)) / (2 * h)
     assert np.allclose(contact.force(w, d), slope, rtol=1e-6, atol=1e-9)
+    assert contact.exponent == {"hertz": 3 / 2, "bilinear": 1}[law]
     with pytest.raises(KeyError):
         Contact("glue", 1e6).force(w, d)
 

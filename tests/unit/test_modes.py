@@ -303,6 +303,8 @@ def test_case_round_trip_and_systems():
         NnmCase.from_table({"nnm": {"modes": [3]}})
     with pytest.raises(CaseError, match=r"nnm.own"):
         NnmCase.from_table({"nnm": {"system": "own"}})
+    with pytest.raises(CaseError, match="lowest energy above 0"):
+        NnmCase.from_table({"nnm": {"direction": "down"}})
 
 
 def test_systems_of_every_kind_of_case():

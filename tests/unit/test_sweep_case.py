@@ -93,6 +93,7 @@ def test_written_out_and_read_back_it_has_the_same_members():
         ("[sweep.drive]\namplitud = [1.0]", "did you mean drive.amplitude?"),
         ('[sweep]\nzip = [["drive.cycles"]]\n[sweep.drive]\namplitude = [1.0]', "not among the keys that vary"),
         ('[sweep]\nzip=[["drive.cycles","drive.amplitude"]]\n[sweep.drive]\namplitude=[1.0]\ncycles=[3,4]', "as many"),
+        ('[sweep]\nzip=[["drive.cycles"],["drive.cycles"]]\n[sweep.drive]\ncycles=[3,4]', "in one group only"),
     ],
 )
 def test_what_is_wrong_is_named_with_its_remedy(text, says):
