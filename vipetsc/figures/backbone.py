@@ -50,22 +50,18 @@ def backbone(paths: Sequence[Path]) -> Figure:
     for column, branch in enumerate(branches):
         upper = rows[0, column].subplots()
         frequency_energy(upper, branch)
-        panel_title(upper, f"({'abcdef'[column]}) {_heading(branch, len(branches) > 1)}")
+        # The reading is one of the paper's parameters only, not of a cell or system of one's own.
+        table = tomllib.loads(branch.attrs.get("case", ""))
+        custom = "cell" in table.get("lattice", {}) or table.get("nnm", {}).get("system") == "own"
+        law = table.get("contacts", {}).get("law", "") if len(branches) > 1 else ""
+        heading = branch.attrs["name"], law, "" if custom else table.get("lattice", {}).get("reading", "")
+        panel_title(upper, f"({'abcdef'[column]}) {', '.join(filter(None, heading))}")
         slope(rows[1, column].subplots(), branch)
         if has_flows:
             flow_differences(rows[2, column].subplots(), branch)
         if has_orbits:
             portraits(rows[-1, column], branch)
     return figure
-
-
-def _heading(branch: xr.Dataset, with_law: bool) -> str:
-    """Name, law and reading; the reading of the paper's parameters only, not of a cell or system of one's own."""
-    table = tomllib.loads(branch.attrs.get("case", ""))
-    lattice, law = table.get("lattice", {}), table.get("contacts", {}).get("law", "")
-    custom = "cell" in lattice or table.get("nnm", {}).get("system") == "own"
-    parts = branch.attrs["name"], law if with_law else "", "" if custom else lattice.get("reading", "")
-    return ", ".join(filter(None, parts))
 
 
 def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:

@@ -14,7 +14,6 @@ from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import label_outer, panel_title, percentile_norm
 from vipetsc.figures.study import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
-from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import member_folder
@@ -54,14 +53,14 @@ class EntropyCurve(NamedTuple):
         return cls(row[AMPLITUDE].values[valid], normalised, scale * error[valid], fit)
 
 
-def entropy(sweeps: Sweeps) -> Iterator[Drawing]:
+def entropy(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Entropy against amplitude for each reading, wavenumber and average: linear above, log-log with fits below."""
     for ensemble, rows, stem in _facets(sweeps):
         for average in _averages(rows):
             yield f"{stem}-{average}", partial(_entropy, ensemble, rows, average)
 
 
-def entropy_all(sweeps: Sweeps) -> Iterator[Drawing]:
+def entropy_all(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
     for ensemble, rows, stem in _facets(sweeps, ("reading",)):
         if len({_driven_wavenumber(row, ensemble) for row in rows}) > 1:
@@ -69,7 +68,7 @@ def entropy_all(sweeps: Sweeps) -> Iterator[Drawing]:
                 yield f"{stem}-{average}", partial(_entropy_all, ensemble, rows, average)
 
 
-def entropy_history(sweeps: Sweeps) -> Iterator[Drawing]:
+def entropy_history(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """H(t) against amplitude as an image for every configuration of a reading and wavenumber."""
     for ensemble, rows, stem in _facets(sweeps, needs="entropy/history"):
         shown = [row for row in rows if np.isfinite(row["entropy/history"]).any()]

@@ -18,7 +18,6 @@ from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.panels import empty_figure, note, panel_title, recorded_sites
 from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
-from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer_curves import Curve, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site
 
@@ -112,7 +111,7 @@ class ContactMotion(NamedTuple):
             return cls(member.case, u, v, float(member.analysis["ibtet"]))
 
 
-def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
+def phase_regimes(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Trajectories of one embedded contact cell, for every law and reading, beside the transfer curve."""
     members = []
     for member in transfer_members(sweeps):

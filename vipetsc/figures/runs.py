@@ -108,9 +108,7 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
     index = site.astype(int) - 1
     loss, episodes = np.bincount(index, np.nan_to_num(lost), len(sites)), np.bincount(index, minlength=len(sites))
-    bars.barh(number, loss, 0.6, color=style.VERMILION)
-    for at, energy, count in zip(number, loss, episodes, strict=True):
-        panels.note(bars, f"{count}", (max(energy, 0), at), (2, 0), va="center")
+    bars.bar_label(bars.barh(number, loss, 0.6, color=style.VERMILION), episodes, padding=2, fontsize=6.5)
     bars.set(xlabel="Energy lost (J)", xlim=(0, 1.25 * max(loss.max(), 1e-300)))
     bars.tick_params(left=False)
     panel_title(bars, "(b) Loss, episodes")

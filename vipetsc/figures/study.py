@@ -153,7 +153,8 @@ def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
                 wave = Wave.of(case)
                 others = [name for name in axes(ensemble) if name not in (AMPLITUDE, "reading", "wavenumber", "sites")]
                 title = [f"{case.lattice.reading.capitalize()} reading", *(_in_words(first, n, " ") for n in others)]
-                title += [counted(len(sites_of(case)), "site"), *[f"κ* = {in_pi(wave.wavenumber)}"][: wave.band]]
+                title += [counted(len(sites_of(case)), "site")]
+                title += [f"κ* = {in_pi(wave.wavenumber)}"] if wave.band else []
                 yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), ", ".join(title), runs, wave)
 
 

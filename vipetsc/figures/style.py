@@ -98,7 +98,7 @@ def draw_each(
     note: str = "",
     keep: Callable[[Path], bool] = lambda path: False,
 ) -> list[Path]:
-    """Draw those of ``drawings`` whose number is among ``turns``, into ``target/<stem>.<format>``.
+    """Draw those of ``drawings`` whose number is among ``turns``, into ``target/<stem>.<format>``; returns the files.
 
     Parameters
     ----------
@@ -109,11 +109,6 @@ def draw_each(
         A line of text below every picture.
     keep
         Whether the file at a path is to stay as it is.
-
-    Returns
-    -------
-    list of Path
-        The files written, each complete.
     """
     written: list[Path] = []
     turn = next(turns, None)

@@ -15,7 +15,6 @@ from vipetsc.case import Case
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import KAPPA, panel_title
 from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, transfer_members
-from vipetsc.figures.style import Drawing
 from vipetsc.figures.transfer_curves import Curve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
@@ -30,7 +29,7 @@ LARGEST_ERROR = 0.01
 LEAST_SHARE = 1e-3  # of the largest total: the error is not judged below
 
 
-def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
+def transfer(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """For every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for member in transfer_members(sweeps):
         if "velocity" in member.run and all(name in member.analysis for name in ("kinetic_energy", *SEGMENTS)):
@@ -126,7 +125,7 @@ def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
     inset.set_xlabel("s", fontsize=5.5, labelpad=-4, loc="right")
 
 
-def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
+def transfer_dispersions(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Every reading and configuration: laws in rows, amplitudes in columns."""
     members = ((m.case, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis)
     for name, group in grouped(members, lambda pair: Labels.of(pair[0]).page_stem).items():
@@ -156,7 +155,7 @@ def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
     return figure
 
 
-def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
+def band_energies(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Energies of all parts and their sum over time for every whole member; mean shares for every sweep."""
     for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and member.analysis.sizes["time"] > 1:

@@ -13,7 +13,6 @@ from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.panels import label_outer, panel_title, shade_regions
 from vipetsc.figures.study import AMPLITUDE, Labels, Sweeps, grouped, sites_of
-from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves
 
@@ -60,7 +59,7 @@ def columns_of_laws(
     return figure
 
 
-def ibtet(sweeps: Sweeps) -> Iterator[Drawing]:
+def ibtet(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """One page a reading: laws in columns, linear and log-log scales in rows."""
     for reading, of_reading in grouped(transfer_curves(sweeps), lambda curve: curve.case.lattice.reading).items():
         yield reading, partial(_page, reading, of_reading)
@@ -112,7 +111,7 @@ def _draw(axes: Axes, shown: Sequence[Curve], kinds: dict[str, tuple[str, str]],
             axes.axhline(float(curve.data["floor"]), color=colour, lw=0.6, ls=(0, (4, 3)), zorder=1)
 
 
-def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
+def ibtet_backbone(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Every reading and configuration of ``backbone.h5``, laws in columns; one made of another sweep is passed over."""
     for ensemble in sweeps:
         path = Path(ensemble.attrs["folder"]) / "backbone.h5"
