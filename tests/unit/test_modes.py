@@ -417,6 +417,11 @@ def test_xarray_opens_the_branch(short_branch, tmp_path):
         assert data.frequency.attrs["units"] == "Hz"
         assert data.initial.dims == ("point", "dof")
         assert float(data.energy[0]) == short_branch.points[0].energy
+    last = short_branch.points[-1]
+    with xarray.open_dataset(tmp_path / "branch-out-of-phase.h5", engine="h5netcdf", group="orbits") as orbits:
+        assert np.array_equal(orbits.displacement[0, 0], last.x)
+        assert np.all(orbits.velocity[0, 0] == 0)
+        assert (float(orbits.energy[0]), int(orbits.number[0])) == (last.energy, last.index)
 
 
 def test_picture_from_the_file(short_branch, tmp_path):

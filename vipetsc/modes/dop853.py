@@ -16,6 +16,8 @@ from vipetsc.modes.flow import Flow, FlowError
 
 # Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed.
 DONE, STUCK, FULL = range(3)
+# Errors allowed per step, relative to the size of the orbit and of each variation.
+RTOL, RTOL_SENSITIVITY = 1e-13, 1e-11
 # Contact changes of one arc beyond which a flow gives up.
 MOST_CHANGES = 2000
 STAGES = 12
@@ -58,13 +60,10 @@ E3[[0, 8, 11]] -= _THIRD
 class Stepper(NamedTuple):
     """What a step reads and writes: rates at its ``stages`` (STAGES, 2n, 1 + m), state and rates at its end.
 
-    Errors allowed per step are relative to the size of the orbit and of each variation. Velocities count as
-    displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian.
+    Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian.
     """
 
     step: flow.Step
-    rtol: float
-    rtol_sensitivity: float
     omega_ref: float
     stages: np.ndarray
     end: np.ndarray
@@ -91,7 +90,7 @@ def _scaled_error(stepper: Stepper, y: np.ndarray, h: float) -> float:
             third = max(third, abs(e3) * unit)
             scale = max(scale, abs(out[i, j]) * unit, abs(y[i, j]) * unit)
         if fifth > 0.0:
-            allowed = (stepper.rtol if j == 0 else stepper.rtol_sensitivity) * scale
+            allowed = (RTOL if j == 0 else RTOL_SENSITIVITY) * scale
             error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / allowed)
     return error
 
@@ -173,8 +172,8 @@ class Dop853Flow(Flow):
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
         events, stages = np.empty((MOST_CHANGES, 4)), np.empty((STAGES, *y.shape))
-        allowed = self.rtol, self.rtol_sensitivity, self.omega_ref(period)
-        stepper = Stepper(flow.begin(self.compiled, y), *allowed, stages, np.empty_like(y), np.empty_like(y))
+        step, omega = flow.begin(self.compiled, y), self.omega_ref(period)
+        stepper = Stepper(step, omega, stages, np.empty_like(y), np.empty_like(y))
         outcome, count, closed = _flow(stepper, y, duration, events)
         if outcome != DONE:
             why = {STUCK: "the step became too small", FULL: f"more than {MOST_CHANGES} contact changes"}

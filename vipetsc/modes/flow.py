@@ -1,8 +1,7 @@
 """What every flow shares: arcs of orbits, and the system in compiled form with its rates and contact changes.
 
-The set of closed contacts is frozen inside a step, so the force is smooth there; after each step the gap of every
-contact is searched, and the step is repeated so that it ends on the first change. Contact forces are continuous,
-hence so are the variational equations' solutions (saltation is the identity, see the package's docstring).
+The set of closed contacts is frozen inside a step, so that the force is smooth there. After each step the gap of every
+contact is searched, and the step is repeated so that it ends on the first change (see the package's docstring).
 """
 
 from dataclasses import dataclass, replace
@@ -174,14 +173,9 @@ class Arc:
 
 
 class Flow:
-    """What every flow offers; a subclass gives its ``name``, ``_advance`` and allowed errors.
-
-    ``rtol`` is the error per step relative to the orbit's size, ``rtol_sensitivity`` that of the sensitivities.
-    """
+    """What every flow offers; a subclass gives its ``name`` and ``_advance``."""
 
     name: ClassVar[str]
-    rtol: ClassVar[float] = 1e-13
-    rtol_sensitivity: ClassVar[float] = 1e-11
 
     def __init__(self, system: System) -> None:
         self.system = system

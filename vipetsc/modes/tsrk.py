@@ -13,6 +13,9 @@ from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
 from vipetsc.modes.flow import Flow, FlowError
 from vipetsc.modes.system import System
 
+# Errors allowed per step, relative to the size of the orbit and of each variation.
+RTOL, RTOL_SENSITIVITY = 1e-13, 1e-10
+
 
 class Tsrk(Flow):
     """PETSc TSRK of type 8vr; options begin with ``-nnm_basic_`` for steps, with ``-nnm_none_`` for landings.
@@ -22,7 +25,6 @@ class Tsrk(Flow):
     """
 
     name = "tsrk"
-    rtol_sensitivity = 1e-10
 
     def __init__(self, system: System) -> None:
         super().__init__(system)
@@ -75,9 +77,9 @@ class Tsrk(Flow):
         omega = self.omega_ref(period)
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / omega)
         unit = np.repeat([1.0, omega], n)
-        absolute, relative = np.empty(self._shape), np.full(self._shape, self.rtol_sensitivity)
-        absolute[:, 0], relative[:, 0] = self.rtol * size * unit, self.rtol
-        absolute[:, 1:] = self.rtol_sensitivity * unit[:, None] / unit[None, :]
+        absolute, relative = np.empty(self._shape), np.full(self._shape, RTOL_SENSITIVITY)
+        absolute[:, 0], relative[:, 0] = RTOL * size * unit, RTOL
+        absolute[:, 1:] = RTOL_SENSITIVITY * unit[:, None] / unit[None, :]
         rtol, atol = (PETSc.Vec().createWithArray(a.ravel(), comm=PETSc.COMM_SELF) for a in (relative, absolute))
         self._adaptive.setTolerances(rtol=rtol, atol=atol)
 
