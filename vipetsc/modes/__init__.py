@@ -12,9 +12,9 @@ v(T/2; u0, 0) = 0. If f is odd the orbit u(t + T/2) = -u(t) passes the centre u 
 
 The whole period is there for comparison: its condition is 1e6 times worse. n equations for n + 1 unknowns: a branch.
 
-**Variational equations.** S' = [[0, I], [-M^-1 (K + f'(u)), 0]] S is integrated beside the orbit (``dop853`` of
-Hairer et al. 1993; ``tsrk``: PETSc; ``newmark``: the paper's rule). At a contact change h(u) = |w| - D = 0
-the slope f' jumps, and S passes it with the saltation matrix (Leine and Nijmeijer 2004, ch. 7)
+**Variational equations.** S' = [[0, I], [-M^-1 (K + f'(u)), 0]] S is integrated beside the orbit (``flow``; ``dop853``:
+Dormand and Prince's pair, Hairer et al. 1993; ``tsrk``: PETSc; ``newmark``: the paper's rule). At a contact change
+h(u) = |w| - D = 0 the slope f' jumps, and S passes it with the saltation matrix (Leine and Nijmeijer 2004, ch. 7)
 
     S+ = (I + (g+ - g-) grad h^T / (grad h^T g-)) S-,
 
@@ -34,12 +34,12 @@ that an arclength means something) the next one solves H(xi) = 0 and t . (xi - x
 SNES. The tangent is the null vector of dH/dxi. Charts scale: ``relative`` (gaps over the clearance), ``logarithmic``,
 ``grazing`` (a root of w - D in place of w: an orbit that starts on its largest |w| depends on w - D through one).
 Narrow tongues of internal resonances lie close together, and a residual cannot tell a jump from one arc to another.
-``Guards`` therefore bound, per step, the change of asinh(c) of each half-trace, the number of contacts
-that appear or go, the correction over the step and the turn of the tangent; ``audit`` looks for jumps afterwards and
-for a branch that retraces itself.
+``Guards`` therefore bound, per step, the change of asinh(c) of each half-trace, the number of contacts that appear or
+go, the correction over the step and the turn of the tangent; ``audit`` looks for jumps afterwards and for a branch that
+retraces itself, and compares flows.
 
-**Files.** ``follow`` shares the branches of a case over ranks, ``branch`` writes and reads them, tells the
-regions of a backbone and fits their power laws, ``point`` looks closer at single orbits.
+**Files.** ``follow`` shares the branches of a case over ranks; ``branch`` writes and reads them, tells the regions of
+a backbone and fits their power laws; ``point`` is one orbit, with its samples and its resonance.
 
 A loop of one's own (importing the package loads PETSc)::
 

@@ -5,6 +5,7 @@ encodes (x, period) as xi, decodes it, and gives d(x, period)/d xi (n + 1, n + 1
 """
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from vipetsc.modes.system import System
 
@@ -35,10 +36,7 @@ class Relative:
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
         """d(x, period)/d xi."""
-        d = np.zeros((len(xi), len(xi)))
-        d[:-1, :-1] = self.inverse
-        d[-1, -1] = self.period
-        return d
+        return block_diag(self.inverse, self.period)
 
 
 class Logarithmic:
