@@ -65,16 +65,14 @@ class Chain:
         """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; needs little for <= 1e6."""
         n, d = self.cells, self.cell.dofs
         rows, columns, values = [], [], []
-        index = np.arange(n)
+        index, every = np.arange(n), np.ones(n, bool)
         for mass, offset, other, stiffness in self.cell.couplings():
             neighbour = index + offset
-            inside = (neighbour >= 0) & (neighbour < n)
-            if self.ends == "periodic":
-                neighbour, inside = neighbour % n, np.ones(n, bool)
-            held = np.ones(n, bool) if self.ends == "fixed" else inside
+            inside = every if self.ends == "periodic" else (neighbour >= 0) & (neighbour < n)
+            held = every if self.ends == "fixed" else inside
             here = index * d + mass
             rows += [here[held], here[inside]]
-            columns += [here[held], neighbour[inside] * d + other]
+            columns += [here[held], neighbour[inside] % n * d + other]
             values += [np.full(held.sum(), stiffness), np.full(inside.sum(), -stiffness)]
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         return coo_matrix(entries, shape=(n * d, n * d)).tocsc()
