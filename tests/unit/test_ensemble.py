@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import vipetsc
 from vipetsc.case import Case, Sweep, case_id
+from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.lattice import four_band
 from vipetsc.studies.ensemble import fit_curve
@@ -100,3 +102,15 @@ def test_a_linear_wave_arrives_with_its_host():
     assert wave["envelope"].values == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
     expected = case.drive.amplitude * wave["envelope"].values[[19, 6, 2]] / np.asarray(case.contacts.clearance)
     assert reached(wave, case) == pytest.approx(expected)
+
+
+def test_a_linear_wave_of_another_version_is_made_again(tmp_path, monkeypatch):
+    case, store = Case.builtin(), MemberStore(tmp_path)
+    assert store.wave(case) is None
+    folder = store.linear_folder(case)
+    folder.mkdir(parents=True)
+    values = {"cell": [1, 2], "envelope": ("cell", [1.0, 2.0]), "arrival": ("cell", [0.1, 0.2])}
+    write_netcdf(folder / "wave.h5", xr.Dataset(values, attrs={"vipetsc_version": vipetsc.__version__}))
+    assert store.wave(case, current=True)["arrival"].values.tolist() == [0.1, 0.2]
+    monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
+    assert store.wave(case) is not None and store.wave(case, current=True) is None
