@@ -493,7 +493,8 @@ def test_a_low_run_with_contacts_is_not_linear(tmp_path):
 # Transfer to higher bands
 
 
-def put_transfer(root, top, floor=1e-4, one=0.1):
+def put_transfer(root, top, floor=1e-4, one=0.1, slow=0.0):
+    """Transfer that sets in at 17 N, below ``slow`` N with a fiftieth of its size, and decays."""
     table = {
         "lattice": {"preset": "four-band"},
         "drive": {"band": 2, "at": "max-group-velocity"},
@@ -508,6 +509,7 @@ def put_transfer(root, top, floor=1e-4, one=0.1):
 
     def content(case):
         a, highest = case.drive.amplitude, top if len(case.contacts.sites) > 1 else one
+        highest *= 0.02 if a < slow else 1.0
         return {"ibtet": floor + (highest * (a / 17.0) ** -1.5 if a > 17.0 else 0.0)}
 
     return put_sweep(root / "interband", table, content, lambda case: int(case.drive.amplitude > 17.0))
@@ -530,6 +532,13 @@ def test_transfer_as_the_paper_has_it_holds(tmp_path):
     assert onset.value["floor, hertz"] == pytest.approx(1e-4)
     assert single.value["correlation of 15 and 30 cycles, hertz"] == pytest.approx(1.0)
     assert single.uncertainty["amplitudes, hertz"] == 17
+
+
+def test_an_onset_ends_at_half_the_maximum(tmp_path):
+    ratio = "ratio of amplitudes from the floor to half the maximum, hertz"
+    for folder, slow, expected in (("a", 0.0, 10**0.25), ("b", 90.0, 10.0)):
+        put_transfer(tmp_path / folder, 0.35, slow=slow)
+        assert measure("C11", tmp_path / folder).value[ratio] == pytest.approx(expected, rel=1e-5)
 
 
 def test_transfer_of_another_size_holds_in_part(tmp_path):
