@@ -1,7 +1,5 @@
 """The propagator's parts alone: stencil, series and impulses against the matrix exponential; collocation; grouping."""
 
-from __future__ import annotations
-
 from mpi4py import MPI
 
 import numpy as np
@@ -11,7 +9,9 @@ from scipy.linalg import expm
 
 from tests.conftest import small_case
 from vipetsc.contact.law import CLOSED, Contacts, ForceLaw, create_contacts
+from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.advance import FAILED
 from vipetsc.dynamics.propagator.collocation import (
     EXIT,
     HISTORY,
@@ -28,6 +28,7 @@ from vipetsc.dynamics.propagator.collocation import (
     error_ratio,
     update_taylor,
 )
+from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.forces import create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.free_motion import apply_impulses, evaluate, expand_free_motion, shift
 from vipetsc.dynamics.propagator.series import StepSeries
@@ -137,6 +138,18 @@ def test_clusters_that_cannot_touch_are_left_alone():
         state[resonator, 11] = reached
         fetch(layout, halo, state)
         assert [c for c in range(4) if expand_free_motion(tables, c, halo.record.columns, taylor)] == expected
+
+
+def test_contacts_that_cannot_be_followed_end_the_run():
+    model = small_case(contacts={"sites": [6, 12]}).model()
+    engine = Propagator(model, Layout.of(model, MPI.COMM_SELF))
+    assert engine.advance(3 * model.sample_interval)
+    assert (engine.steps, engine.time) == (3, 3 * model.sample_interval)
+    engine._events = iter([(FAILED, 2, 0.0125)])
+    with pytest.raises(StalledError, match=r"the contacts of sites 2 at 0.0125 s"):
+        engine.advance(4 * model.sample_interval)
+    assert (engine.steps, engine.time) == (3, 3 * model.sample_interval)
+    engine.destroy()
 
 
 def test_dofs_within_reach_are_grouped_across_a_periodic_end():

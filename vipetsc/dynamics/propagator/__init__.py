@@ -22,7 +22,7 @@ with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k (k - 1) |a_k| boun
 one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and such steps
 converge to the first one.
 
-**3. Forces** (``collocation``, ``substep``). An impulse on DoF l moves DoF i by G_il(s) = sum_m g_ilm s^(2m+1), odd
+**3. Forces** (``collocation``). An impulse on DoF l moves DoF i by G_il(s) = sum_m g_ilm s^(2m+1), odd
 coefficients as in 1. While forces act,
 
     x_i(s) = a_i(s) + H sum_l integral_0^s G_il(s - z) F_l(z, x_l, x'_l) dz,
@@ -45,10 +45,11 @@ the moments mu_k = integral of F (1 - s)^k dt over the step,
 
 in the cells within r. Nothing else of the forces' history is needed.
 
-**6. Clusters and ranks** (``cluster``, ``forces``, ``halo``). DoFs within r cells of one another must be solved for
-together and form a cluster. Every rank that owns a cell within r of a cluster advances it, from the same numbers to the
-same bits, so that one exchange of ``HaloRegions`` a step is all that ranks must say to each other. ``engine`` weighs a
-step's cost against the size of its clusters.
+**6. Clusters and ranks** (``forces``, ``stencil``). DoFs within r cells of one another must be solved for together and
+form a cluster. Every rank that owns a cell within r of a cluster advances it, from the same numbers to the same bits,
+so that one exchange of ``HaloRegions`` a step is all that ranks must say to each other. ``engine`` weighs a step's cost
+against the size of its clusters. Its loop over the steps is compiled as a whole, and enters Python where a state is
+complete, ranks exchange cells, or sites switch.
 
 References
 ----------

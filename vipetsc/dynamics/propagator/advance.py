@@ -130,11 +130,8 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     change = first_change(cluster.contacts, cluster.site_motion, trial.site_motion, cluster.interval * substep.length)
     if change.share > 1.0:
         return substep, False
-    separates = (
-        cluster.contacts.law.exponent != 1.0
-        and abs(cluster.contacts.sites[change.site].mode) == CLOSED
-        and change.function == 0
-    )
+    mode = cluster.contacts.sites[change.site].mode
+    separates = cluster.contacts.law.exponent != 1.0 and abs(mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
         # The force begins and ends as a root: one substep for each.
         state.length = 0.5 * change.share * substep.length

@@ -78,15 +78,12 @@ class StepSeries:
         """Cells each way beyond which the propagator's entries sum to less than the tolerance."""
         return next(r for r in range(1, self._width + 1) if self._beyond(r) <= self.tolerance / 2)
 
-    @property
-    def _middle(self) -> slice:
-        return slice(self._width - self.reach, self._width + self.reach + 1)
-
     @cached_property
     def truncation(self) -> float:
         """Bound on the relative error of one step: entries left out and the remainder of the series."""
-        small = np.where(self.interior() == 0.0, self._share[:, :, self._middle], 0.0).sum(axis=(1, 2)).max()
-        return self._beyond(self.reach) + float(small) + self._remainder(self.terms)
+        share = self._share[:, :, self._width - self.reach : self._width + self.reach + 1]
+        small = float(np.where(self.interior() == 0.0, share, 0.0).sum(axis=(1, 2)).max())
+        return self._beyond(self.reach) + small + self._remainder(self.terms)
 
     def _powers(self, cell: int, width: int, free_left: bool = False, free_right: bool = False) -> np.ndarray:
         """Rows (dof, term, dof, width) of the masses of ``cell`` on a chain of ``width`` cells.
@@ -150,8 +147,8 @@ class StepSeries:
 
     def interior(self) -> np.ndarray:
         """P's rows (2 dof, 2 dof, 2 reach + 1) of a cell at least ``reach`` from both ends; small entries are zero."""
-        is_small = self._share <= 1e-3 * self.tolerance
-        return np.where(is_small, 0.0, self.stencil(self._interior))[:, :, self._middle]
+        entries = np.where(self._share > 1e-3 * self.tolerance, self.stencil(self._interior), 0.0)
+        return entries[:, :, self._width - self.reach : self._width + self.reach + 1]
 
     def end(self, right: bool) -> np.ndarray:
         """P's rows (cell, 2 dof, 2 dof, 2 reach) of the first or last ``reach`` cells, over twice as many cells."""
