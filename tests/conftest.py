@@ -74,6 +74,10 @@ def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]
         assert values.tolist() == second[name].tolist() if texts else values.tobytes() == second[name].tobytes(), name
 
 
+# One rank shares the cores with other tests; mpirun has them to itself.
+alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, marks=pytest.mark.mpirun)])
+
+
 class StopAt(StopRequest):
     """A request that comes at the n-th look."""
 

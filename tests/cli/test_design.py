@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray
 
-from tests.conftest import assert_same_bits, datasets
+from tests.conftest import alone_and_on_two_ranks, assert_same_bits, datasets
 from vipetsc.case import Case, CaseError
 from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
@@ -34,7 +34,7 @@ def numbers(path):
 
 
 @pytest.mark.mpirun
-def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, case, tmp_path):
+def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, in_process, case, tmp_path):
     out = tmp_path / "out"
     done = vipetsc(0, "design", case, "--out", out)
     assert done.returncode == 0, done.stderr
@@ -62,7 +62,7 @@ def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, case, tmp_path
         np.testing.assert_allclose((best.optimum_amplitude**2).sum("dof"), 1)
     assert DesignCase.load(out / "case.toml").to_toml() == (out / "case.toml").read_text()
 
-    again = vipetsc(0, "design", case, "--out", out)
+    again = in_process("design", case, "--out", out)
     assert again.returncode == 2
     assert "--force" in again.stderr
     before = numbers(out / "design.h5")
@@ -123,8 +123,7 @@ def test_what_is_wrong_with_a_search_is_named(change, message):
     assert message in str(error.value)
 
 
-@pytest.mark.mpirun
-@pytest.mark.parametrize("ranks", [0, 2])
+@alone_and_on_two_ranks
 def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
     """Everything wrong is said at once, once."""
     wrong = ("--set", "design.eta.last=1.5", "--set", "design.lambda.coutn=3", "--set", "design.wavenumbers=2")

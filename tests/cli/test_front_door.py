@@ -8,11 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import assert_same_bits, clean_environment, datasets
+from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets
+from vipetsc.case import Case
+from vipetsc.dynamics import simulate
 
 SMALL = """
 [lattice]
@@ -37,8 +40,7 @@ def case(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.mpirun
-@pytest.mark.parametrize("ranks", [0, 2])
+@alone_and_on_two_ranks
 def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, case, tmp_path, ranks):
     ended = vipetsc(ranks, "run", case, "--out", tmp_path / "out")
     assert ended.returncode == 0, ended.stderr
@@ -68,8 +70,7 @@ def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
     assert forced.returncode == 0, forced.stderr
 
 
-@pytest.mark.mpirun
-@pytest.mark.parametrize("ranks", [0, 2])
+@alone_and_on_two_ranks
 def test_everything_wrong_with_a_case_is_said_at_once(vipetsc, tmp_path, ranks):
     path = tmp_path / "bad.toml"
     path.write_text(
@@ -183,8 +184,7 @@ def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["statistics"]["method"] == "5dp"
 
 
-@pytest.mark.mpirun
-@pytest.mark.parametrize("ranks", [0, 2])
+@alone_and_on_two_ranks
 def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_path, ranks):
     """Explicit Euler without step control feeds energy in: the guard ends the run and keeps what is good."""
     out = tmp_path / "out"
@@ -220,12 +220,17 @@ def await_checkpoints(process: subprocess.Popen, out: Path, ranks: int, number: 
 LONG = ("--set", "time.end=1.0")
 
 
-@pytest.mark.mpirun
-@pytest.mark.parametrize("ranks", [0, 2])
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """The long run that nothing stops."""
+    folder = tmp_path_factory.mktemp("whole")
+    simulate(Case.from_table(tomllib.loads(SMALL), ["time.end=1.0"]), folder / "run")
+    return folder / "run"
+
+
+@alone_and_on_two_ranks
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, number):
-    whole = vipetsc(ranks, "run", case, "--out", tmp_path / "whole", *QUICK, *LONG)
-    assert whole.returncode == 0, whole.stderr
+def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, in_process, case, whole, tmp_path, ranks, number):
     out = tmp_path / "out"
     process = begin(case, out, ranks, *LONG)
     await_checkpoints(process, out, ranks, 2)
@@ -236,20 +241,20 @@ def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, n
     process.communicate(timeout=60)
     assert process.returncode != 0
     assert not (out / "run.h5").exists()
-    refused = vipetsc(ranks, "run", case, "--out", out, *QUICK, *LONG)
+    refused = in_process("run", case, "--out", out, *QUICK, *LONG)
     assert refused.returncode == 2
     assert "--resume" in refused.stderr
-    other = vipetsc(ranks, "run", case, "--out", out, *QUICK, *LONG, "--set", "drive.amplitude=20.0", "--resume")
+    other = in_process("run", case, "--out", out, *QUICK, *LONG, "--set", "drive.amplitude=20.0", "--resume")
     assert other.returncode == 2
     assert "amplitude = 20.0" in other.stderr
     resumed = vipetsc(ranks, "run", case, "--out", out, *QUICK, *LONG, "--resume")
     assert resumed.returncode == 0, resumed.stderr
-    assert_same_bits(datasets(tmp_path / "whole" / "run.h5"), datasets(out / "run.h5"))
+    assert_same_bits(datasets(whole / "run.h5"), datasets(out / "run.h5"))
     assert not (out / "parts").exists()
 
 
 @pytest.mark.mpirun
-def test_one_killed_rank_ends_all_and_loses_nothing(vipetsc, case, tmp_path):
+def test_one_killed_rank_ends_all_and_loses_nothing(vipetsc, in_process, case, tmp_path):
     out = tmp_path / "out"
     process = begin(case, out, 2, *LONG)
     await_checkpoints(process, out, 2, 1)
@@ -257,9 +262,15 @@ def test_one_killed_rank_ends_all_and_loses_nothing(vipetsc, case, tmp_path):
     os.kill(int(children[-1]), signal.SIGKILL)
     process.communicate(timeout=60)
     assert process.returncode != 0
-    wrong = vipetsc(0, "run", case, "--out", out, *QUICK, *LONG, "--resume")
+    wrong = in_process("run", case, "--out", out, *QUICK, *LONG, "--resume")
     assert wrong.returncode == 2
     assert "mpirun -n 2" in wrong.stderr
+    refused = vipetsc(2, "run", case, "--out", out, *QUICK, *LONG)
+    assert refused.returncode == 2
+    assert "--resume" in refused.stderr
+    other = vipetsc(2, "run", case, "--out", out, *QUICK, *LONG, "--set", "drive.amplitude=20.0", "--resume")
+    assert other.returncode == 2
+    assert "amplitude = 20.0" in other.stderr
     resumed = vipetsc(2, "run", case, "--out", out, *QUICK, *LONG, "--resume")
     assert resumed.returncode == 0, resumed.stderr
 
@@ -276,10 +287,10 @@ sys.exit(main(sys.argv[2:]))
 @pytest.mark.mpirun
 @pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize("limit", [300_000, 440_000])
-def test_a_disk_that_fills_ends_all_and_loses_nothing(vipetsc, case, tmp_path, ranks, limit):
+def test_a_disk_that_fills_ends_all_and_loses_nothing(vipetsc, in_process, case, tmp_path, ranks, limit):
     """No file may grow beyond the limit: the first part does not fit, or the parts do and run.h5 does not."""
     out = tmp_path / "out"
-    first = vipetsc(ranks, "run", case, "--out", out, *QUICK)
+    first = in_process("run", case, "--out", out, *QUICK)
     assert first.returncode == 0, first.stderr
     before = (out / "run.h5").read_bytes()
     script = tmp_path / "full.py"
@@ -291,7 +302,8 @@ def test_a_disk_that_fills_ends_all_and_loses_nothing(vipetsc, case, tmp_path, r
     assert "Traceback" not in full.stderr
     assert "File too large" in full.stderr
     assert (out / "run.h5").read_bytes() == before
-    resumed = vipetsc(ranks, "run", case, "--out", out, "--resume", *QUICK)
+    resume = ("run", case, "--out", out, "--resume", *QUICK)
+    resumed = in_process(*resume) if ranks == 1 else vipetsc(ranks, *resume)
     assert resumed.returncode == 0, resumed.stderr
     assert (out / "run.h5").stat().st_size == len(before)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import h5py
 import pytest
 
-from tests.conftest import assert_same_bits, datasets
+from tests.conftest import alone_and_on_two_ranks, assert_same_bits, datasets
 
 CASE = """
 [lattice]
@@ -76,8 +76,7 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
 
 
-@pytest.mark.mpirun
-@pytest.mark.parametrize("ranks", [0, 2])
+@alone_and_on_two_ranks
 def test_a_file_that_is_no_branch_is_refused_on_all_ranks(vipetsc, tmp_path, ranks):
     with h5py.File(tmp_path / "branch-x.h5", "w") as file:
         file["energy"] = [1.0]

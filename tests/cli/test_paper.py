@@ -19,29 +19,23 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.tiny_paper import DRAWN, tiny_plan
+from tests.cli.tiny_paper import DRAWN, drawing, tiny_plan
 from tests.conftest import clean_environment
 from vipetsc.paper.figures import PAPER_FIGURES
+from vipetsc.paper.make import make_paper
 from vipetsc.paper.plan import CLAIMS, DONE, paper_plan
 
 ROOT = Path(__file__).parents[2]
 
 
-def command(ranks: int, folder: Path, *ids: str) -> list[str]:
-    launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
-    return [*launcher, sys.executable, "-m", "tests.cli.tiny_paper", str(folder), *ids]
+def command(folder: Path) -> list[str]:
+    return ["mpirun", "--oversubscribe", "-n", "2", sys.executable, "-m", "tests.cli.tiny_paper", str(folder)]
 
 
-def make(ranks: int, folder: Path, *ids: str) -> dict:
-    """What the tiny paper says it did."""
+def make(folder: Path) -> dict:
+    """What the tiny paper says it did on two ranks."""
     ended = subprocess.run(
-        command(ranks, folder, *ids),
-        cwd=ROOT,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
+        command(folder), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=300, check=False
     )
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout.splitlines()[-1])
@@ -56,7 +50,7 @@ def killed(tmp_path_factory) -> Path:
     """The tiny paper on two ranks, killed in the middle and gone on with."""
     folder = tmp_path_factory.mktemp("paper") / "out"
     process = subprocess.Popen(
-        command(2, folder), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        command(folder), cwd=ROOT, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         start_new_session=True,
     )  # fmt: skip
     deadline = time.monotonic() + 200
@@ -67,7 +61,7 @@ def killed(tmp_path_factory) -> Path:
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not (folder / "claims.json").exists()
-    done = make(2, folder)
+    done = make(folder)
     assert done["complete"]
     assert "interband" in done["made"]
     assert "scattering-amplitudes" not in done["made"]
@@ -76,8 +70,8 @@ def killed(tmp_path_factory) -> Path:
 
 @pytest.mark.mpirun
 def test_one_rank_makes_the_same_claims_as_two_that_were_killed(killed, tmp_path):
-    done = make(0, tmp_path / "out", "C8", "C11")
-    assert set(done["made"]) == {"scattering", "interband"}
+    done = make_paper(drawing(tiny_plan()), tmp_path / "out", only=["C8", "C11"])
+    assert set(done.made) == {"scattering", "interband"}
     claims = (killed / "claims.json").read_bytes()
     assert (tmp_path / "out" / "claims.json").read_bytes() == claims
     assert {row["verdict"] for row in json.loads(claims)} == {"holds"}
@@ -86,10 +80,10 @@ def test_one_rank_makes_the_same_claims_as_two_that_were_killed(killed, tmp_path
 @pytest.mark.mpirun
 def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(killed):
     before = {path: path.stat().st_mtime_ns for path in killed.rglob("*") if path.is_file()}
-    assert make(2, killed) == {"made": [], "drawn": 0, "complete": True}
+    assert make(killed) == {"made": [], "drawn": 0, "complete": True}
     assert {path: path.stat().st_mtime_ns for path in killed.rglob("*") if path.is_file()} == before
     (killed / "figures" / "fig10-reduced-model-printed.pdf").unlink()
-    assert make(0, killed)["drawn"] == 2
+    assert len(make_paper(drawing(tiny_plan()), killed).drawn) == 2
 
 
 @pytest.mark.mpirun
@@ -145,7 +139,7 @@ def test_list_says_what_is_left(in_process, tmp_path):
 
 
 @pytest.mark.mpirun
-def test_bad_ids_and_foreign_folders_are_refused(vipetsc, tmp_path):
+def test_bad_ids_and_foreign_folders_are_refused(vipetsc, in_process, tmp_path):
     wrong = vipetsc(2, "paper", "--only", "fig99", "C7", "--out", tmp_path / "out")
     assert wrong.returncode == 2
     assert wrong.stderr.count("--only fig99: figures are fig01, fig02") == 1
@@ -153,7 +147,7 @@ def test_bad_ids_and_foreign_folders_are_refused(vipetsc, tmp_path):
     assert not (tmp_path / "out").exists()
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "letter.txt").write_text("mine")
-    foreign = vipetsc(0, "paper", "--only", "fig10", "--out", tmp_path / "foreign")
+    foreign = in_process("paper", "--only", "fig10", "--out", tmp_path / "foreign")
     assert foreign.returncode == 2
     assert "not a paper's of this kind" in foreign.stderr
 

@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, clean_environment, datasets
+from vipetsc.case import Sweep
+from vipetsc.studies.sweep import run_sweep
 
 SWEEP = """
 [lattice]
@@ -47,7 +49,7 @@ def case(tmp_path) -> Path:
 
 
 @pytest.mark.mpirun
-def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, case, tmp_path):
+def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, case, tmp_path):
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out)
     assert ended.returncode == 0, ended.stderr
@@ -70,9 +72,9 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, case, tmp_path
     for row in index["members"]:
         files = {p.name for p in (out / row["id"]).iterdir()}
         assert files == {"case.toml", "run.h5", "analysis.h5", "summary.json"}
-    again = vipetsc(0, "sweep", case, "--out", out)
+    again = in_process("sweep", case, "--out", out)
     assert re.search(r"made now +0 in", again.stdout)
-    changed = vipetsc(0, "sweep", case, "--out", out, "--set", "drive.cycles=6")
+    changed = in_process("sweep", case, "--out", out, "--set", "drive.cycles=6")
     assert changed.returncode == 2
     assert "holds another sweep; --force replaces it" in changed.stderr
 
@@ -100,14 +102,20 @@ def test_a_scaled_member_is_what_its_simulation_would_be(in_process, case, tmp_p
     assert np.array_equal(scaled["time"], run["time"])
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A folder with a sweep that nothing killed and its case: many members, on the slower engine, to be killed in."""
+    folder = tmp_path_factory.mktemp("whole")
+    text = SWEEP.replace("[time]", '[time]\nengine = "ts"').replace("count = 6", "count = 20")
+    (folder / "long.toml").write_text(text)
+    run_sweep(Sweep.load(folder / "long.toml", []), folder / "out")
+    return folder
+
+
 @pytest.mark.mpirun
 @pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGTERM)])
-def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks, number):
-    # Many members on the slower engine leave time to be killed in.
-    case.write_text(SWEEP.replace("[time]", '[time]\nengine = "ts"').replace("count = 6", "count = 20"))
-    whole = vipetsc(0, "sweep", case, "--out", tmp_path / "whole")
-    assert whole.returncode == 0, whole.stderr
-    out = tmp_path / "killed"
+def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, in_process, whole, tmp_path, ranks, number):
+    case, out = whole / "long.toml", tmp_path / "killed"
     command = [
         "mpirun",
         "--oversubscribe",
@@ -138,11 +146,12 @@ def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, case, tmp_path, ranks,
     assert not (out / "ensemble.h5").exists()
     made = {p: p.stat().st_mtime_ns for p in out.glob("*/summary.json")}
     assert made
-    ended = vipetsc(ranks, "sweep", case, "--out", out)
+    again = ("sweep", case, "--out", out)
+    ended = in_process(*again) if ranks == 1 else vipetsc(ranks, *again)
     assert ended.returncode == 0, ended.stderr
     assert {p: p.stat().st_mtime_ns for p in made} == made
-    assert_same_bits(datasets(tmp_path / "whole" / "ensemble.h5"), datasets(out / "ensemble.h5"))
-    assert (tmp_path / "whole" / "ensemble.h5").read_bytes() == (out / "ensemble.h5").read_bytes()
+    assert_same_bits(datasets(whole / "out" / "ensemble.h5"), datasets(out / "ensemble.h5"))
+    assert (whole / "out" / "ensemble.h5").read_bytes() == (out / "ensemble.h5").read_bytes()
 
 
 @pytest.mark.mpirun
@@ -192,7 +201,7 @@ def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
 
 
 @pytest.mark.mpirun
-def test_full_fields_on_request(vipetsc, case, tmp_path):
+def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
     out = tmp_path / "out"
     ended = vipetsc(
         2,
@@ -212,7 +221,7 @@ def test_full_fields_on_request(vipetsc, case, tmp_path):
     # As a kill leaves it that comes before the run has begun.
     shutil.rmtree(out / member["id"])
     (out / member["id"] / "parts").mkdir(parents=True)
-    again = vipetsc(1, "sweep", out / "case.toml", "--out", out)
+    again = in_process("sweep", out / "case.toml", "--out", out)
     assert again.returncode == 0, again.stderr
     found = datasets(out / member["id"] / "run.h5")
     assert found["velocity"].shape == (301, 40, 2)
@@ -223,7 +232,7 @@ def test_full_fields_on_request(vipetsc, case, tmp_path):
 
 
 @pytest.mark.mpirun
-def test_measures_again_from_files(vipetsc, case, tmp_path):
+def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
     out = tmp_path / "out"
     keys = (
         "--set",
@@ -233,7 +242,7 @@ def test_measures_again_from_files(vipetsc, case, tmp_path):
         "--set",
         "sweep.contacts.sites=[2]",
     )
-    assert vipetsc(0, "sweep", case, "--out", out, *keys).returncode == 0
+    assert in_process("sweep", case, "--out", out, *keys).returncode == 0
     before = {p: datasets(p) for p in [*out.glob("*/analysis.h5"), out / "ensemble.h5"]}
     for path in before:
         path.unlink()
@@ -242,7 +251,7 @@ def test_measures_again_from_files(vipetsc, case, tmp_path):
     assert len(before) == 3
     for path, found in before.items():
         assert_same_bits(found, datasets(path))
-    nothing = vipetsc(0, "analyse", tmp_path)
+    nothing = in_process("analyse", tmp_path)
     assert nothing.returncode == 2
     assert "holds no run.h5" in nothing.stderr
 
