@@ -12,9 +12,8 @@ from bench_peers import Solution, Solver
 
 from vipetsc.case import Case
 from vipetsc.case.schema import TimeTable
-from vipetsc.dynamics.engine import select_engine
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.run import ENGINES
+from vipetsc.dynamics.run import select_engine
 
 
 def engines() -> tuple[str, ...]:
@@ -31,7 +30,7 @@ class Flight:
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
         self.model = case.model()
         self.layout = Layout.of(self.model, comm)
-        kind, refused = select_engine(case.time.engine, self.model, ENGINES)
+        kind, refused = select_engine(case.time.engine, self.model)
         if refused:
             raise RuntimeError(refused)
         self.engine = kind(self.model, self.layout)

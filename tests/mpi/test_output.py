@@ -13,9 +13,8 @@ import pytest
 from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.dynamics import simulate
 from vipetsc.io import store
-from vipetsc.io.chunks import ChunkFiles
 from vipetsc.io.folder import FolderError
-from vipetsc.io.store import RunMemory
+from vipetsc.io.store import RunFolder, RunMemory
 from vipetsc.parallel import on_every_rank
 
 COMM = MPI.COMM_WORLD
@@ -82,23 +81,23 @@ def test_what_one_rank_raises_all_raise():
 
 @pytest.mark.parallel(2)
 def test_only_checkpoints_that_all_ranks_wrote_count(folder):
-    chunks = ChunkFiles(folder / "parts", COMM)
+    chunks, parts = RunFolder(folder, COMM), folder / "parts"
     if COMM.rank == 0:
-        chunks.folder.mkdir()
+        parts.mkdir(parents=True)
     COMM.Barrier()
     for number in range(4):
         chunks.append({"x": np.array(number)})
         chunks.save_state({"number": np.array(number)})
     COMM.Barrier()
-    assert sorted(path.name for path in chunks.folder.glob(f"state-*-{COMM.rank}-2.npy")) == [
+    assert sorted(path.name for path in parts.glob(f"state-*-{COMM.rank}-2.npy")) == [
         f"state-00000{number}-{COMM.rank}-2.npy" for number in (2, 3)
     ]
     COMM.Barrier()
     if COMM.rank == 1:
-        (chunks.folder / "state-000003-1-2.npy").unlink()  # killed while it wrote the last one
+        (parts / "state-000003-1-2.npy").unlink()  # killed while it wrote the last one
     COMM.Barrier()
-    again = ChunkFiles(folder / "parts", COMM)
+    again = RunFolder(folder, COMM)
     assert again.last_state()["number"] == 2
     assert again.count == 3
     with pytest.raises(FolderError, match="resume with mpirun -n 2"):
-        ChunkFiles(folder / "parts", MPI.COMM_SELF).last_state()
+        RunFolder(folder, MPI.COMM_SELF).last_state()

@@ -11,9 +11,9 @@ from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.dynamics import recorder as recording
 from vipetsc.dynamics import simulate
 from vipetsc.io import store
-from vipetsc.io.chunks import ChunkList, load_arrays, save_arrays
+from vipetsc.io.atomic import load_arrays, save_arrays
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.store import IMPACTS, LEDGER, RunDescription, RunMemory, run_dataset
+from vipetsc.io.store import SAMPLED, RunDescription, RunMemory
 
 PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 
@@ -56,8 +56,8 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
     before = (path / "run.h5").read_bytes()
     case = small_case(time={"end": 0.02})
 
-    def fails(fields, *_):
-        fields["velocity"][0] = 1.0
+    def fails(field, *_):
+        field[0] = 1.0
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(store, "put_chunks", fails)
@@ -74,15 +74,15 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
 
 def test_episodes_stand_in_the_order_of_their_onsets():
     """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
-    chunks = ChunkList()
-    chunks.begin()
+    given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4)}
+    memory = RunMemory()
+    memory.begin(RunDescription("", given | {"sites/cell": np.arange(1, 4)}, ()), force=False, resume=False)
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
-        chunk = {f"impact_{name}": np.arange(len(sites)) * 1.0 for name in IMPACTS}
-        chunk |= {"impact_site": np.array(sites), "impact_onset": np.array(onsets)}
-        chunk |= dict.fromkeys(LEDGER, np.zeros(1)) | {"dissipated_by_site": np.zeros((1, 3))}
-        chunks.append(chunk | {"time": np.zeros(1), "field_time": np.zeros(1)})
-    description = RunDescription("", np.arange(1, 5), 4, (1, 2, 3), (1e-4,) * 3, ())
-    run = run_dataset(description, chunks, {})
+        chunk = {n: np.zeros(1) if dims == "time" else np.arange(len(sites)) * 1.0 for n, (dims, *_) in SAMPLED.items()}
+        chunk |= {"impacts/site": np.array(sites), "impacts/onset": np.array(onsets)}
+        memory.append(chunk | {"field_time": np.zeros(1), "energy/dissipated_by_site": np.zeros((1, 3))})
+    memory.finish({}, None, {})
+    run = memory.dataset
     assert run["impacts/onset"].values.tolist() == [0.1, 0.2, 0.3, 0.5, 0.5]
     assert run["impacts/site"].values.tolist() == [1, 2, 1, 1, 3]
     assert run["impacts/loss"].values.tolist() == [1, 0, 2, 1, 0]

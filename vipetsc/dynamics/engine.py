@@ -1,4 +1,4 @@
-"""What every engine offers to a simulation, and which one a case gets."""
+"""What every engine offers to a simulation."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
@@ -62,13 +62,3 @@ class Engine(ABC):
     @abstractmethod
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
-
-
-def select_engine(name: str, model: Model, engines: tuple[type[Engine], ...]) -> tuple[type[Engine], str | None]:
-    """The engine called ``name``, or for ``auto`` the first, and None; or the last of ``engines``, and why.
-
-    The last one suits every model.
-    """
-    engine = next((engine for engine in engines if engine.name == name), engines[0])
-    refusal = engine.refusal(model)
-    return (engine, None) if refusal is None else (engines[-1], f"{engine.name} refused: {refusal}")

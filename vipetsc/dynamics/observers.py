@@ -65,6 +65,7 @@ class Observer:
     """
 
     name: ClassVar[str]
+    saved: ClassVar[tuple[str, ...]] = ()  # numbers among its attributes that a checkpoint keeps
     registry: ClassVar[dict[str, "type[Observer]"]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -88,10 +89,12 @@ class Observer:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """What a resumed run needs to go on with the same bits, this rank's share."""
-        return {}
+        return {key: np.array(getattr(self, key)) for key in self.saved}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on from what ``checkpoint`` gave; the engine is there already."""
+        for key in self.saved:
+            setattr(self, key, state[key].item())
 
     def finish(self, stopped: bool) -> None:
         """Come to an end; ``stopped`` on request, to be gone on with from the checkpoint just made."""
@@ -105,6 +108,7 @@ class Guard(Observer):
     """Raises RunawayError for a state that is not finite, or holds energy that nothing has put in."""
 
     name = "guard"
+    saved = ("most_work",)
     most_work = 0.0
 
     def observe(self, sample: Sample) -> None:
@@ -118,19 +122,12 @@ class Guard(Observer):
                 f"the energy runs away: {energies.total:.4g} J in the lattice, {energies.work:.4g} J of work done"
             )
 
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """See ``Observer``."""
-        return {"most_work": np.array(self.most_work)}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """See ``Observer``."""
-        self.most_work = float(state["most_work"])
-
 
 class Ledger(Observer):
     """Keeps the largest residual of the energy balance, work - dissipated - (kinetic + spring + contact), in J."""
 
     name = "ledger"
+    saved = ("worst", "most_work", "work", "dissipated")
     worst = most_work = 0.0
     work = dissipated = float("nan")
 
@@ -139,14 +136,6 @@ class Ledger(Observer):
         self.work, self.dissipated = sample.energies.work, sample.energies.dissipated
         self.worst = max(self.worst, abs(sample.energies.residual))
         self.most_work = max(self.most_work, abs(self.work))
-
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """See ``Observer``."""
-        return {"sums": np.array([self.worst, self.most_work, self.work, self.dissipated])}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """See ``Observer``."""
-        self.worst, self.most_work, self.work, self.dissipated = state["sums"].tolist()
 
     def statistics(self) -> dict[str, Any]:
         """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end."""

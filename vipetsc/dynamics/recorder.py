@@ -1,6 +1,6 @@
 """Samples on their way to a file: buffered on each rank, sent in chunks to whoever writes them."""
 
-from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 from mpi4py import MPI
@@ -11,7 +11,7 @@ from vipetsc.case import Case
 from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.observers import Observer, Sample, Setup
-from vipetsc.io.store import GATHER_LIMIT, IMPACTS, LEDGER
+from vipetsc.io.store import GATHER_LIMIT
 
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
 CHUNK_SAMPLES = 256
@@ -25,6 +25,8 @@ class Recorder(Observer):
     """
 
     name = "recorder"
+    saved = ("episodes",)
+    episodes = 0
 
     def begin(self, setup: Setup) -> None:
         """See ``Observer``."""
@@ -44,7 +46,6 @@ class Recorder(Observer):
         self._dissipated = np.empty((self._length, len(layout.sites)))
         self._samples: list[tuple[float, Energies]] = []
         self._field_times: list[float] = []
-        self._episodes = 0
 
     def observe(self, sample: Sample) -> None:
         """See ``Observer``."""
@@ -72,17 +73,9 @@ class Recorder(Observer):
         if not stopped:
             self._write(self.setup.engine.take_episodes(unfinished=True))
 
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """See ``Observer``."""
-        return {"episodes": np.array(self._episodes)}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """See ``Observer``."""
-        self._episodes = int(state["episodes"])
-
     def statistics(self) -> dict[str, Any]:
         """Contact episodes logged."""
-        return {"episodes": self._episodes}
+        return {"episodes": self.episodes}
 
     def _write(self, episodes: list[Episode]) -> None:
         """Hand the samples kept so far and this rank's ``episodes`` on as a chunk, then forget them.
@@ -91,35 +84,33 @@ class Recorder(Observer):
         rank 0 of all.
         """
         layout, comm = self.setup.layout, self.setup.layout.comm
-        fields = np.moveaxis(self._buffer[: len(self._field_times)], 2, 3)  # (samples, field, cell, dof)
-        share = layout.sites, self._dissipated[: len(self._samples)], episodes, None if self.columns else fields
+        block = np.moveaxis(self._buffer[: len(self._field_times)], 2, 3)  # (samples, field, cell, dof)
+        share = layout.sites, self._dissipated[: len(self._samples)], episodes, None if self.columns else block
         shares = comm.gather(share) if comm.size > 1 else [share]
         chunk: dict[str, np.ndarray] = {}
         if shares is not None:
             sites, dissipated, logs, blocks = zip(*shares, strict=True)
             chunk |= {"time": np.array([t for t, _ in self._samples]), "field_time": np.array(self._field_times)}
-            chunk |= {name: np.array([getattr(energies, name) for _, energies in self._samples]) for name in LEDGER}
+            chunk |= columns("energy", Energies, [energies for _, energies in self._samples])
             order = np.argsort([site for some in sites for site in some])
-            chunk["dissipated_by_site"] = np.concatenate(dissipated, axis=1)[:, order]
-            chunk |= impact_table([episode for log in logs for episode in log])
-            fields = fields if self.columns else np.concatenate(blocks, axis=2)
+            chunk["energy/dissipated_by_site"] = np.concatenate(dissipated, axis=1)[:, order]
+            chunk |= columns("impacts", Episode, [episode for log in logs for episode in log])
+            chunk["impacts/site"] += 1  # counted from 1
+            block = block if self.columns else np.concatenate(blocks, axis=2)
         if shares is not None or self.columns:
-            chunk |= {name: fields[:, i] for i, name in enumerate(self.setup.case.output.fields)}
-        self.setup.output.chunks.append(chunk or None)
-        self._episodes += comm.allreduce(len(episodes))
+            chunk |= {name: block[:, i] for i, name in enumerate(self.setup.case.output.fields)}
+        self.setup.output.append(chunk or None)
+        self.episodes += comm.allreduce(len(episodes))
         self._samples.clear()
         self._field_times.clear()
+
+
+def columns(group: str, record: type, rows: list[Any]) -> dict[str, np.ndarray]:
+    """``rows`` of a dataclass ``record`` as arrays ``group/<field>``."""
+    return {f"{group}/{c.name}": np.array([getattr(row, c.name) for row in rows], c.type) for c in fields(record)}
 
 
 def recorded_cells(case: Case) -> np.ndarray:
     """Cells (0-based) of the whole lattice whose fields are recorded."""
     first, last = case.output.window or (1, case.lattice.cells)
     return np.arange(first - 1, last, case.output.every)
-
-
-def impact_table(episodes: list[Episode]) -> dict[str, np.ndarray]:
-    """The log as columns ``impact_<name>``; sites counted from 1."""
-    kinds = dict.fromkeys(("site", "side"), np.int64)
-    table = {f"impact_{n}": np.array([getattr(e, n) for e in episodes], kinds.get(n, float)) for n in IMPACTS}
-    table["impact_site"] += 1
-    return table

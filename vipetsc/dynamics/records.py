@@ -14,13 +14,11 @@ from vipetsc.contact.law import Contacts, create_contacts
 from vipetsc.dynamics.layout import Layout
 from vipetsc.lattice import ToneBurst
 
-_INT, _FLOAT = np.int64, np.float64
-
-MASS = np.dtype([("inverse_mass", _FLOAT), ("first", _INT), ("last", _INT)])
+MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
-COUPLING = np.dtype([("offset", _INT), ("other", _INT), ("stiffness", _FLOAT)])
+COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64)])
 """A spring as one of its masses sees it: cells to the other mass, that mass, N/m."""
-SPRING = np.dtype([("start", _INT), ("end", _INT), ("next_cell", _INT), ("stiffness", _FLOAT)])
+SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int64), ("stiffness", np.float64)])
 """A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
 
 
@@ -78,40 +76,34 @@ def create_burst(drive: ToneBurst) -> Burst:
 def create_record(model: Model, layout: Layout) -> LatticeRecord:
     """The record of the part of ``model`` that ``layout`` gives to this rank; all sites are free."""
     chain, cell = model.chain, model.chain.cell
-    couplings = cell.couplings()
-    rows = np.searchsorted([c[0] for c in couplings], np.arange(cell.dofs + 1)).tolist()
-    masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
-    springs = [(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs]
-    return LatticeRecord(
-        shape=_shape(model, layout),
-        masses=np.array(masses, MASS),
-        couplings=np.array([c[1:] for c in couplings], COUPLING),
-        springs=np.array(springs, SPRING),
-        site_cells=np.array([chain.sites[i] - layout.start for i in layout.sites], _INT),
-        contacts=create_contacts(model.contact, [chain.clearances[i] for i in layout.sites]),
-        burst=create_burst(model.drive),
-    )
-
-
-def _shape(model: Model, layout: Layout) -> Shape:
-    left, right = layout.neighbours()
-    free = model.chain.ends == "free"
-    n, d = layout.owned, layout.dofs
-    return Shape(
+    n, d, (left, right) = layout.owned, layout.dofs, layout.neighbours()
+    shape = Shape(
         cells=n,
         dofs=d,
-        host=model.chain.cell.host,
-        resonator=model.chain.cell.resonator,
+        host=cell.host,
+        resonator=cell.resonator,
         owned=layout.size,
         ghosted=layout.size + d * ((left is not None) + (right is not None)),
         exchange=layout.comm.size > 1 or layout.periodic,
         left_ghost=-1 if left is None else layout.size,
         right_ghost=-1 if right is None else layout.size + d * (left is not None),
-        left_free=free and left is None,
-        right_free=free and right is None,
+        left_free=chain.ends == "free" and left is None,
+        right_free=chain.ends == "free" and right is None,
         driven=(d + model.drive_mass) * n + model.drive_cell - layout.start if layout.owns_drive else -1,
         work=layout.work,
         dissipated=layout.dissipated,
+    )
+    couplings = cell.couplings()
+    rows = np.searchsorted([c[0] for c in couplings], np.arange(d + 1)).tolist()
+    masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
+    return LatticeRecord(
+        shape,
+        np.array(masses, MASS),
+        np.array([c[1:] for c in couplings], COUPLING),
+        np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
+        np.array([chain.sites[i] - layout.start for i in layout.sites], np.int64),
+        create_contacts(model.contact, [chain.clearances[i] for i in layout.sites]),
+        create_burst(model.drive),
     )
 
 

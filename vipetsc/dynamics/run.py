@@ -12,7 +12,7 @@ import numpy as np
 
 from vipetsc.case import Case, Model
 from vipetsc.dynamics.energies import EnergyMeter
-from vipetsc.dynamics.engine import StalledError, select_engine
+from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Observer, RunawayError, Sample, Setup
 from vipetsc.dynamics.propagator.engine import Propagator
@@ -89,41 +89,33 @@ def simulate(
     model = case.model()
     output.begin(_description(case, model), force, resume)
     layout = Layout.of(model, output.comm)
-    kind, refusal = select_engine(case.time.engine, model, ENGINES)
+    kind, refusal = select_engine(case.time.engine, model)
     setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
     run = Run(setup, [*OBSERVERS, *(["progress"] if progress else []), *observers])
-    state = output.chunks.last_state() if resume else None
+    state = output.last_state() if resume else None
     if state is not None:
         run.restore(state)
-    return _finish(run, *run.advance(), begin, {"engine_note": refusal} if refusal else {})
-
-
-def _finish(run: "Run", ending: str, sentence: str, begin: tuple[float, float], note: dict[str, str]) -> Result:
-    """Write the last checkpoint of a run that was stopped, or the files of one that ended; what rank 0 tells counts."""
-    output, comm = run.setup.output, run.setup.output.comm
-    if ending == STOPPED:
-        run.checkpoint()
-        sentence += "; --resume goes on from there"
-    statistics = run.finish(ending == STOPPED) | note
-    cpu = comm.allreduce(time.process_time() - begin[1])
-    statistics |= {"wall_seconds": round(time.perf_counter() - begin[0], 3), "cpu_seconds": round(cpu, 3)}
-    attributes = provenance(comm) | {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
-    attributes = comm.bcast(attributes)
-    if ending != STOPPED:
-        output.finish(attributes, run.recorder.columns, {"case": run.setup.case.model_dump(by_alias=True)})
-    run.setup.engine.destroy()
-    return Result(ending == COMPLETE, ending == STOPPED, sentence, attributes["statistics"], output.folder)
+    ending, sentence = run.advance()
+    return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
 
 
 def _description(case: Case, model: Model) -> RunDescription:
-    return RunDescription(
-        case=case.to_toml(),
-        cells=recorded_cells(case) + 1,
-        dofs=model.chain.cell.dofs,
-        sites=tuple(cell + 1 for cell in model.chain.sites),
-        clearances=tuple(model.chain.clearances),
-        fields=tuple(case.output.fields),
-    )
+    chain = model.chain
+    given = {
+        "cell": recorded_cells(case) + 1,
+        "dof": np.arange(1, chain.cell.dofs + 1),
+        "site": np.arange(1, len(chain.sites) + 1),
+        "sites/cell": np.array(chain.sites, np.int64) + 1,
+        "sites/clearance": np.array(chain.clearances, float),
+    }
+    return RunDescription(case.to_toml(), given, tuple(case.output.fields))
+
+
+def select_engine(name: str, model: Model) -> tuple[type[Engine], str | None]:
+    """The engine called ``name``, for ``auto`` the first, and None; or the last, which suits every model, and why."""
+    engine = next((engine for engine in ENGINES if engine.name == name), ENGINES[0])
+    refusal = engine.refusal(model)
+    return (engine, None) if refusal is None else (ENGINES[-1], f"{engine.name} refused: {refusal}")
 
 
 class Run:
@@ -174,16 +166,27 @@ class Run:
         state = self.setup.engine.checkpoint() | {"samples": np.array(self.samples)}
         for observer in self.observers:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
-        self.setup.output.chunks.save_state(state)
+        self.setup.output.save_state(state)
 
-    def finish(self, stopped: bool) -> dict[str, Any]:
-        """End all observers; statistics of theirs and of the engine."""
-        engine = self.setup.engine
+    def finish(self, ending: str, sentence: str, begin: tuple[float, float], note: dict[str, str]) -> Result:
+        """Write the last checkpoint of a run that was stopped, or the files of one that ended, and free the engine."""
+        engine, output, comm = self.setup.engine, self.setup.output, self.setup.output.comm
+        if ending == STOPPED:
+            self.checkpoint()
+            sentence += "; --resume goes on from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
         for observer in self.observers:
-            observer.finish(stopped)
+            observer.finish(ending == STOPPED)
             statistics |= observer.statistics()
-        return statistics
+        cpu = comm.allreduce(time.process_time() - begin[1])
+        statistics |= note
+        statistics |= {"wall_seconds": round(time.perf_counter() - begin[0], 3), "cpu_seconds": round(cpu, 3)}
+        attributes = provenance(comm) | {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
+        attributes = comm.bcast(attributes)  # what rank 0 tells counts
+        if ending != STOPPED:
+            output.finish(attributes, self.recorder.columns, {"case": self.setup.case.model_dump(by_alias=True)})
+        engine.destroy()
+        return Result(ending == COMPLETE, ending == STOPPED, sentence, attributes["statistics"], output.folder)
 
 
 def fastest_place(setup: Setup) -> str:

@@ -1,16 +1,17 @@
 """Where a run goes: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
 
-While a run goes on, its samples are kept as chunks (``io.chunks``); when it has ended they become one dataset in the
-layout of ``io.netcdf``. Fields (t, cell, dof) are too large to be held whole: a writer is a context manager that gives
-a mapping by which ``fields[name][samples, cells] = values`` puts them where they belong, in a file of one rank, in one
-that all ranks share, or in memory; the writers differ in open and close only.
+While a run goes on, its samples are kept as chunks: chunk k holds those between the checkpoints k - 1 and k. A chunk
+and a checkpoint are named arrays; a rank writes its share of each into a file of its own, so nothing is sent while a
+run goes on. When it has ended, the chunks become one dataset in the layout of ``io.netcdf``. Its fields (t, cell, dof)
+are too large to be held whole: they are copied chunk by chunk, to a file of one rank or to one that all ranks share.
 """
 
 import json
 import os
+import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,31 +22,42 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from vipetsc.io.atomic import write_text
-from vipetsc.io.chunks import ChunkFiles, ChunkList
-from vipetsc.io.folder import RUN, claim_folder
-from vipetsc.io.netcdf import add_variable, put_dataset, variable
+from vipetsc.io.atomic import Arrays, load_arrays, save_arrays, write_text
+from vipetsc.io.folder import RUN, FolderError, claim_folder
+from vipetsc.io.netcdf import add_variable, put_dataset, tabulated
 from vipetsc.parallel import on_every_rank, on_root
 
-Chunks = ChunkFiles | ChunkList
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
-FIELDS = {"displacement": "m", "velocity": "m/s"}
-LEDGER = {
-    "kinetic": "kinetic energy",
-    "spring": "energy of the springs",
-    "contact": "elastic energy of the contacts",
-    "work": "work done by the drive",
-    "dissipated": "energy dissipated in contacts",
+FIELDS = {
+    "displacement": {"units": "m", "long_name": "displacement of each mass"},
+    "velocity": {"units": "m/s", "long_name": "velocity of each mass"},
 }
-IMPACTS = {
-    "site": ("1", "site, counted from 1"),
-    "side": ("1", "side of the clearance: +1 or -1"),
-    "onset": ("s", "time of onset"),
-    "approach_velocity": ("m/s", "relative velocity at onset, w'_minus"),
-    "separation": ("s", "time of separation; NaN if still in contact"),
-    "indentation": ("m", "largest indentation"),
-    "force": ("N", "largest contact force"),
-    "loss": ("J", "energy dissipated in the episode"),
+# Name in the file: dimensions, units, text. What a chunk holds besides fields, and what is known from the beginning.
+SAMPLED = {
+    "time": ("time", "s", "time"),
+    "field_time": ("field_time", "s", "time of the recorded fields"),
+    "energy/kinetic": ("time", "J", "kinetic energy"),
+    "energy/spring": ("time", "J", "energy of the springs"),
+    "energy/contact": ("time", "J", "elastic energy of the contacts"),
+    "energy/work": ("time", "J", "work done by the drive"),
+    "energy/dissipated": ("time", "J", "energy dissipated in contacts"),
+    "energy/dissipated_by_site": ("time site", "J", "energy dissipated at each site"),
+    "impacts/site": ("episode", "1", "site, counted from 1"),
+    "impacts/side": ("episode", "1", "side of the clearance: +1 or -1"),
+    "impacts/onset": ("episode", "s", "time of onset"),
+    "impacts/approach_velocity": ("episode", "m/s", "relative velocity at onset, w'_minus"),
+    "impacts/separation": ("episode", "s", "time of separation; NaN if still in contact"),
+    "impacts/indentation": ("episode", "m", "largest indentation"),
+    "impacts/force": ("episode", "N", "largest contact force"),
+    "impacts/loss": ("episode", "J", "energy dissipated in the episode"),
+}
+GIVEN = {
+    "cell": ("cell", "1", "cell, counted from 1"),
+    "dof": ("dof", "1", "mass within the cell, from 1"),
+    "site": ("site", "1", "contact site, from 1"),
+    "episode": ("episode", "1", "contact episode, by onset"),
+    "sites/cell": ("site", "1", "cell of the site"),
+    "sites/clearance": ("site", "m", "clearance of the site"),
 }
 
 
@@ -53,20 +65,17 @@ IMPACTS = {
 class RunDescription:
     """What ``run.h5`` tells of its case.
 
-    ``case``: as TOML; ``cells`` (cell,): the recorded ones of the whole lattice, from 1; ``dofs``: masses in a cell;
-    ``sites`` (site,): their cells, from 1; ``clearances`` (site,) in m; ``fields``: which of ``FIELDS`` are recorded.
+    ``case``: as TOML; ``given``: the arrays of ``GIVEN``, but for the episodes; ``fields``: those of ``FIELDS`` that
+    are recorded.
     """
 
     case: str
-    cells: np.ndarray
-    dofs: int
-    sites: tuple[int, ...]
-    clearances: tuple[float, ...]
+    given: Arrays
     fields: tuple[str, ...]
 
 
 class RunOutput(ABC):
-    """Takes a run's ``chunks``, on all ranks of ``comm`` together, and what is told of it when it has ended.
+    """Takes a run's chunks, ``count`` of them, on all ranks of ``comm`` together, and puts them together at its end.
 
     ``shared`` outputs let every rank write its own cells; ``folder`` is None for a run in memory.
     """
@@ -74,11 +83,34 @@ class RunOutput(ABC):
     shared: ClassVar[bool]
     folder: Path | None
     comm: MPI.Comm
-    chunks: Chunks
+    count = 0
+    description: RunDescription
 
     @abstractmethod
     def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
         """Make ready for a run, or for one that goes on; all ranks must call it. Raises FolderError."""
+
+    @abstractmethod
+    def append(self, chunk: Arrays | None) -> None:
+        """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
+
+        Raises OSError on all ranks if one cannot write.
+        """
+
+    @abstractmethod
+    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
+        """Chunk ``number`` as ``rank`` kept it, at least the arrays ``wanted``."""
+
+    @abstractmethod
+    def save_state(self, state: Arrays) -> None:
+        """Keep this rank's checkpoint after the last chunk; as ``append``."""
+
+    def last_state(self) -> Arrays | None:
+        """Go back to the last checkpoint that all ranks wrote, if there is one: ``count``, and this rank's share.
+
+        All ranks must call it; raises FolderError if it was written by another number of ranks.
+        """
+        return None
 
     @abstractmethod
     def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
@@ -94,39 +126,97 @@ class RunOutput(ABC):
             What ``summary.json`` tells besides ``attributes``.
         """
 
+    def joined(self, names: Collection[str]) -> dict[str, np.ndarray]:
+        """The arrays ``names`` of rank 0, those of all chunks one after the other."""
+        chunks = [self.read(number, 0, names) for number in range(self.count)]
+        return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
+
+    def dataset_without_fields(self, attributes: Mapping[str, Any]) -> xr.Dataset:
+        """All of the run but its fields, from the chunks of rank 0; episodes in the order of their onsets."""
+        arrays = self.joined(SAMPLED)
+        order = np.lexsort((arrays["impacts/site"], arrays["impacts/onset"]))
+        arrays |= {name: values[order] for name, values in arrays.items() if name.startswith("impacts/")}
+        if len(arrays["field_time"]) == len(arrays["time"]):
+            del arrays["field_time"]
+        arrays |= {**self.description.given, "episode": np.arange(1, len(order) + 1)}
+        return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": self.description.case, **attributes})
+
 
 class RunFolder(RunOutput):
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after."""
 
     shared = True
+    folder: Path
 
     def __init__(self, folder: Path, comm: MPI.Comm) -> None:
-        self._path = self.folder = Path(folder)
-        self.comm = comm
-        self.chunks = ChunkFiles(self._path / "parts", comm)
+        self.folder, self.comm = Path(folder), comm
+        self._parts = self.folder / "parts"
 
     def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
         """See ``RunOutput``."""
-        self._description = description
+        self.description = description
 
         def claim() -> None:
-            claim_folder(self._path, RUN, description.case, force=force, resume=resume)
-            self.chunks.begin()
+            claim_folder(self.folder, RUN, description.case, force=force, resume=resume)
+            self._parts.mkdir(exist_ok=True)
 
         on_root(self.comm, claim)
 
+    def append(self, chunk: Arrays | None) -> None:
+        """See ``RunOutput``."""
+        path = self._chunk(self.count, self.comm.rank)
+        on_every_rank(self.comm, lambda: None if chunk is None else save_arrays(path, chunk))
+        self.count += 1
+
+    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
+        """See ``RunOutput``."""
+        return load_arrays(self._chunk(number, rank), wanted)
+
+    def save_state(self, state: Arrays) -> None:
+        """See ``RunOutput``; the last two checkpoints are kept."""
+        number = self.count - 1
+        on_every_rank(self.comm, lambda: save_arrays(self._state(number), state))
+        self._state(number - 2).unlink(missing_ok=True)
+
+    def last_state(self) -> Arrays | None:
+        """See ``RunOutput``."""
+
+        def last_complete() -> int:
+            names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
+            sizes = {int(size) for *_, size in names}
+            if sizes - {self.comm.size}:
+                message = f"was begun on {max(sizes)} ranks; resume with mpirun -n {max(sizes)}"
+                raise FolderError(f"{self.folder}: {message}")
+            counts = Counter(int(number) for _, number, *_ in names)
+            return max((number for number, count in counts.items() if count == self.comm.size), default=-1)
+
+        number = on_root(self.comm, last_complete)
+        self.count = number + 1
+        return load_arrays(self._state(number)) if number >= 0 else None
+
+    def _chunk(self, number: int, rank: int) -> Path:
+        return self._parts / f"part-{number:06d}-{rank}.npy"
+
+    def _state(self, number: int) -> Path:
+        return self._parts / f"state-{number:06d}-{self.comm.rank}-{self.comm.size}.npy"
+
     def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
         """See ``RunOutput``: ``run.h5`` takes its name when it is complete, then the chunks go."""
-        target, aside = self._path / "run.h5", self._path / ".run.h5.part"
+        target, aside = self.folder / "run.h5", self.folder / ".run.h5.part"
 
         def write() -> None:
             if columns is None and self.comm.rank:
                 return
-            names, sharing = self._description.fields, None if columns is None else self.comm
-            data = run_dataset(self._description, self.chunks, attributes)
+            data = self.dataset_without_fields(attributes)
             try:
-                with fields_in_file(aside, data, names, sharing) as fields:
-                    put_chunks(fields, self.chunks, self.comm.rank, names, columns or slice(None))
+                with h5py.File(aside, "w", **({"driver": "mpio", "comm": self.comm} if columns else {})) as file:
+                    put_dataset(file, data, write=self.comm.rank == 0)
+                    dims = field_dimensions(data)
+                    shape = [data.sizes[dim] for dim in dims]
+                    # All of them first: ranks create together, but each copies and may fail alone.
+                    fields = {n: add_variable(file, n, dims, shape, float, FIELDS[n]) for n in self.description.fields}
+                    for name, field in fields.items():
+                        put_chunks(field, self, name, columns or slice(None))
             except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
                 message = f"{target} could not be written; make room and go on with --resume: {error}"
                 raise OSError(message) from error
@@ -134,8 +224,8 @@ class RunFolder(RunOutput):
         def conclude() -> None:
             os.replace(aside, target)
             text = json.dumps({**attributes, **summary}, indent=2, allow_nan=False)
-            write_text(self._path / "summary.json", text + "\n")
-            self.chunks.remove()
+            write_text(self.folder / "summary.json", text + "\n")
+            shutil.rmtree(self._parts)
 
         try:
             on_every_rank(self.comm, write)
@@ -155,89 +245,48 @@ class RunMemory(RunOutput):
     folder = None
 
     def __init__(self, comm: MPI.Comm = MPI.COMM_SELF) -> None:
-        self.comm, self.chunks = comm, ChunkList()
+        self.comm = comm
         self.dataset: xr.Dataset | None = None
 
     def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
         """See ``RunOutput``; raises ValueError for ``resume``."""
         if resume:
             raise ValueError("a run in memory cannot be resumed")
-        self._description = description
-        self.chunks.begin()
+        self.description, self.count = description, 0
+        self._chunks: list[Arrays] = []
+
+    def append(self, chunk: Arrays | None) -> None:
+        """See ``RunOutput``."""
+        self._chunks.append(chunk or {})
+        self.count += 1
+
+    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
+        """See ``RunOutput``."""
+        return self._chunks[number]
+
+    def save_state(self, state: Arrays) -> None:
+        """Nothing: a run in memory cannot be gone on with."""
 
     def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
         """See ``RunOutput``."""
         if self.comm.rank == 0:
-            names = self._description.fields
-            self.dataset = run_dataset(self._description, self.chunks, attributes)
-            with fields_in_memory(self.dataset, names) as fields:
-                put_chunks(fields, self.chunks, 0, names, slice(None))
-        self.chunks.remove()
+            self.dataset = self.dataset_without_fields(attributes)
+            for name, values in self.joined(self.description.fields).items():
+                self.dataset[name] = field_dimensions(self.dataset), values, FIELDS[name]
+        self._chunks = []
 
 
-@contextmanager
-def fields_in_file(
-    path: Path, data: xr.Dataset, names: tuple[str, ...], comm: MPI.Comm | None = None
-) -> Iterator[Mapping[str, Any]]:
-    """The fields ``names`` of a new file with all of ``data``: of one rank's, or of one that ``comm`` shares."""
-    with h5py.File(path, "w", **({"driver": "mpio", "comm": comm} if comm else {})) as file:
-        put_dataset(file, data, write=comm is None or comm.rank == 0)
-        for name, (dims, shape, attributes) in describe_fields(data, names).items():
-            add_variable(file, name, dims, shape, float, attributes)
-        yield file
+def field_dimensions(data: xr.Dataset) -> list[str]:
+    """Dimensions of the fields beside ``data``."""
+    return ["field_time" if "field_time" in data else "time", "cell", "dof"]
 
 
-@contextmanager
-def fields_in_memory(data: xr.Dataset, names: tuple[str, ...]) -> Iterator[Mapping[str, Any]]:
-    """The fields ``names`` as arrays, which become variables of ``data``."""
-    described = describe_fields(data, names)
-    arrays = {name: np.empty(shape) for name, (_, shape, _) in described.items()}
-    yield arrays
-    for name, (dims, _, attributes) in described.items():
-        data[name] = dims, arrays[name], attributes
-
-
-def describe_fields(data: xr.Dataset, names: tuple[str, ...]) -> dict[str, tuple[list[str], list[int], dict[str, str]]]:
-    """Dimensions, shape and attributes of the fields ``names`` beside ``data``."""
-    dims = ["field_time" if "field_time" in data else "time", "cell", "dof"]
-    shape = [data.sizes[dim] for dim in dims]
-    return {name: (dims, shape, {"units": FIELDS[name], "long_name": f"{name} of each mass"}) for name in names}
-
-
-def put_chunks(fields: Mapping[str, Any], chunks: Chunks, rank: int, names: tuple[str, ...], columns: slice) -> None:
-    """Copy the fields ``names`` of all ``chunks`` of ``rank`` to the cells ``columns`` of ``fields``."""
+def put_chunks(field: h5py.Dataset, output: RunOutput, name: str, columns: slice) -> None:
+    """Copy the field ``name`` of all chunks of this rank to the cells ``columns`` of ``field``."""
     first = 0
-    for number in range(chunks.count if names else 0):
-        chunk = chunks.read(number, rank, names)
-        samples = slice(first, first + len(chunk[names[0]]))
-        for name in names:
-            # h5py leaves out empty selections, on which writing together would hang.
-            if chunk[name].size:
-                fields[name][samples, columns] = chunk[name]
-        first = samples.stop
-
-
-def run_dataset(description: RunDescription, chunks: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """All of a run but its fields, from the chunks of rank 0; episodes in the order of their onsets."""
-    wanted = {"time", "field_time", "dissipated_by_site", *LEDGER, *(f"impact_{name}" for name in IMPACTS)}
-    parts = [chunks.read(number, 0, wanted) for number in range(chunks.count)]
-    table = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
-    order = np.lexsort((table["impact_site"], table["impact_onset"]))
-    sites, clearances = np.asarray(description.sites, np.int64), np.asarray(description.clearances, float)
-    by_site = variable(("time", "site"), table["dissipated_by_site"], "J", "energy dissipated at each site")
-    variables = {
-        "time": variable("time", table["time"], "s", "time"),
-        "cell": variable("cell", description.cells, "1", "cell, counted from 1"),
-        "dof": variable("dof", np.arange(1, description.dofs + 1), "1", "mass within the cell, from 1"),
-        "site": variable("site", np.arange(1, len(sites) + 1), "1", "contact site, from 1"),
-        "episode": variable("episode", np.arange(1, len(order) + 1), "1", "contact episode, by onset"),
-        "sites/cell": variable("site", sites, "1", "cell of the site"),
-        "sites/clearance": variable("site", clearances, "m", "clearance of the site"),
-        **{f"energy/{name}": variable("time", table[name], "J", text) for name, text in LEDGER.items()},
-        "energy/dissipated_by_site": by_site,
-    }
-    for name, (units, text) in IMPACTS.items():
-        variables[f"impacts/{name}"] = variable("episode", table[f"impact_{name}"][order], units, text)
-    if len(table["field_time"]) != len(table["time"]):
-        variables["field_time"] = variable("field_time", table["field_time"], "s", "time of the recorded fields")
-    return xr.Dataset(variables, attrs={"case": description.case, **attributes})
+    for number in range(output.count):
+        values = output.read(number, output.comm.rank, [name])[name]
+        # h5py leaves out empty selections, on which writing together would hang.
+        if values.size:
+            field[first : first + len(values), columns] = values
+        first += len(values)

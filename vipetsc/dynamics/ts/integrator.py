@@ -3,7 +3,6 @@
 The method stands in the package's docstring.
 """
 
-from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 from mpi4py import MPI
@@ -29,16 +28,8 @@ STRETCH = 1.08
 MOST_TRIALS = 200_000
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
-
-
-@dataclass
-class StepCounts:
-    """What the integrator did."""
-
-    steps: int = 0
-    rejected: int = 0
-    landings: int = 0
-    switches: int = 0
+# What is counted.
+COUNTS = ("steps", "rejected", "landings", "switches")
 
 
 class Integrator(Engine):
@@ -65,7 +56,7 @@ class Integrator(Engine):
         self.tracker = ImpactTracker(self.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
         self._burst_end = model.drive.duration
         self._dissipated = layout.dissipated
-        self.counts = StepCounts()
+        self.counts = dict.fromkeys(COUNTS, 0)
         self.time = 0.0
         self.state = layout.create_vector()
         self.saved = self.state.duplicate()
@@ -129,19 +120,17 @@ class Integrator(Engine):
             observe(self.time if time is None else time, local.array, self.lattice, motion)
 
     def advance(self, target: float) -> bool:
-        """Step until the time is exactly ``target`` in s; returns False if a stop was requested.
-
-        Raises StalledError where no step can be taken.
-        """
+        """See ``Engine``."""
         # The drive's end is a kink of its third derivative: a step ends there.
         if self.time < self._burst_end < target and not self.advance(self._burst_end):
             return False
-        before = self.counts.steps + self.counts.rejected
+        trials = 0
         while self.time < target:
-            if self.counts.steps + self.counts.rejected - before > MOST_TRIALS:
+            if trials > MOST_TRIALS:
                 raise StalledError(f"{MOST_TRIALS} steps did not reach t = {target:.6g} s")
             if not self._step(target):
                 return False
+            trials += 1
         return True
 
     def _step(self, target: float) -> bool:
@@ -159,7 +148,7 @@ class Integrator(Engine):
         self.state.copy(self.saved)
         accepted, suggestion = self._trial(h)
         if not accepted:
-            self.counts.rejected += 1
+            self.counts["rejected"] += 1
             self.step = suggestion
             self.saved.copy(self.state)
             self.ts.restartStep()
@@ -167,7 +156,7 @@ class Integrator(Engine):
         # A step cut short to meet a sample says little about the longest one possible.
         if not self._fixed_step and (suggestion < 4 * h or suggestion > self.step):
             self.step = suggestion
-        self.counts.steps += 1
+        self.counts["steps"] += 1
         end = target if count == 1 else self.time + h
         self.observe(self.tracker.end, end)
         change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h)
@@ -199,7 +188,7 @@ class Integrator(Engine):
         comm, tracker = self.comm, self.tracker
         owner = comm.allreduce(comm.rank if change.share == share else comm.size, MPI.MIN)
         attempt, outcome = begin_landing(share, h), RETRY
-        self.counts.landings += 1
+        self.counts["landings"] += 1
         while outcome == RETRY:
             length = attempt.length
             self.saved.copy(self.state)
@@ -234,7 +223,7 @@ class Integrator(Engine):
         """Switch modes of all landed sites and set the step with which to go on."""
         tracker = self.tracker
         was_free = not self._any_open
-        self.counts.switches += tracker.switch(self.time, self.state.array_r[self._dissipated :])
+        self.counts["switches"] += tracker.switch(self.time, self.state.array_r[self._dissipated :])
         shortest = self.comm.allreduce(tracker.contact_time(), MPI.MIN)
         self._any_open = bool(np.isfinite(shortest))
         if self._any_open and not self._fixed_step:
@@ -252,32 +241,31 @@ class Integrator(Engine):
 
     def statistics(self) -> dict[str, Any]:
         """Steps, what landings and limits of the contact law there were, and how the right-hand side is called."""
-        limits = {name: self.comm.allreduce(count) for name, count in self.tracker.counts.items()}
-        statistics = asdict(self.counts) | limits
-        statistics["switches"] = self.comm.allreduce(self.counts.switches)
-        return statistics | {"method": self.ts.getRKType(), "right_hand_side": self.right_hand_side}
+        of_sites = {"switches": self.counts["switches"]} | self.tracker.counts
+        sums = {name: self.comm.allreduce(count) for name, count in of_sites.items()}
+        return self.counts | sums | {"method": self.ts.getRKType(), "right_hand_side": self.right_hand_side}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """All that a resumed run needs to go on with the same bits, this rank's share."""
+        """See ``Engine``."""
         return self.tracker.checkpoint() | {
             "state": self.state.array_r.copy(),
             "time": np.array(self.time),
             "steps": np.array([self.step, self.free_step, float(self._any_open)]),
-            "counts": np.array(astuple(self.counts)),
+            "counts": np.array(list(self.counts.values())),
         }
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
-        """Go back to a checkpoint."""
+        """See ``Engine``."""
         self.tracker.restore(checkpoint)
         self.state.array[:] = checkpoint["state"]
         self.time = float(checkpoint["time"])
         self.step, self.free_step, any_open = checkpoint["steps"].tolist()
         self._any_open = bool(any_open)
-        self.counts = StepCounts(*checkpoint["counts"].tolist())
+        self.counts = dict(zip(COUNTS, checkpoint["counts"].tolist(), strict=True))
         self.ts.restartStep()
         self.observe(self.tracker.start)
 
     def destroy(self) -> None:
-        """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
+        """See ``Engine``."""
         for petsc_object in (self.ts, self.state, self.saved):
             petsc_object.destroy()

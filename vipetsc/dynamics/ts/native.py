@@ -12,7 +12,7 @@ from numba import carray, types
 from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 
-from vipetsc.compiled import cfunc, njit
+from vipetsc.compiled import cfunc
 from vipetsc.contact.law import SITE, Contacts, ForceLaw
 from vipetsc.dynamics.records import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
 from vipetsc.dynamics.ts.right_hand_side import right_hand_side
@@ -68,28 +68,6 @@ def _pointer_of(typing_context: Any, address: Any) -> tuple[Any, Callable]:
 _pointer: Any = intrinsic(_pointer_of)
 
 
-@njit(error_model="numpy")
-def _lattice(context: Any) -> LatticeRecord:
-    """The record whose tables stand at the context's addresses."""
-    shape, law, burst, at, size = context.shape, context.law, context.burst, context.address, context.length
-    return LatticeRecord(
-        Shape(
-            shape.cells, shape.dofs, shape.host, shape.resonator, shape.owned, shape.ghosted, shape.exchange,
-            shape.left_ghost, shape.right_ghost, shape.left_free, shape.right_free, shape.driven, shape.work,
-            shape.dissipated,
-        ),
-        carray(_pointer(at.masses), (size.masses,), MASS),
-        carray(_pointer(at.couplings), (size.couplings,), COUPLING),
-        carray(_pointer(at.springs), (size.springs,), SPRING),
-        carray(_pointer(at.site_cells), (size.site_cells,), np.int64),
-        Contacts(
-            ForceLaw(law.stiffness, law.exponent, law.damping, law.clip, law.approach_floor),
-            carray(_pointer(at.sites), (size.sites,), SITE),
-        ),
-        Burst(burst.amplitude, burst.frequency, burst.cycles, burst.duration),
-    )  # fmt: skip
-
-
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     context: Any = carray(_pointer(address), (1,), CONTEXT)[0]
     shape = context.shape
@@ -101,8 +79,18 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     error = _get_write(f, address)
     if error != 0:
         return error
+    at, size = context.address, context.length
+    lattice = LatticeRecord(
+        shape,
+        carray(_pointer(at.masses), (size.masses,), MASS),
+        carray(_pointer(at.couplings), (size.couplings,), COUPLING),
+        carray(_pointer(at.springs), (size.springs,), SPRING),
+        carray(_pointer(at.site_cells), (size.site_cells,), np.int64),
+        Contacts(context.law, carray(_pointer(at.sites), (size.sites,), SITE)),
+        context.burst,
+    )
     rate = carray(_pointer(context.array), (shape.owned,), np.float64)
-    right_hand_side(t, carray(_pointer(state), (shape.ghosted,), np.float64), rate, _lattice(context))
+    right_hand_side(t, carray(_pointer(state), (shape.ghosted,), np.float64), rate, lattice)
     error = _restore_write(f, address)
     if error != 0:
         return error

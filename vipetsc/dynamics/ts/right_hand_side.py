@@ -82,7 +82,7 @@ def _spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acce
     """Accelerations (cells,) of a mass by its springs, in chunks of cells whose neighbours are all owned."""
     n = acceleration.size
     here = y[mass * n : (mass + 1) * n]
-    row = lattice.masses[mass]
+    row, inverse_mass = lattice.masses[mass], lattice.masses[mass].inverse_mass
     for a in range(1, n - 1, CHUNK):
         b = min(a + CHUNK, n - 1)
         out = acceleration[a:b]
@@ -92,7 +92,7 @@ def _spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acce
             first = coupling.other * n + coupling.offset
             _add_spring(out, y[first + a : first + b], here[a:b], coupling.stiffness)
         for i in range(out.size):
-            out[i] *= row.inverse_mass
+            out[i] *= inverse_mass
     if n > 0:
         acceleration[0] = spring_acceleration(y, lattice, 0, mass)
     if n > 1:
