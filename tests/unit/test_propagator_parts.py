@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from tests.conftest import small_case
 from vipetsc.contact.law import CLOSED, Contacts, ForceLaw, create_contacts
 from vipetsc.dynamics.engine import StalledError
-from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.layout import Burst, Layout
 from vipetsc.dynamics.propagator.advance import FAILED
 from vipetsc.dynamics.propagator.collocation import (
     EXIT,
@@ -33,7 +33,6 @@ from vipetsc.dynamics.propagator.forces import create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.free_motion import apply_impulses, evaluate, expand_free_motion, shift
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, gather
-from vipetsc.dynamics.records import Burst
 
 ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 

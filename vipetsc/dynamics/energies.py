@@ -14,8 +14,7 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.law import elastic_energy
-from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.records import LatticeRecord, create_record
+from vipetsc.dynamics.layout import LatticeRecord, Layout, create_record
 from vipetsc.dynamics.ts.right_hand_side import displacement, relative_motion
 
 _FINE = 2.0**40  # multiples of the finer rest in one unit
@@ -112,7 +111,6 @@ class EnergyMeter:
         burst = model.drive.duration * model.speed  # cells that the packet covers
         scale = sum(model.chain.cell.masses) * speed**2 * max(burst, 1.0)
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
-        self._total = np.zeros(9)
 
     @property
     def largest(self) -> float:
@@ -121,7 +119,7 @@ class EnergyMeter:
 
     def measure(self, state: PETSc.Vec) -> Energies:
         """Energies of ``state``, whose ghosts must be up to date; all ranks must call it."""
-        total = self._total
+        total = np.empty(2 * _WORK + 1)
         with state.localForm() as local:
             measure(local.array, self._lattice, self.unit, total)
         self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)

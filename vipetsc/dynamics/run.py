@@ -178,9 +178,8 @@ class Run:
         for observer in self.observers:
             observer.finish(ending == STOPPED)
             statistics |= observer.statistics()
-        cpu = comm.allreduce(time.process_time() - begin[1])
-        statistics |= note
-        statistics |= {"wall_seconds": round(time.perf_counter() - begin[0], 3), "cpu_seconds": round(cpu, 3)}
+        wall, cpu = time.perf_counter() - begin[0], comm.allreduce(time.process_time() - begin[1])
+        statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
         attributes = provenance(comm) | {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
         attributes = comm.bcast(attributes)  # what rank 0 tells counts
         if ending != STOPPED:

@@ -116,22 +116,18 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
 
 
 def _flat(groups: dict[str, xr.Dataset]) -> xr.Dataset:
-    """All groups in one dataset, names of variables, dimensions and attributes by their paths."""
+    """All groups in one dataset, names of variables, dimensions and attributes by their paths.
+
+    The coordinate of a dimension stands in the same group, or in the nearest one around it.
+    """
+    nodes = {PurePosixPath(group): data for group, data in groups.items()}
+    scales = {node / str(n) for node, data in nodes.items() for n, item in data.variables.items() if item.dims == (n,)}
     variables: dict[str, xr.Variable] = {}
     attributes: dict[str, Any] = {}
-    for group, data in groups.items():
-        prefix = group.strip("/") + "/" if group.strip("/") else ""
+    for node, data in nodes.items():
         for name, item in data.variables.items():
-            dims = [_dimension(groups, PurePosixPath(group), str(dim)) for dim in item.dims]
-            variables[f"{prefix}{name}"] = item._replace(dims=dims)
-        attributes |= {f"{prefix}{key}": value for key, value in data.attrs.items()}
+            around = [[above / str(dim) for above in (node, *node.parents)] for dim in item.dims]
+            dims = [next((path for path in paths if path in scales), paths[0]) for paths in around]
+            variables[str(node / str(name)).strip("/")] = item._replace(dims=[str(dim).strip("/") for dim in dims])
+        attributes |= {str(node / str(key)).strip("/"): value for key, value in data.attrs.items()}
     return xr.Dataset(variables, attrs=attributes)
-
-
-def _dimension(groups: dict[str, xr.Dataset], group: PurePosixPath, name: str) -> str:
-    """Path of the coordinate ``name`` of a dimension met in ``group``: there, or in the nearest group around it."""
-    for node in (group, *group.parents):
-        around = groups.get(str(node))
-        if around is not None and name in around.variables and around.variables[name].dims == (name,):
-            return str(node / name).strip("/")
-    return str(group / name).strip("/")

@@ -9,12 +9,11 @@ are too large to be held whole: they are copied chunk by chunk, to a file of one
 import json
 import os
 import shutil
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from mpi4py import MPI
 
@@ -74,86 +73,20 @@ class RunDescription:
     fields: tuple[str, ...]
 
 
-class RunOutput(ABC):
-    """Takes a run's chunks, ``count`` of them, on all ranks of ``comm`` together, and puts them together at its end.
+class RunFolder:
+    """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
-    ``shared`` outputs let every rank write its own cells; ``folder`` is None for a run in memory.
+    It takes the run's chunks, ``count`` of them, on all ranks of ``comm`` together, and puts them together at the end.
     """
 
-    shared: ClassVar[bool]
-    folder: Path | None
-    comm: MPI.Comm
-    count = 0
-    description: RunDescription
-
-    @abstractmethod
-    def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
-        """Make ready for a run, or for one that goes on; all ranks must call it. Raises FolderError."""
-
-    @abstractmethod
-    def append(self, chunk: Arrays | None) -> None:
-        """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
-
-        Raises OSError on all ranks if one cannot write.
-        """
-
-    @abstractmethod
-    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """Chunk ``number`` as ``rank`` kept it, at least the arrays ``wanted``."""
-
-    @abstractmethod
-    def save_state(self, state: Arrays) -> None:
-        """Keep this rank's checkpoint after the last chunk; as ``append``."""
-
-    def last_state(self) -> Arrays | None:
-        """Go back to the last checkpoint that all ranks wrote, if there is one: ``count``, and this rank's share.
-
-        All ranks must call it; raises FolderError if it was written by another number of ranks.
-        """
-        return None
-
-    @abstractmethod
-    def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
-        """Put the chunks together; all ranks must call it. Raises OSError on all ranks if one cannot write.
-
-        Parameters
-        ----------
-        attributes
-            Root attributes besides the case; the same on all ranks.
-        columns
-            The recorded cells whose fields this rank's chunks hold; None: rank 0's hold those of all.
-        summary
-            What ``summary.json`` tells besides ``attributes``.
-        """
-
-    def joined(self, names: Collection[str]) -> dict[str, np.ndarray]:
-        """The arrays ``names`` of rank 0, those of all chunks one after the other."""
-        chunks = [self.read(number, 0, names) for number in range(self.count)]
-        return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
-
-    def dataset_without_fields(self, attributes: Mapping[str, Any]) -> xr.Dataset:
-        """All of the run but its fields, from the chunks of rank 0; episodes in the order of their onsets."""
-        arrays = self.joined(SAMPLED)
-        order = np.lexsort((arrays["impacts/site"], arrays["impacts/onset"]))
-        arrays |= {name: values[order] for name, values in arrays.items() if name.startswith("impacts/")}
-        if len(arrays["field_time"]) == len(arrays["time"]):
-            del arrays["field_time"]
-        arrays |= {**self.description.given, "episode": np.arange(1, len(order) + 1)}
-        return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": self.description.case, **attributes})
-
-
-class RunFolder(RunOutput):
-    """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after."""
-
-    shared = True
-    folder: Path
+    shared = True  # every rank can write its own cells
 
     def __init__(self, folder: Path, comm: MPI.Comm) -> None:
-        self.folder, self.comm = Path(folder), comm
+        self.folder, self.comm, self.count = Path(folder), comm, 0
         self._parts = self.folder / "parts"
 
     def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
-        """See ``RunOutput``."""
+        """Make ready for a run, or for one that goes on; all ranks must call it. Raises FolderError."""
         self.description = description
 
         def claim() -> None:
@@ -163,23 +96,29 @@ class RunFolder(RunOutput):
         on_root(self.comm, claim)
 
     def append(self, chunk: Arrays | None) -> None:
-        """See ``RunOutput``."""
+        """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
+
+        Raises OSError on all ranks if one cannot write.
+        """
         path = self._chunk(self.count, self.comm.rank)
         on_every_rank(self.comm, lambda: None if chunk is None else save_arrays(path, chunk))
         self.count += 1
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """See ``RunOutput``."""
+        """The arrays ``wanted`` of chunk ``number`` as ``rank`` kept it."""
         return load_arrays(self._chunk(number, rank), wanted)
 
     def save_state(self, state: Arrays) -> None:
-        """See ``RunOutput``; the last two checkpoints are kept."""
+        """Keep this rank's checkpoint after the last chunk, and the one before; as ``append``."""
         number = self.count - 1
         on_every_rank(self.comm, lambda: save_arrays(self._state(number), state))
         self._state(number - 2).unlink(missing_ok=True)
 
     def last_state(self) -> Arrays | None:
-        """See ``RunOutput``."""
+        """Go back to the last checkpoint that all ranks wrote, if there is one: ``count``, and this rank's share.
+
+        All ranks must call it; raises FolderError if it was written by another number of ranks.
+        """
 
         def last_complete() -> int:
             names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
@@ -201,13 +140,25 @@ class RunFolder(RunOutput):
         return self._parts / f"state-{number:06d}-{self.comm.rank}-{self.comm.size}.npy"
 
     def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
-        """See ``RunOutput``: ``run.h5`` takes its name when it is complete, then the chunks go."""
+        """Put the chunks together; all ranks must call it. Raises OSError on all ranks if one cannot write.
+
+        ``run.h5`` takes its name when it is complete, then the chunks go.
+
+        Parameters
+        ----------
+        attributes
+            Root attributes besides the case; the same on all ranks.
+        columns
+            The recorded cells whose fields this rank's chunks hold; None: rank 0's hold those of all.
+        summary
+            What ``summary.json`` tells besides ``attributes``.
+        """
         target, aside = self.folder / "run.h5", self.folder / ".run.h5.part"
 
         def write() -> None:
             if columns is None and self.comm.rank:
                 return
-            data = self.dataset_without_fields(attributes)
+            data = dataset_without_fields(self, attributes)
             try:
                 with h5py.File(aside, "w", **({"driver": "mpio", "comm": self.comm} if columns else {})) as file:
                     put_dataset(file, data, write=self.comm.rank == 0)
@@ -235,45 +186,68 @@ class RunFolder(RunOutput):
                 aside.unlink(missing_ok=True)
 
 
-class RunMemory(RunOutput):
+class RunMemory:
     """Keeps a run in memory: ``dataset`` on rank 0 of ``comm``, None on the others and before its end.
 
-    Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
+    It is used as a ``RunFolder``. Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
     """
 
     shared = False
     folder = None
 
     def __init__(self, comm: MPI.Comm = MPI.COMM_SELF) -> None:
-        self.comm = comm
+        self.comm, self.count = comm, 0
         self.dataset: xr.Dataset | None = None
 
     def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
-        """See ``RunOutput``; raises ValueError for ``resume``."""
+        """Make ready; raises ValueError for ``resume``."""
         if resume:
             raise ValueError("a run in memory cannot be resumed")
         self.description, self.count = description, 0
         self._chunks: list[Arrays] = []
 
     def append(self, chunk: Arrays | None) -> None:
-        """See ``RunOutput``."""
+        """Keep the next chunk."""
         self._chunks.append(chunk or {})
         self.count += 1
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """See ``RunOutput``."""
+        """Chunk ``number`` of this rank, which has what is ``wanted``."""
         return self._chunks[number]
 
     def save_state(self, state: Arrays) -> None:
         """Nothing: a run in memory cannot be gone on with."""
 
+    def last_state(self) -> None:
+        """No checkpoint."""
+
     def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
-        """See ``RunOutput``."""
+        """Make the dataset; all ranks must call it."""
         if self.comm.rank == 0:
-            self.dataset = self.dataset_without_fields(attributes)
-            for name, values in self.joined(self.description.fields).items():
+            self.dataset = dataset_without_fields(self, attributes)
+            for name, values in joined(self, self.description.fields).items():
                 self.dataset[name] = field_dimensions(self.dataset), values, FIELDS[name]
         self._chunks = []
+
+
+RunOutput = RunFolder | RunMemory
+
+
+def joined(output: RunOutput, names: Collection[str]) -> dict[str, np.ndarray]:
+    """The arrays ``names`` of rank 0, those of all chunks one after the other."""
+    chunks = [output.read(number, 0, names) for number in range(output.count)]
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
+
+
+def dataset_without_fields(output: RunOutput, attributes: Mapping[str, Any]) -> xr.Dataset:
+    """All of a run but its fields, from the chunks of rank 0; episodes in the order of their onsets."""
+    arrays = joined(output, SAMPLED)
+    order = np.lexsort((arrays["impacts/site"], arrays["impacts/onset"]))
+    arrays |= {name: values[order] for name, values in arrays.items() if name.startswith("impacts/")}
+    if len(arrays["field_time"]) == len(arrays["time"]):
+        del arrays["field_time"]
+    arrays |= {**output.description.given, "episode": np.arange(1, len(order) + 1)}
+    return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": output.description.case, **attributes})
 
 
 def field_dimensions(data: xr.Dataset) -> list[str]:

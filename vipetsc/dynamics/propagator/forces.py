@@ -17,13 +17,12 @@ from vipetsc.compiled import njit
 from vipetsc.contact.changes import Extremes
 from vipetsc.contact.law import Contacts, create_contacts
 from vipetsc.contact.tracker import LIMITS, Episode, ImpactTracker
-from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.layout import Layout, create_burst
 from vipetsc.dynamics.propagator.advance import ORDER
 from vipetsc.dynamics.propagator.collocation import HISTORY, SUBSTEP_STATE, Cluster, collocation
 from vipetsc.dynamics.propagator.free_motion import DofTables
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.records import create_burst
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1

@@ -15,8 +15,7 @@ from vipetsc.contact.changes import Change, first_change, switching
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, begin_landing, correct, shorten
 from vipetsc.contact.tracker import Episode, ImpactTracker
 from vipetsc.dynamics.engine import Engine, StalledError
-from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.records import create_record
+from vipetsc.dynamics.layout import Layout, create_record
 from vipetsc.dynamics.ts.native import register
 from vipetsc.dynamics.ts.right_hand_side import observe, right_hand_side
 from vipetsc.parallel import StopRequest
@@ -65,7 +64,6 @@ class Integrator(Engine):
         options = PETSc.Options()
         self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
         self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
-        self._buffer = np.empty(2)
         self._stop = stop or StopRequest()
         self._any_open = False
         # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
@@ -160,14 +158,15 @@ class Integrator(Engine):
         end = target if count == 1 else self.time + h
         self.observe(self.tracker.end, end)
         change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h)
-        self._buffer[:] = change.share, -float(self._stop.requested)
-        self.comm.Allreduce(MPI.IN_PLACE, self._buffer, MPI.MIN)
-        if self._buffer[0] <= 1.0:
-            self._land(h, float(self._buffer[0]), change)
+        earliest = np.array([change.share, -float(self._stop.requested)])
+        self.comm.Allreduce(MPI.IN_PLACE, earliest, MPI.MIN)
+        share, stop = earliest.tolist()
+        if share <= 1.0:
+            self._land(h, share, change)
         else:
             self.tracker.accept_step(h)
             self.time = end
-        return self._buffer[1] == 0.0
+        return stop == 0.0
 
     def _trial(self, h: float) -> tuple[bool, float]:
         """Try one step from the state at ``time``: whether PETSc accepted it, and its next step size."""

@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 
 from vipetsc.compiled import cfunc
 from vipetsc.contact.law import SITE, Contacts, ForceLaw
-from vipetsc.dynamics.records import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
+from vipetsc.dynamics.layout import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape
 from vipetsc.dynamics.ts.right_hand_side import right_hand_side
 
 _TABLES = ("masses", "couplings", "springs", "site_cells", "sites")
@@ -98,16 +98,6 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     return _restore_read(u, address)
 
 
-def _create_context(lattice: LatticeRecord) -> np.ndarray:
-    """The context (1,) of a record."""
-    context = np.zeros(1, CONTEXT)
-    tables = lattice._asdict() | {"sites": lattice.contacts.sites}
-    context["shape"], context["law"], context["burst"] = lattice.shape, lattice.contacts.law, lattice.burst
-    context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
-    context["length"] = tuple(tables[name].size for name in _TABLES)
-    return context
-
-
 def compile_callback() -> CFunc:
     """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
 
@@ -122,7 +112,11 @@ def compile_callback() -> CFunc:
 
 def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
     """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``."""
-    callback, context = compile_callback(), _create_context(lattice)
+    callback, context = compile_callback(), np.zeros(1, CONTEXT)
+    tables = lattice._asdict() | {"sites": lattice.contacts.sites}
+    context["shape"], context["law"], context["burst"] = lattice.shape, lattice.contacts.law, lattice.burst
+    context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
+    context["length"] = tuple(tables[name].size for name in _TABLES)
     ts.setAttr("callback", (callback, context, lattice))  # PETSc holds bare pointers: all must live as long as ts
     pointers = (ctypes.c_void_p(p) for p in (ts.handle, None, callback.address, context.ctypes.data))
     error = petsc_library().TSSetRHSFunction(*pointers)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.contact.law import FREE, contact_force
-from vipetsc.dynamics.records import LatticeRecord, drive_force
+from vipetsc.dynamics.layout import LatticeRecord, drive_force
 
 # Cells in one pass: what a pass touches stays in the first-level cache.
 CHUNK = 512
