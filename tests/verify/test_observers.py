@@ -109,7 +109,7 @@ def test_an_observer_is_taken_by_its_name_and_goes_on_with_the_run(folder):
     resumed = simulate(case, folder / "stopped", resume=True, observers=["test-watch"])
     assert Watch.calls == ["begin", "restore", "finish"]
     assert stopped.statistics["watched"] + resumed.statistics["watched"] == straight.statistics["watched"]
-    for name in ("fastest", "ledger_error", "work", "dissipated", "episodes", "samples"):
+    for name in ("fastest", "ledger_error", "work", "dissipated", "episodes", "samples", "steps", "switches", "grazes"):
         assert resumed.statistics[name] == straight.statistics[name], name
     assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "stopped")))
 
