@@ -9,8 +9,7 @@ import ast
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, overload
@@ -28,8 +27,9 @@ def njit(function: Function, /) -> Function: ...
 def njit(*signature: str, **options: Any) -> Callable[[Function], Function]: ...
 def njit(*signature: Any, **options: Any) -> Any:
     """``numba.njit`` with a cache; without a signature, it compiles at the first call."""
-    bare = signature and callable(signature[0])
-    return _decorator(numba.njit)(signature[0]) if bare else _decorator(numba.njit, *signature, **options)
+    if signature and callable(signature[0]):
+        return _decorator(numba.njit)(signature[0])
+    return _decorator(numba.njit, *signature, **options)
 
 
 def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -38,23 +38,18 @@ def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]
 
 
 def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``compiler`` with ``kernel_cache`` as numba's folder meanwhile; a NUMBA_CACHE_DIR stays the parent."""
+
     def decorate(function: Callable[..., Any]) -> Any:
-        with _cache_folder():
-            return compiler(*signature, **{"cache": True} | options)(function)
+        config: Any = numba.config
+        chosen = config.CACHE_DIR
+        config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, chosen))
+        try:
+            return compiler(*signature, cache=True, **options)(function)
+        finally:
+            config.CACHE_DIR = chosen
 
     return decorate
-
-
-@contextmanager
-def _cache_folder() -> Iterator[None]:
-    """Have numba keep what is compiled meanwhile in ``kernel_cache``; a NUMBA_CACHE_DIR stays the parent."""
-    config: Any = numba.config
-    chosen = config.CACHE_DIR
-    config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, chosen))
-    try:
-        yield
-    finally:
-        config.CACHE_DIR = chosen
 
 
 @cache

@@ -23,7 +23,6 @@ def test_an_exact_law_is_recovered(exponent, factor, count):
     x = np.geomspace(0.1, 20, count)
     for method in METHODS:
         fit = power_law(x, factor * x**exponent, method)
-        assert fit.points == count
         assert fit.exponent == pytest.approx(exponent, abs=1e-9)
         assert fit.factor == pytest.approx(factor, rel=1e-8)
         if abs(exponent) > 0.01:
@@ -35,11 +34,10 @@ def test_the_line_has_the_textbook_statistics():
     y = scattered()
     law = power_law(X, y)
     book = stats.linregress(np.log(X), np.log(y))
-    half = stats.t.ppf(0.975, len(X) - 2) * np.array([book.stderr, book.intercept_stderr])
+    half = stats.t.ppf(0.975, len(X) - 2) * book.stderr
     assert law.exponent == pytest.approx(book.slope, rel=1e-12)
     assert law.factor == pytest.approx(np.exp(book.intercept), rel=1e-12)
-    assert law.exponent_interval == pytest.approx((book.slope - half[0], book.slope + half[0]), rel=1e-10)
-    assert np.log(law.factor_interval) == pytest.approx([book.intercept - half[1], book.intercept + half[1]], rel=1e-10)
+    assert law.exponent_interval == pytest.approx((book.slope - half, book.slope + half), rel=1e-10)
     r2 = book.rvalue**2
     assert law.r2_adjusted == pytest.approx(1 - (1 - r2) * (len(X) - 1) / (len(X) - 2), rel=1e-12)
 
@@ -53,9 +51,8 @@ def test_the_nonlinear_fit_is_least_in_squares():
         assert np.sum((y - factor * fit.factor * X ** (fit.exponent + shift)) ** 2) > least
     jacobian = np.stack([X**fit.exponent, fitted * np.log(X)], axis=1)
     covariance = np.linalg.inv(jacobian.T @ jacobian) * least / (len(X) - 2)
-    half = stats.t.ppf(0.975, len(X) - 2) * np.sqrt(np.diag(covariance))
-    assert fit.factor_interval == pytest.approx((fit.factor - half[0], fit.factor + half[0]), rel=1e-5)
-    assert fit.exponent_interval == pytest.approx((fit.exponent - half[1], fit.exponent + half[1]), rel=1e-5)
+    half = stats.t.ppf(0.975, len(X) - 2) * np.sqrt(covariance[1, 1])
+    assert fit.exponent_interval == pytest.approx((fit.exponent - half, fit.exponent + half), rel=1e-5)
     r2 = 1 - least / np.sum((y - y.mean()) ** 2)
     assert fit.r2_adjusted == pytest.approx(1 - (1 - r2) * 11 / 10, rel=1e-9)
 
@@ -90,7 +87,7 @@ def test_the_peak_starts_the_decay():
     y = np.where(X < 1, 0.01, X**-0.7)
     order = np.random.default_rng(1).permutation(len(X))
     law = from_peak(X[order], y[order])
-    assert law.points == np.sum(X >= 1)
+    assert law == power_law(X[X >= 1], y[X >= 1])
     assert law.exponent == pytest.approx(-0.7)
     with pytest.raises(ValueError, match="1 points"):
         from_peak(X, X)

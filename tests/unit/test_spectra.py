@@ -15,7 +15,6 @@ from vipetsc.spectra import (
     ibtet,
     kinetic_energy,
     part_energies,
-    part_kinetic_energy,
     ridge,
     split,
     taper,
@@ -84,10 +83,8 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
     assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
     monkeypatch.setattr("vipetsc.spectra.bands.BLOCK", 64 * 3)
     assert np.allclose(part_energies(velocity, MASSES, 0.1, edges), energy, rtol=1e-12)
-    middle = part_kinetic_energy(velocity, MASSES, 0.1, 8.0, 20.0)
-    assert np.allclose(middle.sum(axis=1), energy[1], rtol=1e-12)
-    lowest = part_kinetic_energy(velocity, MASSES, 0.1, 0.0, 8.0)
-    assert np.allclose(lowest.sum(axis=1), energy[0], rtol=1e-12)
+    (middle,) = split(velocity, 0.1, edges[1:3])
+    assert np.allclose(kinetic_energy(middle, MASSES).sum(axis=1), energy[1], rtol=1e-12)
 
 
 def test_a_tone_stays_in_its_part():

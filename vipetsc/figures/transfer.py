@@ -18,7 +18,7 @@ from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, transfer
 from vipetsc.figures.transfer_curves import Curve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
-from vipetsc.spectra import TAPER, Parts, part_kinetic_energy, taper
+from vipetsc.spectra import TAPER, Parts, kinetic_energy, split, taper
 
 INPUT_CELL = 5  # the paper's cell before the sites; the one behind them is the middle of the lattice, its cell 150
 SEGMENTS = {"dispersion_before": ("Input segment", style.SKY), "dispersion_after": ("Output segment", style.YELLOW)}
@@ -75,8 +75,8 @@ def _space_time(page: SubFigure, member: MeasuredRun, velocity: np.ndarray, lett
     maps = [whole]
     for i, p in enumerate(bands):
         axes = page.add_subplot(grid[i // columns, 1 + i % columns], sharex=whole, sharey=whole)
-        part = part_kinetic_energy(velocity, cell.masses, field_interval(run), *parts.edges[p : p + 2])
-        panels.draw_map(axes, time, cells, part.T, norm)
+        (part,) = split(velocity, field_interval(run), parts.edges[p : p + 2])
+        panels.draw_map(axes, time, cells, kinetic_energy(part, cell.masses).T, norm)
         panel_title(axes, f"({next(letters)}) {parts.names[p].capitalize()}")
         axes.set_xlabel("Time (s)")
         axes.label_outer()

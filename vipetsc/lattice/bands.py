@@ -19,7 +19,7 @@ class BlochPoint:
     """Solution of the Bloch problem; leading axes are those of ``wavenumber`` (rad per cell).
 
     ``frequency`` (..., band) in rad/s, ``vectors`` (..., dof, band) mass-normalised, ``group_velocity``
-    (..., band) in cells/s. Of several cells, the axis of cells comes first.
+    (..., band) in cells/s.
     """
 
     wavenumber: np.ndarray
@@ -37,35 +37,24 @@ class Band:
     high: float
 
 
-def bloch(cell: UnitCell | Sequence[UnitCell], kappa: ArrayLike) -> BlochPoint:
+def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     """Frequencies, eigenvectors and group velocities of ``cell`` at wavenumbers ``kappa`` (rad per cell).
 
     Solves (K(kappa) - omega^2 M) u = 0; the group velocity is d omega/d kappa = u* K' u / (2 omega), taken
-    as the limit from kappa > 0 where omega = 0. Several cells of as many masses each are solved together.
+    as the limit from kappa > 0 where omega = 0.
     """
     kappa = np.asarray(kappa, float)
     # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
     off_zero = np.where(np.abs(kappa) < 3e-4, 3e-4, kappa)
-    if isinstance(cell, UnitCell):
-        masses = np.asarray(cell.masses)
-    else:
-        masses = np.stack([c.masses for c in cell]).reshape(len(cell), *(1,) * kappa.ndim, -1)
-    root = 1 / np.sqrt(masses)
-    scale = root[..., :, None] * root[..., None, :]
-    squared, vectors = np.linalg.eigh(_each(UnitCell.stiffness_matrix, cell, kappa) * scale)
+    root = 1 / np.sqrt(cell.masses)
+    scale = root[:, None] * root
+    squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)
     frequency = np.sqrt(np.maximum(squared, 0))
-    eigenvalue, u = np.linalg.eigh(_each(UnitCell.stiffness_matrix, cell, off_zero) * scale)
-    stiffness_slope = _each(_stiffness_slope, cell, off_zero) * scale
+    eigenvalue, u = np.linalg.eigh(cell.stiffness_matrix(off_zero) * scale)
+    stiffness_slope = _stiffness_slope(cell, off_zero) * scale
     eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope @ u).real
     group_velocity = eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny)))
-    return BlochPoint(kappa, frequency, vectors * root[..., :, None], group_velocity)
-
-
-def _each(
-    matrix: Callable[[UnitCell, np.ndarray], np.ndarray], cell: UnitCell | Sequence[UnitCell], kappa: np.ndarray
-) -> np.ndarray:
-    """``matrix(cell, kappa)`` of one cell, or of several along a first axis."""
-    return matrix(cell, kappa) if isinstance(cell, UnitCell) else np.stack([matrix(c, kappa) for c in cell])
+    return BlochPoint(kappa, frequency, vectors * root[:, None], group_velocity)
 
 
 def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:

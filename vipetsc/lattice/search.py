@@ -1,5 +1,6 @@
 """The search of the supplement for the four-band cell: which (lambda, eta) suit inter-band transfer best."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,16 +12,6 @@ from vipetsc.lattice.cell import Reading, UnitCell, four_band
 COSTS = ("deflection", "group_velocity", "weighted")
 DRIVEN = 2  # the band whose wave is to open and close the contacts; waves are to be fast from here upwards
 AT_REST = 1e-12  # of the product of two unit-norm displacements, which then have no phase
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """The best cell of a search by one cost: its index (row, column) in the grid, its parameters, its cost."""
-
-    index: tuple[int, int]
-    lam: float
-    eta: float
-    value: float
 
 
 @dataclass(frozen=True)
@@ -58,13 +49,13 @@ class Search:
         speed = self.speed[..., DRIVEN - 1 :].sum(axis=-1)
         return {"deflection": deflection, "group_velocity": speed, "weighted": speed * deflection}[name]
 
-    def optimum(self, name: str) -> Optimum | None:
-        """The best of the cells that are out of phase, by the cost ``name``; None if there is no such cell."""
+    def optimum(self, name: str) -> tuple[int, int] | None:
+        """Where (lambda, eta) the cost ``name`` is best, of the cells out of phase; None if there is no such cell."""
         if not self.out_of_phase.any():
             return None
         cost = np.where(self.out_of_phase, self.cost(name), -np.inf)
-        row, column = (int(i) for i in np.unravel_index(np.argmax(cost), cost.shape))
-        return Optimum((row, column), float(self.lam[row]), float(self.eta[column]), float(cost[row, column]))
+        row, column = np.unravel_index(np.argmax(cost), cost.shape)
+        return int(row), int(column)
 
 
 def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLike) -> Search:
@@ -73,13 +64,14 @@ def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLi
     Raises ValueError if a lambda is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
     """
     lams, etas, kappa = (np.atleast_1d(np.asarray(values, float)) for values in (lam, eta, wavenumber))
-    rows = []
-    for value in lams:  # row by row, so that the eigenvectors in memory stay few
-        cells = [four_band(reading, value, e) for e in etas]
-        point = bloch(cells, kappa)
-        deflection = signed_deflection(cells[0], point)[..., DRIVEN - 1]
-        rows.append((point.frequency, deflection, np.abs(point.group_velocity).max(axis=1)))
-    return Search(lams, etas, kappa, *(np.stack(part) for part in zip(*rows, strict=True)))
+    cells = []  # of each, what is kept of its Bloch waves
+    for of_lam, of_eta in itertools.product(lams, etas):
+        cell = four_band(reading, of_lam, of_eta)
+        point = bloch(cell, kappa)
+        deflection = signed_deflection(cell, point)[:, DRIVEN - 1]
+        cells.append((point.frequency, deflection, np.abs(point.group_velocity).max(axis=0)))
+    fields = (np.reshape(values, (len(lams), len(etas), *values[0].shape)) for values in zip(*cells, strict=True))
+    return Search(lams, etas, kappa, *fields)
 
 
 def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Measures on sampled fields, in plain numpy and scipy: Fourier, wavelets, band energies, entropy, power laws."""
 
-from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, part_kinetic_energy, split
+from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, split
 from vipetsc.spectra.entropies import Entropy, entropy, local_entropy
 from vipetsc.spectra.fits import PowerLaw, from_peak, normalised, power_law
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content

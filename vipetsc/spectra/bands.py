@@ -34,24 +34,22 @@ class Parts:
     @classmethod
     def of(cls, bands: Sequence[Band]) -> Self:
         """The partition that ``bands``, lowest first, make of the frequency axis."""
-        merged: list[tuple[float, float, tuple[int, ...]]] = []
-        for band in sorted(bands, key=lambda b: (b.low, b.high)):
-            if merged and band.low <= merged[-1][1]:
-                low, high, numbers = merged.pop()
-                merged.append((low, max(high, band.high), (*numbers, band.number)))
-            else:
-                merged.append((band.low, band.high, (band.number,)))
+        edges: list[float] = [0.0]
+        inside: list[tuple[int, ...]] = []  # the bands of each part
         # Rounding leaves the first band of a free lattice a hair above zero; nothing is below it.
-        tiny = 1e-6 * merged[-1][1]
-        parts: list[tuple[float, str, tuple[int, ...]]] = []  # upper edge, name, bands
-        below, number = 0.0, itertools.count(1)
-        for low, high, numbers in merged:
-            if low > below + tiny:
-                parts.append((low, f"gap {next(number)}", ()))
-            parts.append((high, f"band {'+'.join(map(str, sorted(numbers)))}", numbers))
-            below = high
-        edges, names, bands_inside = zip(*parts, (np.inf, "above", ()), strict=True)
-        return cls(np.array([0.0, *edges]), names, bands_inside)
+        tiny = 1e-6 * max(band.high for band in bands)
+        for band in sorted(bands, key=lambda b: (b.low, b.high)):
+            if inside and band.low <= edges[-1]:
+                edges[-1], inside[-1] = max(edges[-1], band.high), (*inside[-1], band.number)
+                continue
+            if band.low > edges[-1] + tiny:
+                edges.append(band.low)
+                inside.append(())
+            edges.append(band.high)
+            inside.append((band.number,))
+        gap = itertools.count(1)
+        names = (f"band {'+'.join(map(str, sorted(part)))}" if part else f"gap {next(gap)}" for part in inside)
+        return cls(np.array([*edges, np.inf]), (*names, "above"), (*inside, ()))
 
     def above(self, frequency: float) -> np.ndarray:
         """Which parts (part) are pass bands above the one driven at ``frequency`` (rad/s)."""
@@ -87,17 +85,6 @@ def part_energies(velocity: np.ndarray, masses: ArrayLike, interval: float, edge
         for first in range(0, cells, block):
             for p, part in enumerate(split(of_mass[:, first : first + block], interval, edges)):
                 energy[p] += 0.5 * mass * np.einsum("tc,tc->t", part, part)
-    return energy
-
-
-def part_kinetic_energy(
-    velocity: np.ndarray, masses: ArrayLike, interval: float, low: float, high: float
-) -> np.ndarray:
-    """Kinetic energy (t, cell) in J of what moves between the frequencies ``low`` and ``high`` (rad/s)."""
-    energy = np.zeros(velocity.shape[:2])
-    for j, mass in enumerate(np.asarray(masses)):
-        (part,) = split(np.asarray(velocity[..., j]), interval, [low, high])
-        energy += 0.5 * mass * part**2
     return energy
 
 

@@ -63,7 +63,15 @@ def entropy(velocity: np.ndarray, start: int = 0) -> Entropy:
     snapshot = np.einsum("tc,tc->t", share, local)
     position = -np.sum(share * np.log2(share, out=np.zeros_like(share), where=share > 0), axis=1)
     means = float(snapshot[start:].mean()), float((snapshot + position)[start:].mean())
-    return Entropy(local, weight, snapshot, *means, *_masked(local[start:], weight[start:]))
+    # Eq. (d), of all cells and of each.
+    above_threshold = weight[start:] > FLOOR * weight[start:].max()
+    count = above_threshold.sum(axis=0)
+    sums = np.where(above_threshold, local[start:], 0.0).sum(axis=0)
+    counted = count > 0
+    if not counted.any():
+        return Entropy(local, weight, snapshot, *means, masked=0.0, error=0.0)
+    of_cells = sums[counted] / count[counted]
+    return Entropy(local, weight, snapshot, *means, float(sums.sum() / count.sum()), float(np.std(of_cells)))
 
 
 def local_entropy(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -84,9 +92,9 @@ def local_entropy(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         total, s_log_s = np.zeros(signal.shape), np.zeros(signal.shape)
         for length, groups in _octaves(cells):
             spectrum = fft.rfft(signal, length)
-            for low, filters in groups:
-                x = np.empty((len(signal), len(filters), length), dtype=complex)
-                _filter(spectrum, filters, low, x)
+            for band, filters in groups:
+                x = np.zeros((len(signal), len(filters), length), dtype=complex)
+                np.multiply(spectrum[:, None, band], filters, out=x[:, :, band])
                 _accumulate(fft.ifft(x, overwrite_x=True), total, s_log_s)
         _entropies(total, s_log_s, local[rows])
         weight[rows] = np.ldexp(total, 2 * exponent[:, None])
@@ -94,11 +102,10 @@ def local_entropy(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=8)
-def _octaves(cells: int) -> list[tuple[int, list[tuple[int, np.ndarray]]]]:
+def _octaves(cells: int) -> list[tuple[int, list[tuple[slice, np.ndarray]]]]:
     """For each octave of nodes the padded length, which its lowest node sets, and its filters.
 
-    The filters come in groups: the first row of the band where any of them lets something through, and their rows
-    (kappa, band) from there on.
+    The filters come in groups: the band where any of them lets something through, and what they are there (kappa, k).
     """
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
     octaves = []
@@ -109,20 +116,10 @@ def _octaves(cells: int) -> list[tuple[int, list[tuple[int, np.ndarray]]]]:
         for first in range(0, len(some), GROUP):
             group = filters[first : first + GROUP]
             inside = np.flatnonzero(group.max(axis=0) > np.finfo(float).eps * group.max())
-            groups.append((int(inside[0]), np.ascontiguousarray(group[:, inside[0] : inside[-1] + 1])))
+            band = slice(inside[0], inside[-1] + 1)
+            groups.append((band, group[:, band]))
         octaves.append((length, groups))
     return octaves
-
-
-@njit("void(c16[:,::1], f8[:,::1], i8, c16[:,:,::1])")
-def _filter(spectrum: np.ndarray, filters: np.ndarray, low: int, x: np.ndarray) -> None:
-    """Spectra ``x`` (t, kappa, k) of the wavelet transforms; ``filters`` (kappa, band) start at row ``low``."""
-    for t in range(x.shape[0]):
-        for k in range(x.shape[1]):
-            x[t, k, :low] = 0.0
-            for i in range(filters.shape[1]):
-                x[t, k, low + i] = spectrum[t, low + i] * filters[k, i]
-            x[t, k, low + filters.shape[1] :] = 0.0
 
 
 @njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", error_model="numpy", fastmath={"contract"})
@@ -167,14 +164,3 @@ def _entropies(weight: np.ndarray, s_log_s: np.ndarray, local: np.ndarray) -> No
                 local[t, c] = max(np.log2(w) - s_log_s[t, c] / w, 0.0)
             else:
                 weight[t, c] = local[t, c] = 0.0
-
-
-def _masked(local: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """The masked mean of Eq. (d), and the deviation over the cells of each one's mean over time."""
-    above_threshold = weight > FLOOR * weight.max()
-    if not above_threshold.any():
-        return 0.0, 0.0
-    count = above_threshold.sum(axis=0)
-    sums = np.where(above_threshold, local, 0.0).sum(axis=0)
-    counted = count > 0
-    return float(sums.sum() / count.sum()), float(np.std(sums[counted] / count[counted]))

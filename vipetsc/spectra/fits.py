@@ -19,7 +19,7 @@ Method = Literal["log-log", "nonlinear"]
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """y = ``factor`` x^``exponent`` through ``points`` points, with 95 % confidence intervals (low, high) of both.
+    """y = ``factor`` x^``exponent``, with the 95 % confidence interval (low, high) of the exponent.
 
     ``r2_adjusted`` is that of the logarithms for the log-log line, and of the values for the nonlinear fit.
     """
@@ -27,9 +27,7 @@ class PowerLaw:
     factor: float
     exponent: float
     r2_adjusted: float
-    factor_interval: tuple[float, float]
     exponent_interval: tuple[float, float]
-    points: int
 
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
@@ -73,12 +71,9 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     slope = float(u @ v / (u @ u))
     if method == "nonlinear":
         return _nonlinear(u, y / np.exp(cy), slope, cx, cy)
-    variance = float(np.sum((v - slope * u) ** 2)) / freedom
-    deviation = float(np.sqrt(variance / (u @ u)))
-    at_one = cy - slope * cx
-    low, high = _interval(at_one, float(np.sqrt(variance / len(x) + (cx * deviation) ** 2)), freedom)
-    intervals = (float(np.exp(low)), float(np.exp(high))), _interval(slope, deviation, freedom)
-    return PowerLaw(float(np.exp(at_one)), slope, r2_adjusted(v, slope * u), *intervals, len(x))
+    deviation = float(np.sqrt(float(np.sum((v - slope * u) ** 2)) / freedom / (u @ u)))
+    interval = _interval(slope, deviation, freedom)
+    return PowerLaw(float(np.exp(cy - slope * cx)), slope, r2_adjusted(v, slope * u), interval)
 
 
 def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float) -> PowerLaw:
@@ -95,13 +90,9 @@ def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float)
         (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=slopes, **tolerances)
     except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
         nan = float("nan")
-        return PowerLaw(nan, nan, nan, (nan, nan), (nan, nan), len(u))
-    # The factor's deviation by linear propagation from (c, b) to a.
-    factor = c * np.exp(cy - b * cx)
-    gradient = np.array([factor / c, -cx * factor])
-    of_factor = _interval(float(factor), float(np.sqrt(gradient @ covariance @ gradient)), len(u) - 2)
-    of_exponent = _interval(float(b), float(np.sqrt(covariance[1, 1])), len(u) - 2)
-    return PowerLaw(float(factor), float(b), r2_adjusted(w, law(u, c, b)), of_factor, of_exponent, len(u))
+        return PowerLaw(nan, nan, nan, (nan, nan))
+    interval = _interval(float(b), float(np.sqrt(covariance[1, 1])), len(u) - 2)
+    return PowerLaw(float(c * np.exp(cy - b * cx)), float(b), r2_adjusted(w, law(u, c, b)), interval)
 
 
 def from_peak(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:

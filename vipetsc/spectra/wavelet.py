@@ -177,27 +177,17 @@ class Partition:
     """Kinetic energies in J of the parts v_b of a velocity field.
 
     ``energy`` (bin, t) summed over the lattice, ``field`` (bin, t, cell) or None, ``kinetic`` (t) of the velocities
-    themselves, ``reconstructed`` (t): KE_rec = 1/2 sum m (sum_b v_b)^2.
+    themselves, ``reconstructed`` (t): KE_rec = 1/2 sum m (sum_b v_b)^2. Both 0 at rest: ``error`` (t) =
+    |KE_rec - KE| / KE, the paper's Eq. (A8), and ``cross_share`` (t) = 1 - sum_b KE_b / KE, the energy in products of
+    different parts.
     """
 
     energy: np.ndarray
     field: np.ndarray | None
     kinetic: np.ndarray
     reconstructed: np.ndarray
-
-    @property
-    def error(self) -> np.ndarray:
-        """e (t) = |KE_rec - KE| / KE (the paper's Eq. (A8)), 0 at rest."""
-        return _share(np.abs(self.reconstructed - self.kinetic), self.kinetic)
-
-    @property
-    def cross_share(self) -> np.ndarray:
-        """1 - sum_b KE_b / KE (t): the energy in products of different parts, 0 at rest."""
-        return _share(self.kinetic - self.energy.sum(axis=0), self.kinetic)
-
-
-def _share(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0)
+    error: np.ndarray
+    cross_share: np.ndarray
 
 
 def partition(
@@ -227,4 +217,6 @@ def partition(
             reconstructed[rows] += 0.5 * mass * np.einsum("tc,tc->t", whole, whole)
             if field is not None:
                 field[:, rows] += 0.5 * mass * parts**2
-    return Partition(energy, field, kinetic, reconstructed)
+    missing = np.stack([np.abs(reconstructed - kinetic), kinetic - energy.sum(axis=0)])
+    shares = np.divide(missing, kinetic, out=np.zeros_like(missing), where=kinetic > 0)
+    return Partition(energy, field, kinetic, reconstructed, *shares)

@@ -90,10 +90,11 @@ def _optima(searches: Mapping[Reading, Search], grids: Mapping[str, Any]) -> dic
         for j, name in enumerate(COSTS):
             best = result.optimum(name)
             if best is not None:
-                cell = four_band(reading, best.lam, best.eta)
+                lam, eta = result.lam[best[0]], result.eta[best[1]]
+                cell = four_band(reading, lam, eta)
                 point = bloch(cell, result.wavenumber)
-                at_best = best.lam, best.eta, best.value, np.abs(unit_vectors(point)), signed_deflection(cell, point)
-                for array, value in zip(optima.values(), at_best, strict=True):
+                waves = np.abs(unit_vectors(point)), signed_deflection(cell, point)
+                for array, value in zip(optima.values(), (lam, eta, result.cost(name)[best], *waves), strict=True):
                     array[i, j] = value
     return optima
 
