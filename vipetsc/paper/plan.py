@@ -146,7 +146,7 @@ class Step:
 class Plan:
     """Steps in the order in which they are made, and the figures of the paper.
 
-    ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``measure`` gives the claims (dataclasses) from
+    ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``measure`` gives the rows of ``claims.json`` from
     the folder of all steps.
     """
 
@@ -154,7 +154,7 @@ class Plan:
     steps: tuple[Step, ...]
     figures: Sequence[PaperFigure] = PAPER_FIGURES
     note: str = ""
-    measure: Callable[[Path], Sequence[Any]] = measure_claims
+    measure: Callable[[Path], Sequence[Mapping[str, Any]]] = measure_claims
 
     def only(self, ids: Iterable[str]) -> Self:
         """The part of the plan that figures and claims need; all of it without ``ids``; raises FolderError."""

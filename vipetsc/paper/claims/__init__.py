@@ -1,3 +1,3 @@
 """The paper's seventeen claims (SPEC.md 11), each measured from files in both readings of its parameters."""
 
-from vipetsc.paper.claims.measure import Claim, measure_claims, write_claims
+from vipetsc.paper.claims.measure import measure_claims, write_claims

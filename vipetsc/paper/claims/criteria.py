@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from math import inf, isfinite
-from typing import Any
+from typing import Any, SupportsFloat
 
 HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
 ROUNDING = 1e-9  # of a measured number beside its threshold
@@ -54,11 +54,11 @@ class Criterion:
     source: str
     decisive: bool = False
 
-    def met(self, value: float | None) -> bool:
+    def met(self, value: SupportsFloat | None) -> bool:
         """Whether ``value`` keeps to the threshold; a number that is not there or not finite does not."""
         low, high = self.interval
         scale = high if self.comparison == "of" else 1
-        return value is not None and isfinite(value) and low - ROUNDING <= value * scale <= high + ROUNDING
+        return value is not None and isfinite(value) and low - ROUNDING <= float(value) * scale <= high + ROUNDING
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -92,7 +92,7 @@ class ClaimSpec:
     criteria: tuple[Criterion, ...]
 
 
-def verdict(criteria: Sequence[Criterion], value: Mapping[str, float | None]) -> tuple[str, list[str]]:
+def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | None]) -> tuple[str, list[str]]:
     """The verdict on the numbers ``value``, and the quantities of the criteria that are not met or not measured.
 
     It holds when every criterion is met, not at all when none is or a decisive one is not, and else in part; what

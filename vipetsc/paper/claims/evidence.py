@@ -1,10 +1,11 @@
 """What claims are measured from, the steps of the paper in one folder, and what a measurement gathers."""
 
 import tomllib
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, SupportsFloat
 
 import numpy as np
 import xarray as xr
@@ -12,12 +13,11 @@ import xarray as xr
 from vipetsc.case import Case
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, member_folder, open_ensemble, select
-from vipetsc.spectra import normalised
 from vipetsc.studies.backbone import initiation_of
 
 EXCITED = 5 * np.pi / 9  # rad/cell, driven in the paper's section II
 
-Numbers = dict[str, float | None]
+Numbers = dict[str, SupportsFloat | None]
 
 
 class MissingEvidence(Exception):
@@ -51,10 +51,9 @@ class MeasuredRun:
     @property
     def onset(self) -> float:
         """Amplitude in N of the first contact of runs like this one; NaN if their linear run is gone."""
-        try:
+        with suppress(OSError, ValueError):
             return initiation_of(self.folder.parent, self.case).onset
-        except (OSError, ValueError):
-            return float("nan")
+        return float("nan")
 
     def arrays(self, *names: str) -> tuple[np.ndarray, ...]:
         """Variables of the analysis by name."""
@@ -62,32 +61,22 @@ class MeasuredRun:
 
 
 class AmplitudeCurve:
-    """A measure over rising ``amplitude`` (point) in N, without failed members, and the contact ``episodes``.
+    """The measure ``name`` of ``Evidence.select`` over rising ``amplitude`` (point) in N, without failed members.
 
-    ``untouched`` (point) tells where there is no contact, ``peak`` is the index of the largest value.
+    ``untouched`` (point) tells where there is no contact, ``peak`` is the index of the largest value. Raises
+    MissingEvidence.
     """
 
-    def __init__(self, amplitude: np.ndarray, value: np.ndarray, episodes: np.ndarray) -> None:
-        self.amplitude, self.value, self.episodes = amplitude, value, episodes
-        self.untouched, self.peak = episodes == 0, int(np.argmax(value))
-        self.peak_amplitude = float(amplitude[self.peak])
-
-    @classmethod
-    def of(cls, members: xr.Dataset, name: str) -> Self:
-        """The measure ``name`` of ``Evidence.select``; raises MissingEvidence."""
+    def __init__(self, members: xr.Dataset, name: str) -> None:
         step = Path(members.attrs["folder"]).name
         if name not in members:
             raise MissingEvidence(f"{step} holds no {name} over the amplitude")
         valid = members.isel(amplitude=np.isfinite(members[name].values))
         if not valid.sizes["amplitude"]:
             raise MissingEvidence(f"{step}: every member of a curve of {name} failed")
-        return cls(valid["amplitude"].values, valid[name].values, valid["contact_episodes"].values)
-
-    @property
-    def normalised(self) -> Self:
-        """The same with values on [.01, 1], as the paper's; NaN if they are all equal."""
-        value = normalised(self.value) if np.ptp(self.value) > 0 else np.full(len(self.value), np.nan)
-        return type(self)(self.amplitude, value, self.episodes)
+        self.amplitude, self.value = valid["amplitude"].values, valid[name].values
+        self.untouched, self.peak = valid["contact_episodes"].values == 0, int(np.argmax(self.value))
+        self.peak_amplitude = float(self.amplitude[self.peak])
 
     def growth_ratio(self, low: float, high: float) -> float:
         """Ratio of the amplitudes between which the values grow: from the last <= ``low`` to the first >= ``high``.
@@ -116,7 +105,7 @@ class Evidence(ExitStack):
         super().__init__()
         self.root = Path(root)
         self.files: list[str] = []
-        self._ensembles: dict[str, xr.Dataset] = {}
+        self._open_ensemble = cache(open_ensemble)
 
     def path(self, *parts: str) -> Path:
         """A file below ``root``, noted down."""
@@ -133,10 +122,7 @@ class Evidence(ExitStack):
 
     def ensemble(self, step: str) -> xr.Dataset:
         """The finished sweep of a step."""
-        self.path(step, "ensemble.h5")
-        if step not in self._ensembles:
-            self._ensembles[step] = open_ensemble(self.root / step)
-        return self._ensembles[step]
+        return self._open_ensemble(self.path(step, "ensemble.h5").parent)
 
     def select(self, step: str, reading: str, **wanted: Any) -> xr.Dataset:
         """The members of a sweep over rising amplitude, in one reading and with the coordinates ``wanted``.

@@ -21,20 +21,20 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
     )
     for i, name in enumerate(costs):
         for symbol in ("lambda", "eta"):
-            result.value[f"{symbol} at the optimum, {name}"] = float(search[f"optimum_{symbol}"].values[row, i])
+            result.value[f"{symbol} at the optimum, {name}"] = search[f"optimum_{symbol}"].values[row, i]
     # The paper searched a coarse grid; a finer one has its optimum beside.
     rows, columns = _on_grid(lam), _on_grid(eta)
     coarse = np.where(phase, cost, -np.inf)[np.ix_(rows, columns)]
     at_lam, at_eta = np.unravel_index(np.argmax(coarse), coarse.shape)
     cell = int(np.argmin(abs(lam - PAPER_CELL[0]))), int(np.argmin(abs(eta - PAPER_CELL[1])))
     result.value |= {
-        f"lambda at the optimum of a grid of {GRID:g}": float(lam[rows][at_lam]),
-        f"eta at the optimum of a grid of {GRID:g}": float(eta[columns][at_eta]),
-        "u2 and u3 out of phase on band 2 at the paper's cell (1 = yes)": int(phase[cell]),
-        "weighted cost of the paper's cell over the optimum's": float(paper[weighted] / best[weighted]),
+        f"lambda at the optimum of a grid of {GRID:g}": lam[rows][at_lam],
+        f"eta at the optimum of a grid of {GRID:g}": eta[columns][at_eta],
+        "u2 and u3 out of phase on band 2 at the paper's cell (1 = yes)": phase[cell],
+        "weighted cost of the paper's cell over the optimum's": paper[weighted] / best[weighted],
     }
     for name, values in (("lambda", lam), ("eta", eta)):
-        result.uncertainty[f"spacing of {name}"] = float(np.diff(values).max(initial=0.0))
+        result.uncertainty[f"spacing of {name}"] = np.diff(values).max(initial=0.0)
 
 
 def _on_grid(values: np.ndarray) -> np.ndarray:
@@ -44,7 +44,7 @@ def _on_grid(values: np.ndarray) -> np.ndarray:
 
 
 def _transfer(evidence: Evidence, reading: str, law: str, sites: int, cycles: int) -> AmplitudeCurve:
-    return AmplitudeCurve.of(evidence.select(STEP, reading, law=law, sites=sites, cycles=cycles), "ibtet")
+    return AmplitudeCurve(evidence.select(STEP, reading, law=law, sites=sites, cycles=cycles), "ibtet")
 
 
 def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -52,8 +52,8 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
     maxima = []
     for law in LAWS:
         curve = _transfer(evidence, reading, law, 5, 30)
-        floor = float(curve.value[curve.untouched].mean()) if curve.untouched.any() else np.nan
-        highest = float(curve.value[curve.peak])
+        floor = curve.value[curve.untouched].mean() if curve.untouched.any() else np.nan
+        highest = curve.value.max()
         growth = curve.growth_ratio(LOW * floor, highest / 2)
         maxima.append(highest)
         result.value |= {
@@ -61,13 +61,13 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
             f"ratio of amplitudes from the floor to half the maximum, {law}": growth,
             f"maximum, {law}": highest,
             f"amplitude of the maximum (N), {law}": curve.peak_amplitude,
-            f"transfer at the largest amplitude, {law}": float(curve.value[-1]),
+            f"transfer at the largest amplitude, {law}": curve.value[-1],
         }
         # The larger of its two neighbours shows how well the grid of amplitudes resolves the maximum.
         beside = np.sort(curve.value[max(curve.peak - 1, 0) : curve.peak + 2])[-2:][0]
-        result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - float(beside)
+        result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - beside
         result.uncertainty[f"amplitudes, {law}"] = len(curve.amplitude)
-    result.uncertainty["spread of the maxima between the laws"] = float(np.ptp(maxima))
+    result.uncertainty["spread of the maxima between the laws"] = np.ptp(maxima)
     lowest = next(c.interval[0] for c in CLAIMS["C11"].criteria if c.quantity.startswith("maximum"))
     if max(maxima) < lowest and reading == "printed":
         result.reasons.append("the resonator's spring lambda k of the printed equations gives less transfer")
@@ -76,15 +76,15 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
 def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C12: share of the upper bands at medium over low and high amplitude (Figs. 7, 8, S6)."""
     for law in LAWS:
-        curve = AmplitudeCurve.of(evidence.select(AMPLITUDES, reading, law=law), "ibtet")
+        curve = AmplitudeCurve(evidence.select(AMPLITUDES, reading, law=law), "ibtet")
         if len(curve.amplitude) < 3:
             raise MissingEvidence(f"{AMPLITUDES} has {len(curve.amplitude)} amplitudes; low, medium, high are needed")
         index = {"low": 0, "medium": len(curve.value) // 2, "high": -1}
-        share = {name: float(curve.value[i]) for name, i in index.items()}
+        share = {name: curve.value[i] for name, i in index.items()}
         result.value[f"medium over low amplitude, {law}"] = share["medium"] / share["low"]
         result.value[f"medium over high amplitude, {law}"] = share["medium"] / share["high"]
         result.value |= {f"share of the upper bands, {name}, {law}": value for name, value in share.items()}
-        result.uncertainty |= {f"{name} amplitude (N)": float(curve.amplitude[i]) for name, i in index.items()}
+        result.uncertainty |= {f"{name} amplitude (N)": curve.amplitude[i] for name, i in index.items()}
 
 
 def bands_sum(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -144,13 +144,13 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
         many, short, single = (_transfer(evidence, reading, law, *kind) for kind in ((5, 30), (5, 15), (1, 30)))
         shared, i, j = np.intersect1d(many.amplitude, short.amplitude, return_indices=True)
         logarithms = np.log(many.value[i]), np.log(short.value[j])
-        correlation = float(np.corrcoef(*logarithms)[0, 1]) if len(shared) > 2 else np.nan
+        correlation = np.corrcoef(*logarithms)[0, 1] if len(shared) > 2 else np.nan
         peaks = many.peak_amplitude, short.peak_amplitude
         result.value |= {
-            f"maximum with one site, {law}": float(single.value.max()),
-            f"maximum with one site over that with five, {law}": float(single.value.max() / many.value.max()),
+            f"maximum with one site, {law}": single.value.max(),
+            f"maximum with one site over that with five, {law}": single.value.max() / many.value.max(),
             f"correlation of 15 and 30 cycles, {law}": correlation,
             f"ratio of the peaks' amplitudes, 15 and 30 cycles, {law}": max(peaks) / min(peaks),
-            f"maximum with 15 cycles, {law}": float(short.value.max()),
+            f"maximum with 15 cycles, {law}": short.value.max(),
         }
         result.uncertainty[f"amplitudes, {law}"] = len(shared)

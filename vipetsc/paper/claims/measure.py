@@ -2,10 +2,10 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from importlib import import_module
 from math import isfinite
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
 
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import CLAIMS, UNMEASURED, verdict
@@ -15,44 +15,26 @@ READINGS = "printed", "calibrated"
 DIGITS = 6  # significant ones of the numbers in claims.json
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim as measured in one reading of the paper's parameters.
-
-    ``value`` holds named numbers, None where one could not be had, the deciding ones among them under the names that
-    stand in ``threshold``; ``uncertainty`` intervals, spreads and numbers of points by name. ``figure`` is the stem of
-    the picture that shows it, ``files`` are what it was measured from, relative to the folder of all steps.
-    """
-
-    id: str
-    reading: str
-    claim: str
-    value: Numbers
-    uncertainty: Numbers
-    threshold: str
-    verdict: str
-    reason: str
-    figure: str
-    files: tuple[str, ...]
-
-
-def measure_claims(root: str | Path) -> list[Claim]:
+def measure_claims(root: str | Path) -> list[dict[str, Any]]:
     """C1-C17 in both readings, from the steps in ``root`` (scattering/, interband/, nnm-hertz/, ...).
 
-    What cannot be measured because its files are missing has the verdict "not measured" and says what is missing.
+    A row of ``claims.json`` is a claim in one ``reading`` of the paper's parameters. ``value`` holds named numbers,
+    None where one could not be had, the deciding ones among them under the names that stand in ``threshold``;
+    ``uncertainty`` intervals, spreads and numbers of points by name. ``figure`` is the stem of the picture that shows
+    the claim, ``files`` are what it was measured from, relative to ``root``. What cannot be measured because its files
+    are missing has the verdict "not measured", and ``reason`` says what is missing.
     """
     return [measure_claim(claim, reading, Path(root)) for claim in CLAIMS for reading in READINGS]
 
 
-def measure_claim(claim: str, reading: str, root: Path) -> Claim:
+def measure_claim(claim: str, reading: str, root: Path) -> dict[str, Any]:
     """One claim, by its id, in one reading."""
     result, spec = Measurement(), CLAIMS[claim]
     judgement, missed = UNMEASURED, list[str]()
-    module, _, name = spec.measure.partition(".")
-    function = getattr(import_module(f"vipetsc.paper.claims.{module}"), name)
+    measure = resolve_name(f"vipetsc.paper.claims.{spec.measure}")
     with Evidence(root) as evidence:
         try:
-            function(evidence, reading, result)
+            measure(evidence, reading, result)
         except MissingEvidence as missing:
             result.reasons.append(str(missing))
         except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
@@ -62,26 +44,25 @@ def measure_claim(claim: str, reading: str, root: Path) -> Claim:
         else:
             judgement, missed = verdict(spec.criteria, result.value)
     reasons = [f"not met: {' / '.join(missed)}"] if 0 < len(missed) < len(spec.criteria) else []
-    return Claim(
-        claim,
-        reading,
-        spec.claim,
-        rounded(result.value),
-        rounded(result.uncertainty),
-        "; ".join(map(str, spec.criteria)),
-        judgement,
-        "; ".join([*reasons, *result.reasons]),
-        result.figure or spec.figure.format(reading=reading),
-        tuple(evidence.files),
-    )
+    return {
+        "id": claim,
+        "reading": reading,
+        "claim": spec.claim,
+        "value": rounded(result.value),
+        "uncertainty": rounded(result.uncertainty),
+        "threshold": "; ".join(map(str, spec.criteria)),
+        "verdict": judgement,
+        "reason": "; ".join([*reasons, *result.reasons]),
+        "figure": result.figure or spec.figure.format(reading=reading),
+        "files": evidence.files,
+    }
 
 
-def rounded(numbers: Mapping[str, float | None]) -> Numbers:
+def rounded(numbers: Numbers) -> dict[str, float | None]:
     """``numbers`` with ``DIGITS`` significant digits; None for what is not finite."""
     return {k: float(f"{v:.{DIGITS}g}") if v is not None and isfinite(v) else None for k, v in numbers.items()}
 
 
-def write_claims(claims: Sequence[Claim], path: Path) -> None:
+def write_claims(claims: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write ``claims`` as a list of JSON objects, whole or not at all; the same claims give the same bytes."""
-    rows = [asdict(claim) for claim in claims]
-    write_text(path, json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(path, json.dumps(claims, indent=1, ensure_ascii=False, allow_nan=False) + "\n")

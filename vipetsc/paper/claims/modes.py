@@ -72,24 +72,23 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
         _, law, sites, _, cycles, _ = name.split("-")
         main = name.endswith(MAIN)
         label = law if main else f"{law}, {sites} site{'s' if sites != '1' else ''}, {cycles} cycles"
-        length = len(name) + 1
-        about = {key[length:]: value for key, value in relation.attrs.items() if key.startswith(f"{name}/")}
-        difference = abs(float(about["exponent"] - about["slope_exponent"]))
+        about = {k.removeprefix(f"{name}/"): v for k, v in relation.attrs.items() if k.startswith(f"{name}/")}
+        difference = abs(about["exponent"] - about["slope_exponent"])
         fitted = relation[f"{name}/fitted"].values.astype(bool)
         energy, ibtet = (relation[f"{name}/{key}"].values[fitted] for key in ("energy", "ibtet"))
         branch = (relation[f"{name}/branch/{key}"].values for key in ("energy", "slope", "region"))
         # Transfer over (slope / divisor + floor); the mean factor is exp of the rms logarithm.
         ratio = np.log(ibtet / (np.exp(log_slope(energy, *branch)) / about["divisor"] + about["floor"]))
         result.value |= {
-            f"adjusted R^2 in region III, {label}": float(about["r2_adjusted"]),
-            f"exponent of the transfer, {label}": float(about["exponent"]),
-            f"exponent of the slope, {label}": float(about["slope_exponent"]),
-            f"mean factor between transfer and slope, {label}": float(np.exp(np.sqrt(np.mean(ratio**2)))),
+            f"adjusted R^2 in region III, {label}": about["r2_adjusted"],
+            f"exponent of the transfer, {label}": about["exponent"],
+            f"exponent of the slope, {label}": about["slope_exponent"],
+            f"mean factor between transfer and slope, {label}": np.exp(np.sqrt(np.mean(ratio**2))),
             f"difference of the exponents, {label}": difference,
         }
-        interval = float((about["exponent_high"] - about["exponent_low"]) / 2)
+        interval = (about["exponent_high"] - about["exponent_low"]) / 2
         result.uncertainty[f"transfer exponent's 95 % interval (+/-), {label}"] = interval
-        result.uncertainty[f"points of the fit, {label}"] = int(fitted.sum())
+        result.uncertainty[f"points of the fit, {label}"] = fitted.sum()
         if main and difference > SAME_EXPONENT:
             result.reasons.append(
                 f"{law}: the transfer falls as E^{about['exponent']:.2f}, the slope there as"
@@ -102,16 +101,15 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
 
 def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C17: regimes of host and resonator at the only site of the lattice (Suppl., Figs. S4, S5)."""
-    evidence.ensemble(ONE_SITE)
     for law in LAWS:
         runs = evidence.runs(ONE_SITE, reading, law=law)
         host, resonator, above = zip(*(pair_motion(evidence, run) for run in runs), strict=True)
-        correlation = [_correlation(*pair) for pair in zip(host, resonator, strict=True)]
+        correlation = [np.corrcoef(*pair)[0, 1] for pair in zip(host, resonator, strict=True)]
         touching = [i for i, run in enumerate(runs) if run.episodes]
         if len(touching) < 2 or runs[0].episodes:
             raise MissingEvidence(f"{ONE_SITE}, {law}: one amplitude without contact and two with are needed")
         first, last = touching[0], touching[-1]
-        grazing = _correlation(resonator[first], resonator[0])
+        grazing = np.corrcoef(resonator[first], resonator[0])[0, 1]
         result.value |= {
             f"I: correlation of host and resonator, {law}": correlation[0],
             f"II: correlation with the motion without contact, {law}": grazing,
@@ -149,10 +147,4 @@ def pair_motion(evidence: Evidence, run: MeasuredRun) -> tuple[np.ndarray, np.nd
     frequency = 2 * np.pi * np.fft.rfftfreq(len(velocity), interval)
     waves = waves_at(cell, model.drive.frequency)
     edge = pass_bands(cell)[waves[0][0] - 1].high if waves else model.drive.frequency
-    return *velocity.T, float(energy[frequency > edge].sum() / energy.sum())
-
-
-def _correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Correlation of two motions at the same times."""
-    n = min(len(first), len(second))
-    return float(np.corrcoef(first[:n], second[:n])[0, 1])
+    return *velocity.T, energy[frequency > edge].sum() / energy.sum()

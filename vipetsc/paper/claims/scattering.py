@@ -43,7 +43,7 @@ class AmplitudeTriple:
         content = content[time >= self.duration / 2 + self.distance / self.speed]
         new = np.abs(wavenumber - self.wavenumber) > self.lobe
         outside, whole = content[:, new].sum(axis=1), content.sum(axis=1)
-        return float(outside.sum() / whole.sum()), float(np.std(outside / whole))
+        return outside.sum() / whole.sum(), np.std(outside / whole)
 
     def explain_medium(self, result: Measurement) -> None:
         """Add a reason if the medium amplitude makes no contact: from where on there is one."""
@@ -90,7 +90,7 @@ def linear_content(evidence: Evidence, reading: str, result: Measurement) -> Non
     moved = 0.5 * np.abs(share - share[0]).sum(axis=1)
     result.value["contact episodes at low amplitude"] = triple.low.episodes
     result.value["largest share of the energy that changes its wavenumber"] = moved.max()
-    result.uncertainty |= {"mean over time of that share": moved.mean(), "samples": int(free.sum())}
+    result.uncertainty |= {"mean over time of that share": moved.mean(), "samples": free.sum()}
 
 
 def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -114,25 +114,25 @@ def _branch_share(run: MeasuredRun) -> float:
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
     cell = run.case.unit_cell()
     distance = np.abs(frequency[None, :, None] - bloch(cell, wavenumber).frequency[:, None, :]).min(axis=2)
-    return float(energy[distance <= BESIDE * pass_bands(cell)[-1].high].sum() / energy.sum())
+    return energy[distance <= BESIDE * pass_bands(cell)[-1].high].sum() / energy.sum()
 
 
 def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C4: new wavenumbers at high over medium amplitude, and the share reflected (Figs. 2, 3)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "kinetic_energy")
-    new = {name: triple.new_share(run) for name, run in triple.runs.items()}
+    new = {}
     for name, run in triple.runs.items():
-        shares = {"share at new wavenumbers": new[name]}
-        shares["share of the incident energy reflected"] = _reflected_share(triple, run)
-        for quantity, (share, deviation) in shares.items():
-            result.value[f"{quantity}, {name} amplitude"] = share
-            text = quantity.replace("of the incident energy ", "")
-            result.uncertainty[f"deviation over time of the {text}, {name} amplitude"] = deviation
-    result.value["new wavenumbers, high over medium amplitude"] = new["high"][0] / new["medium"][0]
+        new[name], deviation = triple.new_share(run)
+        share, spread = _reflected_share(triple, run)
+        result.value[f"share at new wavenumbers, {name} amplitude"] = new[name]
+        result.value[f"share of the incident energy reflected, {name} amplitude"] = share
+        result.uncertainty[f"deviation over time of the share at new wavenumbers, {name} amplitude"] = deviation
+        result.uncertainty[f"deviation over time of the share reflected, {name} amplitude"] = spread
+    result.value["new wavenumbers, high over medium amplitude"] = new["high"] / new["medium"]
     triple.explain_medium(result)
-    onset = result.value.get("first contact (N)")
-    if onset:
-        result.reasons.append(f"{triple.high.amplitude:g} N is {triple.high.amplitude / onset:.3g} times first contact")
+    if "first contact (N)" in result.value:
+        ratio = triple.high.amplitude / triple.medium.onset
+        result.reasons.append(f"{triple.high.amplitude:g} N is {ratio:.3g} times first contact")
 
 
 def _reflected_share(triple: AmplitudeTriple, run: MeasuredRun) -> tuple[float, float]:
@@ -148,7 +148,7 @@ def _reflected_share(triple: AmplitudeTriple, run: MeasuredRun) -> tuple[float, 
     incident = triple.low.analysis["kinetic_energy"].values[returning].sum(axis=1).mean()
     incident *= (run.amplitude / triple.low.amplitude) ** 2
     share = energy[returning][:, before].sum(axis=1) / incident
-    return float(share.mean()), float(share.std())
+    return share.mean(), share.std()
 
 
 def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -184,7 +184,7 @@ def reconstruction(evidence: Evidence, reading: str, result: Measurement) -> Non
         result.value[f"largest error, {name} amplitude"] = largest[-1]
         result.value[f"mean share between the bins, {name} amplitude"] = cross[-1]
     result.value["largest error of the reconstructed kinetic energy after the drive"] = max(largest)
-    result.uncertainty["snapshots"] = int(after.sum())
+    result.uncertainty["snapshots"] = after.sum()
     result.reasons.append(
         "the bins' velocities are added before they are squared; the plain sum of the bins' energies would miss"
         f" {100 * np.mean(cross):.0f} %"
