@@ -64,14 +64,13 @@ def bands_report(bands: dict[str, Any]) -> str:
 
 def sweep_table(result: "SweepResult") -> str:
     """How a sweep ended: counts, time, what failed."""
-    complete, scaled, failed = (result.count(status) for status in range(3))
+    complete, scaled, failed, missing = (result.count(status) for status in range(4))
     counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
     rows = [
         ("members", f"{len(result.outcomes)}: {counts}"),
         ("made now", f"{result.made} in {result.seconds:.1f} s"),
         ("ranks busy", ", ".join(f"{100 * share:.0f} %" for share in result.busy)),
     ]
-    missing = sum(outcome is None for outcome in result.outcomes)
     left = ("missing", f"{missing}; stopped on request, the same command goes on")
     rows.append(left if missing else ("leaves", str(result.folder / "ensemble.h5")))
     members = json.loads((result.folder / "index.json").read_text(encoding="utf-8"))["members"]

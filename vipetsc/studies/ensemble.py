@@ -17,8 +17,8 @@ from vipetsc.spectra import from_peak, normalised
 from vipetsc.studies.analysis import LAYOUT
 
 FORMAT_VERSION = 1
-COMPLETE, SCALED, FAILED = 0, 1, 2
-STATUS = ("complete", "scaled", "failed")
+STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached before a stop
+COMPLETE, SCALED, FAILED, MISSING = range(4)
 AMPLITUDE = "drive.amplitude"
 FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
 
@@ -61,15 +61,15 @@ FIT = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a member ended: ``status`` COMPLETE, SCALED or FAILED, why, and its statistics."""
+    """How a member ended: the index of its ``status`` in ``STATUS``, why, and its run's statistics."""
 
     status: int
-    reason: str
+    reason: str = ""
     statistics: dict[str, Any] = field(default_factory=dict)
 
 
-def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> Path:
-    """Write ``folder/ensemble.h5`` from the members' files, whole or not at all; returns its path.
+def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> None:
+    """Write ``folder/ensemble.h5`` from the members' files, whole or not at all.
 
     A dimension for every axis, named after its first key, with a coordinate for every key; NaN where a member
     failed. The file depends on the members alone, not on when or on how many ranks they were made.
@@ -82,7 +82,7 @@ def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Out
     dims = tuple(names[axis.keys[0]] for axis in plan.axes)
 
     status = np.array([outcome.status for outcome in outcomes], np.int8).reshape(plan.shape)
-    flags = {"flag_values": np.arange(len(STATUS), dtype=np.int8), "flag_meanings": " ".join(STATUS)}
+    flags = {"flag_values": np.arange(MISSING, dtype=np.int8), "flag_meanings": " ".join(STATUS[:MISSING])}
     data["status"] = variable(dims, status, "1", "how the member ended", **flags)
     parts = {row["parts"] for row in rows if "parts" in row}
     for name, (further, *texts) in (STATISTICS | MEASURES).items():
@@ -103,7 +103,6 @@ def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Out
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
     about |= {"case": plan.to_toml(), "failed": failed}
     write_netcdf(folder / "ensemble.h5", xr.Dataset(data | _fits(plan, data), attrs=about))
-    return folder / "ensemble.h5"
 
 
 def _rows(members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> list[dict[str, Any]]:

@@ -78,7 +78,12 @@ class MemberStore:
             return file.load() if not current or file.attrs.get("vipetsc_version") == vipetsc.__version__ else None
 
     def make_linear(self, case: Case) -> None:
-        """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if it does not come out."""
+        """Simulate the linear run of ``case``, unless this version has.
+
+        Raises StoppedError, or RuntimeError if it does not come out.
+        """
+        if on_root(self.team, lambda: self.wave(case, current=True) is not None):
+            return
         linear, memory = linear_case(case), RunMemory(self.team)
         self._simulate(linear, memory)
 

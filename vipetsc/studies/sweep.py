@@ -5,7 +5,7 @@ The measures of runs already made, of one or of all members of a sweep whose fie
 
 import json
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -13,7 +13,6 @@ from typing import TypeVar
 from mpi4py import MPI
 
 import numpy as np
-import xarray as xr
 
 import vipetsc
 from vipetsc.case import Case, Sweep, SweepMember
@@ -23,7 +22,7 @@ from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_every_rank, on_root
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS, Outcome, assemble
+from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Outcome, assemble
 from vipetsc.studies.members import MemberStore, StoppedError, arrival_at, reached
 
 FORMAT_VERSION = 1
@@ -35,13 +34,13 @@ Job = TypeVar("Job", bound=Hashable)
 
 @dataclass(frozen=True)
 class SweepResult:
-    """How a sweep ended: outcomes in the members' order, None for those not reached before a stop.
+    """How a sweep ended: outcomes in the members' order.
 
     ``made`` counts the members simulated or scaled now; ``busy`` (rank) is the share of the time in which each
     rank worked on members.
     """
 
-    outcomes: tuple[Outcome | None, ...]
+    outcomes: list[Outcome]
     made: int
     seconds: float
     busy: tuple[float, ...]
@@ -50,11 +49,11 @@ class SweepResult:
     @property
     def complete(self) -> bool:
         """Whether every member is there."""
-        return all(o is not None and o.status != FAILED for o in self.outcomes)
+        return not self.count(FAILED) and not self.count(MISSING)
 
     def count(self, status: int) -> int:
         """Number of members that ended so."""
-        return sum(o is not None and o.status == status for o in self.outcomes)
+        return [outcome.status for outcome in self.outcomes].count(status)
 
 
 def run_sweep(
@@ -86,15 +85,9 @@ def run_sweep(
     missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_complete(case, current=True)])
     source = {key: store.linear_folder(cases[key]) for key in missing}
     linear = {source[key]: cases[key] for key in missing}
-
-    def current_waves() -> dict[Path, xr.Dataset]:
-        stored = {path: store.wave(case, current=True) for path, case in linear.items()}
-        return {path: wave for path, wave in stored.items() if wave is not None}
-
-    ready = on_root(comm, current_waves)
-    absent = [path for path in linear if path not in ready]
-    failures = pool.share(absent, lambda path: store.make_linear(linear[path]), None)
-    waves = on_root(comm, current_waves)
+    failures = pool.share(list(linear), lambda path: store.make_linear(linear[path]))
+    stored = on_root(comm, lambda: {path: store.wave(case, current=True) for path, case in linear.items()})
+    waves = {path: wave for path, wave in stored.items() if wave is not None}
 
     def cost(key: str) -> float:
         """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
@@ -115,31 +108,30 @@ def run_sweep(
 
 def conclude(
     plan: Sweep, members: Sequence[SweepMember], store: MemberStore, reasons: Mapping[str, str]
-) -> tuple[Outcome | None, ...]:
+) -> list[Outcome]:
     """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns how the members ended.
 
     ``reasons`` names the members (by id) that failed just now, and why.
     """
     outcomes, rows = [], []
     for member in members:
-        outcome, reason = None, reasons.get(member.id) or member.problem
-        if reason:
+        outcome = Outcome(MISSING)
+        if reason := reasons.get(member.id) or member.problem:
             outcome = Outcome(FAILED, reason)
         elif member.case and store.is_complete(member.case):
             summary = store.summary(member.case)
             status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
             outcome = Outcome(status, summary["status"], summary["statistics"])
         outcomes.append(outcome)
-        told = (STATUS[outcome.status], outcome.reason) if outcome else ("missing", "")
-        rows.append({"place": member.index, "id": member.id, "status": told[0], "reason": told[1]})
+        told = {"status": STATUS[outcome.status], "reason": outcome.reason}
+        rows.append({"place": member.index, "id": member.id} | told)
     names = plan.names()
     axes = [{"keys": axis.keys, "names": [names[k] for k in axis.keys], "values": axis.values} for axis in plan.axes]
     index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}
     write_text(store.folder / "index.json", json.dumps(index, indent=1) + "\n")
-    ended = [outcome for outcome in outcomes if outcome]
-    if len(ended) == len(outcomes):
-        assemble(plan, members, ended, store.folder)
-    return tuple(outcomes)
+    if all(outcome.status != MISSING for outcome in outcomes):
+        assemble(plan, members, outcomes, store.folder)
+    return outcomes
 
 
 class TaskPool:
@@ -149,7 +141,9 @@ class TaskPool:
         self.comm, self.team, self.stop = comm, team, stop
         self.busy = 0.0
 
-    def share(self, jobs: Sequence[Job], work: Callable[[Job], None], progress: Progress | None) -> dict[Job, str]:
+    def share(
+        self, jobs: Sequence[Job], work: Callable[[Job], None], progress: Progress | None = None
+    ) -> dict[Job, str]:
         """Do all ``jobs``; returns for each one done the reason why it failed, "" if it did not. Collective."""
         drawn, ended = SharedCounter(self.comm), SharedCounter(self.comm)
         reasons: dict[Job, str] = {}
@@ -189,37 +183,33 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
 
     Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
     """
-    runs = on_root(comm, lambda: [folder for path in paths for folder in _run_folders(path)])
-
-    def has_fields(folder: Path) -> bool:
-        with open_run(folder / "run.h5") as run:
-            return "velocity" in run or not (folder.parent / "index.json").exists()
+    runs = on_root(comm, lambda: [folder for path in paths for folder in _measurable(path)])
 
     def reassemble(folder: Path) -> Path:
         plan = Sweep.load(folder / "case.toml")
-        if not all(conclude(plan, plan.members(), MemberStore(folder, plan.options), {})):
+        outcomes = conclude(plan, plan.members(), MemberStore(folder, plan.options), {})
+        if any(outcome.status == MISSING for outcome in outcomes):
             raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
         return folder / "ensemble.h5"
 
-    share = filter(has_fields, runs[comm.rank :: comm.size])
-    measured = on_every_rank(comm, lambda: [measure_run(folder) for folder in share])
+    measured = on_every_rank(comm, lambda: [measure_run(folder) for folder in runs[comm.rank :: comm.size]])
     written = sorted(path for paths in comm.allgather(measured) for path in paths)
     return written + on_root(comm, lambda: [reassemble(path) for path in paths if (path / "index.json").exists()])
 
 
-def _run_folders(path: Path) -> list[Path]:
-    """The folders of the runs in ``path``, every one checked; raises FolderError."""
+def _measurable(path: Path) -> Iterator[Path]:
+    """The folders of the runs in ``path`` that can be measured, every run checked; raises FolderError."""
     folder = path.parent if path.name == "run.h5" else path
     sweep = (folder / "index.json").exists()
-    folders = [run.parent for run in sorted(folder.glob("*/run.h5"))] if sweep else [folder]
     if not sweep and not (folder / "run.h5").exists():
         raise FolderError(f"{path}: holds no run.h5; the folder of a finished run or sweep is needed")
-    for one in folders:
+    for file in sorted(folder.glob("*/run.h5")) if sweep else [folder / "run.h5"]:
         try:
-            open_run(one / "run.h5").close()
+            with open_run(file) as run:
+                if "velocity" in run or not (file.parents[1] / "index.json").exists():
+                    yield file.parent
         except (OSError, ValueError, KeyError) as error:
-            raise FolderError(f"{one / 'run.h5'}: is not a run of vipetsc ({error})") from None
-    return folders
+            raise FolderError(f"{file}: is not a run of vipetsc ({error})") from None
 
 
 def measure_run(folder: Path) -> Path:
