@@ -13,7 +13,7 @@ from vipetsc.dynamics import simulate
 from vipetsc.io import store
 from vipetsc.io.atomic import load_arrays, save_arrays
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.store import SAMPLED, RunDescription, RunMemory
+from vipetsc.io.store import SAMPLED, Recording, RunMemory
 
 PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 
@@ -76,12 +76,13 @@ def test_episodes_stand_in_the_order_of_their_onsets():
     """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4)}
     memory = RunMemory()
-    memory.begin(RunDescription("", given | {"sites/cell": np.arange(1, 4)}, ()), force=False, resume=False)
+    memory.begin("", force=False, resume=False)
+    memory.recording = Recording(given | {"sites/cell": np.arange(1, 4)}, (), None)
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
         chunk = {n: np.zeros(1) if dims == "time" else np.arange(len(sites)) * 1.0 for n, (dims, *_) in SAMPLED.items()}
         chunk |= {"impacts/site": np.array(sites), "impacts/onset": np.array(onsets)}
         memory.append(chunk | {"field_time": np.zeros(1), "energy/dissipated_by_site": np.zeros((1, 3))})
-    memory.finish({}, None, {})
+    memory.finish({}, {})
     run = memory.dataset
     assert run["impacts/onset"].values.tolist() == [0.1, 0.2, 0.3, 0.5, 0.5]
     assert run["impacts/site"].values.tolist() == [1, 2, 1, 1, 3]

@@ -7,11 +7,10 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case import Case
 from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.observers import Observer, Sample, Setup
-from vipetsc.io.store import GATHER_LIMIT
+from vipetsc.io.store import GATHER_LIMIT, Recording
 
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
 CHUNK_SAMPLES = 256
@@ -19,10 +18,7 @@ CHUNK_BYTES = 64 * 2**20
 
 
 class Recorder(Observer):
-    """Keeps the case's share of the fields, the energies and the contact episodes, and writes them in chunks.
-
-    ``columns`` are this rank's places among the recorded cells if every rank writes its own, else None.
-    """
+    """Keeps the case's share of the fields, the energies and the contact episodes, and writes them in chunks."""
 
     name = "recorder"
     saved = ("episodes",)
@@ -31,16 +27,26 @@ class Recorder(Observer):
     def begin(self, setup: Setup) -> None:
         """See ``Observer``."""
         super().begin(setup)
-        layout, output, comm = setup.layout, setup.case.output, setup.layout.comm
-        recorded = recorded_cells(setup.case)
+        layout, output, chain = setup.layout, setup.case.output, setup.model.chain
+        begin, end = output.window or (1, chain.cells)
+        recorded = np.arange(begin - 1, end, output.every)
         first, stop = (int(i) for i in np.searchsorted(recorded, [layout.start, layout.stop]))
         local = recorded[first:stop] - layout.start
         self._cells = slice(int(local[0]), int(local[-1]) + 1, output.every) if local.size else slice(0)
         sample_bytes = len(output.fields) * layout.dofs * 8
         large = sample_bytes * len(recorded) * -(-setup.model.samples // output.stride) > GATHER_LIMIT
         parallel = output.writer == "parallel" or (output.writer == "auto" and large)
-        self.columns = slice(first, stop) if comm.size > 1 and setup.output.shared and parallel else None
-        most = comm.allreduce(local.size, MPI.MAX) if self.columns else len(recorded)
+        # A run in memory is gathered whatever the writer is.
+        columns = slice(first, stop) if layout.comm.size > 1 and setup.output.folder and parallel else None
+        given = {
+            "cell": recorded + 1,
+            "dof": np.arange(1, layout.dofs + 1),
+            "site": np.arange(1, len(chain.sites) + 1),
+            "sites/cell": np.array(chain.sites, np.int64) + 1,
+            "sites/clearance": np.array(chain.clearances, float),
+        }
+        setup.output.recording = Recording(given, tuple(output.fields), columns)
+        most = layout.comm.allreduce(local.size, MPI.MAX) if columns else len(recorded)
         self._length = int(np.clip(CHUNK_BYTES // max(sample_bytes * most, 1), 1, CHUNK_SAMPLES))
         self._buffer = np.empty((self._length, len(output.fields), layout.dofs, local.size))
         self._dissipated = np.empty((self._length, len(layout.sites)))
@@ -83,34 +89,29 @@ class Recorder(Observer):
         Rank 0's chunk holds times, energies and all ranks' episodes; the fields are those of a rank's own cells, or on
         rank 0 of all.
         """
-        layout, comm = self.setup.layout, self.setup.layout.comm
+        layout, comm, output = self.setup.layout, self.setup.layout.comm, self.setup.output
+        columns = output.recording.columns
         block = np.moveaxis(self._buffer[: len(self._field_times)], 2, 3)  # (samples, field, cell, dof)
-        share = layout.sites, self._dissipated[: len(self._samples)], episodes, None if self.columns else block
+        share = layout.sites, self._dissipated[: len(self._samples)], episodes, None if columns else block
         shares = comm.gather(share) if comm.size > 1 else [share]
         chunk: dict[str, np.ndarray] = {}
         if shares is not None:
             sites, dissipated, logs, blocks = zip(*shares, strict=True)
             chunk |= {"time": np.array([t for t, _ in self._samples]), "field_time": np.array(self._field_times)}
-            chunk |= columns("energy", Energies, [energies for _, energies in self._samples])
+            chunk |= as_columns("energy", Energies, [energies for _, energies in self._samples])
             order = np.argsort([site for some in sites for site in some])
             chunk["energy/dissipated_by_site"] = np.concatenate(dissipated, axis=1)[:, order]
-            chunk |= columns("impacts", Episode, [episode for log in logs for episode in log])
+            chunk |= as_columns("impacts", Episode, [episode for log in logs for episode in log])
             chunk["impacts/site"] += 1  # counted from 1
-            block = block if self.columns else np.concatenate(blocks, axis=2)
-        if shares is not None or self.columns:
-            chunk |= {name: block[:, i] for i, name in enumerate(self.setup.case.output.fields)}
-        self.setup.output.append(chunk or None)
+            block = block if columns else np.concatenate(blocks, axis=2)
+        if shares is not None or columns:
+            chunk |= {name: block[:, i] for i, name in enumerate(output.recording.fields)}
+        output.append(chunk or None)
         self.episodes += comm.allreduce(len(episodes))
         self._samples.clear()
         self._field_times.clear()
 
 
-def columns(group: str, record: type, rows: list[Any]) -> dict[str, np.ndarray]:
+def as_columns(group: str, record: type, rows: list[Any]) -> dict[str, np.ndarray]:
     """``rows`` of a dataclass ``record`` as arrays ``group/<field>``."""
     return {f"{group}/{c.name}": np.array([getattr(row, c.name) for row in rows], c.type) for c in fields(record)}
-
-
-def recorded_cells(case: Case) -> np.ndarray:
-    """Cells (0-based) of the whole lattice whose fields are recorded."""
-    first, last = case.output.window or (1, case.lattice.cells)
-    return np.arange(first - 1, last, case.output.every)

@@ -14,18 +14,18 @@ from vipetsc.case import Case, Model
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.observers import Observer, RunawayError, Sample, Setup
+from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample, Setup
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.recorder import Recorder, recorded_cells
+from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import provenance
-from vipetsc.io.store import RunDescription, RunFolder, RunOutput
+from vipetsc.io.store import RunFolder, RunOutput
 from vipetsc.parallel import StopRequest
 
 # In the order in which engine = "auto" tries them.
 ENGINES = (Propagator, Integrator)
 # The guard first: a sample that it refuses is not recorded.
-OBSERVERS = ("guard", "ledger", "recorder")
+OBSERVERS = (Guard.name, Ledger.name, Recorder.name)
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
 
 
@@ -87,7 +87,7 @@ def simulate(
     begin = time.perf_counter(), time.process_time()
     output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
     model = case.model()
-    output.begin(_description(case, model), force, resume)
+    output.begin(case.to_toml(), force, resume)
     layout = Layout.of(model, output.comm)
     kind, refusal = select_engine(case.time.engine, model)
     setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
@@ -97,18 +97,6 @@ def simulate(
         run.restore(state)
     ending, sentence = run.advance()
     return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
-
-
-def _description(case: Case, model: Model) -> RunDescription:
-    chain = model.chain
-    given = {
-        "cell": recorded_cells(case) + 1,
-        "dof": np.arange(1, chain.cell.dofs + 1),
-        "site": np.arange(1, len(chain.sites) + 1),
-        "sites/cell": np.array(chain.sites, np.int64) + 1,
-        "sites/clearance": np.array(chain.clearances, float),
-    }
-    return RunDescription(case.to_toml(), given, tuple(case.output.fields))
 
 
 def select_engine(name: str, model: Model) -> tuple[type[Engine], str | None]:
@@ -123,8 +111,7 @@ class Run:
 
     def __init__(self, setup: Setup, observers: Sequence[str]) -> None:
         self.setup = setup
-        self.recorder = Recorder()
-        self.observers = [self.recorder if name == "recorder" else Observer.registry[name]() for name in observers]
+        self.observers = [Observer.registry[name]() for name in observers]
         self.samples = 0
         self.last: float | None = None  # time of the last good sample
         for observer in self.observers:
@@ -183,7 +170,7 @@ class Run:
         attributes = provenance(comm) | {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
         attributes = comm.bcast(attributes)  # what rank 0 tells counts
         if ending != STOPPED:
-            output.finish(attributes, self.recorder.columns, {"case": self.setup.case.model_dump(by_alias=True)})
+            output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
         engine.destroy()
         return Result(ending == COMPLETE, ending == STOPPED, sentence, attributes["statistics"], output.folder)
 

@@ -61,36 +61,40 @@ GIVEN = {
 
 
 @dataclass(frozen=True)
-class RunDescription:
-    """What ``run.h5`` tells of its case.
+class Recording:
+    """What the chunks of a run hold.
 
-    ``case``: as TOML; ``given``: the arrays of ``GIVEN``, but for the episodes; ``fields``: those of ``FIELDS`` that
-    are recorded.
+    ``given``: the arrays of ``GIVEN``, but for the episodes; ``fields``: those of ``FIELDS`` that are recorded;
+    ``columns``: the recorded cells whose fields this rank's chunks hold, None where rank 0's hold those of all.
     """
 
-    case: str
     given: Arrays
     fields: tuple[str, ...]
+    columns: slice | None
 
 
 class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
-    It takes the run's chunks, ``count`` of them, on all ranks of ``comm`` together, and puts them together at the end.
+    It takes the run's chunks, ``count`` of them, on all ranks of ``comm`` together, and puts them together at the end;
+    ``recording`` tells it what they hold.
     """
 
-    shared = True  # every rank can write its own cells
+    recording: Recording
 
     def __init__(self, folder: Path, comm: MPI.Comm) -> None:
         self.folder, self.comm, self.count = Path(folder), comm, 0
         self._parts = self.folder / "parts"
 
-    def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
-        """Make ready for a run, or for one that goes on; all ranks must call it. Raises FolderError."""
-        self.description = description
+    def begin(self, case: str, force: bool, resume: bool) -> None:
+        """Make ready for a run of ``case`` (TOML), or for one that goes on; all ranks must call it.
+
+        Raises FolderError.
+        """
+        self.case = case
 
         def claim() -> None:
-            claim_folder(self.folder, RUN, description.case, force=force, resume=resume)
+            claim_folder(self.folder, RUN, case, force=force, resume=resume)
             self._parts.mkdir(exist_ok=True)
 
         on_root(self.comm, claim)
@@ -139,21 +143,13 @@ class RunFolder:
     def _state(self, number: int) -> Path:
         return self._parts / f"state-{number:06d}-{self.comm.rank}-{self.comm.size}.npy"
 
-    def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
+    def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Put the chunks together; all ranks must call it. Raises OSError on all ranks if one cannot write.
 
-        ``run.h5`` takes its name when it is complete, then the chunks go.
-
-        Parameters
-        ----------
-        attributes
-            Root attributes besides the case; the same on all ranks.
-        columns
-            The recorded cells whose fields this rank's chunks hold; None: rank 0's hold those of all.
-        summary
-            What ``summary.json`` tells besides ``attributes``.
+        ``attributes`` besides the case are the root's, the same on all ranks; ``summary.json`` tells them and
+        ``summary``. ``run.h5`` takes its name when it is complete, then the chunks go.
         """
-        target, aside = self.folder / "run.h5", self.folder / ".run.h5.part"
+        target, aside, columns = self.folder / "run.h5", self.folder / ".run.h5.part", self.recording.columns
 
         def write() -> None:
             if columns is None and self.comm.rank:
@@ -165,7 +161,7 @@ class RunFolder:
                     dims = field_dimensions(data)
                     shape = [data.sizes[dim] for dim in dims]
                     # All of them first: ranks create together, but each copies and may fail alone.
-                    fields = {n: add_variable(file, n, dims, shape, float, FIELDS[n]) for n in self.description.fields}
+                    fields = {n: add_variable(file, n, dims, shape, float, FIELDS[n]) for n in self.recording.fields}
                     for name, field in fields.items():
                         put_chunks(field, self, name, columns or slice(None))
             except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
@@ -192,18 +188,18 @@ class RunMemory:
     It is used as a ``RunFolder``. Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
     """
 
-    shared = False
     folder = None
+    recording: Recording
 
     def __init__(self, comm: MPI.Comm = MPI.COMM_SELF) -> None:
         self.comm, self.count = comm, 0
         self.dataset: xr.Dataset | None = None
 
-    def begin(self, description: RunDescription, force: bool, resume: bool) -> None:
+    def begin(self, case: str, force: bool, resume: bool) -> None:
         """Make ready; raises ValueError for ``resume``."""
         if resume:
             raise ValueError("a run in memory cannot be resumed")
-        self.description, self.count = description, 0
+        self.case, self.count = case, 0
         self._chunks: list[Arrays] = []
 
     def append(self, chunk: Arrays | None) -> None:
@@ -221,11 +217,11 @@ class RunMemory:
     def last_state(self) -> None:
         """No checkpoint."""
 
-    def finish(self, attributes: Mapping[str, Any], columns: slice | None, summary: Mapping[str, Any]) -> None:
+    def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Make the dataset; all ranks must call it."""
         if self.comm.rank == 0:
             self.dataset = dataset_without_fields(self, attributes)
-            for name, values in joined(self, self.description.fields).items():
+            for name, values in joined(self, self.recording.fields).items():
                 self.dataset[name] = field_dimensions(self.dataset), values, FIELDS[name]
         self._chunks = []
 
@@ -246,8 +242,8 @@ def dataset_without_fields(output: RunOutput, attributes: Mapping[str, Any]) -> 
     arrays |= {name: values[order] for name, values in arrays.items() if name.startswith("impacts/")}
     if len(arrays["field_time"]) == len(arrays["time"]):
         del arrays["field_time"]
-    arrays |= {**output.description.given, "episode": np.arange(1, len(order) + 1)}
-    return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": output.description.case, **attributes})
+    arrays |= {**output.recording.given, "episode": np.arange(1, len(order) + 1)}
+    return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": output.case, **attributes})
 
 
 def field_dimensions(data: xr.Dataset) -> list[str]:
