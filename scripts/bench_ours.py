@@ -29,7 +29,7 @@ class Flight:
 
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
         self.model = case.model()
-        self.layout = Layout.of(self.model, comm)
+        self.layout = Layout(self.model, comm)
         kind, refused = select_engine(case.time.engine, self.model)
         if refused:
             raise RuntimeError(refused)

@@ -16,7 +16,6 @@ from vipetsc.contact.law import (
     elastic_energy,
     elastic_force,
     elastic_force_and_slope,
-    force_law,
 )
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.lattice import Contact
@@ -44,7 +43,7 @@ def test_the_force_is_that_of_the_plain_law(law, side):
 
 @LAWS
 def test_energy_force_and_gradient_belong_together(law):
-    record, x = force_law(Contact(law, KC)), 3e-5
+    record, x = create_contacts(Contact(law, KC), []).law, 3e-5
     h = 1e-4 * x
     assert elastic_force(record, x) == pytest.approx(KC * x ** Contact(law, KC).exponent)
     assert elastic_force(record, -x) == -elastic_force(record, x)
@@ -57,7 +56,7 @@ def test_energy_force_and_gradient_belong_together(law):
 
 
 def test_another_exponent_goes_between_the_two():
-    record, x = force_law(Contact("hertz", KC))._replace(exponent=1.25), 3e-5
+    record, x = create_contacts(Contact("hertz", KC), []).law._replace(exponent=1.25), 3e-5
     assert elastic_force(record, -x) == pytest.approx(-KC * x**1.25)
     assert elastic_force_and_slope(record, x)[1] == pytest.approx(1.25 * KC * x**0.25)
     assert elastic_energy(record, x) == pytest.approx(KC * x**2.25 / 2.25)
@@ -128,7 +127,7 @@ def test_clipping_begins_where_g_falls_through_zero():
 
 
 def test_a_landing_on_a_root_converges_and_one_on_a_near_miss_is_searched_again():
-    attempt = search.begin_landing(0.4, 1.0)
+    attempt = search.Landing(0.4, 1.0, np.inf, 0)
     for _ in range(8):
         value, rate = np.exp(attempt.length) - 2, np.exp(attempt.length)
         attempt, outcome = search.correct(attempt, value, rate, 1e-10, 1e-10)
@@ -137,7 +136,7 @@ def test_a_landing_on_a_root_converges_and_one_on_a_near_miss_is_searched_again(
     assert outcome == search.LANDED
     assert attempt.length == pytest.approx(np.log(2), abs=1e-10)
 
-    attempt, outcome = search.begin_landing(0.5, 1.0), search.RETRY
+    attempt, outcome = search.Landing(0.5, 1.0, np.inf, 0), search.RETRY
     outcomes = []
     while outcome not in (search.MISSED, search.LANDED):
         value, rate = -1e-6 - (attempt.length - 0.5) ** 2, -2 * (attempt.length - 0.5)
@@ -152,7 +151,7 @@ def test_a_landing_on_a_root_converges_and_one_on_a_near_miss_is_searched_again(
 
 def test_a_landing_within_the_tolerance_goes_on_while_it_gains():
     """With a goal below the tolerance, the last attempt that still halves the distance is followed by another."""
-    start = search.begin_landing(0.5, 1.0)
+    start = search.Landing(0.5, 1.0, np.inf, 0)
     attempt, outcome = search.correct(start, 1e-11, 1.0, 1e-10, 1e-14)
     assert outcome == search.RETRY
     assert attempt.length == 0.5 - 1e-11

@@ -45,7 +45,7 @@ def test_rates_motion_and_energies_are_those_of_the_equations(ends, native):
         drive={"cell": DRIVEN, "mass": 2},
     )
     model = case.model()
-    layout = Layout.of(model, MPI.COMM_SELF)
+    layout = Layout(model, MPI.COMM_SELF)
     engine = Integrator(model, layout, native)
     chain, d, t = model.chain, layout.dofs, 0.3 * model.drive.duration
     host, resonator = chain.cell.host, chain.cell.resonator

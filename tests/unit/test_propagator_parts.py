@@ -51,7 +51,7 @@ def exponential(chain, t: float) -> np.ndarray:
 def parts(ends: str, interval: float, tolerance: float, sites=(5, 6, 12)):
     """Model, layout, series, halo of a chain of 24 cells on one rank."""
     model = small_case(lattice={"ends": ends}, contacts={"sites": list(sites)}).model()
-    layout = Layout.of(model, MPI.COMM_SELF)
+    layout = Layout(model, MPI.COMM_SELF)
     return model, layout, StepSeries(model.chain, interval, tolerance), HaloRegions(layout)
 
 
@@ -141,7 +141,7 @@ def test_clusters_that_cannot_touch_are_left_alone():
 
 def test_contacts_that_cannot_be_followed_end_the_run():
     model = small_case(contacts={"sites": [6, 12]}).model()
-    engine = Propagator(model, Layout.of(model, MPI.COMM_SELF))
+    engine = Propagator(model, Layout(model, MPI.COMM_SELF))
     assert engine.advance(3 * model.sample_interval)
     assert (engine.steps, engine.time) == (3, 3 * model.sample_interval)
     engine._events = iter([(FAILED, 2, 0.0125)])

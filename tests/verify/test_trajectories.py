@@ -254,7 +254,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
         }
     )  # fmt: skip
     model = case.model()
-    layout = Layout.of(model, MPI.COMM_SELF)
+    layout = Layout(model, MPI.COMM_SELF)
     integrator = Integrator(model, layout)
     tracker = integrator.tracker
     # Velocities lie behind the displacements, mass by mass: host and resonator of cell 1.

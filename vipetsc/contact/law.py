@@ -39,18 +39,14 @@ class Contacts(NamedTuple):
     sites: np.ndarray
 
 
-def force_law(contact: Contact) -> ForceLaw:
-    """The record of a contact law."""
-    clip = contact.adhesion == "clip"
-    return ForceLaw(contact.stiffness, contact.exponent, contact.damping, clip, contact.approach_floor)
-
-
 def create_contacts(contact: Contact, clearances: Sequence[float]) -> Contacts:
     """Free sites with the ``clearances`` in m."""
+    clip = contact.adhesion == "clip"
+    law = ForceLaw(contact.stiffness, contact.exponent, contact.damping, clip, contact.approach_floor)
     sites = np.zeros(len(clearances), SITE)
     sites["clearance"] = clearances
     sites["approach"] = 1.0
-    return Contacts(force_law(contact), sites)
+    return Contacts(law, sites)
 
 
 @njit(error_model="numpy")

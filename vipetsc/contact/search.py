@@ -39,11 +39,9 @@ def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> No
 @njit(error_model="numpy")
 def evaluate(b: np.ndarray, s: float) -> float:
     """Value at s in [0, 1] by de Casteljau's scheme, for up to six coefficients."""
-    c = np.empty(6)
-    n = b.size
-    c[:n] = b
-    for k in range(1, n):
-        for i in range(n - k):
+    c = b.copy()
+    for k in range(1, b.size):
+        for i in range(b.size - k):
             c[i] = (1.0 - s) * c[i] + s * c[i + 1]
     return c[0]
 
@@ -80,9 +78,7 @@ def first_upcrossing(b: np.ndarray) -> float:
             return begin
         if c.max() <= 0.0:
             continue
-        changes = 0
-        for i in range(1, n):
-            changes += (c[i - 1] <= 0.0) != (c[i] <= 0.0)
+        changes = np.sum((c[:-1] <= 0.0) != (c[1:] <= 0.0))
         if changes == 1 and c[n - 1] > 0.0:
             return begin + size * _bisect(c)
         if size < 1e-13:
@@ -108,25 +104,19 @@ def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
     if abs(b[0]) > tolerance:
         return first_upcrossing(b)
     n = b.size - 1
-    divided = np.empty(n)  # by s, without the value at 0
-    for i in range(n):
-        divided[i] = b[i + 1] * n / (i + 1)
-    return first_upcrossing(divided)
+    return first_upcrossing(b[1:] * n / np.arange(1, b.size))  # divided by s, without the value at 0
 
 
 class Landing(NamedTuple):
-    """An attempt: the step's ``length``, the ``longest`` allowed, the ``residual`` before it, the attempts so far."""
+    """An attempt: the step's ``length``, the ``longest`` allowed, the ``residual`` before it, the attempts so far.
+
+    The first one ends where a search of the longest step found the change; its residual is infinite.
+    """
 
     length: float
     longest: float
     residual: float
     attempts: int
-
-
-@njit(error_model="numpy")
-def begin_landing(share: float, longest: float) -> Landing:
-    """The first attempt at a change that a search found at a ``share`` of the step ``longest``."""
-    return Landing(share * longest, longest, np.inf, 0)
 
 
 @njit(error_model="numpy")

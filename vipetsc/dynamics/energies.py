@@ -19,7 +19,7 @@ from vipetsc.dynamics.ts.right_hand_side import displacement, relative_motion
 
 _FINE = 2.0**40  # multiples of the finer rest in one unit
 _LARGEST = 2.0**50
-_KINETIC, _SPRING, _CONTACT, _DISSIPATED, _WORK = range(5)
+_KINETIC, _SPRING, _CONTACT, _DISSIPATED = range(4)
 
 
 @njit(error_model="numpy", forceinline=True)
@@ -54,13 +54,10 @@ def _cell_energies(y: np.ndarray, lattice: LatticeRecord, cell: int) -> tuple[fl
 
 
 @njit(error_model="numpy")
-def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, total: np.ndarray) -> None:
-    """Kinetic, spring, contact and dissipated energy (2 whole numbers each) and the work (J) into ``total`` (9,).
-
-    Carrying leaves every number below 2^53: their sums over ranks, as floats, are exact.
-    """
+def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
+    """Kinetic, spring, contact and dissipated energy (4, 2), as multiples of ``unit`` and of unit/2^40."""
     shape, contacts = lattice.shape, lattice.contacts
-    sums = np.zeros((_WORK, 2), np.int64)
+    sums = np.zeros((4, 2), np.int64)
     for cell in range(shape.cells):
         kinetic, spring = _cell_energies(y, lattice, cell)
         _add(sums, _KINETIC, kinetic, unit)
@@ -69,11 +66,7 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, total: np.ndarra
         w, _ = relative_motion(y, lattice, i)
         _add(sums, _CONTACT, elastic_energy(contacts.law, abs(w) - contacts.sites[i].clearance), unit)
         _add(sums, _DISSIPATED, y[shape.dissipated + i], unit)
-    for part in range(_WORK):
-        carried = sums[part, 1] >> 40
-        total[2 * part] = sums[part, 0] + carried
-        total[2 * part + 1] = sums[part, 1] - (carried << 40)
-    total[2 * _WORK] = y[shape.work] if shape.work >= 0 else 0.0
+    return sums
 
 
 @dataclass(frozen=True)
@@ -119,11 +112,12 @@ class EnergyMeter:
 
     def measure(self, state: PETSc.Vec) -> Energies:
         """Energies of ``state``, whose ghosts must be up to date; all ranks must call it."""
-        total = np.empty(2 * _WORK + 1)
         with state.localForm() as local:
-            measure(local.array, self._lattice, self.unit, total)
+            whole, fine = measure(local.array, self._lattice, self.unit).T
+            work = local.array[self._lattice.shape.work] if self._lattice.shape.work >= 0 else 0.0
+        # Carrying leaves every number below 2^53: their sums over ranks, as floats, are exact.
+        carried = fine >> 40
+        total = np.hstack([whole + carried, fine - (carried << 40), work])
         self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
-        *pairs, work = total.tolist()
-        sums = [a * self.unit + b * (self.unit / _FINE) for a, b in zip(pairs[::2], pairs[1::2], strict=True)]
-        kinetic, spring, contact, dissipated = sums
-        return Energies(kinetic, spring, contact, work, dissipated)
+        kinetic, spring, contact, dissipated = (total[:4] * self.unit + total[4:8] * (self.unit / _FINE)).tolist()
+        return Energies(kinetic, spring, contact, float(total[8]), dissipated)

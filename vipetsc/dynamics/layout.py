@@ -8,9 +8,8 @@ the left, then on the right. Mass by mass keeps every inner loop contiguous.
 Compiled kernels see a rank's part as a ``LatticeRecord``: tables of masses, springs and sites, and the drive.
 """
 
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import NamedTuple, Self
+from itertools import accumulate, pairwise
+from typing import NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -23,64 +22,28 @@ from vipetsc.contact.law import Contacts, create_contacts
 from vipetsc.lattice import ToneBurst
 
 
-@dataclass(frozen=True)
 class Layout:
-    """The share of a lattice that one rank owns: cells ``start`` to ``stop`` (0-based, half open)."""
+    """The share of a lattice that one rank owns: cells ``start`` to ``stop`` (0-based, half open), ``owned`` of them.
 
-    comm: MPI.Comm
-    cells: int
-    dofs: int
-    start: int
-    stop: int
-    periodic: bool
-    sites: tuple[int, ...]
-    owns_drive: bool
-    ranges: tuple[tuple[int, int], ...]
-    offsets: tuple[int, ...]
+    Cells come in equal blocks, the first ranks have one more where they do not divide; a rank may be empty. ``ranges``
+    and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
+    ``size`` components; that of the first owned site's dissipated energy is ``dissipated``.
+    """
 
-    @classmethod
-    def of(cls, model: Model, comm: MPI.Comm) -> Self:
-        """Cells in equal blocks, the first ranks one more where they do not divide; a rank may be empty."""
-        cells, dofs = model.chain.cells, model.chain.cell.dofs
-        cuts = [r * (cells // comm.size) + min(r, cells % comm.size) for r in range(comm.size + 1)]
-        ranges = tuple(pairwise(cuts))
-        sizes = []
-        for a, b in ranges:
-            extras = (a <= model.drive_cell < b) + sum(a <= c < b for c in model.chain.sites)
-            sizes.append(2 * dofs * (b - a) + extras)
-        start, stop = ranges[comm.rank]
-        return cls(
-            comm=comm,
-            cells=cells,
-            dofs=dofs,
-            start=start,
-            stop=stop,
-            periodic=model.chain.ends == "periodic",
-            sites=tuple(i for i, c in enumerate(model.chain.sites) if start <= c < stop),
-            owns_drive=start <= model.drive_cell < stop,
-            ranges=ranges,
-            offsets=tuple(int(x) for x in np.concatenate([[0], np.cumsum(sizes)])),
-        )
-
-    @property
-    def owned(self) -> int:
-        """Number of cells on this rank."""
-        return self.stop - self.start
-
-    @property
-    def size(self) -> int:
-        """Number of state components on this rank."""
-        return self.offsets[self.comm.rank + 1] - self.offsets[self.comm.rank]
-
-    @property
-    def work(self) -> int:
-        """Local index of the work of the drive, or -1 where another rank owns it."""
-        return 2 * self.dofs * self.owned if self.owns_drive else -1
-
-    @property
-    def dissipated(self) -> int:
-        """Local index of the first owned site's dissipated energy."""
-        return 2 * self.dofs * self.owned + self.owns_drive
+    def __init__(self, model: Model, comm: MPI.Comm) -> None:
+        chain = model.chain
+        self.comm, self.cells, self.dofs = comm, chain.cells, chain.cell.dofs
+        self.periodic = chain.ends == "periodic"
+        cuts = [r * (self.cells // comm.size) + min(r, self.cells % comm.size) for r in range(comm.size + 1)]
+        self.ranges = list(pairwise(cuts))
+        of_ledger = (model.drive_cell, *chain.sites)
+        sizes = [2 * self.dofs * (b - a) + sum(a <= cell < b for cell in of_ledger) for a, b in self.ranges]
+        self.offsets = list(accumulate(sizes, initial=0))
+        self.start, self.stop = self.ranges[comm.rank]
+        self.owned, self.size = self.stop - self.start, sizes[comm.rank]
+        self.sites = tuple(i for i, cell in enumerate(chain.sites) if self.start <= cell < self.stop)
+        self.owns_drive = self.start <= model.drive_cell < self.stop
+        self.dissipated = 2 * self.dofs * self.owned + self.owns_drive
 
     def neighbours(self) -> tuple[int | None, int | None]:
         """Cells to the left and to the right of this rank's; None beyond an end, or on an empty rank."""
@@ -101,12 +64,8 @@ class Layout:
         """A zero state with ghosts for the neighbouring cells' displacements, in ``array`` if one is given."""
         cells = [cell for cell in self.neighbours() if cell is not None]
         indices = np.array([self.state_indices(cell)[: self.dofs] for cell in cells], PETSc.IntType).ravel()
-        size = (self.size, PETSc.DETERMINE)
-        if array is not None:
-            return PETSc.Vec().createGhostWithArray(indices, array, size=size, comm=self.comm)
-        vector = PETSc.Vec().createGhost(indices, size=size, comm=self.comm)
-        vector.set(0.0)
-        return vector
+        array = np.zeros(self.size + indices.size) if array is None else array
+        return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
 
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
@@ -185,7 +144,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         left_free=chain.ends == "free" and left is None,
         right_free=chain.ends == "free" and right is None,
         driven=(d + model.drive_mass) * n + model.drive_cell - layout.start if layout.owns_drive else -1,
-        work=layout.work,
+        work=2 * d * n if layout.owns_drive else -1,
         dissipated=layout.dissipated,
     )
     couplings = cell.couplings()

@@ -88,7 +88,7 @@ def simulate(
     output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
     model = case.model()
     output.begin(case.to_toml(), force, resume)
-    layout = Layout.of(model, output.comm)
+    layout = Layout(model, output.comm)
     kind, refusal = select_engine(case.time.engine, model)
     setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
     run = Run(setup, [*OBSERVERS, *(["progress"] if progress else []), *observers])
@@ -178,10 +178,8 @@ class Run:
 def fastest_place(setup: Setup) -> str:
     """The cell that moves fastest, or is not finite, and the site nearest to it; all ranks must call it."""
     layout = setup.layout
-    half = layout.dofs * layout.owned
-    y = setup.engine.state.array_r
-    finite = np.isfinite(y[:half]) & np.isfinite(y[half : 2 * half])
-    speed = np.where(finite, np.abs(y[half : 2 * half]), np.inf).reshape(layout.dofs, layout.owned)
+    u, v = setup.engine.state.array_r[: 2 * layout.dofs * layout.owned].reshape(2, layout.dofs, layout.owned)
+    speed = np.where(np.isfinite(u) & np.isfinite(v), np.abs(v), np.inf)
     local = (-1.0, layout.start)
     if layout.owned:
         local = float(speed.max()), layout.start + int(speed.max(axis=0).argmax())

@@ -8,7 +8,7 @@ import numpy as np
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.law import CLOSED, FREE, contact_force
-from vipetsc.contact.search import LANDED, RETRY, SEARCH, begin_landing, correct, shorten
+from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.dynamics.propagator.collocation import (
     EXIT,
     NODES,
@@ -101,7 +101,7 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
 def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> tuple[float, bool]:
     """Repeat a substep to end on a ``change``; the length taken, negative if it could not be, whether it was met."""
     contacts, site, h = cluster.contacts, change.site, cluster.interval
-    landing = begin_landing(change.share, substep.length)
+    landing = Landing(change.share * substep.length, substep.length, np.inf, 0)
     while True:
         if landing.length <= ROUNDING:
             begin = switching(contacts, site, change.function, cluster.site_motion[site])

@@ -12,7 +12,7 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.contact.changes import Change, first_change, switching
-from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, begin_landing, correct, shorten
+from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import Episode, ImpactTracker
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout, create_record
@@ -53,8 +53,6 @@ class Integrator(Engine):
         self.comm = layout.comm
         self.lattice = create_record(model, layout)
         self.tracker = ImpactTracker(self.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
-        self._burst_end = model.drive.duration
-        self._dissipated = layout.dissipated
         self.counts = dict.fromkeys(COUNTS, 0)
         self.time = 0.0
         self.state = layout.create_vector()
@@ -120,7 +118,8 @@ class Integrator(Engine):
     def advance(self, target: float) -> bool:
         """See ``Engine``."""
         # The drive's end is a kink of its third derivative: a step ends there.
-        if self.time < self._burst_end < target and not self.advance(self._burst_end):
+        burst_end = self.lattice.burst.duration
+        if self.time < burst_end < target and not self.advance(burst_end):
             return False
         trials = 0
         while self.time < target:
@@ -144,12 +143,9 @@ class Integrator(Engine):
         if h < shortest:
             raise StalledError(f"the step fell to {h:.3g} s")
         self.state.copy(self.saved)
-        accepted, suggestion = self._trial(h)
-        if not accepted:
+        suggestion = self._trial(h)
+        if suggestion is None:
             self.counts["rejected"] += 1
-            self.step = suggestion
-            self.saved.copy(self.state)
-            self.ts.restartStep()
             return True
         # A step cut short to meet a sample says little about the longest one possible.
         if not self._fixed_step and (suggestion < 4 * h or suggestion > self.step):
@@ -168,16 +164,19 @@ class Integrator(Engine):
             self.time = end
         return stop == 0.0
 
-    def _trial(self, h: float) -> tuple[bool, float]:
-        """Try one step from the state at ``time``: whether PETSc accepted it, and its next step size."""
+    def _trial(self, h: float) -> float | None:
+        """Try one step of ``h`` s from ``saved``: PETSc's next step size; None if it was rejected, and is undone."""
         ts = self.ts
         ts.setTime(self.time)
         ts.setTimeStep(h)
         ts.step()
         suggestion = ts.getTimeStep()
-        if not np.isfinite(suggestion):
-            return False, 0.1 * h
-        return ts.getConvergedReason() >= 0, suggestion
+        if np.isfinite(suggestion) and ts.getConvergedReason() >= 0:
+            return suggestion
+        self.step = suggestion if np.isfinite(suggestion) else 0.1 * h
+        self.saved.copy(self.state)
+        ts.restartStep()
+        return None
 
     def _land(self, h: float, share: float, change: Change) -> None:
         """Step from the saved state onto the change at ``share`` of the step just tried, and switch there.
@@ -186,7 +185,7 @@ class Integrator(Engine):
         """
         comm, tracker = self.comm, self.tracker
         owner = comm.allreduce(comm.rank if change.share == share else comm.size, MPI.MIN)
-        attempt, outcome = begin_landing(share, h), RETRY
+        attempt, outcome = Landing(share * h, h, np.inf, 0), RETRY
         self.counts["landings"] += 1
         while outcome == RETRY:
             length = attempt.length
@@ -195,10 +194,7 @@ class Integrator(Engine):
             if length <= SHORTEST_STEP * max(self.time, self.free_step):
                 self._switch()  # the change lies at the start of the step
                 return
-            accepted, suggestion = self._trial(length)
-            if not accepted:
-                self.step = suggestion
-                self.saved.copy(self.state)
+            if self._trial(length) is None:
                 return
             self.observe(tracker.end, self.time + length)
             attempt, outcome = comm.bcast(self._judge(attempt, change) if comm.rank == owner else None, owner)
@@ -222,7 +218,7 @@ class Integrator(Engine):
         """Switch modes of all landed sites and set the step with which to go on."""
         tracker = self.tracker
         was_free = not self._any_open
-        self.counts["switches"] += tracker.switch(self.time, self.state.array_r[self._dissipated :])
+        self.counts["switches"] += tracker.switch(self.time, self.state.array_r[self.lattice.shape.dissipated :])
         shortest = self.comm.allreduce(tracker.contact_time(), MPI.MIN)
         self._any_open = bool(np.isfinite(shortest))
         if self._any_open and not self._fixed_step:
@@ -236,7 +232,7 @@ class Integrator(Engine):
 
     def take_episodes(self, unfinished: bool = False) -> list[Episode]:
         """See ``Engine``: those of the owned sites."""
-        return self.tracker.take_episodes(self.state.array_r[self._dissipated :], unfinished)
+        return self.tracker.take_episodes(self.state.array_r[self.lattice.shape.dissipated :], unfinished)
 
     def statistics(self) -> dict[str, Any]:
         """Steps, what landings and limits of the contact law there were, and how the right-hand side is called."""
