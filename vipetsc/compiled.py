@@ -2,7 +2,7 @@
 
 Numba's own cache looks at the file of a kernel alone: a kernel that calls a changed one of another file, or uses a
 constant of it, would go on with the old code. Here the folder of the cache bears a hash of all files with kernels,
-and of the modules that they import: constants are frozen into compiled code.
+of the modules that they import and of the tables beside them: constants are frozen into compiled code.
 """
 
 import ast
@@ -65,8 +65,8 @@ def kernel_cache(package: Path, chosen: str = "") -> Path:
 
 
 def kernel_sources(package: Path) -> list[Path]:
-    """The files of ``package`` with kernels, and those that they import from it."""
-    sources = set()
+    """The files of ``package`` with kernels, those that they import from it, and its tables of numbers."""
+    sources = set(package.rglob("*.csv"))
     for path in package.rglob("*.py"):
         text = path.read_bytes()
         if HAS_KERNELS.search(text):

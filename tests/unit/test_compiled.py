@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,11 @@ from vipetsc import compiled
 from vipetsc.dynamics.ts.native import compile_callback
 
 ROOT = Path(vipetsc.__file__).parent
-CONSTANTS = "SCALE = 2.0\n"
+CONSTANTS = """
+from pathlib import Path
+SCALE = 2.0
+SHIFT = float(Path(__file__).with_suffix(".csv").read_text())
+"""
 INNER = """
 from vipetsc.compiled import njit
 from vipetsc.constants import SCALE
@@ -26,13 +31,14 @@ def scaled(x):
 """
 OUTER = """
 from vipetsc.compiled import cfunc, njit
+from vipetsc.constants import SHIFT
 from vipetsc.inner import scaled
 @njit
 def twice(x):
     return scaled(scaled(x))
 @cfunc("f8(f8)")
 def callback(x):
-    return scaled(x) + 1.0
+    return scaled(x) + SHIFT
 """
 ASK = """
 import json, os, sys, numba
@@ -51,6 +57,7 @@ def package(tmp_path):
     folder.mkdir()
     (folder / "__init__.py").write_text("")
     (folder / "constants.py").write_text(CONSTANTS)
+    (folder / "constants.csv").write_text("1.0")
     (folder / "inner.py").write_text(INNER)
     (folder / "outer.py").write_text(OUTER)
     (folder / "plain.py").write_text("import numpy\n")
@@ -73,13 +80,20 @@ def test_kernels_are_found_again_until_the_source_of_any_changes(package):
     assert ask() == [[15.0, 8.0], [0, 0, 0], True]
     (folder / "constants.py").write_text(CONSTANTS.replace("2.0", "3.0"))
     assert ask() == [[31.0, 11.0], [0, 0, 0], True]
-    assert len(list(folder.glob("__pycache__/kernels-*"))) == 3
+    (folder / "constants.csv").write_text("2.0")
+    assert ask() == [[31.0, 12.0], [0, 0, 0], True]
+    assert len(list(folder.glob("__pycache__/kernels-*"))) == 4
 
 
 def test_a_chosen_folder_holds_them(package, tmp_path):
     folder, _ = package
     chosen = compiled.kernel_cache(folder, str(tmp_path / "chosen"))
     assert chosen == tmp_path / "chosen" / compiled.kernel_cache(folder).name
+
+
+def test_tables_of_numbers_come_with_the_package():
+    declared = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    assert set(ROOT.rglob("*.csv")) == {*(ROOT / "modes").glob(*declared["vipetsc.modes"])}
 
 
 def test_importing_the_package_changes_no_environment():
