@@ -15,17 +15,17 @@ from hypothesis import strategies as st
 from scipy.integrate import DOP853
 
 from vipetsc.case import CaseError
-from vipetsc.case.nnm import Guards, NnmCase
+from vipetsc.case.nnm import Guards, NnmCase, NnmTable
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
 from vipetsc.modes import dop853
 from vipetsc.modes.audit import sampled
 from vipetsc.modes.branch import Branch, slope_laws, tell_regions
 from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
 from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
-from vipetsc.modes.continuation import Continuation, StepControl, half_trace_change, unit
+from vipetsc.modes.continuation import Continuation, half_trace_change, unit
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import half_traces, linear_start, multipliers, sample_orbit
-from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 
@@ -84,8 +84,8 @@ def test_half_map_of_an_asymmetric_system():
     """x'' + x + a x^2 = 0: the second-order frequency 1 - 5/12 a^2 A^2 (Nayfeh and Mook 1979)."""
     a, energy = 0.1, 1e-3
     system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, quadratic=a)])
-    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["half"]))
-    point = linear_start(corrector, 0, energy)
+    problem = Shooting(Dop853Flow(system), MAPS["half"])
+    point = linear_start(problem, 0, energy)
     assert 2 * np.pi * point.frequency == pytest.approx(1 - 5 / 12 * a**2 * 2 * point.energy, abs=2e-9)
     assert point.multiplier == 1
 
@@ -198,12 +198,12 @@ def test_the_tableau_is_the_one_of_dop853():
 def test_multipliers_are_those_of_the_monodromy_matrix(name):
     """At a linear orbit the multipliers are exp(+-i omega_1 T_2), whatever the map."""
     system = reduced()
-    corrector = Corrector(Shooting(Dop853Flow(system), MAPS[name]))
-    point = linear_start(corrector, 1, 1e-3)
-    traces = half_traces(corrector.problem, corrector.problem.arc(point.x, point.period))
+    problem = Shooting(Dop853Flow(system), MAPS[name])
+    point = linear_start(problem, 1, 1e-3)
+    traces = half_traces(problem, problem.arc(point.x, point.period))
     omega = system.linear_modes()[0]
     expected = np.cos(2 * np.pi * omega[0] / omega[1])
-    mu = multipliers(traces, corrector.problem.map.quarter)
+    mu = multipliers(traces, problem.map.quarter)
     assert mu.real == pytest.approx(expected, abs=1e-9)
     assert np.abs(mu) == pytest.approx(1, abs=1e-9)
 
@@ -270,13 +270,13 @@ def test_regions_without_contacts():
 
 def test_portrait_is_the_orbit_itself():
     """The mirrored quarter agrees with a flow over the whole period."""
-    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
-    start = linear_start(corrector, 1, 0.02)
-    points = list(Continuation(corrector, start, StepControl(points=150, energy=(0, 0.5))))
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
+    start = linear_start(problem, 1, 0.02)
+    points = list(Continuation(problem, start, NnmTable(points=150, energy=[0.0, 0.5])))
     point = points[-1]
-    displacement, velocity = sample_orbit(corrector.problem, point, 40)
+    displacement, velocity = sample_orbit(problem, point, 40)
     for place in (13, 33):  # in the second and in the last quarter
-        arc = corrector.problem.flow.arc(np.append(point.x, [0, 0]), place / 40 * point.period, point.period)
+        arc = problem.flow.arc(np.append(point.x, [0, 0]), place / 40 * point.period, point.period)
         assert displacement[place] == pytest.approx(arc.end[:2], rel=1e-8)
         assert velocity[place] == pytest.approx(arc.end[2:], rel=1e-8)
 
@@ -344,12 +344,12 @@ def test_a_cell_of_ones_own_needs_clearances():
 
 @pytest.fixture(scope="module")
 def short_branch() -> Branch:
-    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
-    start = linear_start(corrector, 1, 0.02)
-    growing = Continuation(corrector, start, StepControl(points=400, energy=(0, 1e4)))
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
+    start = linear_start(problem, 1, 0.02)
+    growing = Continuation(problem, start, NnmTable(points=400, energy=[0.0, 1e4]))
     points = [growing.point, *growing]
     assert growing.finished
-    orbits = sampled(corrector.problem, points[-1:])
+    orbits = sampled(problem, points[-1:])
     return Branch("out-of-phase", "name = 'x'", 2, points, 0.1, True, "done", ["a", "b"], orbits)
 
 
@@ -382,7 +382,7 @@ def test_guards_are_what_the_points_obey(short_branch):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
     """On the way up and on the way down again; the energy is stationary along the branch there."""
-    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
     points = [replace(p, tangent=sign * p.tangent, energy_tangent=sign * p.energy_tangent) for p in short_branch.points]
     points = points[::sign]
     turning = [
@@ -390,10 +390,10 @@ def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
     ]
     assert len(turning) == 2
     for a, b in turning:
-        (fold,) = (p for p in locate(corrector, a, b) if p.kind == "fold-energy")
+        (fold,) = (p for p in locate(problem, a, b) if p.kind == "fold-energy")
         assert abs(fold.energy_tangent) <= 1e-9 * abs(a.energy_tangent)
         assert fold.half_traces[0] == pytest.approx(1, abs=1e-6)
-    kinds = {p.kind for a, b in itertools.pairwise(points[-20:]) for p in locate(corrector, a, b)}
+    kinds = {p.kind for a, b in itertools.pairwise(points[-20:]) for p in locate(problem, a, b)}
     assert "fold-energy" not in kinds
 
 

@@ -8,16 +8,16 @@ import itertools
 import numpy as np
 import pytest
 
-from vipetsc.case.nnm import Guards
+from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.lattice import Chain, Contact, contact_stiffness, four_band
 from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
 from vipetsc.modes.chart import Relative
-from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl
+from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.flow import FiniteDifferences
 from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.point import Point, linear_start, resonance
-from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import SmoothSpring, System
 from vipetsc.modes.tsrk import Tsrk
@@ -37,55 +37,53 @@ def cubic() -> System:
 
 
 def follow(system: System, mode: int, start: float, flow=Dop853Flow, shooting: str = "quarter", **control):
-    """Corrector, points and special points of a branch."""
-    corrector = Corrector(Shooting(flow(system), MAPS[shooting]))
-    first = linear_start(corrector, mode, start)
-    branch = Continuation(corrector, first, StepControl(**{"points": 20000} | control))
+    """Problem, points and special points of a branch."""
+    problem = Shooting(flow(system), MAPS[shooting])
+    first = linear_start(problem, mode, start)
+    branch = Continuation(problem, first, NnmTable(**{"points": 20000} | control))
     points, special = [branch.point], []
     for point in branch:
-        special += locate(corrector, points[-1], point, control.get("chart", "relative"), grazing=True)
+        special += locate(problem, points[-1], point, control.get("chart", "relative"), grazing=True)
         points.append(point)
-    return corrector, points, special
+    return problem, points, special
 
 
-def at_energy(corrector: Corrector, points: list[Point], energy: float) -> Point:
+def at_energy(problem: Shooting, points: list[Point], energy: float) -> Point:
     """The point of an increasing stretch of a branch at an energy, corrected there."""
     i = max(k for k, p in enumerate(points[:-1]) if p.energy <= energy < points[k + 1].energy)
     last = points[i]
     for _ in range(8):  # Newton in the energy along the branch
         share = (energy - last.energy) / last.energy_tangent
-        chart = Relative(corrector.problem.system, last.x, last.period)
+        chart = Relative(problem.system, last.x, last.period)
         xi = chart.encode(last.x, last.period)
         tangent = np.linalg.solve(chart.derivative(xi), last.tangent)
         row = tangent / np.linalg.norm(tangent)
-        attempt = corrector.solve(chart, xi + share * tangent, row, row @ (xi + share * tangent))
+        attempt = problem.solve(chart, xi + share * tangent, row, row @ (xi + share * tangent))
         assert attempt.converged, attempt.history
-        null = np.linalg.svd(corrector.matrix(attempt.xi))[2][-1]
-        last = Point.of(corrector.problem, attempt, chart, null)
+        null = np.linalg.svd(problem.matrix(attempt.xi))[2][-1]
+        last = Point.of(problem, attempt, chart, null)
     assert last.energy == pytest.approx(energy, rel=1e-12)
     return last
 
 
 @pytest.fixture(scope="module")
 def bilinear():
-    return follow(reduced(), OUT_OF_PHASE, 3e-4, energy=(1e-4, 1e9), chart="auto")
+    return follow(reduced(), OUT_OF_PHASE, 3e-4, energy=[1e-4, 1e9], chart="auto")
 
 
 @pytest.fixture(scope="module")
 def hertz():
-    return follow(reduced("hertz"), OUT_OF_PHASE, 3e-4, energy=(1e-4, 1e9), chart="auto")
+    return follow(reduced("hertz"), OUT_OF_PHASE, 3e-4, energy=[1e-4, 1e9], chart="auto")
 
 
 @pytest.fixture(scope="module")
 def in_phase():
-    """Corrector and points of the in-phase branch from the linear mode to the limit, without special points."""
-    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
-    growing = Continuation(
-        corrector, linear_start(corrector, IN_PHASE, 1e-3), StepControl(energy=(0.0, 6e9), points=20000)
-    )
+    """Problem and points of the in-phase branch from the linear mode to the limit, without special points."""
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
+    growing = Continuation(problem, linear_start(problem, IN_PHASE, 1e-3), NnmTable(energy=[0.0, 6e9], points=20000))
     points = [growing.point, *growing]
     assert growing.finished
-    return corrector, points
+    return problem, points
 
 
 def of_kind(special: list[Point], kind: str) -> list[Point]:
@@ -122,7 +120,7 @@ def test_bilinear_folds_and_stability(bilinear):
         elif not first <= p.index <= second:
             assert p.multiplier == pytest.approx(1, abs=1e-6)
     # the folds do not depend on how the branch is stepped
-    _, _, again = follow(reduced(), OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.1), largest_step=0.05, chart="relative")
+    _, _, again = follow(reduced(), OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.1], largest_step=0.05, chart="relative")
     for fold, other in zip(folds, of_kind(again, "fold-energy"), strict=True):
         assert other.energy == pytest.approx(fold.energy, rel=1e-9)
         assert other.frequency == pytest.approx(fold.frequency, rel=1e-8)
@@ -130,9 +128,9 @@ def test_bilinear_folds_and_stability(bilinear):
 
 def test_bilinear_approaches_its_limit(bilinear):
     """f_limit - f falls as E^(-1/2), the clearance over the amplitude."""
-    corrector, points, _ = bilinear
-    limit = corrector.problem.system.closed_frequencies()[1] / (2 * np.pi)
-    distance = [limit - at_energy(corrector, points, e).frequency for e in (1e6, 1e8)]
+    problem, points, _ = bilinear
+    limit = problem.system.closed_frequencies()[1] / (2 * np.pi)
+    distance = [limit - at_energy(problem, points, e).frequency for e in (1e6, 1e8)]
     assert distance[0] / distance[1] == pytest.approx(10, rel=2e-3)
 
 
@@ -140,17 +138,17 @@ def test_hertz_folds_only_at_200_mpa(hertz):
     _, points, special = hertz
     assert not of_kind(special, "fold-energy")
     assert max(p.multiplier for p in points) == pytest.approx(1, abs=1e-6)
-    _, stiffer, special = follow(reduced("hertz", 2e8), OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.1))
+    _, stiffer, special = follow(reduced("hertz", 2e8), OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.1])
     assert len(of_kind(special, "fold-energy")) == 2
     assert max(p.multiplier for p in stiffer) > 1.01
 
 
 def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
     """The quarter period from modal superposition: closed, then open, with one separation between."""
-    corrector, points, _ = bilinear
-    system = corrector.problem.system
-    point = at_energy(corrector, points, 1.0)
-    arc = corrector.problem.arc(point.x, point.period)
+    problem, points, _ = bilinear
+    system = problem.system
+    point = at_energy(problem, points, 1.0)
+    arc = problem.arc(point.x, point.period)
     (event,) = arc.events
     row = np.array([-1.0, 1.0])
     sign = np.sign(row @ point.x)
@@ -177,17 +175,17 @@ def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
 @pytest.mark.parametrize("flow", [Tsrk, Newmark])
 def test_other_flows_agree(flow, law, bilinear, hertz):
     """TSRK is as exact as the compiled flow; Newmark has its own error, at the same amplitude."""
-    corrector, points, _ = bilinear if law == "bilinear" else hertz
-    system = corrector.problem.system
-    other = Corrector(Shooting(flow(system), MAPS["quarter"]), tolerance=1e-12)
+    problem, points, _ = bilinear if law == "bilinear" else hertz
+    system = problem.system
+    other = Shooting(flow(system), MAPS["quarter"], tolerance=1e-12)
     for energy in (0.1, 10.0, 1e4, 1e8):
-        point = at_energy(corrector, points, energy)
+        point = at_energy(problem, points, energy)
         chart = Relative(system, point.x, point.period)
         xi = chart.encode(point.x, point.period)
         row = np.array([0.0, 1.0, 0.0])  # the same w
         attempt = other.solve(chart, xi + 1e-6 * (1 - row), row, row @ xi)  # begin beside the orbit
         assert attempt.converged, attempt.history
-        found = Point.of(other.problem, attempt, chart)
+        found = Point.of(other, attempt, chart)
         accuracy = (1e-11, 1e-11) if flow is Tsrk else (1e-4, 1e-4)
         assert found.energy == pytest.approx(point.energy, rel=accuracy[0])
         assert found.frequency == pytest.approx(point.frequency, rel=accuracy[1])
@@ -236,22 +234,22 @@ def test_short_contacts_inside_a_step_are_found():
 
 def test_in_phase_through_the_first_tongues(in_phase):
     """The grazing cascade and the 5:1 and 7:1 resonances, without a jump; grazing at its own energy."""
-    corrector, points = in_phase
+    problem, points = in_phase
     points = list(itertools.takewhile(lambda p: p.frequency < 333, points))
-    special = (p for a, b in itertools.pairwise(points) for p in locate(corrector, a, b, grazing=True))
+    special = (p for a, b in itertools.pairwise(points) for p in locate(problem, a, b, grazing=True))
     graze = next(p for p in special if p.kind == "grazing")
     assert graze.energy == pytest.approx(GRAZING[IN_PHASE], rel=1e-10)
     assert max(p.residual for p in points) <= 1e-11
     assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
     assert not list(suspects(points))
-    monitor = BranchMonitor(corrector)
+    monitor = BranchMonitor(problem.system)
     assert not [s for s in map(monitor.check, points) if s]
 
 
 def test_in_phase_through_every_odd_tongue_to_the_limit(in_phase):
     """At the tip of the k:1 tongue the resonator strikes (k + 1)/2 times in a quarter period, for every odd k."""
-    corrector, points = in_phase
-    system = corrector.problem.system
+    problem, points = in_phase
+    system = problem.system
     assert points[-1].energy > 6e9
     assert max(p.residual for p in points) <= 3e-12
     assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
@@ -263,7 +261,7 @@ def test_in_phase_through_every_odd_tongue_to_the_limit(in_phase):
     labels, last = set(), points[0]
     for point in points[1:]:
         if last.energy_tangent < 0 < point.energy_tangent and point.episodes > 0:  # the inner end of a tongue
-            k = resonance(corrector.problem, point)
+            k = resonance(problem, point)
             if point.episodes == (k + 1) // 2:
                 labels.add(k)
         last = point
@@ -273,22 +271,22 @@ def test_in_phase_through_every_odd_tongue_to_the_limit(in_phase):
 def test_degenerate_tangent_is_named():
     """Two equal oscillators without coupling: every combination is an orbit, so the start is a branch point."""
     system = System.assemble([1.0, 1.0], [(None, 0, 1.0), (None, 1, 1.0)])
-    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["half"]))
+    problem = Shooting(Dop853Flow(system), MAPS["half"])
     x = np.array([1.0, 0.5])
     chart = Relative(system, x, 2 * np.pi)
     xi = chart.encode(x, 2 * np.pi)
-    attempt = corrector.solve(chart, xi, np.array([1.0, 0.0, 0.0]), xi[0])
+    attempt = problem.solve(chart, xi, np.array([1.0, 0.0, 0.0]), xi[0])
     with pytest.raises(ContinuationError, match=r"degenerate tangent at E = 0.625 J"):
-        Continuation(corrector, Point.of(corrector.problem, attempt, chart), StepControl())
+        Continuation(problem, Point.of(problem, attempt, chart), NnmTable())
 
 
 def test_both_directions_give_the_same_curve():
     """Down from above grazing returns through both folds to the linear mode, which the monitor reports."""
     system = reduced()
-    corrector, points, _ = follow(system, OUT_OF_PHASE, 1e-2, energy=(1e-4, 0.5))
-    down = Continuation(corrector, points[-1], StepControl(points=2000, energy=(1e-3, 1.0)), step=1e-3)
+    problem, points, _ = follow(system, OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.5])
+    down = Continuation(problem, points[-1], NnmTable(points=2000, energy=[1e-3, 1.0]), step=1e-3)
     down.point = dataclasses.replace(points[-1], tangent=-points[-1].tangent)
-    monitor, back, said = BranchMonitor(corrector), [], None
+    monitor, back, said = BranchMonitor(problem.system), [], None
     for point in down:
         back.append(point)
         said = monitor.check(point)
@@ -301,14 +299,14 @@ def test_both_directions_give_the_same_curve():
 
 
 def test_without_guards_the_branch_jumps_and_the_detector_says_so():
-    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]))
-    start = linear_start(corrector, IN_PHASE, 3e-3)
-    control = StepControl(points=150, guards=Guards(half_trace=0, contacts=0, corrector=0, turn=0))
-    points = [start, *Continuation(corrector, start, control)]
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
+    start = linear_start(problem, IN_PHASE, 3e-3)
+    control = NnmTable(points=150, guards=Guards(half_trace=0, contacts=0, corrector=0, turn=0))
+    points = [start, *Continuation(problem, start, control)]
     assert max(p.residual for p in points) <= 1e-12  # no residual tells
-    found = [(i, why) for i, why in suspects(points) if is_jump(corrector, points[i], points[i + 1], control)]
+    found = [(i, why) for i, why in suspects(points) if is_jump(problem, points[i], points[i + 1], control)]
     assert found
-    guarded = [start, *Continuation(corrector, start, StepControl(points=150))]
+    guarded = [start, *Continuation(problem, start, NnmTable(points=150))]
     assert not list(suspects(guarded))
 
 
@@ -316,13 +314,13 @@ def test_cubic_benchmark():
     """Kerschen and Peeters (2009): linear frequencies, both modes to E = 1e6, the 3:1 and the 5:1 tongue."""
     system = cubic()
     assert system.linear_modes()[0] == pytest.approx([1.0, np.sqrt(3)], rel=1e-14)
-    corrector, points, special = follow(system, IN_PHASE, 1e-3, energy=(0.0, 1e6))
+    problem, points, special = follow(system, IN_PHASE, 1e-3, energy=[0.0, 1e6])
     assert points[0].frequency == pytest.approx(1 / (2 * np.pi), rel=1e-3)
     assert points[-1].energy > 1e6
     assert max(p.residual for p in points) <= 1e-12
-    tips = {resonance(corrector.problem, p) for p in of_kind(special, "fold-energy")}
+    tips = {resonance(problem, p) for p in of_kind(special, "fold-energy")}
     assert {3, 5} <= tips
-    _, points, _ = follow(system, OUT_OF_PHASE, 1e-3, energy=(0.0, 1e6))
+    _, points, _ = follow(system, OUT_OF_PHASE, 1e-3, energy=[0.0, 1e6])
     assert points[-1].energy > 1e6
     # mass 1 on its hardening spring alone: f ~ E^(1/4)
     high = [p for p in points if p.energy > 1e4]
@@ -333,17 +331,17 @@ def test_cubic_benchmark():
 @pytest.mark.parametrize("shooting", ["half", "whole"])
 def test_maps_agree(shooting, bilinear):
     """The half and the whole period find the quarter's orbits, with the same multipliers."""
-    corrector, points, _ = bilinear
+    problem, points, _ = bilinear
     point = next(p for p in points if p.energy > 1.0)
     unstable = max(points, key=lambda p: p.multiplier)
     for p in (point, unstable):
-        other = Corrector(Shooting(corrector.problem.flow, MAPS[shooting]), tolerance=1e-11)
-        chart = Relative(corrector.problem.system, p.x, p.period)
+        other = Shooting(problem.flow, MAPS[shooting], tolerance=1e-11)
+        chart = Relative(problem.system, p.x, p.period)
         xi = chart.encode(p.x, p.period)
         row = np.append(p.x / np.linalg.norm(p.x), 0.0)
         attempt = other.solve(chart, xi + 1e-7, row, row @ xi)
         assert attempt.converged, attempt.history
-        found = Point.of(other.problem, attempt, chart)
+        found = Point.of(other, attempt, chart)
         assert found.frequency == pytest.approx(p.frequency, rel=1e-9)
         assert found.multiplier == pytest.approx(p.multiplier, rel=1e-3)
 
@@ -351,19 +349,19 @@ def test_maps_agree(shooting, bilinear):
 @pytest.mark.parametrize("kind", ["symmetry-breaking", "period-doubling"])
 def test_branch_switching(kind):
     """The crossing branch starts at the special point and its orbits have lost the old symmetry."""
-    corrector, _, special = follow(cubic(), IN_PHASE, 1e-3, energy=(0.0, 4500.0), frequency=(0.0, 0.2229))
+    problem, _, special = follow(cubic(), IN_PHASE, 1e-3, energy=[0.0, 4500.0], frequency=[0.0, 0.2229])
     point = of_kind(special, kind)[0]
-    fresh, first = switch(corrector, point, amplitude=1e-3)
+    fresh, first = switch(problem, point, amplitude=1e-3)
     assert first.energy == pytest.approx(point.energy, rel=1e-3)
     times = 2 if kind == "period-doubling" else 1
     assert first.period == pytest.approx(times * point.period, rel=1e-3)
-    crossing = list(Continuation(fresh, first, StepControl(points=10)))
+    crossing = list(Continuation(fresh, first, NnmTable(points=10)))
     far = crossing[-1]
     assert far.residual <= 1e-11
-    arc = fresh.problem.arc(far.x, far.period)
-    quarter = fresh.problem.flow.arc(arc.start, far.period / 4, far.period).end
-    n = fresh.problem.system.dofs
-    old = quarter[:n] if fresh.problem.map.start == "rest" else quarter[n:]
+    arc = fresh.arc(far.x, far.period)
+    quarter = fresh.flow.arc(arc.start, far.period / 4, far.period).end
+    n = fresh.system.dofs
+    old = quarter[:n] if fresh.map.start == "rest" else quarter[n:]
     assert np.abs(old).max() > 1e-4 * np.abs(quarter).max()  # not the quarter-symmetric orbit
 
 
@@ -373,18 +371,18 @@ def test_three_cells_through_grazing(law, mode):
     chain = Chain(four_band(), 3, "fixed", (0, 1, 2), (10**-2.65, 10**-2.7, 10**-2.75))
     system = System.from_chain(chain, Contact(law, contact_stiffness(1e8, 0.005, 0.3)))
     graze = system.grazing_energy(mode)
-    _, points, special = follow(system, mode, graze / 2, energy=(0.0, 1.05 * graze), points=400)
+    _, points, special = follow(system, mode, graze / 2, energy=[0.0, 1.05 * graze], points=400)
     assert points[-1].energy > 1.05 * graze
     assert of_kind(special, "grazing")[0].energy == pytest.approx(graze, rel=1e-10)
     assert max(p.residual for p in points) <= 1e-12
 
 
 def test_failure_says_where_why_and_what_to_turn():
-    corrector = Corrector(Shooting(Dop853Flow(reduced()), MAPS["quarter"]), max_newton=1)
-    start = linear_start(corrector, OUT_OF_PHASE, 2.9e-2)
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"], max_newton=1)
+    start = linear_start(problem, OUT_OF_PHASE, 2.9e-2)
     points = []
     with pytest.raises(ContinuationError) as caught:
-        for point in Continuation(corrector, start, StepControl(smallest_step=1e-6, first_step=1e-2)):
+        for point in Continuation(problem, start, NnmTable(smallest_step=1e-6, first_step=1e-2)):
             points.append(point)
     text = str(caught.value)
     assert points

@@ -43,8 +43,8 @@ a backbone and fits their power laws; ``point`` is one orbit, with its samples a
 
 A loop of one's own (importing the package loads PETSc)::
 
-    corrector = Corrector(Shooting(Dop853Flow(system), MAPS["quarter"]))
-    for point in Continuation(corrector, linear_start(corrector, mode, energy), StepControl()):
+    problem = Shooting(Dop853Flow(system), MAPS["quarter"])
+    for point in Continuation(problem, linear_start(problem, mode, energy), NnmTable()):
         ...
 
 References
@@ -58,14 +58,14 @@ J. R. Dormand and P. J. Prince, A family of embedded Runge-Kutta formulae, J. Co
 E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 2nd ed., Springer 1993.
 """
 
-from vipetsc.case.nnm import Guards
+from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.modes.branch import Branch
-from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl
+from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.follow import follow_all
 from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.point import Point, linear_start
-from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.modes.tsrk import Tsrk

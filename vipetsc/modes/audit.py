@@ -5,13 +5,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vipetsc.case.nnm import Guards
+from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.chart import Relative
-from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl, chart_at, half_trace_change
+from vipetsc.modes.continuation import Continuation, ContinuationError, chart_at, half_trace_change
 from vipetsc.modes.flow import Flow, FlowError
 from vipetsc.modes.point import Point, sample_orbit
-from vipetsc.modes.shooting import Corrector, Shooting
+from vipetsc.modes.shooting import Shooting
+from vipetsc.modes.system import System
 
 
 def suspects(points: list[Point]) -> Iterator[tuple[int, str]]:
@@ -25,18 +26,19 @@ def suspects(points: list[Point]) -> Iterator[tuple[int, str]]:
             yield i, f"asinh of a half-trace changes by {change:.2g}"
 
 
-def is_jump(corrector: Corrector, left: Point, right: Point, control: StepControl) -> bool:
+def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> bool:
     """Whether the guarded branch from ``left`` misses ``right``.
 
     Follows the branch from the left point with the guards on, until it passes the right one or is further
     from the left point than three times the step.
     """
-    chart = chart_at(corrector.problem, "relative", left)
+    chart = chart_at(problem, "relative", left)
     origin, goal = chart.encode(left.x, left.period), chart.encode(right.x, right.period)
     reach = float(np.linalg.norm(goal - origin))
-    last, first = origin, min(control.first_step, reach / 4)
-    guarded = StepControl(first, control.smallest_step, largest_step=reach / 4, points=400)
-    for point in Continuation(corrector, left, guarded):
+    last, first, anywhere = origin, min(control.first_step, reach / 4), [0.0, np.inf]
+    steps = {"first_step": first, "largest_step": reach / 4, "points": 400, "chart": "relative", "guards": Guards()}
+    guarded = control.model_copy(update={**steps, "energy": anywhere, "frequency": anywhere})
+    for point in Continuation(problem, left, guarded):
         here = chart.encode(point.x, point.period)
         share, missed, length = (float(a[0]) for a in _nearest(goal, last[None, :], here[None, :]))
         # a smooth arc leaves its chord by its length times the turn allowed
@@ -48,12 +50,12 @@ def is_jump(corrector: Corrector, left: Point, right: Point, control: StepContro
     return True
 
 
-def jumps(points: list[Point], corrector: Corrector, control: StepControl) -> Iterator[str]:
+def jumps(points: list[Point], problem: Shooting, control: NnmTable) -> Iterator[str]:
     """Sentences about steps that jumped to another arc; only suspicious ones are followed again."""
     for i, why in suspects(points):
         a, b = points[i], points[i + 1]
         try:
-            jumped = is_jump(corrector, a, b, control)
+            jumped = is_jump(problem, a, b, control)
         except (ContinuationError, FlowError):
             jumped = True
         if jumped:
@@ -75,8 +77,7 @@ def _nearest(place: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[n
 class BranchMonitor:
     """Tells when a growing branch retraces itself and when it returns to a linear mode."""
 
-    def __init__(self, corrector: Corrector) -> None:
-        system = corrector.problem.system
+    def __init__(self, system: System) -> None:
         self._linear = system.linear_modes()[0] / (2 * np.pi)
         self._track = np.empty((0, system.dofs + 2))
         self._touched = False
@@ -120,15 +121,14 @@ def sampled(problem: Shooting, points: list[Point]) -> Variables:
     }
 
 
-def compare(reference: Corrector, points: list[Point], flow: Flow) -> Variables:
+def compare(reference: Shooting, points: list[Point], flow: Flow) -> Variables:
     """What ``flow`` gives on every fourth of ``points``, as variables of the branch's file; NaN where it fails.
 
     The points are corrected keeping the first contact's w (or the largest displacement): at the same energy or
     frequency the comparison would be ill-posed where the branch is vertical or flat. The differences are the flow's
     values over the branch's, less 1.
     """
-    problem = Shooting(flow, reference.problem.map)
-    corrector = Corrector(problem, max(reference.tolerance, 1e-12))
+    problem = Shooting(flow, reference.map, max(reference.tolerance, 1e-12))
     contacts, chosen = problem.system.contacts, points[::4]
     difference = np.full((2, len(chosen)), np.nan)
     for i, point in enumerate(chosen):
@@ -137,7 +137,7 @@ def compare(reference: Corrector, points: list[Point], flow: Flow) -> Variables:
         row = np.zeros(len(xi))
         row[contacts[0].resonator if contacts else int(np.abs(point.x).argmax())] = 1.0
         # begin beside the orbit, or a flow whose residual passes there would not move at all
-        attempt = corrector.solve(chart, xi + 1e-6 * (1 - row), row, row @ xi)
+        attempt = problem.solve(chart, xi + 1e-6 * (1 - row), row, row @ xi)
         if attempt.converged:
             x, period = chart.decode(attempt.xi)
             difference[:, i] = problem.energy(x) / point.energy - 1, point.period / period - 1

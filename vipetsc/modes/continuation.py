@@ -1,37 +1,18 @@
 """Pseudo-arclength continuation as an iterator over points; the caller owns the loop."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from vipetsc.case.nnm import Guards
+from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.chart import CHARTS, Chart, Grazing, Relative
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Attempt, Corrector, Shooting, null_vector
+from vipetsc.modes.shooting import Attempt, Shooting, null_vector
 
 
 class ContinuationError(RuntimeError):
     """The branch cannot go on; the message says where, why, and which option to turn."""
-
-
-@dataclass(frozen=True)
-class StepControl:
-    """How a branch is followed.
-
-    Steps are in units of the chart (relative changes); the branch ends outside ``energy`` (J), outside ``frequency``
-    (Hz) or after ``points`` points. ``chart`` is ``relative``, ``logarithmic``, ``grazing`` or ``auto`` (grazing near a
-    contact at the arc's start, relative elsewhere). The names are those of the case's section [nnm].
-    """
-
-    first_step: float = 1e-3
-    smallest_step: float = 1e-13
-    largest_step: float = 0.1
-    points: int = 5000
-    energy: Sequence[float] = (0.0, np.inf)
-    frequency: Sequence[float] = (0.0, np.inf)
-    chart: str = "relative"
-    guards: Guards = field(default_factory=Guards)
 
 
 # Most growth of a step over the last one.
@@ -48,23 +29,27 @@ GUARDED = {
 class Frame:
     """The chart at a point of a branch, the unknowns ``xi`` (n + 1,) of the point and the unit ``tangent`` there."""
 
-    def __init__(self, corrector: Corrector, chart: str, point: Point) -> None:
-        self.corrector, self.chart = corrector, chart_at(corrector.problem, chart, point)
+    def __init__(self, problem: Shooting, chart: str, point: Point) -> None:
+        self.problem, self.chart = problem, chart_at(problem, chart, point)
         self.xi = self.chart.encode(point.x, point.period)
         self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), point.direction))
 
     def correct(self, guess: np.ndarray, step: float) -> Attempt:
         """Newton's method from ``guess`` for the orbit at the arclength ``step`` along the tangent."""
-        return self.corrector.solve(self.chart, guess, self.tangent, self.tangent @ self.xi + step)
+        return self.problem.solve(self.chart, guess, self.tangent, self.tangent @ self.xi + step)
 
     def point(self, attempt: Attempt, index: int, step: float) -> tuple[Point, np.ndarray]:
         """The point that an attempt has converged to, and the unit tangent there in this chart."""
-        direction = self.corrector.tangent(attempt.xi, self.tangent)
-        return Point.of(self.corrector.problem, attempt, self.chart, direction, index, step), direction
+        direction = self.problem.tangent(attempt.xi, self.tangent)
+        return Point.of(self.problem, attempt, self.chart, direction, index, step), direction
 
 
 class Continuation:
     """Iterates over the points of a branch, from ``start`` in the direction of growing or falling energy.
+
+    Of the section [nnm], ``control``, it takes the ``chart`` (``auto``: grazing near a contact at the arc's start, else
+    relative), the steps in units of the chart, the ``guards``, and where the branch ends: outside ``energy`` (J),
+    outside ``frequency`` (Hz) or after ``points`` points.
 
     Each point is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended, ``finished``
     whether it left its range. The whole state is the last point and the next step: a stored branch can be resumed.
@@ -72,11 +57,11 @@ class Continuation:
     """
 
     def __init__(
-        self, corrector: Corrector, start: Point, control: StepControl, direction: int = 1, step: float | None = None
+        self, problem: Shooting, start: Point, control: NnmTable, direction: int = 1, step: float | None = None
     ) -> None:
-        self.corrector, self.control, self.point = corrector, control, start
+        self.problem, self.control, self.point = problem, control, start
         if start.tangent is None:
-            self.point = replace(start, tangent=first_tangent(corrector, start, direction))
+            self.point = replace(start, tangent=first_tangent(problem, start, direction))
         self.step = control.first_step if step is None else step
         self.ending, self.finished = "not finished", False
 
@@ -99,7 +84,7 @@ class Continuation:
         return False
 
     def _next(self) -> Point:
-        last, frame = self.point, Frame(self.corrector, self.control.chart, self.point)
+        last, frame = self.point, Frame(self.problem, self.control.chart, self.point)
         residuals, why, knob = "none", "no step tried", "nnm.max_newton or nnm.tolerance"
         while self.step >= self.control.smallest_step:
             attempt = frame.correct(frame.xi + self.step * frame.tangent, self.step)
@@ -167,12 +152,11 @@ def half_trace_change(a: Point, b: Point) -> float:
     return float(max(distance.min(axis=axis, initial=np.inf).max(initial=0.0) for axis in (0, 1)))
 
 
-def first_tangent(corrector: Corrector, start: Point, direction: int) -> np.ndarray:
+def first_tangent(problem: Shooting, start: Point, direction: int) -> np.ndarray:
     """Tangent d(x, period) at a corrected point, towards growing (+1) or falling (-1) energy.
 
     Raises ContinuationError at a branch point, where the tangent is not unique.
     """
-    problem = corrector.problem
     chart = Relative(problem.system, start.x, start.period)
     xi = chart.encode(start.x, start.period)
     matrix = problem.jacobian(problem.arc(start.x, start.period)) @ chart.derivative(xi)

@@ -2,22 +2,23 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
 from vipetsc.case import NnmCase
+from vipetsc.case.nnm import NnmTable
 from vipetsc.io.folder import BRANCHES, claim_folder, provenance
 from vipetsc.modes.audit import BranchMonitor, compare, jumps, sampled
 from vipetsc.modes.branch import Branch
-from vipetsc.modes.continuation import Continuation, ContinuationError, StepControl
+from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.flow import FiniteDifferences, Flow, FlowError
 from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.point import Point, linear_start
-from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import System
 from vipetsc.modes.tsrk import Tsrk
@@ -69,9 +70,8 @@ class Follower:
         if options.jacobian == "differences":
             flow = FiniteDifferences(flow)
         automatic = "quarter" if self.system.odd else "half"
-        problem = Shooting(flow, MAPS[automatic if options.map == "auto" else options.map])
-        self.corrector = Corrector(problem, options.tolerance, max_newton=options.max_newton)
-        self.control = StepControl(**{f.name: getattr(options, f.name) for f in fields(StepControl)})
+        shooting_map = MAPS[automatic if options.map == "auto" else options.map]
+        self.problem = Shooting(flow, shooting_map, options.tolerance, options.max_newton)
 
     def follow(self, mode: int, resume: bool = False) -> list[Branch]:
         """The branch of ``mode`` (0-based), then the branches that cross it if the case asks for them."""
@@ -86,38 +86,32 @@ class Follower:
             start = branch.regular()[-1] if branch.points else self._start(mode)
             if options.direction == "both" and not branch.points:
                 down = self._empty(name)
-                self.grow(down, self.corrector, start, self.control, -1)
+                self.grow(down, self.problem, start, options, -1)
                 # from the far end towards the start, with the tangents turned round
                 branch.points = [
                     replace(p, tangent=-p.direction, energy_tangent=-p.energy_tangent) for p in reversed(down.points)
                 ]
                 branch.findings += down.findings
             direction = -1 if options.direction == "down" else 1
-            self.grow(branch, self.corrector, start, self.control, direction, save=True)
-            branch.extra = sampled(self.corrector.problem, self._typical(branch))
+            self.grow(branch, self.problem, start, options, direction, save=True)
+            branch.extra = sampled(self.problem, self._typical(branch))
             for flow in options.compare:
-                branch.extra |= compare(self.corrector, branch.regular(), FLOWS[flow](self.system))
+                branch.extra |= compare(self.problem, branch.regular(), FLOWS[flow](self.system))
         except FAILURES as error:
             branch.ending = f"failed: {error}"
         branch.write(self.folder, self.about)
         return [branch, *self._crossing(branch)]
 
     def grow(
-        self,
-        branch: Branch,
-        corrector: Corrector,
-        start: Point,
-        control: StepControl,
-        direction: int = 1,
-        save: bool = False,
+        self, branch: Branch, problem: Shooting, start: Point, control: NnmTable, direction: int = 1, save: bool = False
     ) -> None:
         """Continue ``branch`` from ``start`` until it ends; its special points are located on the way.
 
         Raises ContinuationError or FlowError if it cannot go on; the branch holds the points so far.
         """
-        control = replace(control, points=max(control.points - max(len(branch.regular()) - 1, 0), 0))
-        points = Continuation(corrector, start, control, direction, branch.next_step or None)
-        monitor = BranchMonitor(corrector)
+        control = control.model_copy(update={"points": max(control.points - max(len(branch.regular()) - 1, 0), 0)})
+        points = Continuation(problem, start, control, direction, branch.next_step or None)
+        monitor = BranchMonitor(self.system)
         for point in branch.regular():
             monitor.check(point)
         last, finding = points.point, None
@@ -125,7 +119,7 @@ class Follower:
         try:
             for point in points:
                 if self.options.locate:
-                    branch.points += locate(corrector, last, point, control.chart, self.options.locate_grazing)
+                    branch.points += locate(problem, last, point, control.chart, self.options.locate_grazing)
                 branch.points.append(point)
                 branch.next_step = points.step
                 if self.listener is not None:
@@ -139,7 +133,7 @@ class Follower:
                 last = point
         finally:
             branch.findings += [
-                jump for jump in jumps(branch.regular(), corrector, control) if jump not in branch.findings
+                jump for jump in jumps(branch.regular(), problem, control) if jump not in branch.findings
             ]
         branch.ending, branch.complete = finding or points.ending, finding is not None or points.finished
 
@@ -148,10 +142,10 @@ class Follower:
 
     def _start(self, mode: int) -> Point:
         if self.options.start_energy != "auto":
-            return linear_start(self.corrector, mode, self.options.start_energy)
+            return linear_start(self.problem, mode, self.options.start_energy)
         graze = self.system.grazing_energy(mode)
         energy = graze / 100 if math.isfinite(graze) else 1e-3
-        return linear_start(self.corrector, mode, max(energy, self.options.energy[0] * 1.001))
+        return linear_start(self.problem, mode, max(energy, self.options.energy[0] * 1.001))
 
     def _typical(self, branch: Branch) -> list[Point]:
         """The regular points in the middle of every region, and at the energies asked for."""
@@ -166,14 +160,14 @@ class Follower:
 
     def _crossing(self, branch: Branch) -> list[Branch]:
         """The branches that cross ``branch`` at the kinds of special points asked for."""
-        control = replace(self.control, points=self.options.switch_points, chart="relative")
+        control = self.options.model_copy(update={"points": self.options.switch_points, "chart": "relative"})
         branches = []
         for kind in self.options.switch:
             for number, point in enumerate(branch.special(kind), 1):
                 crossing = self._empty(f"{branch.name}-{kind}-{number}")
                 try:
-                    corrector, first = switch(self.corrector, point, self.options.switch_amplitude)
-                    self.grow(crossing, corrector, first, control)
+                    problem, first = switch(self.problem, point, self.options.switch_amplitude)
+                    self.grow(crossing, problem, first, control)
                 except FAILURES as error:
                     crossing.ending = f"failed: {error}"
                 crossing.write(self.folder, self.about)

@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc.modes.chart import Chart, Relative
 from vipetsc.modes.flow import Arc
-from vipetsc.modes.shooting import Attempt, Corrector, Shooting
+from vipetsc.modes.shooting import Attempt, Shooting
 
 
 def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
@@ -124,12 +124,11 @@ class Point:
         )
 
 
-def linear_start(corrector: Corrector, mode: int, energy: float) -> Point:
+def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
     """The periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
 
     Raises ValueError if the mode has no stiffness, or Newton does not converge from the linear mode at that energy.
     """
-    problem = corrector.problem
     omega, shapes = problem.system.linear_modes()
     if not omega[mode] > 0:
         raise ValueError(f"mode {mode + 1} is a rigid-body motion; it has no period")
@@ -138,7 +137,7 @@ def linear_start(corrector: Corrector, mode: int, energy: float) -> Point:
     chart = Relative(problem.system, x, period)
     xi = chart.encode(x, period)
     row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
-    attempt = corrector.solve(chart, xi, row, row @ xi)
+    attempt = problem.solve(chart, xi, row, row @ xi)
     if not attempt.converged:
         why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy"
         raise ValueError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")

@@ -42,20 +42,60 @@ MAPS = {
 }
 
 
+@dataclass(eq=False)
+class Attempt:
+    """What Newton's method did: ``history`` of residual norms, ``reason`` why it stopped, last ``xi`` and ``arc``."""
+
+    converged: bool
+    reason: str
+    history: list[float]
+    xi: np.ndarray
+    arc: Arc | None = None
+
+    @property
+    def residuals(self) -> str:
+        """The history as text."""
+        return " ".join(f"{r:.1e}" for r in self.history)
+
+
 class Shooting:
-    """Periodic orbits of ``flow.system``: initial values x (n,) and period are sought.
+    """Periodic orbits of ``flow.system``: initial values x (n,) and period, by Newton's method (PETSc SNES).
 
     x are displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre.
-    Raises ValueError if the map needs an odd system and the system is not.
+    Raises ValueError if the map needs an odd system and the system is not. Newton's method solves the n equations and
+    one more linear row in the unknowns of a chart; it ends at a scaled residual of ``tolerance``, after a step below
+    ``STEP_TOLERANCE``, where rounding allows no more, or after ``max_newton`` steps. PETSc options:
+    ``-nnm_snes_monitor`` and the like.
     """
 
-    def __init__(self, flow: Flow, shooting_map: ShootingMap) -> None:
+    def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
         if "centre" in (shooting_map.start, shooting_map.end) and not flow.system.odd:
             raise ValueError(
                 f"the {shooting_map.name} map needs forces that change sign with the displacement; "
                 "this system's do not: use map = 'half'"
             )
-        self.flow, self.system, self.map = flow, flow.system, shooting_map
+        self.flow, self.system, self.map, self.tolerance = flow, flow.system, shooting_map, tolerance
+        size = self.system.dofs + 1
+        self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
+        self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
+        matrix = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
+        matrix.setUp()
+        snes.setOptionsPrefix("nnm_")
+        snes.setFunction(self._function, self._xi.duplicate())
+        snes.setJacobian(self._jacobian, matrix)
+        snes.setTolerances(max_it=max_newton)
+        snes.setConvergenceTest(self._test)
+        snes.getKSP().setType("preonly")
+        snes.getKSP().getPC().setType("lu")
+        options = PETSc.Options("nnm_")
+        if not options.hasName("snes_linesearch_type"):
+            options["snes_linesearch_type"] = "basic"  # step control is the continuation's business
+        snes.setFromOptions()
+        # the current equations: shooting in a chart, over its size, and row . xi = value
+        self._chart: Chart
+        self._row: tuple[np.ndarray, float]
+        self._last: tuple[np.ndarray, Arc] | None = None
+        self._history: list[float] = []
 
     def arc(self, x: np.ndarray, period: float) -> Arc:
         """The arc from initial values ``x``; raises FlowError where the flow fails."""
@@ -82,59 +122,6 @@ class Shooting:
         """dE/dx (n,) in J over the unit of ``x``."""
         return self.system.forces(x) if self.map.start == "rest" else self.system.masses * x
 
-    def _part(self, section: Section, free: bool) -> slice:
-        """The half of the state that is free, or zero, on a section."""
-        n = self.system.dofs
-        return slice(0, n) if (section == "rest") == free else slice(n, 2 * n)
-
-
-@dataclass(eq=False)
-class Attempt:
-    """What a corrector did: ``history`` of residual norms, ``reason`` why it stopped, last ``xi`` and ``arc``."""
-
-    converged: bool
-    reason: str
-    history: list[float]
-    xi: np.ndarray
-    arc: Arc | None = None
-
-    @property
-    def residuals(self) -> str:
-        """The history as text."""
-        return " ".join(f"{r:.1e}" for r in self.history)
-
-
-class Corrector:
-    """Newton's method (PETSc SNES) for the shooting equations of ``problem`` and one more linear row.
-
-    It ends at a scaled residual of ``tolerance``, after a step (of unknowns of order one) below ``STEP_TOLERANCE``,
-    where rounding allows no more, or after ``max_newton`` steps. PETSc options: ``-nnm_snes_monitor`` and the like.
-    """
-
-    def __init__(self, problem: Shooting, tolerance: float = 1e-13, max_newton: int = 7) -> None:
-        self.problem, self.tolerance = problem, tolerance
-        size = problem.system.dofs + 1
-        self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
-        self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
-        matrix = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
-        matrix.setUp()
-        snes.setOptionsPrefix("nnm_")
-        snes.setFunction(self._function, self._xi.duplicate())
-        snes.setJacobian(self._jacobian, matrix)
-        snes.setTolerances(max_it=max_newton)
-        snes.setConvergenceTest(self._test)
-        snes.getKSP().setType("preonly")
-        snes.getKSP().getPC().setType("lu")
-        options = PETSc.Options("nnm_")
-        if not options.hasName("snes_linesearch_type"):
-            options["snes_linesearch_type"] = "basic"  # step control is the continuation's business
-        snes.setFromOptions()
-        # the current equations: shooting in a chart, over its size, and row . xi = value
-        self._chart: Chart
-        self._row: tuple[np.ndarray, float]
-        self._last: tuple[np.ndarray, Arc] | None = None
-        self._history: list[float] = []
-
     def solve(self, chart: Chart, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Solve shooting(xi) = 0 and row . xi = value, starting from ``guess`` (n + 1,)."""
         self._chart, self._row, self._last, self._history = chart, (row, value), None, []
@@ -149,23 +136,28 @@ class Corrector:
 
     def matrix(self, xi: np.ndarray) -> np.ndarray:
         """The scaled Jacobian (n, n + 1) of the shooting equations at ``xi``, in the chart of the last attempt."""
-        return self.problem.jacobian(self._arc(xi)) @ self._chart.derivative(xi) / self._chart.size
+        return self.jacobian(self._arc(xi)) @ self._chart.derivative(xi) / self._chart.size
 
     def tangent(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
         """Unit tangent (n + 1,) in the chart of the last attempt, at its ``xi``, turned towards ``reference``."""
         direction = null_vector(self.matrix(xi))
         return -direction if direction @ reference < 0 else direction
 
+    def _part(self, section: Section, free: bool) -> slice:
+        """The half of the state that is free, or zero, on a section."""
+        n = self.system.dofs
+        return slice(0, n) if (section == "rest") == free else slice(n, 2 * n)
+
     def _arc(self, xi: np.ndarray) -> Arc:
         if self._last is None or not np.array_equal(self._last[0], xi):
-            self._last = xi.copy(), self.problem.arc(*self._chart.decode(xi))
+            self._last = xi.copy(), self.arc(*self._chart.decode(xi))
         return self._last[1]
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         xi, (row, value) = x.getArray(readonly=True), self._row
         if not np.all(np.isfinite(xi)) or self._chart.decode(xi)[1] <= 0:
             raise FlowError("Newton left the domain: the period is not positive")
-        residual = self.problem.residual(self._arc(xi)) / self._chart.size
+        residual = self.residual(self._arc(xi)) / self._chart.size
         f.setArray(np.append(residual, row @ xi - value))
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:

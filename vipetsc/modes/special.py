@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from vipetsc.modes.chart import Relative
 from vipetsc.modes.continuation import ContinuationError, Frame, unit
 from vipetsc.modes.point import Point, resonance
-from vipetsc.modes.shooting import MAPS, Corrector, Shooting
+from vipetsc.modes.shooting import MAPS, Shooting
 
 Test = Callable[[Point], float]
 
@@ -36,17 +36,15 @@ def special_kinds(problem: Shooting) -> list[tuple[str, Test, float]]:
     ]
 
 
-def locate(
-    corrector: Corrector, left: Point, right: Point, chart: str = "relative", grazing: bool = False
-) -> list[Point]:
+def locate(problem: Shooting, left: Point, right: Point, chart: str = "relative", grazing: bool = False) -> list[Point]:
     """Special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
 
-    ``chart`` as in ``StepControl``; with ``grazing`` also every change of the number of contacts, by bisection (some 40
-    corrections each). An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins
+    ``chart`` as for ``Continuation``; with ``grazing`` also every change of the number of contacts, by bisection (40
+    corrections or so). An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins
     or ends the tongue of a ``resonance``.
     """
     points: list[Point] = []
-    problem, segment = corrector.problem, _Segment(corrector, chart, left, right)
+    segment = _Segment(problem, chart, left, right)
     touching = sum(p.episodes > 0 for p in (left, right))
     for kind, test, floor in special_kinds(problem):
         if not problem.system.springs and touching < (2 if kind.startswith("fold") else 1):
@@ -64,13 +62,13 @@ def locate(
 class _Segment:
     """The branch between two points, parametrised by arclength along the left point's tangent."""
 
-    def __init__(self, corrector: Corrector, chart: str, left: Point, right: Point) -> None:
-        self.left, self.right, self.frame = left, right, Frame(corrector, chart, left)
+    def __init__(self, problem: Shooting, chart: str, left: Point, right: Point) -> None:
+        self.left, self.right, self.frame = left, right, Frame(problem, chart, left)
         self.chord = self.frame.chart.encode(right.x, right.period) - self.frame.xi
         self.length = float(self.frame.tangent @ self.chord)
 
     def at(self, arclength: float) -> Point:
-        """The point at an arclength; raises ArithmeticError if the corrector fails there."""
+        """The point at an arclength; raises ArithmeticError if Newton's method fails there."""
         frame, share = self.frame, arclength / self.length
         # a parabola through both points, tangent at the left one
         guess = frame.xi + arclength * frame.tangent + share**2 * (self.chord - self.length * frame.tangent)
@@ -80,7 +78,7 @@ class _Segment:
         return frame.point(attempt, self.right.index, arclength)[0]
 
     def root(self, kind: str, test: Test, accuracy: float = 1e-14) -> list[Point]:
-        """The point where ``test`` vanishes, to ``accuracy`` of the step; none if the corrector fails on the way."""
+        """The point where ``test`` vanishes, to ``accuracy`` of the step; none if Newton's method fails on the way."""
 
         def value(arclength: float) -> float:
             if arclength == 0:
@@ -94,17 +92,17 @@ class _Segment:
             return []
 
 
-def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: int = 1) -> tuple[Corrector, Point]:
-    """A corrector and a first point, with its tangent, on the branch that crosses at a special ``point``.
+def switch(old: Shooting, point: Point, amplitude: float = 1e-3, sign: int = 1) -> tuple[Shooting, Point]:
+    """The problem and a first point, with its tangent, on the branch that crosses at a special ``point``.
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
     centre, whichever map has a second null direction at ``point``; over the doubled period at a period doubling.
     ``amplitude`` is the first step along the new direction, relative to the orbit's size; ``sign`` (1 or -1) the side
-    of a pitchfork. Raises ContinuationError if no map has a second null direction, or the corrector fails.
+    of a pitchfork. Raises ContinuationError if no map has a second null direction, or Newton's method fails.
     """
-    singular, old = [], corrector.problem
+    singular = []
     for name in ("quarter", "half", "half-centre") if old.map.quarter else (old.map.name,):
-        problem = Shooting(old.flow, MAPS[name])
+        problem = Shooting(old.flow, MAPS[name], old.tolerance)
         x, period = _re_expressed(old, point, problem)
         chart = Relative(problem.system, x, period, rest=problem.map.start == "rest")
         xi = chart.encode(x, period)
@@ -120,12 +118,11 @@ def switch(corrector: Corrector, point: Point, amplitude: float = 1e-3, sign: in
         along = chart.encode(*_re_expressed(old, replace(point, x=x, period=period), problem)) - xi
         first, second = directions[-2:] @ (directions[-2:].T @ directions[-2:] @ along)
         row = sign * unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
-        fresh = Corrector(problem, corrector.tolerance)
-        attempt = fresh.solve(chart, xi + amplitude * row, row, row @ xi + amplitude)
+        attempt = problem.solve(chart, xi + amplitude * row, row, row @ xi + amplitude)
         if not attempt.converged:
             why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.switch_amplitude"
             raise ContinuationError(f"no convergence on the crossing branch at E = {point.energy:.9g} J {why}")
-        return fresh, Point.of(problem, attempt, chart, fresh.tangent(attempt.xi, row))
+        return problem, Point.of(problem, attempt, chart, problem.tangent(attempt.xi, row))
     where = f"at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz"
     raise ContinuationError(f"no branch crosses {where}: smallest singular values {', '.join(singular)}")
 
