@@ -14,13 +14,11 @@ from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
 from vipetsc.modes.chart import Relative
 from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.flow import FiniteDifferences
-from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.point import Point, linear_start, resonance
+from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import SmoothSpring, System
-from vipetsc.modes.tsrk import Tsrk
 
 D = 10**-2.75
 IN_PHASE, OUT_OF_PHASE = 0, 1

@@ -63,9 +63,8 @@ from vipetsc.modes.branch import Branch
 from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.follow import follow_all
-from vipetsc.modes.newmark import Newmark
 from vipetsc.modes.point import Point, linear_start
+from vipetsc.modes.reference import Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
-from vipetsc.modes.tsrk import Tsrk

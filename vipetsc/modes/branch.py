@@ -1,7 +1,5 @@
 """A branch: its points in order, special ones among them, its regions and power laws, and the files that hold it."""
 
-import csv
-import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -92,15 +90,13 @@ class Branch:
 
     def to_csv(self) -> str:
         """The branch as CSV text, a row a point; numbers in full precision."""
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\n")
         traces = ["half_trace"] if self.dofs == 2 else [f"half_trace_{i}" for i in range(1, self.dofs)]
         names = ["energy", "frequency", "period", *(f"x{i + 1}" for i in range(self.dofs)), *traces]
-        table.writerow([*names, "multiplier_max", "slope", "contacts", "region", "kind"])
+        lines = [",".join([*names, "multiplier_max", "slope", "contacts", "region", "kind"])]
         for p, region in zip(self.points, self.regions(), strict=True):
             numbers = [p.energy, p.frequency, p.period, *p.x.tolist(), *p.half_traces.tolist(), p.multiplier, p.slope]
-            table.writerow([*map(repr, numbers), p.episodes, region, p.kind])
-        return text.getvalue()
+            lines.append(",".join([*map(repr, numbers), str(p.episodes), str(region), p.kind]))
+        return "\n".join(lines) + "\n"
 
     def to_dataset(self) -> xr.Dataset:
         """The branch as it is in its file."""

@@ -8,15 +8,13 @@ import numpy as np
 from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.chart import CHARTS, Chart, Grazing, Relative
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Attempt, Shooting, null_vector
+from vipetsc.modes.shooting import Attempt, Shooting
 
 
 class ContinuationError(RuntimeError):
     """The branch cannot go on; the message says where, why, and which option to turn."""
 
 
-# Most growth of a step over the last one.
-GROWTH = 2.0
 # What a guard holds down, for messages.
 GUARDED = {
     "half_trace": "the half-trace changes too much",
@@ -67,21 +65,15 @@ class Continuation:
 
     def __iter__(self) -> Iterator[Point]:
         for _ in range(self.control.points):
-            self.point = self._next()
-            self.finished = self._outside()
-            yield self.point
+            point = self.point = self._next()
+            for name, value, unit_name in (("frequency", point.frequency, "Hz"), ("energy", point.energy, "J")):
+                low, high = getattr(self.control, name)
+                if not low <= value <= high:
+                    self.finished, self.ending = True, f"left the {name} range {low:g} to {high:g} {unit_name}"
+            yield point
             if self.finished:
                 return
         self.ending = f"{self.control.points} points reached: raise nnm.points and resume to go on"
-
-    def _outside(self) -> bool:
-        """Whether the branch has left its range; says so in ``ending``."""
-        for name, value, unit_name in (("energy", self.point.energy, "J"), ("frequency", self.point.frequency, "Hz")):
-            low, high = getattr(self.control, name)
-            if not low <= value <= high:
-                self.ending = f"left the {name} range {low:g} to {high:g} {unit_name}"
-                return True
-        return False
 
     def _next(self) -> Point:
         last, frame = self.point, Frame(self.problem, self.control.chart, self.point)
@@ -95,7 +87,7 @@ class Continuation:
                 continue
             point, strain, guard = self._judge(frame, attempt)
             if strain <= 1.0:
-                effort = max(strain / 0.7, point.newton / 5, 1 / GROWTH)
+                effort = max(strain / 0.7, point.newton / 5, 0.5)  # a step at most doubles
                 self.step = min(self.step / effort, self.control.largest_step)
                 return point
             why, knob = GUARDED[guard], f"nnm.guards.{guard}"
@@ -160,12 +152,12 @@ def first_tangent(problem: Shooting, start: Point, direction: int) -> np.ndarray
     chart = Relative(problem.system, start.x, start.period)
     xi = chart.encode(start.x, start.period)
     matrix = problem.jacobian(problem.arc(start.x, start.period)) @ chart.derivative(xi)
-    values = np.linalg.svd(matrix)[1]
+    values, directions = np.linalg.svd(matrix)[1:]
     if values[-1] < 1e-12 * values[0]:
         raise ContinuationError(
             f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values {values}; "
             "start elsewhere (nnm.start_energy) or switch branches there"
         )
-    tangent = chart.derivative(xi) @ null_vector(matrix)
+    tangent = chart.derivative(xi) @ directions[-1]
     energy_tangent = problem.energy_gradient(start.x) @ tangent[:-1]
     return tangent * (np.sign(energy_tangent) * direction or direction)

@@ -4,7 +4,7 @@ The set of closed contacts is frozen inside a step, so that the force is smooth 
 contact is searched, and the step is repeated so that it ends on the first change (see the package's docstring).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -87,12 +87,11 @@ def restore(system: CompiledSystem, side: np.ndarray, u: np.ndarray, pull: np.nd
 @njit
 def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarray) -> None:
     """Time derivative ``dy`` of the orbit, column 0, and variations of ``y`` (2n, 1 + m): displacements, velocities."""
-    n, columns = y.shape[0] // 2, y.shape[1]
+    n = y.shape[0] // 2
     restore(system, side, y[:n], dy[n:])
+    dy[:n] = y[n:]
     for i in range(n):
-        for j in range(columns):
-            dy[i, j] = y[n + i, j]
-            dy[n + i, j] *= system.inverse_mass[i]
+        dy[n + i] *= system.inverse_mass[i]
 
 
 @njit
@@ -210,26 +209,3 @@ class Flow:
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
         """State and variations (2n, 1 + 2n) after ``duration``, the arc's ``events`` and ``closed``; ``y`` is lost."""
         raise NotImplementedError
-
-
-class FiniteDifferences(Flow):
-    """Another flow with its sensitivities replaced by central differences, the paper's choice in region III.
-
-    ``step`` is relative to the orbit's size; velocities count as displacements over a radian of the period.
-    """
-
-    name = "finite-differences"
-
-    def __init__(self, flow: Flow, step: float = 1e-6) -> None:
-        super().__init__(flow.system)
-        self.flow, self.step = flow, step
-
-    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
-        """See ``Flow.arc``."""
-        n, rate = self.system.dofs, 2 * np.pi / period
-        size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / rate)
-        columns = []
-        for move in np.diag(self.step * size * np.repeat([1.0, rate], n)):
-            later, earlier = (self.flow.arc(start + s * move, duration, period).end for s in (1, -1))
-            columns.append((later - earlier) / (2 * move.max()))
-        return replace(self.flow.arc(start, duration, period), sensitivity=np.column_stack(columns))

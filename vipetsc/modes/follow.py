@@ -15,13 +15,12 @@ from vipetsc.modes.audit import BranchMonitor, compare, jumps, sampled
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.flow import FiniteDifferences, Flow, FlowError
-from vipetsc.modes.newmark import Newmark
+from vipetsc.modes.flow import Flow, FlowError
 from vipetsc.modes.point import Point, linear_start
+from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import System
-from vipetsc.modes.tsrk import Tsrk
 
 # The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
@@ -53,10 +52,8 @@ def follow_all(
     """
     mine = {}
     for job in range(comm.rank, len(case.nnm.modes), comm.size):
-        follower = Follower(case, folder, provenance(comm), listener)
-        mine[job] = follower.follow(case.nnm.modes[job] - 1, resume)
-    gathered = comm.gather(mine) or []
-    branches = {job: group for part in gathered for job, group in part.items()}
+        mine[job] = Follower(case, folder, provenance(comm), listener).follow(case.nnm.modes[job] - 1, resume)
+    branches = {job: group for part in comm.gather(mine) or [] for job, group in part.items()}
     return [branch for job in sorted(branches) for branch in branches[job]]
 
 
@@ -67,9 +64,8 @@ class Follower:
         self.case, self.options, self.folder, self.about, self.listener = case, case.nnm, folder, about, listener
         options, self.system = case.nnm, System.from_case(case)
         flow: Flow = FLOWS[options.flow](self.system)
-        if options.jacobian == "differences":
-            flow = FiniteDifferences(flow)
         automatic = "quarter" if self.system.odd else "half"
+        flow = FiniteDifferences(flow) if options.jacobian == "differences" else flow
         shooting_map = MAPS[automatic if options.map == "auto" else options.map]
         self.problem = Shooting(flow, shooting_map, options.tolerance, options.max_newton)
 
@@ -132,9 +128,8 @@ class Follower:
                     branch.write(self.folder, self.about)
                 last = point
         finally:
-            branch.findings += [
-                jump for jump in jumps(branch.regular(), problem, control) if jump not in branch.findings
-            ]
+            said = branch.findings
+            said += [jump for jump in jumps(branch.regular(), problem, control) if jump not in said]
         branch.ending, branch.complete = finding or points.ending, finding is not None or points.finished
 
     def _empty(self, name: str) -> Branch:

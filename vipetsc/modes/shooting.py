@@ -1,7 +1,6 @@
 """Shooting: a periodic orbit as a boundary value problem over a part of its period, solved by PETSc's SNES."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from petsc4py import PETSc
 
@@ -10,7 +9,6 @@ import numpy as np
 from vipetsc.modes.chart import Chart
 from vipetsc.modes.flow import Arc, Flow, FlowError
 
-Section = Literal["rest", "centre"]
 # A Newton step below this, in unknowns of order one, is rounding.
 STEP_TOLERANCE = 1e-14
 
@@ -24,8 +22,8 @@ class ShootingMap:
     """
 
     name: str
-    start: Section
-    end: Section
+    start: str
+    end: str
     fraction: float
 
     @property
@@ -75,7 +73,10 @@ class Shooting:
                 "this system's do not: use map = 'half'"
             )
         self.flow, self.system, self.map, self.tolerance = flow, flow.system, shooting_map, tolerance
-        size = self.system.dofs + 1
+        n, size = self.system.dofs, self.system.dofs + 1
+        # the half of the state that is free at the arc's start, and the half that should vanish at its end
+        self._free = slice(0, n) if shooting_map.start == "rest" else slice(n, 2 * n)
+        self._zero = slice(n, 2 * n) if shooting_map.end == "rest" else slice(0, n)
         self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
         self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
         matrix = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
@@ -100,18 +101,17 @@ class Shooting:
     def arc(self, x: np.ndarray, period: float) -> Arc:
         """The arc from initial values ``x``; raises FlowError where the flow fails."""
         start = np.zeros(2 * self.system.dofs)
-        start[self._part(self.map.start, free=True)] = x
+        start[self._free] = x
         return self.flow.arc(start, self.map.fraction * period, period)
 
     def residual(self, arc: Arc) -> np.ndarray:
         """What should vanish at the arc's end (n,): displacements in m or velocities in m/s."""
-        return arc.end[self._part(self.map.end, free=False)]
+        return arc.end[self._zero]
 
     def jacobian(self, arc: Arc) -> np.ndarray:
         """Derivative (n, n + 1) of the residual with respect to initial values and period."""
-        rows, columns = self._part(self.map.end, free=False), self._part(self.map.start, free=True)
-        rate = np.append(arc.end[self.system.dofs :], arc.acceleration[1])[rows]
-        return np.column_stack([arc.sensitivity[rows, columns], self.map.fraction * rate])
+        rate = np.append(arc.end[self.system.dofs :], arc.acceleration[1])[self._zero]
+        return np.column_stack([arc.sensitivity[self._zero, self._free], self.map.fraction * rate])
 
     def energy(self, x: np.ndarray) -> float:
         """Energy in J of the orbit with initial values ``x``."""
@@ -140,13 +140,8 @@ class Shooting:
 
     def tangent(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
         """Unit tangent (n + 1,) in the chart of the last attempt, at its ``xi``, turned towards ``reference``."""
-        direction = null_vector(self.matrix(xi))
+        direction = np.linalg.svd(self.matrix(xi))[2][-1]  # the null vector
         return -direction if direction @ reference < 0 else direction
-
-    def _part(self, section: Section, free: bool) -> slice:
-        """The half of the state that is free, or zero, on a section."""
-        n = self.system.dofs
-        return slice(0, n) if (section == "rest") == free else slice(n, 2 * n)
 
     def _arc(self, xi: np.ndarray) -> Arc:
         if self._last is None or not np.array_equal(self._last[0], xi):
@@ -177,11 +172,6 @@ class Shooting:
         if residual > 1e3 * max(self._history[0], 1e-3):
             return reasons.DIVERGED_DTOL
         return reasons.ITERATING
-
-
-def null_vector(matrix: np.ndarray) -> np.ndarray:
-    """Unit null vector (n + 1,) of an (n, n + 1) matrix."""
-    return np.linalg.svd(matrix)[2][-1]
 
 
 _REASONS = {

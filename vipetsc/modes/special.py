@@ -43,8 +43,7 @@ def locate(problem: Shooting, left: Point, right: Point, chart: str = "relative"
     corrections or so). An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins
     or ends the tongue of a ``resonance``.
     """
-    points: list[Point] = []
-    segment = _Segment(problem, chart, left, right)
+    points, segment = list[Point](), _Segment(problem, chart, left, right)
     touching = sum(p.episodes > 0 for p in (left, right))
     for kind, test, floor in special_kinds(problem):
         if not problem.system.springs and touching < (2 if kind.startswith("fold") else 1):
@@ -92,13 +91,13 @@ class _Segment:
             return []
 
 
-def switch(old: Shooting, point: Point, amplitude: float = 1e-3, sign: int = 1) -> tuple[Shooting, Point]:
+def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooting, Point]:
     """The problem and a first point, with its tangent, on the branch that crosses at a special ``point``.
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
     centre, whichever map has a second null direction at ``point``; over the doubled period at a period doubling.
-    ``amplitude`` is the first step along the new direction, relative to the orbit's size; ``sign`` (1 or -1) the side
-    of a pitchfork. Raises ContinuationError if no map has a second null direction, or Newton's method fails.
+    ``amplitude`` is the first step along the new direction, relative to the orbit's size. Raises ContinuationError if
+    no map has a second null direction, or Newton's method fails.
     """
     singular = []
     for name in ("quarter", "half", "half-centre") if old.map.quarter else (old.map.name,):
@@ -117,7 +116,7 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3, sign: int = 1) 
         x, period = point.x + 1e-6 * point.direction[:-1], point.period + 1e-6 * point.direction[-1]
         along = chart.encode(*_re_expressed(old, replace(point, x=x, period=period), problem)) - xi
         first, second = directions[-2:] @ (directions[-2:].T @ directions[-2:] @ along)
-        row = sign * unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
+        row = unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
         attempt = problem.solve(chart, xi + amplitude * row, row, row @ xi + amplitude)
         if not attempt.converged:
             why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.switch_amplitude"

@@ -1,0 +1,225 @@
+"""Flows to compare the compiled one with: PETSc's Runge-Kutta methods, Newmark's rule, central differences.
+
+TSRK lands on contact changes as the compiled flow does, with steps taken one by one: TSEvent loses short contacts and
+error control. Newmark's rule is the paper's flow: a fixed number of steps a period, and the exact derivatives of the
+discrete flow as sensitivities (Peeters et al., Nonlinear normal modes, part II, Mech. Syst. Signal Process. 23, 2009,
+App. A). It meets contacts at the ends of steps only, which is its error.
+"""
+
+from dataclasses import replace
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from vipetsc.compiled import njit
+from vipetsc.modes import flow
+from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
+from vipetsc.modes.flow import Arc, CompiledSystem, Flow, FlowError, close, restore
+from vipetsc.modes.system import System
+
+# Errors that TSRK allows per step, relative to the size of the orbit and of each variation.
+RTOL, RTOL_SENSITIVITY = 1e-13, 1e-10
+# Steps a period of Newmark's rule.
+STEPS = 2000
+
+
+class Tsrk(Flow):
+    """PETSc TSRK of type 8vr; options begin with ``-nnm_basic_`` for steps, with ``-nnm_none_`` for landings.
+
+    8vr restarts every step; an FSAL type such as 5dp is restarted after each change, or its stale stage would spoil
+    the sensitivities.
+    """
+
+    name = "tsrk"
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        self._shape = 2 * system.dofs, 1 + 2 * system.dofs
+        self._y = PETSc.Vec().createSeq(self._shape[0] * self._shape[1], comm=PETSc.COMM_SELF)
+        self._adaptive, self._fixed = self._solver("basic"), self._solver("none")
+        self._record: flow.Step
+
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
+        step = self._record = flow.begin(self.compiled, y)
+        self._set_tolerances(y[:, 0], period)
+        t, h, closed, events, dy = 0.0, 0.05 / self.omega, 0.0, [], np.empty(self._shape)
+        while t < duration:
+            length, state, h = self._step(self._adaptive, y, min(h, 1 / self.omega, duration - t))
+            if length < flow.SMALLEST_STEP * duration and length < duration - t:
+                raise FlowError(f"TSRK's step became too small at {t:.6g} s of {duration:.6g} s")
+            flow.observe(step, y, dy, step.start)
+            flow.observe(step, state, dy, step.end)
+            change = flow.first_change(step, length)
+            changed = change.contact >= 0
+            if changed:
+                length, state, changed = self._land(y, length, change)
+            closed += length if np.any(step.side) else 0.0
+            t = duration if duration - t - length <= 1e-16 * duration else t + length
+            y = state
+            if changed:
+                events.append((t, change.contact, change.side, flow.switch(step, change)))
+                self._adaptive.restartStep()
+        return y, np.array(events).reshape(-1, 4), closed
+
+    def _solver(self, adapt: str) -> PETSc.TS:
+        ts = PETSc.TS().create(PETSc.COMM_SELF)
+        ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
+        ts.setType("rk")
+        ts.setRKType("8vr")
+        ts.setRHSFunction(self._rates, self._y.duplicate())
+        ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
+        ts.setMaxTime(1e300)
+        ts.setMaxSteps(2**31 - 1)
+        ts.setMaxStepRejections(-1)
+        options = PETSc.Options(f"nnm_{adapt}_")
+        options["ts_adapt_type"], options["ts_adapt_wnormtype"] = adapt, "infinity"
+        ts.setOptionsPrefix(f"nnm_{adapt}_")
+        ts.setFromOptions()
+        return ts
+
+    def _set_tolerances(self, start: np.ndarray, period: float) -> None:
+        """Absolute tolerances from the orbit's size; velocities count as displacements over a radian."""
+        n, omega = self.system.dofs, self.omega_ref(period)
+        size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / omega)
+        unit = np.repeat([1.0, omega], n)
+        absolute, relative = np.empty(self._shape), np.full(self._shape, RTOL_SENSITIVITY)
+        absolute[:, 0], relative[:, 0] = RTOL * size * unit, RTOL
+        absolute[:, 1:] = RTOL_SENSITIVITY * unit[:, None] / unit[None, :]
+        rtol, atol = (PETSc.Vec().createWithArray(a.ravel(), comm=PETSc.COMM_SELF) for a in (relative, absolute))
+        self._adaptive.setTolerances(rtol=rtol, atol=atol)
+
+    def _rates(self, ts: PETSc.TS, t: float, y: PETSc.Vec, dy: PETSc.Vec) -> None:
+        state = np.array(y.getArray(readonly=True)).reshape(self._shape)
+        flow.rates(self.compiled, self._record.side, state, dy.getArray().reshape(self._shape))
+
+    def _step(self, ts: PETSc.TS, y: np.ndarray, h: float) -> tuple[float, np.ndarray, float]:
+        """One step from ``y``, of at most ``h``: its length, the new state, the next step's length."""
+        self._y.setArray(y.ravel())
+        ts.setSolution(self._y)
+        ts.setTime(0.0)
+        ts.setTimeStep(h)
+        ts.step()
+        return ts.getTime(), self._y.getArray().reshape(y.shape).copy(), ts.getTimeStep()
+
+    def _land(self, y: np.ndarray, h: float, change: Change) -> tuple[float, np.ndarray, bool]:
+        """Step from ``y`` exactly onto a change found in a step of length ``h``: length, state, whether it is one."""
+        step, dy = self._record, np.empty(self._shape)
+        for _ in range(MOST_ATTEMPTS):
+            length = change.length
+            _, state, _ = self._step(self._fixed, y, length)
+            flow.observe(step, state, dy, step.end)
+            change, outcome = correct(change, step.end[change.contact], 2e-16 * h)
+            if outcome != NONE:
+                return length, state, outcome != EXTREMUM
+        raise FlowError(f"TSRK does not land on the change of contact {change.contact + 1}")
+
+
+@njit
+def _forces(system: CompiledSystem, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Restoring forces (n,) in N and tangent stiffness (n, n) in N/m at displacements ``u`` (n,) in m."""
+    side, columns = np.empty(system.contacts.size, np.int64), np.hstack((u.reshape(-1, 1), np.eye(u.size)))
+    close(system, u, side)
+    pull = np.empty_like(columns)
+    restore(system, side, columns, pull)
+    return -pull[:, 0], -pull[:, 1:]
+
+
+@njit
+def _linear_accelerations(system: CompiledSystem, tangent: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """-M^-1 tangent u (n, columns)."""
+    a = np.zeros_like(u)
+    for k in range(u.shape[0]):
+        a -= (system.inverse_mass * tangent[:, k]).reshape(-1, 1) * u[k]
+    return a
+
+
+@njit
+def _matrix(system: CompiledSystem, tangent: np.ndarray, quarter: float) -> np.ndarray:
+    """I + h^2/4 M^-1 tangent, with ``quarter`` = h^2/4."""
+    return quarter * tangent * system.inverse_mass.reshape(-1, 1) + np.eye(tangent.shape[0])
+
+
+@njit
+def _solve_step(system: CompiledSystem, guess: np.ndarray, a: np.ndarray, quarter: float) -> tuple[np.ndarray, bool]:
+    """Newton's method for the accelerations ``a`` (n,) at a step's end, where u = ``guess`` + h^2/4 a.
+
+    Displacements as unknowns would lose digits to 4/h^2. Returns the tangent stiffness there, and whether it converged.
+    """
+    scale, shift = 0.0, a
+    for _ in range(60):
+        force, tangent = _forces(system, guess + quarter * a)
+        shift = np.linalg.solve(_matrix(system, tangent, quarter), a + force * system.inverse_mass)
+        a -= shift
+        scale = max(scale, np.abs(a).max())
+        if np.abs(shift).max() <= 1e-14 * scale:
+            break
+    return _forces(system, guess + quarter * a)[1], np.abs(shift).max() <= 1e-11 * scale
+
+
+@njit
+def _newmark(system: CompiledSystem, y: np.ndarray, h: float, path: np.ndarray) -> bool:
+    """Advance ``y`` (2n, 1 + m) in place along the ``path`` (steps + 1, n) in steps of ``h``; whether it converged."""
+    steps, n = path.shape[0] - 1, path.shape[1]
+    quarter = 0.25 * h * h
+    u, v = y[:n].copy(), y[n:].copy()
+    force, tangent = _forces(system, u[:, 0].copy())
+    a = _linear_accelerations(system, tangent, u)
+    a[:, 0] = -force * system.inverse_mass
+    path[0] = u[:, 0]
+    for step in range(1, steps + 1):
+        guess = u + h * v + quarter * a
+        orbit = a[:, 0].copy()
+        tangent, converged = _solve_step(system, guess[:, 0].copy(), orbit, quarter)
+        if not converged:
+            return False
+        new = np.linalg.solve(_matrix(system, tangent, quarter), _linear_accelerations(system, tangent, guess))
+        new[:, 0] = orbit
+        u = guess + quarter * new
+        v += 0.5 * h * (a + new)
+        a, path[step] = new, u[:, 0]
+    y[:n], y[n:] = u, v
+    return True
+
+
+class Newmark(Flow):
+    """Average acceleration with the paper's 2000 steps a period."""
+
+    name = "newmark"
+
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
+        count = max(round(STEPS * duration / period), 1)
+        h, path = duration / count, np.empty((count + 1, self.system.dofs))
+        if not _newmark(self.compiled, y, h, path):
+            raise FlowError("Newmark's implicit step does not converge")
+        side = np.sign(path @ self.system.contact_rows.T) * (self.system.gaps(path) > 0)
+        before, after = side[:-1], side[1:]
+        events = [
+            ((i + 1) * h, c, after[i, c] or before[i, c], 1 if after[i, c] else -1)
+            for i, c in zip(*np.nonzero(before != after), strict=True)
+        ]
+        closed = float(np.any(after != 0, axis=1).sum() * duration / count)
+        return y, np.array(events).reshape(-1, 4), closed
+
+
+class FiniteDifferences(Flow):
+    """Another flow with its sensitivities replaced by central differences, the paper's choice in region III.
+
+    ``step`` is relative to the orbit's size; velocities count as displacements over a radian of the period.
+    """
+
+    name = "finite-differences"
+
+    def __init__(self, flow: Flow, step: float = 1e-6) -> None:
+        super().__init__(flow.system)
+        self.flow, self.step = flow, step
+
+    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
+        """See ``Flow.arc``."""
+        n, rate = self.system.dofs, 2 * np.pi / period
+        size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / rate)
+        columns = []
+        for move in np.diag(self.step * size * np.repeat([1.0, rate], n)):
+            later, earlier = (self.flow.arc(start + s * move, duration, period).end for s in (1, -1))
+            columns.append((later - earlier) / (2 * move.max()))
+        return replace(self.flow.arc(start, duration, period), sensitivity=np.column_stack(columns))
