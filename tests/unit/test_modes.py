@@ -21,11 +21,10 @@ from vipetsc.modes import dop853
 from vipetsc.modes.audit import sampled
 from vipetsc.modes.branch import Branch, slope_laws, tell_regions
 from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
-from vipetsc.modes.chart import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.continuation import Continuation, half_trace_change, unit
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import half_traces, linear_start, multipliers, sample_orbit
-from vipetsc.modes.shooting import MAPS, Shooting
+from vipetsc.modes.shooting import MAPS, Chart, Grazing, Logarithmic, Relative, Shooting
 from vipetsc.modes.special import locate
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 

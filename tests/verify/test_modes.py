@@ -11,12 +11,11 @@ import pytest
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.lattice import Chain, Contact, contact_stiffness, four_band
 from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
-from vipetsc.modes.chart import Relative
 from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import Point, linear_start, resonance
 from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
-from vipetsc.modes.shooting import MAPS, Shooting
+from vipetsc.modes.shooting import MAPS, Relative, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import SmoothSpring, System
 

@@ -7,11 +7,10 @@ import numpy as np
 
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.modes.chart import Relative
 from vipetsc.modes.continuation import Continuation, ContinuationError, chart_at, half_trace_change
 from vipetsc.modes.flow import Flow, FlowError
 from vipetsc.modes.point import Point, sample_orbit
-from vipetsc.modes.shooting import Shooting
+from vipetsc.modes.shooting import Relative, Shooting
 from vipetsc.modes.system import System
 
 

@@ -9,26 +9,10 @@ import xarray as xr
 
 from vipetsc.io.atomic import write_text
 from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
-from vipetsc.modes.point import Point
+from vipetsc.modes.point import QUANTITIES, Point
 from vipetsc.spectra import power_law
 
 KINDS = ("regular", "fold-energy", "fold-frequency", "branch-point", "symmetry-breaking", "period-doubling", "grazing")
-# Quantities of a point: name in the files, type, unit, description.
-QUANTITIES: dict[str, tuple[str, type, str, str]] = {
-    "energy": ("energy", float, "J", "energy"),
-    "frequency": ("frequency", float, "Hz", "frequency"),
-    "period": ("period", float, "s", "period"),
-    "slope": ("slope", float, "Hz/J", "slope df/dE of the branch"),
-    "multiplier": ("multiplier_max", float, "1", "largest modulus of a Floquet multiplier"),
-    "residual": ("residual", float, "1", "scaled residual of the shooting equations"),
-    "closed": ("closed", float, "1", "fraction of the time with a contact closed"),
-    "energy_tangent": ("rise", float, "J", "dE along the tangent"),
-    "step": ("step", float, "1", "arclength of the step that led here"),
-    "episodes": ("contacts", int, "1", "contact episodes in the arc that is shot"),
-    "newton": ("newton", int, "1", "Newton steps"),
-    "index": ("number", int, "1", "number of the regular point, or of the one after a special point"),
-    "resonance": ("resonance", int, "1", "k of the k:1 internal resonance at an energy fold; 0 elsewhere"),
-}
 REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 not told"
 
 # Fraction of the time in contact from which the clearance counts as negligible (region IV).

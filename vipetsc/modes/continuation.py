@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from vipetsc.case.nnm import NnmTable
-from vipetsc.modes.chart import CHARTS, Chart, Grazing, Relative
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Attempt, Shooting
+from vipetsc.modes.shooting import CHARTS, Attempt, Chart, Grazing, Relative, Shooting
 
 
 class ContinuationError(RuntimeError):
@@ -30,7 +29,7 @@ class Frame:
     def __init__(self, problem: Shooting, chart: str, point: Point) -> None:
         self.problem, self.chart = problem, chart_at(problem, chart, point)
         self.xi = self.chart.encode(point.x, point.period)
-        self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), point.direction))
+        self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), point.tangent))
 
     def correct(self, guess: np.ndarray, step: float) -> Attempt:
         """Newton's method from ``guess`` for the orbit at the arclength ``step`` along the tangent."""
@@ -39,7 +38,8 @@ class Frame:
     def point(self, attempt: Attempt, index: int, step: float) -> tuple[Point, np.ndarray]:
         """The point that an attempt has converged to, and the unit tangent there in this chart."""
         direction = self.problem.tangent(attempt.xi, self.tangent)
-        return Point.of(self.problem, attempt, self.chart, direction, index, step), direction
+        point = Point.of(self.problem, attempt, self.chart, direction)
+        return replace(point, index=index, step=step), direction
 
 
 class Continuation:
@@ -58,7 +58,7 @@ class Continuation:
         self, problem: Shooting, start: Point, control: NnmTable, direction: int = 1, step: float | None = None
     ) -> None:
         self.problem, self.control, self.point = problem, control, start
-        if start.tangent is None:
+        if not start.tangent.size:
             self.point = replace(start, tangent=first_tangent(problem, start, direction))
         self.step = control.first_step if step is None else step
         self.ending, self.finished = "not finished", False

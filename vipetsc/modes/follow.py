@@ -85,7 +85,7 @@ class Follower:
                 self.grow(down, self.problem, start, options, -1)
                 # from the far end towards the start, with the tangents turned round
                 branch.points = [
-                    replace(p, tangent=-p.direction, energy_tangent=-p.energy_tangent) for p in reversed(down.points)
+                    replace(p, tangent=-p.tangent, energy_tangent=-p.energy_tangent) for p in reversed(down.points)
                 ]
                 branch.findings += down.findings
             direction = -1 if options.direction == "down" else 1

@@ -1,13 +1,29 @@
 """One point of a branch: a periodic orbit with its energy, stability and contacts, its samples and its resonance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
 
-from vipetsc.modes.chart import Chart, Relative
 from vipetsc.modes.flow import Arc
-from vipetsc.modes.shooting import Attempt, Shooting
+from vipetsc.modes.shooting import Attempt, Chart, Relative, Shooting
+
+# Quantities of a point: name in the files, type, unit, description.
+QUANTITIES: dict[str, tuple[str, type, str, str]] = {
+    "energy": ("energy", float, "J", "energy"),
+    "frequency": ("frequency", float, "Hz", "frequency"),
+    "period": ("period", float, "s", "period"),
+    "slope": ("slope", float, "Hz/J", "slope df/dE of the branch"),
+    "multiplier": ("multiplier_max", float, "1", "largest modulus of a Floquet multiplier"),
+    "residual": ("residual", float, "1", "scaled residual of the shooting equations"),
+    "closed": ("closed", float, "1", "fraction of the time with a contact closed"),
+    "energy_tangent": ("rise", float, "J", "dE along the tangent"),
+    "step": ("step", float, "1", "arclength of the step that led here"),
+    "episodes": ("contacts", int, "1", "contact episodes in the arc that is shot"),
+    "newton": ("newton", int, "1", "Newton steps"),
+    "index": ("number", int, "1", "number of the regular point, or of the one after a special point"),
+    "resonance": ("resonance", int, "1", "k of the k:1 internal resonance at an energy fold; 0 elsewhere"),
+}
 
 
 def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
@@ -50,12 +66,9 @@ def multipliers(traces: np.ndarray, quarter: bool) -> np.ndarray:
 class Point:
     """A periodic orbit on a branch.
 
-    ``x`` (n,) initial displacements in m (velocities in m/s for maps from the centre), ``period`` in s, ``energy`` in
-    J, ``residual`` scaled, ``half_traces`` (n - 1,), ``multiplier`` the largest modulus, ``episodes`` contact
-    episodes of the arc, ``closed`` the fraction of the time with a contact closed, ``tangent`` d(x, period) (n + 1,)
-    of any length, ``energy_tangent`` dE in J and ``slope`` df/dE in Hz/J along it, ``newton`` steps, ``step`` the
-    arclength that led here, ``kind`` regular or the name of a special point, ``resonance`` k of the k:1 tongue that
-    an energy fold belongs to (0: not told).
+    ``x`` (n,) are initial displacements in m (velocities in m/s for maps from the centre), ``half_traces`` (n - 1,),
+    ``tangent`` d(x, period) (n + 1,) of any length, empty where a branch begins, ``kind`` is regular or the name of a
+    special point; the others are ``QUANTITIES``.
     """
 
     x: np.ndarray
@@ -67,7 +80,7 @@ class Point:
     episodes: int
     closed: float
     newton: int
-    tangent: np.ndarray | None = None
+    tangent: np.ndarray = field(default_factory=lambda: np.empty(0))
     slope: float = np.nan
     energy_tangent: float = np.nan
     index: int = 0
@@ -80,33 +93,13 @@ class Point:
         """Frequency in Hz."""
         return 1 / self.period
 
-    @property
-    def direction(self) -> np.ndarray:
-        """The tangent (n + 1,) of a point that has one."""
-        assert self.tangent is not None
-        return self.tangent
-
     @classmethod
-    def of(
-        cls,
-        problem: Shooting,
-        attempt: Attempt,
-        chart: Chart,
-        direction: np.ndarray | None = None,
-        index: int = 0,
-        step: float = 0.0,
-    ) -> Self:
+    def of(cls, problem: Shooting, attempt: Attempt, chart: Chart, direction: np.ndarray | None = None) -> Self:
         """The point of a converged attempt in ``chart``, in which ``direction`` is the branch's tangent."""
-        x, period = chart.decode(attempt.xi)
-        arc = attempt.arc
+        (x, period), arc = chart.decode(attempt.xi), attempt.arc
         assert arc is not None
         traces = half_traces(problem, arc)
-        tangent, energy_tangent, slope = None, np.nan, np.nan
-        if direction is not None:
-            tangent = chart.derivative(attempt.xi) @ direction
-            energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
-            slope = float(-tangent[-1] / period**2 / energy_tangent) if energy_tangent else np.inf
-        return cls(
+        point = cls(
             x=x,
             period=period,
             energy=problem.energy(x),
@@ -116,12 +109,13 @@ class Point:
             episodes=arc.episodes,
             closed=arc.closed / arc.duration,
             newton=len(attempt.history) - 1,
-            tangent=tangent,
-            slope=slope,
-            energy_tangent=energy_tangent,
-            index=index,
-            step=step,
         )
+        if direction is None:
+            return point
+        tangent = chart.derivative(attempt.xi) @ direction
+        energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
+        slope = float(-tangent[-1] / period**2 / energy_tangent) if energy_tangent else np.inf
+        return replace(point, tangent=tangent, energy_tangent=energy_tangent, slope=slope)
 
 
 def linear_start(problem: Shooting, mode: int, energy: float) -> Point:

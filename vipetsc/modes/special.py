@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import brentq
 
-from vipetsc.modes.chart import Relative
 from vipetsc.modes.continuation import ContinuationError, Frame, unit
 from vipetsc.modes.point import Point, resonance
-from vipetsc.modes.shooting import MAPS, Shooting
+from vipetsc.modes.shooting import MAPS, Relative, Shooting
 
 Test = Callable[[Point], float]
 
@@ -31,7 +30,7 @@ def special_kinds(problem: Shooting) -> list[tuple[str, Test, float]]:
     pairs = range(problem.system.dofs - 1)
     return [
         ("fold-energy", lambda p: p.energy_tangent, 0.0),
-        ("fold-frequency", lambda p: float(p.direction[-1] / p.period), 0.0),
+        ("fold-frequency", lambda p: float(p.tangent[-1] / p.period), 0.0),
         *((kind, crossing(level, i), 1e-6) for level, kind in levels.items() for i in pairs),
     ]
 
@@ -113,7 +112,7 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
         singular.append(f"{name} {values[-1] / values[0]:.1e}")
         if values[-1] > 1e-5 * values[0]:
             continue
-        x, period = point.x + 1e-6 * point.direction[:-1], point.period + 1e-6 * point.direction[-1]
+        x, period = point.x + 1e-6 * point.tangent[:-1], point.period + 1e-6 * point.tangent[-1]
         along = chart.encode(*_re_expressed(old, replace(point, x=x, period=period), problem)) - xi
         first, second = directions[-2:] @ (directions[-2:].T @ directions[-2:] @ along)
         row = unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
