@@ -115,29 +115,16 @@ class Branch:
         with open_netcdf(path, "branch", ("point", "tangent", "half_trace", "next_step")) as file:
             data, about = file.load(), file.attrs
         traces = data["half_trace"].values + 1j * data["half_trace_imaginary"].values
-        tangents = np.column_stack([data["tangent"].values, data["tangent_period"].values])
-        columns = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
+        columns: dict[str, Any] = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
         del columns["frequency"]  # a property
-        points = [
-            Point(
-                x=data["initial"].values[i],
-                half_traces=traces[i] if np.any(traces[i].imag != 0) else traces[i].real,
-                tangent=tangents[i],
-                kind=KINDS[kind],
-                **{name: column[i] for name, column in columns.items()},
-            )
-            for i, kind in enumerate(data["kind"].values)
-        ]
-        return cls(
-            name=str(about["name"]),
-            case=str(about["case"]),
-            dofs=data.sizes["dof"],
-            points=points,
-            next_step=float(about["next_step"]),
-            complete=bool(about["complete"]),
-            ending=str(about["ending"]),
-            findings=[line for line in str(about["findings"]).split("\n") if line],
-        )
+        columns["x"], columns["kind"] = data["initial"].values, [KINDS[kind] for kind in data["kind"].values]
+        columns["tangent"] = np.column_stack([data["tangent"].values, data["tangent_period"].values])
+        columns["half_traces"] = [c if np.any(c.imag != 0) else c.real for c in traces]
+        points = [Point(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+        name, case, ending = (str(about[key]) for key in ("name", "case", "ending"))
+        next_step, complete = float(about["next_step"]), bool(about["complete"])
+        findings = [line for line in str(about["findings"]).split("\n") if line]
+        return cls(name, case, data.sizes["dof"], points, next_step, complete, ending, findings)
 
 
 def tell_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:

@@ -47,11 +47,10 @@ class Continuation:
 
     Of the section [nnm], ``control``, it takes the ``chart`` (``auto``: grazing near a contact at the arc's start, else
     relative), the steps in units of the chart, the ``guards``, and where the branch ends: outside ``energy`` (J),
-    outside ``frequency`` (Hz) or after ``points`` points.
-
-    Each point is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended, ``finished``
-    whether it left its range. The whole state is the last point and the next step: a stored branch can be resumed.
-    Raises ContinuationError if the step falls below the smallest or the tangent at the start is degenerate.
+    outside ``frequency`` (Hz) or after ``points`` points. Each point is yielded when it has been accepted; ``ending``
+    says in a sentence how the branch ended, ``finished`` whether it left its range. The whole state is the last point
+    and the next step: a stored branch can be resumed. Raises ContinuationError if the step falls below the smallest or
+    the tangent at the start is degenerate.
     """
 
     def __init__(

@@ -208,8 +208,6 @@ class FiniteDifferences(Flow):
     ``step`` is relative to the orbit's size; velocities count as displacements over a radian of the period.
     """
 
-    name = "finite-differences"
-
     def __init__(self, flow: Flow, step: float = 1e-6) -> None:
         super().__init__(flow.system)
         self.flow, self.step = flow, step

@@ -1,6 +1,6 @@
 """Special points between two points of a branch, located and not interpolated, and the branches that cross there."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from vipetsc.modes.shooting import MAPS, Relative, Shooting
 Test = Callable[[Point], float]
 
 
-def special_kinds(problem: Shooting) -> list[tuple[str, Test, float]]:
+def special_kinds(problem: Shooting) -> Iterator[tuple[str, Test, float]]:
     """What can happen on a branch: its kind, a test that changes sign there, by more than a floor on both sides.
 
     A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
@@ -24,15 +24,14 @@ def special_kinds(problem: Shooting) -> list[tuple[str, Test, float]]:
     def crossing(level: float, i: int) -> Test:
         return lambda p: float(np.real(p.half_traces[i])) - level
 
+    yield "fold-energy", lambda p: p.energy_tangent, 0.0
+    yield "fold-frequency", lambda p: float(p.tangent[-1] / p.period), 0.0
     levels = {1.0: "branch-point", -1.0: "symmetry-breaking" if problem.map.quarter else "period-doubling"}
     if problem.map.quarter:
         levels[0.0] = "period-doubling"
-    pairs = range(problem.system.dofs - 1)
-    return [
-        ("fold-energy", lambda p: p.energy_tangent, 0.0),
-        ("fold-frequency", lambda p: float(p.tangent[-1] / p.period), 0.0),
-        *((kind, crossing(level, i), 1e-6) for level, kind in levels.items() for i in pairs),
-    ]
+    for level, kind in levels.items():
+        for i in range(problem.system.dofs - 1):
+            yield kind, crossing(level, i), 1e-6
 
 
 def locate(problem: Shooting, left: Point, right: Point, chart: str = "relative", grazing: bool = False) -> list[Point]:
