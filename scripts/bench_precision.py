@@ -19,7 +19,7 @@ ERRORS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 def lattice_case(overrides: Iterable[str] = ()) -> Case:
     """The compared case: four-band, A = 30 N, conservative; it ends while solvers still agree after first contact."""
     given = ("drive.amplitude=30.0", "contacts.restitution=1.0", "time.sample_interval=2e-4", "time.end=0.3")
-    return Case.builtin([*given, *overrides])
+    return Case.load(overrides=[*given, *overrides])
 
 
 def at_tolerance(case: Case, rtol: float) -> Case:

@@ -57,7 +57,7 @@ def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
     seconds: dict[str, list[float]] = {name: [] for name in engines()}
     for turn in range(rounds + 1):
         for engine, found in seconds.items():
-            case = Case.builtin([f"time.engine={engine}", *(["time.end=0.01"] if turn == 0 else [])])
+            case = Case.load(overrides=[f"time.engine={engine}", *(["time.end=0.01"] if turn == 0 else [])])
             result = simulate(case, folder / f"whole-{engine}", MPI.COMM_SELF, force=True)
             if turn:
                 found.append(result.statistics["cpu_seconds"])

@@ -81,7 +81,7 @@ def test_native_and_python_right_hand_sides_give_the_same_bits(folder):
 
 @pytest.mark.parallel(2)
 def test_the_whole_builtin_run_has_the_same_bits(folder):
-    case = Case.builtin()
+    case = Case.load()
     comm = MPI.COMM_WORLD
     result = simulate(case, folder / "two", comm)
     if comm.rank == 0:

@@ -15,7 +15,7 @@ from vipetsc.studies.analysis import analyse
 @pytest.fixture
 def run():
     """A run of noise on 24 cells; the sites are 15 and 9, the drive is at cell 3."""
-    case = Case.builtin(["lattice.cells=24", "contacts.sites=[15, 9]", "drive.cell=3", "drive.cycles=3"])
+    case = Case.load(overrides=["lattice.cells=24", "contacts.sites=[15, 9]", "drive.cell=3", "drive.cycles=3"])
     time, cells = np.arange(400) * 2e-4, np.arange(1, 25)
     data = {"time": time, "cell": cells, "dof": np.arange(1, 5), "site": [1, 2], "sites/cell": ("site", [15, 9])}
     noise = np.random.default_rng(1).standard_normal((400, 24, 4))

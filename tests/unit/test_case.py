@@ -42,7 +42,7 @@ def problems(table: dict, *overrides: str) -> dict[str, str]:
 
 
 def test_the_builtin_case_is_the_papers():
-    case = Case.builtin()
+    case = Case.load()
     assert case.contacts.sites == [75, 106, 138, 169, 200]
     np.testing.assert_allclose(case.contacts.clearance, np.geomspace(10**-2.65, 10**-2.75, 5), rtol=1e-12)
     assert case.contacts.stiffness == pytest.approx(5180269.459, rel=1e-9)
@@ -76,11 +76,11 @@ def test_every_case_file_is_sound_and_survives_a_round_trip(path):
 
 
 def test_tolerances_scale_with_the_drive():
-    weak, strong = (Case.builtin([f"drive.amplitude={a}"]).model() for a in (2.0**-10, 2.0**3))
+    weak, strong = (Case.load(overrides=[f"drive.amplitude={a}"]).model() for a in (2.0**-10, 2.0**3))
     assert strong.atol[0] == weak.atol[0] * 2**13
     assert strong.atol[0] == 0.1 * strong.rtol * strong.scale
     assert strong.atol[1] == strong.atol[0] * strong.drive.frequency
-    assert Case.builtin(["time.atol=paper"]).model().atol == (24.33e-9, 24.33e-9)
+    assert Case.load(overrides=["time.atol=paper"]).model().atol == (24.33e-9, 24.33e-9)
 
 
 def test_unknown_keys_name_the_nearest():
@@ -128,7 +128,7 @@ def test_a_result_names_its_case():
 
 
 def test_eta_stays_below_one():
-    eta = DesignCase.builtin().design.eta.values()
+    eta = DesignCase.load().design.eta.values()
     assert len(eta) == 36
     assert eta.max() == 0.975
 
@@ -176,7 +176,7 @@ def test_what_does_not_fit_together_is_named():
     assert list(found) == ["drive.frequency"]
     assert "give one of" in found["drive.frequency"]
     with pytest.raises(CaseError, match=r"must be above design\.eta\.first = 0\.1"):
-        DesignCase.builtin(["design.eta.last=0.05"])
+        DesignCase.load(overrides=["design.eta.last=0.05"])
 
 
 def test_a_cell_of_ones_own_is_checked_whole():
@@ -198,14 +198,14 @@ def test_a_cell_of_ones_own_is_checked_whole():
 
 
 def test_a_frequency_in_a_gap_is_a_warning_only():
-    case = Case.builtin(["drive.frequency=650.0"])
+    case = Case.load(overrides=["drive.frequency=650.0"])
     assert any("no pass band" in w for w in case.warnings())
-    assert not Case.builtin().warnings()
+    assert not Case.load().warnings()
 
 
 def test_errors_travel_between_ranks():
     with pytest.raises(CaseError) as caught:
-        Case.builtin(["lattice.cels=3"])
+        Case.load(overrides=["lattice.cels=3"])
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
@@ -213,6 +213,6 @@ def test_errors_travel_between_ranks():
 def test_any_override_is_taken_or_refused(key, value):
     """Nonsense never escapes as anything but a CaseError."""
     try:
-        Case.builtin([f"{key}={value}"])
+        Case.load(overrides=[f"{key}={value}"])
     except CaseError as error:
         assert error.problems

@@ -87,7 +87,7 @@ def test_a_law_is_fitted_from_the_largest_value_on():
 
 
 def test_a_linear_wave_arrives_with_its_host():
-    case = Case.builtin(["lattice.cells=30", "contacts.sites=[20, 7, 3]", "drive.cell=5"])
+    case = Case.load(overrides=["lattice.cells=30", "contacts.sites=[20, 7, 3]", "drive.cell=5"])
     cell, time = four_band(), np.linspace(0, 1, 201)
     velocity, displacement = np.zeros((201, 30, 4)), np.zeros((201, 30, 4))
     peak = 0.2 + 0.02 * np.arange(30)
@@ -106,7 +106,7 @@ def test_a_linear_wave_arrives_with_its_host():
 
 
 def test_a_linear_wave_of_another_version_is_made_again(tmp_path, monkeypatch):
-    case, store = Case.builtin(), MemberStore(tmp_path)
+    case, store = Case.load(), MemberStore(tmp_path)
     assert store.wave(case) is None
     folder = store.linear_folder(case)
     folder.mkdir(parents=True)

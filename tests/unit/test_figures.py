@@ -23,7 +23,7 @@ def write_run(path, *, sites=(8, 16), window=None, stride=1, episodes=6, fields=
     """A run of a 24-cell lattice with a travelling wave in it, as the store lays it out."""
     overrides = [f"lattice.cells={CELLS}", f"contacts.sites={list(sites)}", f"time.end={(NT - 1) * INTERVAL}"]
     overrides += ["contacts.clearance=0.001"] if sites else []
-    case = Case.builtin([*overrides, f"time.sample_interval={INTERVAL}"])
+    case = Case.load(overrides=[*overrides, f"time.sample_interval={INTERVAL}"])
     t = np.arange(NT) * INTERVAL
     number = np.arange(1, CELLS + 1) if window is None else np.arange(window[0], window[1] + 1)
     at = t[::stride]

@@ -156,7 +156,7 @@ def test_agrees_on_other_cells(folder):
 
 
 def test_agrees_over_the_whole_builtin_run(folder):
-    statistics = agree(folder, Case.builtin(), 1e-7, 1e-9)
+    statistics = agree(folder, Case.load(), 1e-7, 1e-9)
     assert statistics["episodes"] == 181
     assert statistics["steps"] == statistics["samples"] - 1
     assert statistics["bandwidth"] == 2

@@ -10,9 +10,8 @@ from pydantic import Field
 
 from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.resolve import check_lattice, check_sites, clearances, site_cells, with_default_preset
-from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive
+from vipetsc.case.schema import PRESETS, ContactsTable, Finite, LatticeTable, Positive
 from vipetsc.lattice import Chain, Contact, contact_stiffness
-from vipetsc.lattice.presets import PRESETS
 
 
 class LinearSpringTable(Section):

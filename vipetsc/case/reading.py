@@ -74,14 +74,11 @@ class CaseFile(Section):
     builtin_table: ClassVar[Table] = {}
 
     @classmethod
-    def load(cls, path: str | Path | None, overrides: Iterable[str] = ()) -> Self:
+    def load(cls, path: str | Path | None = None, overrides: Iterable[str] = ()) -> Self:
         """The case in file ``path``, or the built-in one, with ``a.b=value`` overrides; raises CaseError."""
-        return cls.from_table(read_toml(path), overrides, str(path)) if path else cls.builtin(overrides)
-
-    @classmethod
-    def builtin(cls, overrides: Iterable[str] = ()) -> Self:
-        """The case without a file, with ``a.b=value`` overrides; raises CaseError."""
-        return cls.from_table(cls.builtin_table, overrides, "built-in case")
+        if not path:
+            return cls.from_table(cls.builtin_table, overrides, "built-in case")
+        return cls.from_table(read_toml(path), overrides, str(path))
 
     @classmethod
     def from_toml(cls, text: str) -> Self:

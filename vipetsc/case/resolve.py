@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.reading import Problem, Table
-from vipetsc.case.schema import ContactsTable, LatticeTable, Span
+from vipetsc.case.schema import PRESETS, ContactsTable, LatticeTable, Span
 from vipetsc.lattice import UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import cell_problems
-from vipetsc.lattice.presets import PRESETS
 
 # A key of a case file takes the place of these keys of the preset.
 REPLACES = {

@@ -1,14 +1,15 @@
-"""The sections of a case of one lattice run: types, bounds and defaults; masses and cells count from 1."""
+"""The sections of a case of one lattice run: types, bounds, defaults and presets; masses and cells count from 1."""
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from vipetsc.case.reading import Section
-from vipetsc.lattice.cell import Spring, UnitCell
-from vipetsc.lattice.presets import PRESETS
+from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 
 Method = Literal["2a", "3bs", "5f", "5dp", "5bs", "6vr", "7vr", "8vr"]
 """Runge-Kutta methods of PETSc (``-ts_rk_type``)."""
@@ -31,6 +32,44 @@ def _not_zero(value: float) -> float:
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Wavenumber = Annotated[float, BeforeValidator(number), Field(gt=0, le=np.pi)]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One of the paper's lattices; the tables hold what a case file would say, in SI units.
+
+    ``site_span(cells, count)`` gives the 1-based positions (first, last) between which sites are spread,
+    ``clearance_span(count)`` the clearances in m of the leading and of the last site.
+    """
+
+    cell: Callable[..., UnitCell]
+    cells: int
+    contacts: dict[str, Any]
+    drive: dict[str, Any]
+    site_span: Callable[[int, int], tuple[float, float]]
+    clearance_span: Callable[[int], tuple[float, float]]
+
+
+CONTACTS: dict[str, Any] = {"law": "hertz", "radius": 0.005, "poisson": 0.3, "restitution": 0.7, "sites": 5}
+
+PRESETS: dict[str, Preset] = {
+    "four-band": Preset(
+        cell=four_band,
+        cells=300,
+        contacts=CONTACTS | {"modulus": 1e8},
+        drive={"amplitude": 24.33, "cycles": 30, "band": 2, "at": "max-group-velocity"},
+        site_span=lambda n, count: (n / 3, n / 3) if count == 1 else (n / 4, 2 * n / 3),
+        clearance_span=lambda count: (10 ** (-2.75 if count == 1 else -2.65), 10**-2.75),
+    ),
+    "diatomic": Preset(
+        cell=diatomic,
+        cells=600,
+        contacts=CONTACTS | {"modulus": 2e8},
+        drive={"amplitude": 1.0, "cycles": 30, "wavenumber": "5pi/9", "band": 2},
+        site_span=lambda n, count: (n / 4, n / 2),
+        clearance_span=lambda count: (2e-4, 1e-4),
+    ),
+}
 
 
 class SpringTable(Section):

@@ -31,9 +31,9 @@ MODULES = ("scipy", "matplotlib", "jinja2", "numba", "pydantic", "tqdm", "tomli_
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
-    """Names and values in two columns."""
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
+    """Names and values in two columns; a row without a value is left out."""
+    width = max(len(name) for name, value in rows if value)
+    return "\n".join(f"  {name:<{width}}  {value}" for name, value in rows if value)
 
 
 def bands_table(cell: UnitCell) -> dict[str, Any]:
@@ -130,18 +130,19 @@ def run_table(result: "Result") -> str:
         steps += f", {s['substeps']} with forces"
     else:
         steps = f"{s['steps']} accepted, {s['rejected']} rejected ({s['method']}, {s['right_hand_side']})"
-    limits = ", ".join(f"{name} {s[name]}" for name in ("grazes", "floored", "clipped", "pulled") if s[name])
-    rows = [("impacts", f"{s['episodes']} episodes, {s['landings']} landings"), ("steps", steps)]
+    energy = ""
     if s.get("work"):
         share = f"dissipated {100 * s['dissipated'] / s['work']:.4g} %"
-        closes = f"ledger closes to {s['ledger_error']:.2g} of the work"
-        rows.insert(0, ("energy", f"work {s['work']:.6g} J, {share}, {closes}"))
-    if limits:
-        rows.insert(2, ("limits", limits))
-    rows.append(("time", f"{s['wall_seconds']:.2f} s wall, {s['cpu_seconds']:.2f} s CPU of all ranks"))
-    rows.append(("folder", str(result.folder)))
-    if "engine_note" in s:
-        rows.append(("engine", f"{s['engine']}: {s['engine_note']}"))
+        energy = f"work {s['work']:.6g} J, {share}, ledger closes to {s['ledger_error']:.2g} of the work"
+    rows = [
+        ("energy", energy),
+        ("impacts", f"{s['episodes']} episodes, {s['landings']} landings"),
+        ("limits", ", ".join(f"{name} {s[name]}" for name in ("grazes", "floored", "clipped", "pulled") if s[name])),
+        ("steps", steps),
+        ("time", f"{s['wall_seconds']:.2f} s wall, {s['cpu_seconds']:.2f} s CPU of all ranks"),
+        ("folder", str(result.folder)),
+        ("engine", f"{s['engine']}: {s['engine_note']}" if "engine_note" in s else ""),
+    ]
     return f"{result.sentence}\n{table(rows)}"
 
 

@@ -16,13 +16,12 @@ GRID = np.linspace(0, np.pi, 721)  # wavenumbers between which extremes and wave
 
 @dataclass(frozen=True)
 class BlochPoint:
-    """Solution of the Bloch problem; leading axes are those of ``wavenumber`` (rad per cell).
+    """Solution of the Bloch problem; leading axes are those of the wavenumbers it was solved at.
 
     ``frequency`` (..., band) in rad/s, ``vectors`` (..., dof, band) mass-normalised, ``group_velocity``
     (..., band) in cells/s.
     """
 
-    wavenumber: np.ndarray
     frequency: np.ndarray
     vectors: np.ndarray
     group_velocity: np.ndarray
@@ -54,7 +53,7 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     stiffness_slope = _stiffness_slope(cell, off_zero) * scale
     eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope @ u).real
     group_velocity = eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny)))
-    return BlochPoint(kappa, frequency, vectors * root[:, None], group_velocity)
+    return BlochPoint(frequency, vectors * root[:, None], group_velocity)
 
 
 def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
@@ -96,11 +95,8 @@ def gaps(bands: Sequence[Band]) -> list[tuple[float, float]]:
 @lru_cache
 def max_group_velocity(cell: UnitCell, band: int) -> tuple[float, float, float]:
     """Where ``band`` (1-based) is fastest: wavenumber (rad per cell), frequency (rad/s), |v_g| (cells/s)."""
-
-    def speed(kappa: float) -> float:
-        return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
-
-    fastest, largest = _maximum(speed, np.abs(bloch(cell, GRID).group_velocity[:, band - 1]))
+    speeds = np.abs(bloch(cell, GRID).group_velocity[:, band - 1])
+    fastest, largest = _maximum(lambda kappa: float(abs(bloch(cell, kappa).group_velocity[band - 1])), speeds)
     return fastest, _frequency(cell, band, fastest), largest
 
 

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from pydantic import TypeAdapter
 
 from vipetsc.case import Case
+from vipetsc.case.schema import PRESETS
 from vipetsc.figures.lattice import lattice_page, reduced_model
 from vipetsc.figures.registry import FIGURES, drawings
 from vipetsc.figures.style import Drawing
-from vipetsc.lattice.presets import PRESETS
 
 READINGS = "calibrated", "printed"
 TRANSFER = "interband"  # the sweep that is laid over branches

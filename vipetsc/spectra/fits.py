@@ -39,11 +39,6 @@ def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
     return float(1 - np.sum((y - fitted) ** 2) / scatter * (len(y) - 1) / (len(y) - 2))
 
 
-def _interval(value: float, deviation: float, freedom: int) -> tuple[float, float]:
-    half = float(stdtrit(freedom, 0.5 + LEVEL / 2)) * deviation
-    return value - half, value + half
-
-
 @np.errstate(over="ignore", invalid="ignore")
 def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
     """Fit y = a x^b to points (n).
@@ -64,35 +59,30 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     if not (np.all(x > 0) and np.all(y > 0) and np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
         raise ValueError("power law: x and y must be positive and finite")
     freedom = len(x) - 2
-    # Centred and scaled, so that neither fit depends on the units of x and y.
+    # Centred and scaled, v = b u and w = c exp(b u), so that neither fit depends on the units of x and y.
     lx, ly = np.log(x), np.log(y)
     cx, cy = lx.mean(), ly.mean()
-    u, v = lx - cx, ly - cy
-    slope = float(u @ v / (u @ u))
-    if method == "nonlinear":
-        return _nonlinear(u, y / np.exp(cy), slope, cx, cy)
-    deviation = float(np.sqrt(float(np.sum((v - slope * u) ** 2)) / freedom / (u @ u)))
-    interval = _interval(slope, deviation, freedom)
-    return PowerLaw(float(np.exp(cy - slope * cx)), slope, r2_adjusted(v, slope * u), interval)
+    u, v, w = lx - cx, ly - cy, y / np.exp(cy)
+    c, b = 1.0, float(u @ v / (u @ u))
+    if method == "log-log":
+        r2, variance = r2_adjusted(v, b * u), float(np.sum((v - b * u) ** 2)) / freedom / (u @ u)
+    else:
+        tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
+        try:
+            (c, b), covariance = curve_fit(_exponential, u, w, p0=(c, b), jac=_gradient, **tolerances)
+            r2, variance = r2_adjusted(w, _exponential(u, c, b)), covariance[1, 1]
+        except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
+            c = b = r2 = variance = float("nan")
+    half = float(stdtrit(freedom, 0.5 + LEVEL / 2) * np.sqrt(variance))
+    return PowerLaw(float(c * np.exp(cy - b * cx)), float(b), r2, (float(b) - half, float(b) + half))
 
 
-def _nonlinear(u: np.ndarray, w: np.ndarray, slope: float, cx: float, cy: float) -> PowerLaw:
-    """Fit w = c exp(b u), c of order 1, and return it as y = a x^b with ln a = cy + ln c - b cx."""
+def _exponential(u: np.ndarray, c: float, b: float) -> np.ndarray:
+    return np.asarray(c * np.exp(b * u))
 
-    def law(u: np.ndarray, c: float, b: float) -> np.ndarray:
-        return np.asarray(c * np.exp(b * u))
 
-    def slopes(u: np.ndarray, c: float, b: float) -> np.ndarray:
-        return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
-
-    tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
-    try:
-        (c, b), covariance = curve_fit(law, u, w, p0=(1.0, slope), jac=slopes, **tolerances)
-    except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
-        nan = float("nan")
-        return PowerLaw(nan, nan, nan, (nan, nan))
-    interval = _interval(float(b), float(np.sqrt(covariance[1, 1])), len(u) - 2)
-    return PowerLaw(float(c * np.exp(cy - b * cx)), float(b), r2_adjusted(w, law(u, c, b)), interval)
+def _gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
+    return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
 
 def from_peak(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:

@@ -148,18 +148,11 @@ class Bank:
 
 
 @lru_cache(maxsize=16)
-def filter_bank(
-    cells: int,
-    kc: float = 6.0,
-    normalisation: Normalisation = "analytic",
-    *,
-    voices: float = VOICES,
-    length: int | None = None,
-) -> Bank:
-    """The bank of filters of all bins for lattices of ``cells``, padded to ``length`` (``padded_length``)."""
+def filter_bank(cells: int, kc: float = 6.0, normalisation: Normalisation = "analytic", voices: float = VOICES) -> Bank:
+    """The bank of filters of all bins for lattices of ``cells``."""
     if normalisation not in ("analytic", "dual"):
         raise ValueError(f"normalisation = {normalisation!r}: analytic or dual")
-    length = padded_length(cells, kc) if length is None else length
+    length = padded_length(cells, kc)
     nodes, eta = Nodes.log(kc, voices), wavenumbers(length)
     gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, eta) ** 2
     bin_of = nodes.bins
