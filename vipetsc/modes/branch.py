@@ -183,5 +183,5 @@ def slope_laws(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dic
         law = power_law(e[usable], s[usable])
         if np.isfinite(law.r2_adjusted) and 1 / MOST <= law.factor <= MOST:
             laws[label] = {"exponent": law.exponent, "factor": law.factor, "adjusted_r2": law.r2_adjusted}
-            laws[label]["points"] = law.points
+            laws[label]["points"] = int(usable.sum())
     return laws
