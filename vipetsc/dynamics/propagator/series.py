@@ -57,7 +57,7 @@ class StepSeries:
     @cached_property
     def _interior(self) -> np.ndarray:
         """Rows (dof, term, dof, cell) of an interior cell over all cells within ``_width``."""
-        return self._powers(self._width, 2 * self._width + 1)
+        return self._powers()
 
     @cached_property
     def _share(self) -> np.ndarray:
@@ -85,27 +85,20 @@ class StepSeries:
         small = float(np.where(self.interior() == 0.0, share, 0.0).sum(axis=(1, 2)).max())
         return self._beyond(self.reach) + small + self._remainder(self.terms)
 
-    def _powers(self, cell: int, width: int, free_left: bool = False, free_right: bool = False) -> np.ndarray:
-        """Rows (dof, term, dof, width) of the masses of ``cell`` on a chain of ``width`` cells.
-
-        Walls hold its ends unless they are free.
-        """
-        unit, d = self.chain.cell, self.chain.cell.dofs
+    def _powers(self, exists: np.ndarray | bool = True) -> np.ndarray:
+        """Rows (dof, term, dof, 2 width + 1) of a cell's masses; which of the cells around it ``exists``."""
+        unit, width = self.chain.cell, self._width
         masses = np.asarray(unit.masses, np.longdouble)[:, None]
         squared = np.longdouble(self.interval) ** 2
-        form = np.zeros((d, d, width), np.longdouble)
-        form[:, :, cell] = np.eye(d)
-        rows = [form]
+        rows = [np.zeros((unit.dofs, unit.dofs, 2 * width + 1), np.longdouble)]
+        rows[0][:, :, width] = np.eye(unit.dofs)
         for _ in range(self.terms - 1):
-            u = np.pad(form / masses, ((0, 0), (0, 0), (1, 1)))
-            form = np.zeros_like(form)
+            u, form = rows[-1] / masses, np.zeros_like(rows[0])
             for mass, offset, other, stiffness in unit.couplings():
-                force = u[:, other, 1 + offset : 1 + offset + width] - u[:, mass, 1:-1]
-                if offset < 0 and free_left:
-                    force[:, 0] = 0
-                if offset > 0 and free_right:
-                    force[:, -1] = 0
-                form[:, mass] += squared * np.longdouble(stiffness) * force
+                # No power reaches the last cells: what is rolled past them is zero.
+                force = np.roll(u[:, other], -offset, axis=-1) - u[:, mass]
+                acts = exists & np.roll(exists, -offset) if self.chain.ends == "free" else exists
+                form[:, mass] += squared * np.longdouble(stiffness) * np.where(acts, force, 0)
             rows.append(form)
         return np.stack(rows, axis=1)
 
@@ -114,17 +107,10 @@ class StepSeries:
 
         Cells beyond an end of the chain get zeros; those of a periodic chain count on beyond it.
         """
-        last, free = self.chain.cells - 1, self.chain.ends == "free"
-        begin, end = cell - self._width, cell + self._width
-        if self.is_interior(cell):
-            powers = self._interior
-        else:
-            begin, end = max(begin, 0), min(end, last)
-            powers = self._powers(cell - begin, end - begin + 1, free and begin == 0, free and end == last)
-        rows = np.zeros((*powers.shape[:-1], count), powers.dtype)
-        a, b = max(first, begin), min(first + count - 1, end) + 1
-        rows[..., a - first : b - first] = powers[..., a - begin : b - begin]
-        return rows
+        cells = np.arange(cell - self._width, cell + self._width + 1)
+        powers = self._interior if self.is_interior(cell) else self._powers((cells >= 0) & (cells < self.chain.cells))
+        begin = first - cells[0] + count
+        return np.pad(powers, [(0, 0), (0, 0), (0, 0), (count, count)])[..., begin : begin + count]
 
     def is_interior(self, cell: int) -> bool:
         """Whether the ends lie outside the reach of ``cell``."""
@@ -149,9 +135,3 @@ class StepSeries:
         """P's rows (2 dof, 2 dof, 2 reach + 1) of a cell at least ``reach`` from both ends; small entries are zero."""
         entries = np.where(self._share > 1e-3 * self.tolerance, self.stencil(self._interior), 0.0)
         return entries[:, :, self._width - self.reach : self._width + self.reach + 1]
-
-    def end(self, right: bool) -> np.ndarray:
-        """P's rows (cell, 2 dof, 2 dof, 2 reach) of the first or last ``reach`` cells, over twice as many cells."""
-        n, r = self.chain.cells, self.reach
-        first, cells = (n - 2 * r, range(n - r, n)) if right else (0, range(r))
-        return np.stack([self.stencil(self.rows(cell, first, 2 * r)) for cell in cells])

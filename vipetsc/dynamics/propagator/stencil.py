@@ -98,8 +98,8 @@ class Stencil(NamedTuple):
     The terms of output row o are ``starts[o]`` to ``starts[o + 1]``, a multiple of ``GROUP`` padded with zeros:
     ``values`` times the row ``rows`` at the cell ``offsets`` away. ``pieces`` (piece, 4) are the interior cells:
     whether they are read from the halo's columns, their first column there, the first owned cell, their number.
-    ``ends`` (end, 2 dof, 2 reach, 2 dof reach) are dense rows of cells near an end of the lattice; of these cells
-    ``end_cells`` (end, 4) has the halo's first column, the first one owned, the owned cell it is, their number.
+    ``ends`` (cell, 2 dof, 2 reach, 2 dof) are dense rows of cells near an end of the lattice; ``end_cells`` (cell, 2)
+    has the halo's first column for each and the owned cell that it is.
     """
 
     starts: np.ndarray
@@ -115,39 +115,34 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     """P(H) on the cells of ``layout``; adds to ``halo`` the cells around the rank's borders and at the ends."""
     r, n, start, stop = series.reach, layout.cells, layout.start, layout.stop
     first, last = (start, stop) if layout.periodic else (max(start, r), min(stop, n - r))
-    ends, end_cells = [], []
-    if not layout.periodic:
-        for is_right, a, b in ((False, start, min(stop, r)), (True, max(start, n - r), stop)):
-            if a < b:
-                rows = series.end(is_right)  # (cell, 2 dof, 2 dof, cell)
-                ends.append(rows.transpose(2, 3, 1, 0).reshape(rows.shape[2], 2 * r, -1))
-                column = halo.add(n - 2 * r if is_right else 0, 2 * r)
-                end_cells.append((column, a - (n - r if is_right else 0), a - start, b - a))
     # Cells that see only this rank's read the state itself.
     left, right = max(first, start + r), min(last, stop - r)
     pieces = [(0, left - start, left - start, right - left)] if left < right else []
     for a, b in ((first, left), (right, last)) if left < right else ((first, last),):
         if a < b:
             pieces.append((1, halo.add(a - r, b - a + 2 * r) + r, a - start, b - a))
-    return Stencil(
-        *_interior_terms(series),
-        pieces=np.array(pieces, np.int64).reshape(-1, 4),
-        ends=np.array(ends).reshape(len(ends), 2 * layout.dofs, 2 * r, 2 * layout.dofs * r),
-        end_cells=np.array(end_cells, np.int64).reshape(-1, 4),
-    )
-
-
-def _interior_terms(series: StepSeries) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The starts, rows, offsets and values of ``Stencil``."""
+    ends, end_cells = [], []
+    for begin, a, b in ((0, start, min(stop, first)), (n - 2 * r, max(start, last), stop)):
+        at = halo.add(begin, 2 * r if a < b else 0)
+        ends += [series.stencil(series.rows(cell, begin, 2 * r)).transpose(1, 2, 0) for cell in range(a, b)]
+        end_cells += [(at, cell - start) for cell in range(a, b)]
     starts, rows, offsets, values = [0], [], [], []
     for entry in series.interior():
         row, column = np.nonzero(entry)
         padding = [0] * (-len(row) % GROUP)
         rows += row.tolist() + padding
-        offsets += (column - series.reach).tolist() + padding
+        offsets += (column - r).tolist() + padding
         values += entry[row, column].tolist() + padding
         starts.append(len(rows))
-    return np.array(starts), np.array(rows), np.array(offsets), np.array(values, float)
+    return Stencil(
+        starts=np.array(starts),
+        rows=np.array(rows),
+        offsets=np.array(offsets),
+        values=np.array(values, float),
+        pieces=np.array(pieces, np.int64).reshape(-1, 4),
+        ends=np.array(ends).reshape(-1, 2 * layout.dofs, 2 * r, 2 * layout.dofs),
+        end_cells=np.array(end_cells, np.int64).reshape(-1, 2),
+    )
 
 
 @njit(error_model="numpy")
@@ -178,14 +173,11 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
                 y[:] = 0.0
                 for g in range(stencil.starts[o], stencil.starts[o + 1], GROUP):
                     _add_group(y, flat, first + a, places[g : g + GROUP], stencil.values[g : g + GROUP])
-    total = np.empty(stencil.ends.shape[3])
-    for end in range(stencil.ends.shape[0]):
-        rows = stencil.ends[end]
-        column, first, at, count = stencil.end_cells[end]
-        total[:] = 0.0
+    for cell in range(stencil.ends.shape[0]):
+        rows, (column, at) = stencil.ends[cell], stencil.end_cells[cell]
+        total = np.zeros(out.shape[0])
         for i in range(rows.shape[0]):
             for k in range(rows.shape[1]):
-                value = columns[i, column + k]
                 for o in range(total.size):
-                    total[o] += value * rows[i, k, o]
-        out[:, at : at + count] = total.reshape(out.shape[0], -1)[:, first : first + count]
+                    total[o] += columns[i, column + k] * rows[i, k, o]
+        out[:, at] = total
