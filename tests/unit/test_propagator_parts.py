@@ -29,7 +29,7 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.forces import create_dof_tables, group_dofs
+from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.free_motion import apply_impulses, evaluate, expand_free_motion, shift
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, gather
@@ -102,7 +102,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends):
     d, n = layout.dofs, layout.cells
     state = np.random.default_rng(5).normal(size=(2 * d, n)) * np.repeat([1e-4, 0.1], d)[:, None]
     fetch(layout, halo, state)
-    dofs = [dof for group in groups for dof in group]
+    dofs = contact_dofs(model)[[dof for group in groups for dof in group]]
     taylor = np.zeros((len(dofs), 2 * series.terms))
     for c in range(len(groups)):
         expand_free_motion(tables, c, halo.record.columns, taylor)
@@ -110,8 +110,10 @@ def test_free_motion_and_impulses_are_the_exponential(ends):
         exact = (exponential(series.chain, s * series.interval) @ state.ravel()).reshape(2 * d, n)
         for i, dof in enumerate(dofs):
             w, rate = evaluate(taylor[i], s)
-            assert w == pytest.approx(np.dot(dof.form, exact[:d, dof.cell]), rel=1e-11, abs=1e-17)
-            assert rate / series.interval == pytest.approx(np.dot(dof.form, exact[d:, dof.cell]), rel=1e-11, abs=1e-13)
+            assert w == pytest.approx(np.dot(dof["form"], exact[:d, dof["cell"]]), rel=1e-11, abs=1e-17)
+            assert rate / series.interval == pytest.approx(
+                np.dot(dof["form"], exact[d:, dof["cell"]]), rel=1e-11, abs=1e-13
+            )
     # An impulse on one DoF at s leaves what the exponential makes of it in the rest of the step.
     s = 0.4
     for i, dof in enumerate(dofs):
@@ -119,7 +121,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends):
         moments[0] = (1 - s) ** np.arange(2 * series.terms)
         apply_impulses(tables, i, moments, out)
         impulse = np.zeros((2 * d, n))
-        impulse[d:, dof.cell] = np.array(dof.form) / model.chain.cell.masses
+        impulse[d:, dof["cell"]] = dof["form"] / model.chain.cell.masses
         exact = exponential(series.chain, (1 - s) * series.interval) @ impulse.ravel()
         np.testing.assert_allclose(out.ravel(), exact, rtol=0, atol=1e-12 * np.abs(exact).max())
 
@@ -127,7 +129,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends):
 def test_clusters_that_cannot_touch_are_left_alone():
     model, layout, series, halo = parts("fixed", 1e-4, 1e-14, sites=(4, 12, 20))
     groups = group_dofs(model, series.reach)
-    assert [[dof.site for dof in group] for group in groups] == [[-1], [0], [1], [2]]
+    assert groups == [[-1], [0], [1], [2]]
     tables = create_dof_tables(groups, model, layout, series, halo)
     halo.bind_columns()
     taylor = np.zeros((4, 2 * series.terms))
@@ -154,7 +156,7 @@ def test_contacts_that_cannot_be_followed_end_the_run():
 def test_dofs_within_reach_are_grouped_across_a_periodic_end():
     def sites(ends, reach):
         model = small_case(lattice={"ends": ends}, contacts={"sites": [2, 12, 14, 23]}).model()
-        return [[dof.site for dof in group] for group in group_dofs(model, reach)]
+        return group_dofs(model, reach)
 
     assert sites("fixed", 1) == [[0, -1], [1], [2], [3]]
     assert sites("fixed", 2) == [[0, -1], [1, 2], [3]]

@@ -28,9 +28,9 @@ SMALLEST_RESPONSE = 1e-18
 SUPERCONVERGENCE = 0.02
 BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 
+COUNTS = ("substeps", "rejected", "landings", "switches")
 SUBSTEP_STATE = np.dtype(
-    [("begin", float), ("position", float), ("length", float), ("drive_end", float)]
-    + [(name, np.int64) for name in ("substeps", "rejected", "landings", "switches")]
+    [(name, float) for name in ("begin", "position", "length", "drive_end")] + [(name, np.int64) for name in COUNTS]
 )
 """Where a cluster stands: the step's begin in s; in shares of the step the position, the next substep's length and the
 end of the drive; counts of substeps, of rejected ones, of landings and of switches of a site's mode."""
@@ -173,13 +173,8 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
 
     Picard's iteration, which begins with the forces that ``trial`` holds.
     """
-    state, contacts, h, active, n = (
-        cluster.state[0],
-        cluster.contacts,
-        cluster.interval,
-        trial.active,
-        trial.active.size,
-    )
+    state, contacts, h = cluster.state[0], cluster.contacts, cluster.interval
+    active, n = trial.active, trial.active.size
     free_w, free_v = np.empty((n, NODES)), np.empty((n, NODES))
     for a in range(n):
         for node in range(NODES):

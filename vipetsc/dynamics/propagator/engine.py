@@ -14,7 +14,7 @@ from vipetsc.compiled import njit
 from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.advance import DONE, FAILED, advance_cluster
+from vipetsc.dynamics.propagator.advance import CHANGED, DONE, FAILED, advance_cluster
 from vipetsc.dynamics.propagator.collocation import Cluster
 from vipetsc.dynamics.propagator.forces import Forces, group_dofs, select_cluster
 from vipetsc.dynamics.propagator.free_motion import DofTables, apply_impulses, expand_free_motion
@@ -59,30 +59,29 @@ def step_series(model: Model) -> StepSeries | None:
 
 
 class States(NamedTuple):
-    """Two states that steps read and write in turn.
+    """Two states that steps read and write in turn; a sample interval in s has ``parts`` steps.
 
     ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, ``ghosts`` the
-    neighbouring ones, the last columns of the halo. ``steps`` were taken before; a sample interval in s has ``parts``.
+    neighbouring ones, the last columns of the halo.
     """
 
     components: np.ndarray
     owned: int
     ghosts: int
-    steps: int
     parts: int
     sample_interval: float
 
 
 @njit(error_model="numpy")
 def take_steps(
-    states: States, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster
+    states: States, steps: int, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster
 ) -> Iterator[tuple[int, int, float]]:
-    """Take linear steps, and hand over to Python where it is needed: why, for which cluster, and the time in s.
+    """Go on after so many linear ``steps``; hand over to Python where needed: why, for which cluster, the time in s.
 
     ``ARRIVED``: the state is complete. ``STEPPED``: a step is done, cells of other ranks are to be fetched.
     ``CHANGED``: sites of a cluster are to be switched. ``FAILED``: the contacts of a cluster cannot be followed.
     """
-    rows, owned, steps = halo.columns.shape[0], states.owned, states.steps
+    rows, owned = halo.columns.shape[0], states.owned
     while True:
         state, out = states.components[steps % 2], states.components[1 - steps % 2]
         cells, next_cells = state[: rows * owned].reshape(rows, owned), out[: rows * owned].reshape(rows, owned)
@@ -132,16 +131,14 @@ class Propagator(Engine):
         self._halo.bind_columns()
         self._components = np.zeros((2, layout.size + layout.dofs * len(ghosts)))
         self._states = [layout.create_vector(components) for components in self._components]
+        self._record = States(self._components, layout.owned, len(ghosts), self._parts, self._interval)
         self._status = np.zeros(2)
         self._start(0)
 
     def _start(self, steps: int) -> None:
         """Go on from the state after so many ``steps``."""
-        self.steps = steps
-        layout, forces = self._layout, self._forces
-        ghosts = (self._components.shape[1] - layout.size) // layout.dofs
-        states = States(self._components, layout.owned, ghosts, steps, self._parts, self._interval)
-        self._events = take_steps(states, self._stencil, self._halo.record, forces.dofs, forces.clusters)
+        self.steps, forces = steps, self._forces
+        self._events = take_steps(self._record, steps, self._stencil, self._halo.record, forces.dofs, forces.clusters)
         self._arrive()
 
     def _arrive(self) -> None:
@@ -158,7 +155,7 @@ class Propagator(Engine):
             if model.chain.cells > 2 * shortest.reach:
                 return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
             return f"{model.chain.cells} cells are fewer than the propagator's band"
-        groups = ([dof.cell + 1 for dof in group if dof.site >= 0] for group in group_dofs(model, series.reach))
+        groups = ([model.chain.sites[i] + 1 for i in group if i >= 0] for group in group_dofs(model, series.reach))
         _, cells = max((len(cells), sorted(cells)) for cells in groups)
         if len(cells) > MOST_SITES:
             return (
@@ -176,26 +173,21 @@ class Propagator(Engine):
         """Step until the time is exactly ``target`` in s, a multiple of the sample interval; see ``Engine``."""
         last = round(target / self._interval) * self._parts
         while self.steps < last:
-            failure = self._step()
+            for event, cluster, now in self._events:
+                if event != CHANGED:
+                    break
+                self._forces.switch(cluster, now)
             # Any rank's failure or request counts on all.
-            self._status[:] = self._stop.requested, failure is not None
+            self._status[:] = self._stop.requested, event == FAILED
             self._layout.comm.Allreduce(MPI.IN_PLACE, self._status, MPI.MAX)
+            if event == FAILED:
+                sites = ", ".join(str(site + 1) for site in self._forces.trackers[cluster].numbers)
+                raise StalledError(f"the contacts of sites {sites} at {now:.9g} s")
             if self._status[1]:
-                raise StalledError(failure or "contacts on another rank")
+                raise StalledError("contacts on another rank")
             self.steps += 1
             self._arrive()
         return not self._status[0]
-
-    def _step(self) -> str | None:
-        """Take a step; why it could not be taken, or None."""
-        for event, cluster, now in self._events:
-            if event == STEPPED:
-                break
-            if event == FAILED:
-                sites = ", ".join(str(site + 1) for site in self._forces.trackers[cluster].numbers)
-                return f"the contacts of sites {sites} at {now:.9g} s"
-            self._forces.switch(cluster, now)
-        return None
 
     def take_episodes(self, unfinished: bool = False) -> list[Episode]:
         """See ``Engine``."""

@@ -3,7 +3,6 @@
 Sec. 5 and 6 of the derivation in the package's docstring.
 """
 
-from dataclasses import dataclass
 from itertools import chain, compress
 from math import factorial
 from typing import Any
@@ -19,53 +18,45 @@ from vipetsc.contact.law import Contacts, create_contacts
 from vipetsc.contact.tracker import LIMITS, Episode, ImpactTracker
 from vipetsc.dynamics.layout import Layout, create_burst
 from vipetsc.dynamics.propagator.advance import ORDER
-from vipetsc.dynamics.propagator.collocation import HISTORY, SUBSTEP_STATE, Cluster, collocation
+from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation
 from vipetsc.dynamics.propagator.free_motion import DofTables
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1
-# What clusters count.
-COUNTS = ("substeps", "rejected", "landings", "switches")
 
 
-@dataclass(frozen=True)
-class ContactDof:
-    """One relative displacement of a lattice: of a contact pair, ``site`` (0-based), or of the driven mass, site -1.
+def contact_dofs(model: Model) -> np.ndarray:
+    """The relative displacements of the contact sites and, as the last one, the displacement of the driven mass.
 
-    ``form`` (mass,) weighs the displacements of ``cell``; ``clearance`` is in m.
+    Each has its ``cell``, the weights ``form`` (mass,) of the displacements there and its ``clearance`` in m.
     """
+    lattice, unit = model.chain, np.eye(model.chain.cell.dofs)
+    dofs = np.zeros(len(lattice.sites) + 1, [("cell", int), ("form", float, len(unit)), ("clearance", float)])
+    dofs["cell"] = *lattice.sites, model.drive_cell
+    dofs["form"] = unit[lattice.cell.resonator] - unit[lattice.cell.host]
+    dofs["form"][-1] = unit[model.drive_mass]
+    dofs["clearance"] = *lattice.clearances, np.inf
+    return dofs
 
-    cell: int
-    site: int
-    form: tuple[float, ...]
-    clearance: float = np.inf
 
+def group_dofs(model: Model, reach: int) -> list[list[int]]:
+    """Groups of ``contact_dofs`` of which each is within ``reach`` cells of another, in the lattice's order.
 
-def group_dofs(model: Model, reach: int) -> list[list[ContactDof]]:
-    """Groups of DoFs of which each is within ``reach`` cells of another, in the lattice's order.
-
-    In each group the sites come first, in their own order, then the driven mass.
+    In each group the sites' numbers come first, in their own order, then -1 for the driven mass.
     """
-    cell, cells = model.chain.cell, model.chain.cells
-    unit = np.eye(cell.dofs)
-    pair, sites = (
-        tuple(unit[cell.resonator] - unit[cell.host]),
-        zip(model.chain.sites, model.chain.clearances, strict=True),
-    )
-    dofs = [ContactDof(c, i, pair, clearance) for i, (c, clearance) in enumerate(sites)]
-    dofs.append(ContactDof(model.drive_cell, -1, tuple(unit[model.drive_mass])))
-    groups: list[list[ContactDof]] = []
-    for dof in sorted(dofs, key=lambda dof: dof.cell):
-        if groups and dof.cell - groups[-1][-1].cell <= reach:
+    cells = [*model.chain.sites, model.drive_cell]
+    groups: list[list[int]] = []
+    for dof in sorted(range(-1, len(cells) - 1), key=lambda dof: cells[dof]):
+        if groups and cells[dof] - cells[groups[-1][-1]] <= reach:
             groups[-1].append(dof)
         else:
             groups.append([dof])
     joined = model.chain.ends == "periodic" and len(groups) > 1
-    if joined and groups[0][0].cell + cells - groups[-1][-1].cell <= reach:
+    if joined and cells[groups[0][0]] + model.chain.cells - cells[groups[-1][-1]] <= reach:
         groups[0] = groups.pop() + groups[0]
-    return [sorted(group, key=lambda dof: (dof.site < 0, dof.site)) for group in groups]
+    return [sorted(group, key=lambda dof: (dof < 0, dof)) for group in groups]
 
 
 @njit(error_model="numpy")
@@ -99,14 +90,14 @@ class Forces:
 
     def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
         self._comm = layout.comm
-        groups = [group for group in group_dofs(model, series.reach)
-                  if any((_owned_cells(dof.cell, series.reach, layout) >= 0).any() for dof in group)]  # fmt: skip
+        dofs, r = contact_dofs(model), series.reach
+        groups = [g for g in group_dofs(model, r) if (_owned_cells(dofs["cell"][g], r, layout) >= 0).any()]
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
         count, terms = len(self.dofs.column), series.terms
         self.clusters = Cluster(
-            contacts=create_contacts(model.contact, [dof.clearance for group in groups for dof in group]),
+            contacts=create_contacts(model.contact, [dofs["clearance"][dof] for dof in chain(*groups)]),
             burst=create_burst(model.drive),
-            response=_responses(groups, self.dofs, layout, series),
+            response=_responses(groups, self.dofs, model, series),
             nodes=collocation(2 * terms),
             interval=series.interval,
             omega_max_h=series.omega_max_h,
@@ -121,11 +112,11 @@ class Forces:
         )
         self.clusters.state["length"] = 1.0
         self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
-        self._logs = [layout.start <= group[0].cell < layout.stop for group in groups]
+        self._logs = [layout.start <= dofs["cell"][group[0]] < layout.stop for group in groups]
         self._clusters = [select_cluster(self.clusters, self.dofs, c) for c in range(len(groups))]
         self.trackers = []
         for group, cluster in zip(groups, self._clusters, strict=True):
-            sites = [dof.site for dof in group if dof.site >= 0]
+            sites = [dof for dof in group if dof >= 0]
             self.trackers.append(ImpactTracker(cluster.contacts, sites, model.chain.cell.reduced_mass))
             self.trackers[-1].start = cluster.site_motion
 
@@ -180,62 +171,55 @@ class Forces:
         for name, array in self._saved().items():
             array[:] = checkpoint[name]
         for c, tracker in enumerate(self.trackers):
-            prefix = f"cluster-{c}-"
-            tracker.restore({k.removeprefix(prefix): v for k, v in checkpoint.items() if k.startswith(prefix)})
+            tracker.restore({name: checkpoint[f"cluster-{c}-{name}"] for name in tracker.checkpoint()})
 
 
-def _unwrapped(cell: int, near: int, layout: Layout) -> int:
-    """``cell``, or in a periodic lattice its copy next to ``near``."""
-    return near + (cell - near + layout.cells // 2) % layout.cells - layout.cells // 2 if layout.periodic else cell
-
-
-def _owned_cells(cell: int, reach: int, layout: Layout) -> np.ndarray:
-    """Local numbers (2 reach + 1,) of the cells within ``reach`` of ``cell``, -1 for those of other ranks and none."""
-    cells = np.arange(cell - reach, cell + reach + 1)
-    cells = cells % layout.cells if layout.periodic else cells
-    return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
+def _owned_cells(cells: np.ndarray, reach: int, layout: Layout) -> np.ndarray:
+    """Local numbers (dof, 2 reach + 1) of what lies within ``reach`` of ``cells`` (dof,), -1 where nothing is owned."""
+    around = cells[:, None] + np.arange(-reach, reach + 1)
+    around = around % layout.cells if layout.periodic else around
+    return np.where((around >= layout.start) & (around < layout.stop), around - layout.start, -1)
 
 
 def create_dof_tables(
-    groups: list[list[ContactDof]], model: Model, layout: Layout, series: StepSeries, halo: HaloRegions
+    groups: list[list[int]], model: Model, layout: Layout, series: StepSeries, halo: HaloRegions
 ) -> DofTables:
     """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
-    r, dofs, columns = series.reach, list(chain.from_iterable(groups)), []
-    for group in groups:
-        cells = [_unwrapped(dof.cell, group[0].cell, layout) for dof in group]
-        column = halo.add(min(cells) - r, max(cells) - min(cells) + 2 * r + 1)
-        columns += [column + cell - min(cells) for cell in cells]
+    numbers = list(chain.from_iterable(groups))
+    dofs, r = contact_dofs(model)[numbers], series.reach
     # DoFs away from the ends share their rows.
-    keys = [(None if series.is_interior(dof.cell) else dof.cell, dof.form) for dof in dofs]
+    keys = [(number < 0, -1 if series.is_interior(dof["cell"]) else dof["cell"])
+            for number, dof in zip(numbers, dofs, strict=True)]  # fmt: skip
     rows = {}
     for key, dof in dict(zip(keys, dofs, strict=True)).items():
-        around = series.rows(dof.cell, dof.cell - r, 2 * r + 1).astype(float)
-        rows[key] = np.einsum("i,imjc->jcm", np.array(dof.form), around)
-    numbers = {dof.site: i for i, dof in enumerate(dofs)}
+        around = series.rows(dof["cell"], dof["cell"] - r, 2 * r + 1).astype(float)
+        rows[key] = np.einsum("i,imjc->jcm", dof["form"], around)
     return DofTables(
-        column=np.array(columns, np.int64),
-        owned=np.array([_owned_cells(dof.cell, r, layout) for dof in dofs], np.int64).reshape(-1, 2 * r + 1),
+        column=np.array([halo.add(cell - r, 2 * r + 1) for cell in dofs["cell"]], np.int64),
+        owned=_owned_cells(dofs["cell"], r, layout),
         table=np.array([list(rows).index(key) for key in keys], np.int64),
         rows=np.array(list(rows.values())).reshape(len(rows), layout.dofs, 2 * r + 1, series.terms),
         factors=np.array([series.interval ** (k % 2) / factorial(k) for k in range(2 * series.terms)]),
         inverse_masses=1 / np.asarray(model.chain.cell.masses),
         # An onset within rounding of the clearance is one.
-        clearance=np.array([dof.clearance for dof in dofs]) * (1 - 1e-9),
-        driven=numbers.get(-1, -1),
+        clearance=dofs["clearance"] * (1 - 1e-9),
+        driven=numbers.index(-1) if -1 in numbers else -1,
         first=np.cumsum([0, *map(len, groups)]),
-        ledger=np.array([numbers[site] for site in ((-1,) if layout.owns_drive else ()) + layout.sites], np.int64),
+        ledger=np.array([numbers.index(dof) for dof in (-1,) * layout.owns_drive + layout.sites], np.int64),
     )
 
 
-def _responses(groups: list[list[ContactDof]], dofs: DofTables, layout: Layout, series: StepSeries) -> np.ndarray:
+def _responses(groups: list[list[int]], tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
     """Motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H, in powers 2 m + 1 of s."""
-    factors = dofs.factors[1::2] * series.interval
-    response = np.zeros((len(dofs.column), max(map(len, groups), default=0), series.terms))
-    for group, first in zip(groups, dofs.first[:-1], strict=True):
-        for i, target in enumerate(group, first):
-            for j, source in enumerate(group):
-                offset = _unwrapped(source.cell, target.cell, layout) - target.cell
+    dofs, cells, factors = contact_dofs(model), model.chain.cells, tables.factors[1::2] * series.interval
+    response = np.zeros((len(tables.column), max(map(len, groups), default=0), series.terms))
+    for group, first in zip(groups, tables.first[:-1], strict=True):
+        for i, target in enumerate(dofs[group], first):
+            for j, source in enumerate(dofs[group]):
+                offset = source["cell"] - target["cell"]
+                if model.chain.ends == "periodic":
+                    offset = (offset + cells // 2) % cells - cells // 2
                 if abs(offset) <= series.reach:
-                    weights = dofs.inverse_masses * source.form
-                    response[i, j] = factors * (weights @ dofs.rows[dofs.table[i], :, series.reach + offset])
+                    weights = tables.inverse_masses * source["form"]
+                    response[i, j] = factors * (weights @ tables.rows[tables.table[i], :, series.reach + offset])
     return response
