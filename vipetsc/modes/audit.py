@@ -2,12 +2,13 @@
 
 import itertools
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.modes.continuation import Continuation, ContinuationError, chart_at, half_trace_change
+from vipetsc.modes.continuation import Continuation, ContinuationError, half_trace_change
 from vipetsc.modes.flow import Flow, FlowError
 from vipetsc.modes.point import Point, sample_orbit
 from vipetsc.modes.shooting import Relative, Shooting
@@ -28,24 +29,25 @@ def suspects(points: list[Point]) -> Iterator[tuple[int, str]]:
 def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> bool:
     """Whether the guarded branch from ``left`` misses ``right``.
 
-    Follows the branch from the left point with the guards on, until it passes the right one or is further
-    from the left point than three times the step.
+    Follows the branch from the left point with the guards on, until it passes the right one, is further from the left
+    point than three times the step, or cannot go on.
     """
-    chart = chart_at(problem, "relative", left)
+    chart = Relative(problem.system, left.x, left.period)
     origin, goal = chart.encode(left.x, left.period), chart.encode(right.x, right.period)
     reach = float(np.linalg.norm(goal - origin))
     last, first, anywhere = origin, min(control.first_step, reach / 4), [0.0, np.inf]
     steps = {"first_step": first, "largest_step": reach / 4, "points": 400, "chart": "relative", "guards": Guards()}
     guarded = control.model_copy(update={**steps, "energy": anywhere, "frequency": anywhere})
-    for point in Continuation(problem, left, guarded):
-        here = chart.encode(point.x, point.period)
-        share, missed, length = (float(a[0]) for a in _nearest(goal, last[None, :], here[None, :]))
-        # a smooth arc leaves its chord by its length times the turn allowed
-        if 0 < share < 1 and missed <= guarded.guards.turn * length:
-            return missed > 0.02 * reach
-        if np.linalg.norm(here - origin) > 3 * reach:
-            return True
-        last = here
+    with suppress(ContinuationError, FlowError):
+        for point in Continuation(problem, left, guarded):
+            here = chart.encode(point.x, point.period)
+            share, missed, length = (float(a[0]) for a in _nearest(goal, last[None, :], here[None, :]))
+            # a smooth arc leaves its chord by its length times the turn allowed
+            if 0 < share < 1 and missed <= guarded.guards.turn * length:
+                return missed > 0.02 * reach
+            if np.linalg.norm(here - origin) > 3 * reach:
+                break
+            last = here
     return True
 
 
@@ -53,11 +55,7 @@ def jumps(points: list[Point], problem: Shooting, control: NnmTable) -> Iterator
     """Sentences about steps that jumped to another arc; only suspicious ones are followed again."""
     for i, why in suspects(points):
         a, b = points[i], points[i + 1]
-        try:
-            jumped = is_jump(problem, a, b, control)
-        except (ContinuationError, FlowError):
-            jumped = True
-        if jumped:
+        if is_jump(problem, a, b, control):
             yield (
                 f"jump between points {a.index} and {b.index} (E = {a.energy:.6g} -> {b.energy:.6g} J, "
                 f"f = {a.frequency:.6g} -> {b.frequency:.6g} Hz): {why}; both satisfy the equations "
@@ -142,10 +140,9 @@ def compare(reference: Shooting, points: list[Point], flow: Flow) -> Variables:
             difference[:, i] = problem.energy(x) / point.energy - 1, point.period / period - 1
     axis, group = f"compared_{flow.name}", f"flows/{flow.name}"
     text = "relative {} difference of " + f"{flow.name} at the same amplitude"
-    numbers, energies = [p.index for p in chosen], [p.energy for p in chosen]
     return {
-        axis: variable(axis, numbers, "1", f"number of the point compared with {flow.name}"),
-        f"{group}/energy": variable(axis, energies, "J", "energy of the branch"),
+        axis: variable(axis, [p.index for p in chosen], "1", f"number of the point compared with {flow.name}"),
+        f"{group}/energy": variable(axis, [p.energy for p in chosen], "J", "energy of the branch"),
         f"{group}/energy_difference": variable(axis, difference[0], "1", text.format("energy")),
         f"{group}/frequency_difference": variable(axis, difference[1], "1", text.format("frequency")),
     }

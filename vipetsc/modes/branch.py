@@ -47,11 +47,7 @@ class Branch:
 
     def regular(self) -> list[Point]:
         """The points of the continuation itself."""
-        return self.special("regular")
-
-    def special(self, kind: str) -> list[Point]:
-        """The points of one kind."""
-        return [p for p in self.points if p.kind == kind]
+        return [p for p in self.points if p.kind == "regular"]
 
     def column(self, name: str) -> np.ndarray:
         """One quantity of every point (points,)."""

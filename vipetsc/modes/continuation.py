@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import CHARTS, Attempt, Chart, Grazing, Relative, Shooting
+from vipetsc.modes.shooting import CHARTS, Attempt, Relative, Shooting
 
 
 class ContinuationError(RuntimeError):
@@ -24,10 +24,17 @@ GUARDED = {
 
 
 class Frame:
-    """The chart at a point of a branch, the unknowns ``xi`` (n + 1,) of the point and the unit ``tangent`` there."""
+    """The chart at a point of a branch, the unknowns ``xi`` (n + 1,) of the point and the unit ``tangent`` there.
+
+    The chart ``auto`` is grazing within 5 % of it and relative elsewhere.
+    """
 
     def __init__(self, problem: Shooting, chart: str, point: Point) -> None:
-        self.problem, self.chart = problem, chart_at(problem, chart, point)
+        if chart == "auto":
+            gaps = problem.system.gaps(point.x) if problem.map.start == "rest" else np.array([np.inf])
+            near = np.abs(gaps / problem.system.clearances).min(initial=np.inf) < 0.05
+            chart = "grazing" if near else "relative"
+        self.problem, self.chart = problem, CHARTS[chart](problem.system, point.x, point.period)
         self.xi = self.chart.encode(point.x, point.period)
         self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), point.tangent))
 
@@ -112,15 +119,6 @@ class Continuation:
             strains["contacts"] = 0.0
         worst = max(strains, key=lambda guard: strains[guard])
         return point, strains[worst], worst
-
-
-def chart_at(problem: Shooting, name: str, point: Point) -> Chart:
-    """The chart called ``name`` at a point; ``auto`` is grazing within 5 % of it and relative elsewhere."""
-    if name == "auto":
-        gaps = problem.system.gaps(point.x) if problem.map.start == "rest" else np.array([np.inf])
-        near = np.abs(gaps / problem.system.clearances).min(initial=np.inf) < 0.05
-        return (Grazing if near else Relative)(problem.system, point.x, point.period)
-    return CHARTS[name](problem.system, point.x, point.period)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

@@ -144,10 +144,8 @@ class Follower:
 
     def _typical(self, branch: Branch) -> list[Point]:
         """The regular points in the middle of every region, and at the energies asked for."""
-        groups: list[list[Point]] = [[] for _ in range(5)]
-        for point, region in zip(branch.points, branch.regions(), strict=True):
-            if point.kind == "regular":
-                groups[region].append(point)
+        places = [(p, at) for p, at in zip(branch.points, branch.regions(), strict=True) if p.kind == "regular"]
+        groups = ([p for p, at in places if at == region] for region in range(5))
         chosen = [group[len(group) // 2] for group in groups if group]
         for energy in self.options.orbits_at:
             chosen.append(min(branch.regular(), key=lambda p: abs(math.log(p.energy / energy))))
@@ -158,7 +156,7 @@ class Follower:
         control = self.options.model_copy(update={"points": self.options.switch_points, "chart": "relative"})
         branches = []
         for kind in self.options.switch:
-            for number, point in enumerate(branch.special(kind), 1):
+            for number, point in enumerate((p for p in branch.points if p.kind == kind), 1):
                 crossing = self._empty(f"{branch.name}-{kind}-{number}")
                 try:
                     problem, first = switch(self.problem, point, self.options.switch_amplitude)
