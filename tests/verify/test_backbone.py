@@ -7,9 +7,11 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vipetsc.case import Case, case_id
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
-from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, Initiation, align, read_slope, relate_folders
+from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, align, initiation_of, read_slope, relate_folders
+from vipetsc.studies.members import linear_case
 
 GRAZING = 0.03
 EXPONENT = -0.9
@@ -32,9 +34,16 @@ def lattice(slope, divisor, floor, initiation, count=60):
     return work, np.where(work < initiation, floor, law)
 
 
-def test_energies_align_at_grazing():
-    slope = branch()
-    initiation = Initiation.of(np.array([1e-4, 2e-4]), np.array([2e-3, 1.8e-3]), 0, work=1.5e-3)
+def test_energies_align_at_grazing(tmp_path):
+    slope, envelope = branch(), np.zeros(20)
+    envelope[[16, 8]] = 2e-4, 1e-4
+    case = Case.builtin(["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
+    linear = tmp_path / "linear" / case_id(linear_case(case))
+    linear.mkdir(parents=True)
+    with h5py.File(linear / "wave.h5", "w") as wave, h5py.File(linear / "run.h5", "w") as run:
+        wave["envelope"], run["energy/work"] = envelope, [0.0, 1.5e-3]
+        run["time"], run["cell"], run.attrs["case"] = [0.0, 1.0], np.arange(1, 21), case.to_toml()
+    initiation = initiation_of(tmp_path, case)
     assert initiation.amplitude == pytest.approx(20.0, rel=1e-14)
     assert initiation.onset == pytest.approx(9.0, rel=1e-14)
     assert initiation.energy == pytest.approx(1.5e-3 * 400, rel=1e-14)

@@ -27,9 +27,8 @@ HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
 SNAPSHOTS = 500  # at most this many samples are transformed by wavelets; averages over time need no more
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those who window the record
 
-# What is measured of one run, and of every run of a sweep; "maps" are the space-time maps of the other measures.
+# What is measured of a run whose fields are kept; "maps" are the space-time maps of the other measures.
 FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "maps")
-REDUCED = ("entropy", "bands")
 
 # Dimensions, units and description of every variable; dimensions of a group are named without it.
 LAYOUT = {

@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -81,17 +80,21 @@ class Initiation:
     energy: float
     onset: float
 
-    @classmethod
-    def of(cls, envelope: np.ndarray, clearance: np.ndarray, first: int, work: float) -> Self:
-        """From the linear run at 1 N: largest w (site) in m, and the drive's work in J; ``first`` is a site.
 
-        Until the first contact the lattice is linear, so w grows with the amplitude and the work with its
-        square; the smallest amplitude that touches a site is ``clearance`` / ``envelope``. The envelope is that of
-        w^2 + (w'/Om)^2, so it does not depend on where the samples fall.
-        """
-        touching = np.asarray(clearance) / envelope
-        amplitude = float(touching[first])
-        return cls(amplitude, work * amplitude**2, float(touching.min()))
+def initiation_of(folder: Path, case: Case) -> Initiation:
+    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run; raises OSError.
+
+    Until the first contact the lattice is linear, so w grows with the amplitude and the drive's work with its square:
+    the smallest amplitude that touches a site is its clearance over the envelope at 1 N. The envelope is that of
+    w^2 + (w'/Om)^2, so it does not depend on where the samples fall.
+    """
+    linear = folder / "linear" / case_id(linear_case(case))
+    sites = np.asarray(case.contacts.sites)
+    with open_netcdf(linear / "wave.h5", "linear wave") as wave, open_run(linear / "run.h5") as run:
+        touching = np.asarray(case.contacts.clearance) / wave["envelope"].values[sites - 1]
+        work = float(run["energy/work"][-1])
+    amplitude = float(touching[np.argmax(sites == leading_cell(case))])
+    return Initiation(amplitude, work * amplitude**2, float(touching.min()))
 
 
 def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, branch: xr.Dataset) -> xr.Dataset:
@@ -129,23 +132,8 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     return aligned.assign_attrs(about)
 
 
-def initiation_of(folder: Path, case: Case) -> Initiation:
-    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run; raises OSError."""
-    linear = folder / "linear" / case_id(linear_case(case))
-    sites = np.asarray(case.contacts.sites)
-    with open_netcdf(linear / "wave.h5", "linear wave") as wave, open_run(linear / "run.h5") as run:
-        envelope, work = wave["envelope"].values[sites - 1], float(run["energy/work"][-1])
-    first = int(np.argmax(sites == leading_cell(case)))
-    return Initiation.of(envelope, np.asarray(case.contacts.clearance), first, work)
-
-
-def relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
-    """Write ``backbone.h5`` beside the ensemble: a group a curve; returns its path, None if there is no such curve.
-
-    A curve over the amplitude is laid over the branch of its law and reading, or of its law alone if there is
-    none of its reading. ``branches`` are folders with ``branch-out-of-phase.h5``. What could not be related is
-    named in the attribute ``left_out``. Raises OSError or ValueError for a branch or a linear run that cannot be used.
-    """
+def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
+    """Write ``backbone.h5`` beside the ensemble: a group a curve; returns its path, None if there is no such curve."""
     if "ibtet" not in ensemble or bool(ensemble["ibtet"].isnull().all()):
         return None
     slopes, folder = [read_slope(branch / BRANCH) for branch in branches], Path(ensemble.attrs["folder"])
@@ -206,9 +194,11 @@ def is_related(folder: Path, branches: Sequence[Path]) -> bool:
 
 
 def relate_folders(folders: Sequence[Path]) -> list[Path]:
-    """``relate`` every finished sweep among ``folders`` to the branches in the others; the files written.
+    """Relate every finished sweep among ``folders`` to the branches in the others; returns the files written.
 
-    Raises FolderError if one of the others holds no out-of-phase branch, or a file cannot be used.
+    A curve over the amplitude is laid over the branch of its law and reading, or of its law alone if there is none of
+    its reading; what could not be related is named in the attribute ``left_out``. Raises FolderError if one of the
+    other folders holds no out-of-phase branch, or a file cannot be used.
     """
     sweeps = [f for f in folders if (f / "ensemble.h5").exists()]
     branches = [f for f in folders if f not in sweeps]
@@ -218,7 +208,7 @@ def relate_folders(folders: Sequence[Path]) -> list[Path]:
     written = []
     for folder in sweeps if branches else ():
         try:
-            written.append(relate(open_ensemble(folder), branches))
+            written.append(_relate(open_ensemble(folder), branches))
         except (KeyError, OSError, ValueError) as error:
             raise FolderError(f"{folder} beside {', '.join(map(str, branches))}: {error}") from None
     return [path for path in written if path]

@@ -58,7 +58,14 @@ def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> 
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
     lam, eta = options.lam.values(), options.eta.values()
     searches = {reading: search(reading, lam, eta, wavenumber) for reading in options.readings}
-    values = _grids(searches)
+    results = list(searches.values())
+    bands = np.arange(1, results[0].frequency.shape[-1] + 1)
+    values: dict[str, Any] = {"reading": list(searches), "lambda": results[0].lam, "eta": results[0].eta}
+    values |= {"cost": list(COSTS), "wavenumber": wavenumber, "band": bands, "dof": bands}
+    for name in ("frequency", "signed_deflection", "speed"):
+        values[name] = np.stack([getattr(result, name) for result in results])
+    values["out_of_phase"] = np.stack([result.out_of_phase for result in results]).astype(np.int8)
+    values |= {name: np.stack([result.cost(name) for result in results]) for name in COSTS}
     values |= _optima(searches, values)
     paper = (search(reading, *PAPER, wavenumber) for reading in options.readings)
     values["paper_value"] = np.array([[result.cost(name).item() for name in COSTS] for result in paper])
@@ -68,18 +75,6 @@ def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> 
     data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
     write_netcdf(folder / "design.h5", data)
     return _table(data)
-
-
-def _grids(searches: Mapping[Reading, Search]) -> dict[str, Any]:
-    """Bands and costs over the grid."""
-    first = next(iter(searches.values()))
-    bands = np.arange(1, first.frequency.shape[-1] + 1)
-    values: dict[str, Any] = {"reading": list(searches), "lambda": first.lam, "eta": first.eta, "cost": list(COSTS)}
-    values |= {"wavenumber": first.wavenumber, "band": bands, "dof": bands}
-    for name in ("frequency", "signed_deflection", "speed", "out_of_phase"):
-        values[name] = np.stack([getattr(result, name) for result in searches.values()])
-    values["out_of_phase"] = values["out_of_phase"].astype(np.int8)
-    return values | {name: np.stack([result.cost(name) for result in searches.values()]) for name in COSTS}
 
 
 def _optima(searches: Mapping[Reading, Search], grids: Mapping[str, Any]) -> dict[str, np.ndarray]:

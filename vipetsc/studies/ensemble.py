@@ -102,7 +102,8 @@ def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Out
     failed = [f"{m.index}: {o.reason}" for m, o in zip(members, outcomes, strict=True) if o.status == FAILED]
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
     about |= {"case": plan.to_toml(), "failed": failed}
-    write_netcdf(folder / "ensemble.h5", xr.Dataset(data | _fits(plan, data), attrs=about))
+    data |= _fits(data, names[AMPLITUDE]) if AMPLITUDE in names else {}
+    write_netcdf(folder / "ensemble.h5", xr.Dataset(data, attrs=about))
 
 
 def _rows(members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> list[dict[str, Any]]:
@@ -136,22 +137,20 @@ def _table(rows: Sequence[dict[str, Any]], name: str, shape: tuple[int, ...]) ->
     return table.reshape(*shape, *longest)
 
 
-def _fits(plan: Sweep, data: Variables) -> Variables:
-    """Power laws over the amplitude from the peak on; entropies are normalised to [.01, 1] first, as the paper's."""
+def _fits(data: Variables, along: str) -> Variables:
+    """Power laws over the amplitude, the coordinate ``along``, from the peak on.
+
+    Entropies are normalised to [.01, 1] first, as the paper's.
+    """
     fits: Variables = {}
-    axis = next((axis for axis in plan.axes if AMPLITUDE in axis.keys), None)
-    if axis is None:
-        return fits
-    along = plan.axes.index(axis)
-    amplitude = np.array(axis.values[axis.keys.index(AMPLITUDE)], float)
+    amplitude = data[along].values.astype(float)
     for name in FITTED:
         if name in data:
-            curves = np.moveaxis(data[name].values, along, -1)
-            others = [str(dim) for i, dim in enumerate(data[name].dims) if i != along]
-            rows = [fit_curve(amplitude, curve, name != "ibtet") for curve in curves.reshape(-1, len(amplitude))]
+            curves = data[name].transpose(..., *data[along].dims)
+            rows = [fit_curve(amplitude, y, name != "ibtet") for y in curves.values.reshape(-1, len(amplitude))]
             for key, about in FIT.items():
                 table = np.array([row[key] for row in rows]).reshape(curves.shape[:-1])
-                fits[f"fits/{name}/{key}"] = variable(others, table, *about)
+                fits[f"fits/{name}/{key}"] = variable(curves.dims[:-1], table, *about)
     return fits
 
 

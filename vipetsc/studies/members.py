@@ -26,7 +26,7 @@ from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import field_time, open_run
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest, on_root
-from vipetsc.studies.analysis import FULL, REDUCED, analyse
+from vipetsc.studies.analysis import FULL, analyse
 
 # A member is scaled where its linear wave stays below this share of every clearance: the largest w between samples
 # exceeds the sampled envelope by less than the rest for any burst of a few cycles.
@@ -60,8 +60,7 @@ class MemberStore:
     ) -> None:
         self.folder, self.options = folder, options or SweepTable.model_validate({})
         self.team, self.stop = team, stop or StopRequest()
-        asked = [MEASURES[name] for name in self.options.measures]
-        self.measures = FULL if self.options.fields else tuple(m for m in REDUCED if m in asked)
+        self.measures = FULL if self.options.fields else [MEASURES[name] for name in self.options.measures]
         self._linear: dict[Path, tuple[xr.Dataset, xr.Dataset]] = {}  # ledgers and measures that scaled members share
         self._requested = {"measures": sorted(self.options.measures), "fields": self.options.fields}
 
