@@ -2,6 +2,8 @@
 
 import json
 
+from mpi4py import MPI
+
 import h5py
 import numpy as np
 import pytest
@@ -12,8 +14,17 @@ from vipetsc.case import Case, Sweep, case_id
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.lattice import four_band
+from vipetsc.parallel import StopRequest
 from vipetsc.studies.ensemble import MISSING, fit_curve
-from vipetsc.studies.members import MemberStore, arrival_at, leading_cell, linear_wave, reached
+from vipetsc.studies.members import (
+    MemberStore,
+    arrival_at,
+    leading_cell,
+    linear_folder,
+    linear_wave,
+    reached,
+    read_wave,
+)
 from vipetsc.studies.sweep import conclude
 
 SWEEP = {
@@ -38,7 +49,7 @@ def measure(case):
 def folder(tmp_path):
     """A finished sweep whose members were not simulated, but have what an ensemble is made of."""
     plan = Sweep.from_table(SWEEP)
-    store, members = MemberStore(tmp_path, plan.options), plan.members()
+    store, members = MemberStore(tmp_path, plan.options, MPI.COMM_SELF, StopRequest()), plan.members()
     for number, member in enumerate(members):
         path = tmp_path / member.id
         path.mkdir()
@@ -106,12 +117,12 @@ def test_a_linear_wave_arrives_with_its_host():
 
 
 def test_a_linear_wave_of_another_version_is_made_again(tmp_path, monkeypatch):
-    case, store = Case.load(), MemberStore(tmp_path)
-    assert store.wave(case) is None
-    folder = store.linear_folder(case)
+    case = Case.load()
+    assert read_wave(tmp_path, case) is None
+    folder = linear_folder(tmp_path, case)
     folder.mkdir(parents=True)
     values = {"cell": [1, 2], "envelope": ("cell", [1.0, 2.0]), "arrival": ("cell", [0.1, 0.2])}
     write_netcdf(folder / "wave.h5", xr.Dataset(values, attrs={"vipetsc_version": vipetsc.__version__}))
-    assert store.wave(case, current=True)["arrival"].values.tolist() == [0.1, 0.2]
+    assert read_wave(tmp_path, case, current=True)["arrival"].values.tolist() == [0.1, 0.2]
     monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
-    assert store.wave(case) is not None and store.wave(case, current=True) is None
+    assert read_wave(tmp_path, case) is not None and read_wave(tmp_path, case, current=True) is None

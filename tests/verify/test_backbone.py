@@ -7,11 +7,11 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vipetsc.case import Case, case_id
+from vipetsc.case import Case
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
 from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, align, initiation_of, read_slope, relate_folders
-from vipetsc.studies.members import linear_case
+from vipetsc.studies.members import linear_folder
 
 GRAZING = 0.03
 EXPONENT = -0.9
@@ -38,7 +38,7 @@ def test_energies_align_at_grazing(tmp_path):
     slope, envelope = branch(), np.zeros(20)
     envelope[[16, 8]] = 2e-4, 1e-4
     case = Case.builtin(["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
-    linear = tmp_path / "linear" / case_id(linear_case(case))
+    linear = linear_folder(tmp_path, case)
     linear.mkdir(parents=True)
     with h5py.File(linear / "wave.h5", "w") as wave, h5py.File(linear / "run.h5", "w") as run:
         wave["envelope"], run["energy/work"] = envelope, [0.0, 1.5e-3]

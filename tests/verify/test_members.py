@@ -1,13 +1,17 @@
 """Members of a sweep are scaled where nothing touches, and simulated where something may."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 
 from vipetsc.case import Case, Sweep
+from vipetsc.case.sweep import SweepTable
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, select
+from vipetsc.parallel import StopRequest
 from vipetsc.studies.ensemble import COMPLETE, SCALED
-from vipetsc.studies.members import MemberStore, reached
+from vipetsc.studies.members import MemberStore, reached, read_wave
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = {
@@ -24,9 +28,8 @@ def sweep(tmp_path_factory):
     """Amplitudes at which the linear wave reaches .6, .85, 1.02, 1.1, 1.25 and 3 times the nearest clearance."""
     folder = tmp_path_factory.mktemp("members")
     case = Case.from_table(TABLE | {"drive": TABLE["drive"] | {"amplitude": 1.0}})
-    store = MemberStore(folder / "wave")
-    store.make_linear(case)
-    one = reached(store.wave(case), case).max()
+    MemberStore(folder / "wave", SweepTable.model_validate({}), MPI.COMM_SELF, StopRequest()).make_linear(case)
+    one = reached(read_wave(folder / "wave", case), case).max()
     shares = np.array([0.6, 0.85, 1.02, 1.1, 1.25, 3.0])
     table = TABLE | {"sweep": {"drive": {"amplitude": (shares / one).tolist()}}}
     result = run_sweep(Sweep.from_table(table), folder / "sweep")

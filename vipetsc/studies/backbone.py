@@ -12,12 +12,12 @@ import xarray as xr
 from scipy.optimize import minimize_scalar
 
 import vipetsc
-from vipetsc.case import Case, case_id
+from vipetsc.case import Case
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, open_run
 from vipetsc.spectra import power_law
-from vipetsc.studies.members import leading_cell, linear_case
+from vipetsc.studies.members import leading_cell, linear_folder
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
@@ -88,7 +88,7 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
     the smallest amplitude that touches a site is its clearance over the envelope at 1 N. The envelope is that of
     w^2 + (w'/Om)^2, so it does not depend on where the samples fall.
     """
-    linear = folder / "linear" / case_id(linear_case(case))
+    linear = linear_folder(folder, case)
     sites = np.asarray(case.contacts.sites)
     with open_netcdf(linear / "wave.h5", "linear wave") as wave, open_run(linear / "run.h5") as run:
         touching = np.asarray(case.contacts.clearance) / wave["envelope"].values[sites - 1]

@@ -51,43 +51,24 @@ class MemberStore:
     of all, ``summary.json``; ``linear/<id>/`` the linear runs.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        options: SweepTable | None = None,
-        team: MPI.Comm = MPI.COMM_SELF,
-        stop: StopRequest | None = None,
-    ) -> None:
-        self.folder, self.options = folder, options or SweepTable.model_validate({})
-        self.team, self.stop = team, stop or StopRequest()
+    def __init__(self, folder: Path, options: SweepTable, team: MPI.Comm, stop: StopRequest) -> None:
+        self.folder, self.options, self.team, self.stop = folder, options, team, stop
         self.measures = FULL if self.options.fields else [MEASURES[name] for name in self.options.measures]
         self._linear: dict[Path, tuple[xr.Dataset, xr.Dataset]] = {}  # ledgers and measures that scaled members share
         self._requested = {"measures": sorted(self.options.measures), "fields": self.options.fields}
-
-    def linear_folder(self, case: Case) -> Path:
-        """Where the linear run of ``case`` belongs."""
-        return self.folder / "linear" / case_id(linear_case(case))
-
-    def wave(self, case: Case, current: bool = False) -> xr.Dataset | None:
-        """The linear wave of ``case``; None if it has not been made, by this version of the package if ``current``."""
-        path = self.linear_folder(case) / "wave.h5"
-        if not path.exists():
-            return None
-        with open_netcdf(path, "linear wave", ("envelope", "arrival")) as file:
-            return file.load() if not current or file.attrs.get("vipetsc_version") == vipetsc.__version__ else None
 
     def make_linear(self, case: Case) -> None:
         """Simulate the linear run of ``case``, unless this version has.
 
         Raises StoppedError, or RuntimeError if it does not come out.
         """
-        if on_root(self.team, lambda: self.wave(case, current=True) is not None):
+        if on_root(self.team, lambda: read_wave(self.folder, case, current=True) is not None):
             return
         linear, memory = linear_case(case), RunMemory(self.team)
         self._simulate(linear, memory)
 
         def measure() -> None:
-            folder, run = self.linear_folder(case), memory.dataset
+            folder, run = linear_folder(self.folder, case), memory.dataset
             assert run is not None
             shutil.rmtree(folder, ignore_errors=True)  # what another version left
             folder.mkdir(parents=True)
@@ -148,7 +129,7 @@ class MemberStore:
 
     def _scale(self, case: Case, folder: Path, wave: xr.Dataset) -> None:
         """The member from its linear run: fields go with the amplitude, energies with its square."""
-        source, factor = self.linear_folder(case), case.drive.amplitude**2
+        source, factor = linear_folder(self.folder, case), case.drive.amplitude**2
         # All members with the same first site share these measures, whichever rank needs them first.
         shared = source / f"analysis-{leading_cell(case)}-{'-'.join(sorted(self.options.measures))}.h5"
         if shared not in self._linear:
@@ -204,6 +185,20 @@ def linear_wave(run: xr.Dataset) -> xr.Dataset:
     arrival = field_time(run)[np.argmax(np.abs(velocity[..., host]), axis=0)]
     values = {"cell": np.arange(1, len(envelope) + 1), "envelope": envelope, "arrival": arrival}
     return xr.Dataset(tabulated(LAYOUT, values), attrs={"vipetsc_version": vipetsc.__version__})
+
+
+def linear_folder(sweep: Path, case: Case) -> Path:
+    """Where the folder of a ``sweep`` holds the linear run of ``case``."""
+    return sweep / "linear" / case_id(linear_case(case))
+
+
+def read_wave(sweep: Path, case: Case, current: bool = False) -> xr.Dataset | None:
+    """The linear wave of ``case``; None if it has not been made, by this version of the package if ``current``."""
+    path = linear_folder(sweep, case) / "wave.h5"
+    if not path.exists():
+        return None
+    with open_netcdf(path, "linear wave", ("envelope", "arrival")) as file:
+        return file.load() if not current or file.attrs.get("vipetsc_version") == vipetsc.__version__ else None
 
 
 def reached(wave: xr.Dataset, case: Case) -> np.ndarray:

@@ -23,7 +23,7 @@ from vipetsc.io.read import open_run
 from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_every_rank, on_root
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Outcome, assemble
-from vipetsc.studies.members import MemberStore, StoppedError, arrival_at, reached
+from vipetsc.studies.members import MemberStore, StoppedError, arrival_at, linear_folder, reached, read_wave
 
 FORMAT_VERSION = 1
 # What a member may raise and leave the others to go on: the machine's limits, a solver's or a file's refusal.
@@ -83,10 +83,10 @@ def run_sweep(
 
     cases = {m.id: m.case for m in members if m.case}
     missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_complete(case, current=True)])
-    source = {key: store.linear_folder(cases[key]) for key in missing}
+    source = {key: linear_folder(folder, cases[key]) for key in missing}
     linear = {source[key]: cases[key] for key in missing}
     failures = pool.share(list(linear), lambda path: store.make_linear(linear[path]))
-    stored = on_root(comm, lambda: {path: store.wave(case, current=True) for path, case in linear.items()})
+    stored = on_root(comm, lambda: {path: read_wave(folder, case, current=True) for path, case in linear.items()})
     waves = {path: wave for path, wave in stored.items() if wave is not None}
 
     def cost(key: str) -> float:
@@ -187,7 +187,8 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
 
     def reassemble(folder: Path) -> Path:
         plan = Sweep.load(folder / "case.toml")
-        outcomes = conclude(plan, plan.members(), MemberStore(folder, plan.options), {})
+        store = MemberStore(folder, plan.options, MPI.COMM_SELF, StopRequest())
+        outcomes = conclude(plan, plan.members(), store, {})
         if any(outcome.status == MISSING for outcome in outcomes):
             raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
         return folder / "ensemble.h5"
@@ -216,7 +217,7 @@ def measure_run(folder: Path) -> Path:
     """Write ``folder/analysis.h5`` and return its path; a sweep knows when the wave arrives. Raises as ``open_run``."""
     with open_run(folder / "run.h5") as run:
         case = Case.of(run)
-        arrival = arrival_at(MemberStore(folder.parent).wave(case), case)
+        arrival = arrival_at(read_wave(folder.parent, case), case)
         write_netcdf(folder / "analysis.h5", analyse(run, arrival=arrival))
     return folder / "analysis.h5"
 
