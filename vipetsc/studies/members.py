@@ -77,17 +77,15 @@ class MemberStore:
 
         on_root(self.team, measure)
 
-    def is_complete(self, case: Case, current: bool = False) -> bool:
-        """Whether the member of ``case`` has all that the sweep asks for; if ``current``, made by this version."""
-        summary = self.summary(case)
-        current = not current or summary.get("vipetsc_version") == vipetsc.__version__
-        return current and bool(summary.get("complete")) and self._requested.items() <= summary.items()
+    def summary(self, case: Case, current: bool = False) -> dict[str, Any]:
+        """``summary.json`` of the member of ``case``; empty if it lacks anything that the sweep asks for.
 
-    def summary(self, case: Case) -> dict[str, Any]:
-        """``summary.json`` of the member of ``case``; empty if there is none."""
+        If ``current``, empty too if another version made it.
+        """
         path = self.folder / case_id(case) / "summary.json"
         summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        return summary
+        asked = self._requested | {"complete": True} | ({"vipetsc_version": vipetsc.__version__} if current else {})
+        return summary if asked.items() <= summary.items() else {}
 
     def make(self, case: Case, wave: xr.Dataset) -> None:
         """Simulate the member of ``case``, or scale it; raises as ``make_linear``."""
@@ -108,14 +106,16 @@ class MemberStore:
         result = self._simulate(simulated, output, force=not begun, resume=begun)
 
         def measure() -> None:
-            folder.mkdir(exist_ok=True)
-            summary = provenance(self.team) | {"status": result.sentence, "complete": True}
-            if memory.dataset is not None:
+            if memory.dataset is None:
+                summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            else:
+                folder.mkdir(exist_ok=True)
                 write_netcdf(folder / "run.h5", _keeping(memory.dataset, case))
+                ended = {"status": result.sentence, "complete": True, "statistics": result.statistics}
+                summary = provenance(self.team) | ended
             with open_run(folder / "run.h5") if memory.dataset is None else memory.dataset as run:
                 write_netcdf(folder / "analysis.h5", analyse(run, self.measures, arrival_at(wave, case)))
-            summary["statistics"] = result.statistics
-            self._finish(folder, case, self.summary(case) if whole else summary)
+            self._finish(folder, case, summary)
 
         on_root(self.team, measure)
 
@@ -177,12 +177,10 @@ def linear_wave(run: xr.Dataset) -> xr.Dataset:
     at the first site.
     """
     model = Case.of(run).model()
-    host, resonator = model.chain.cell.host, model.chain.cell.resonator
-    displacement, velocity = run["displacement"].values, run["velocity"].values
-    w = displacement[..., resonator] - displacement[..., host]
-    rate = velocity[..., resonator] - velocity[..., host]
+    cell, fields = model.chain.cell, (run["displacement"].values, run["velocity"].values)
+    w, rate = (field[..., cell.resonator] - field[..., cell.host] for field in fields)
     envelope = np.sqrt(np.max(w**2 + (rate / model.drive.frequency) ** 2, axis=0))
-    arrival = field_time(run)[np.argmax(np.abs(velocity[..., host]), axis=0)]
+    arrival = field_time(run)[np.argmax(np.abs(fields[1][..., cell.host]), axis=0)]
     values = {"cell": np.arange(1, len(envelope) + 1), "envelope": envelope, "arrival": arrival}
     return xr.Dataset(tabulated(LAYOUT, values), attrs={"vipetsc_version": vipetsc.__version__})
 

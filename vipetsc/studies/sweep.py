@@ -82,7 +82,7 @@ def run_sweep(
     store = MemberStore(folder, plan.options, team, stop)
 
     cases = {m.id: m.case for m in members if m.case}
-    missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.is_complete(case, current=True)])
+    missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.summary(case, current=True)])
     source = {key: linear_folder(folder, cases[key]) for key in missing}
     linear = {source[key]: cases[key] for key in missing}
     failures = pool.share(list(linear), lambda path: store.make_linear(linear[path]))
@@ -118,8 +118,7 @@ def conclude(
         outcome = Outcome(MISSING)
         if reason := reasons.get(member.id) or member.problem:
             outcome = Outcome(FAILED, reason)
-        elif member.case and store.is_complete(member.case):
-            summary = store.summary(member.case)
+        elif member.case and (summary := store.summary(member.case)):
             status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
             outcome = Outcome(status, summary["status"], summary["statistics"])
         outcomes.append(outcome)
