@@ -37,7 +37,7 @@ def lattice(slope, divisor, floor, initiation, count=60):
 def test_energies_align_at_grazing(tmp_path):
     slope, envelope = branch(), np.zeros(20)
     envelope[[16, 8]] = 2e-4, 1e-4
-    case = Case.builtin(["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
+    case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
     linear = linear_folder(tmp_path, case)
     linear.mkdir(parents=True)
     with h5py.File(linear / "wave.h5", "w") as wave, h5py.File(linear / "run.h5", "w") as run:
