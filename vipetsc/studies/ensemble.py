@@ -150,7 +150,7 @@ def _fits(data: Variables, along: str) -> Variables:
             rows = [fit_curve(amplitude, y, name != "ibtet") for y in curves.values.reshape(-1, len(amplitude))]
             for key, about in FIT.items():
                 table = np.array([row[key] for row in rows]).reshape(curves.shape[:-1])
-                fits[f"fits/{name}/{key}"] = variable(curves.dims[:-1], table, *about)
+                fits[f"fits/{name}/{key}"] = variable([*map(str, curves.dims[:-1])], table, *about)
     return fits
 
 
