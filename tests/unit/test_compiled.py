@@ -14,7 +14,7 @@ import pytest
 
 import vipetsc
 from vipetsc import compiled
-from vipetsc.dynamics.ts.native import compile_callback
+from vipetsc.dynamics.ts.right_hand_side import compile_callback
 
 ROOT = Path(vipetsc.__file__).parent
 CONSTANTS = """
@@ -112,5 +112,5 @@ def test_every_kernel_is_kept_this_way():
 
 def test_the_callback_of_petsc_is_found_again():
     compile_callback()
-    code = "from vipetsc.dynamics.ts.native import compile_callback; print(compile_callback().cache_hits)"
+    code = "from vipetsc.dynamics.ts.right_hand_side import compile_callback; print(compile_callback().cache_hits)"
     assert int(subprocess.check_output([sys.executable, "-c", code], cwd=ROOT.parent)) == 1

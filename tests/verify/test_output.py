@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets, small_case
-from vipetsc.dynamics import recorder as recording
-from vipetsc.dynamics import simulate
+from vipetsc.dynamics import observers, simulate
 from vipetsc.io import store
 from vipetsc.io.atomic import load_arrays, save_arrays
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
@@ -22,7 +21,7 @@ PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
     case = small_case(**sections, time={"end": 0.04})
     simulate(case, folder / "long")
-    monkeypatch.setattr(recording, "CHUNK_SAMPLES", 7)
+    monkeypatch.setattr(observers, "CHUNK_SAMPLES", 7)
     simulate(case, folder / "short")
     assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("long", "short")))
 
@@ -61,7 +60,7 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(store, "put_chunks", fails)
-    monkeypatch.setattr(recording, "CHUNK_SAMPLES", 16)
+    monkeypatch.setattr(observers, "CHUNK_SAMPLES", 16)
     with pytest.raises(OSError, match=r"run\.h5 could not be written; make room and go on with --resume: .*No space"):
         simulate(case, path, force=True)
     assert (path / "run.h5").read_bytes() == before

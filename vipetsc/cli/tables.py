@@ -194,7 +194,7 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     """The checks as a table, and whether all is well; all ranks must call it."""
     from petsc4py import PETSc
 
-    from vipetsc.dynamics.ts import native
+    from vipetsc.dynamics.ts.right_hand_side import compile_callback
 
     scalar = np.dtype(PETSc.ScalarType)
     parallel = "yes" if comm.size > 1 else "under mpirun"
@@ -215,7 +215,7 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     rows = [(name.replace("_version", ""), str(value)) for name, value in provenance(comm).items()]
     rows += [(name, f"MISSING: {remedy}" if value is None else value) for name, value, remedy in checks]
     try:
-        native.compile_callback()
+        compile_callback()
         rows.append(("native right-hand side", "yes"))
     except (AttributeError, OSError) as error:
         rows.append(("native right-hand side", f"no, the Python one is used ({error})"))

@@ -34,15 +34,8 @@ class ImpactTracker:
     """Switches the modes of ``contacts`` at located changes and logs every episode.
 
     ``start`` and ``end`` (sites, 3) hold w, w', w'' at both ends of the step at hand; the engine fills them.
-
-    Parameters
-    ----------
-    contacts
-        The sites, whose modes and approach velocities it sets.
-    numbers
-        (sites,) 0-based numbers of the sites in the log.
-    reduced_mass
-        m_host m_resonator / (m_host + m_resonator) in kg.
+    ``numbers`` (sites,) are those of the sites in the log, from 0; ``reduced_mass`` is m_host m_resonator / (m_host +
+    m_resonator) in kg.
     """
 
     def __init__(self, contacts: Contacts, numbers: Sequence[int], reduced_mass: float) -> None:

@@ -104,11 +104,7 @@ class EnergyMeter:
         burst = model.drive.duration * model.speed  # cells that the packet covers
         scale = sum(model.chain.cell.masses) * speed**2 * max(burst, 1.0)
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
-
-    @property
-    def largest(self) -> float:
-        """Energy in J from which on the sums saturate."""
-        return self.unit * _LARGEST
+        self.largest = self.unit * _LARGEST  # energy in J from which on the sums saturate
 
     def measure(self, state: PETSc.Vec) -> Energies:
         """Energies of ``state``, whose ghosts must be up to date; all ranks must call it."""

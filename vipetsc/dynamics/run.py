@@ -14,9 +14,8 @@ from vipetsc.case import Case, Model
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample, Setup
+from vipetsc.dynamics.observers import Guard, Ledger, Observer, Recorder, RunawayError, Sample, Setup
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import provenance
 from vipetsc.io.store import RunFolder, RunOutput

@@ -37,12 +37,7 @@ def tabulated(layout: Mapping[str, tuple[str, str, str]], values: Mapping[str, A
 def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
     """Write ``data`` to ``path``, whole or not at all; an attribute that is a dict becomes JSON.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    ValueError
-        If a dimension has no coordinate.
+    Raises OSError if the file cannot be written, ValueError if a dimension has no coordinate.
     """
     with atomic_write(Path(path)) as aside, h5py.File(aside, "w") as file:
         put_dataset(file, data)
@@ -83,21 +78,9 @@ def add_variable(
 def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Dataset:
     """The file as a flat dataset, a context manager; values are read where they are used.
 
-    Parameters
-    ----------
-    path
-        The file.
-    kind
-        What it should be, for messages: "run", "branch".
-    needs
-        Variables (by path), groups and root attributes without which it is no such file.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened as HDF5.
-    ValueError
-        If it is not of this kind.
+    ``kind`` says what it should be, "run" or "branch", in messages; ``needs`` are variables (by path), groups and root
+    attributes without which it is no such file. Raises OSError if it cannot be opened as HDF5, ValueError if it is not
+    of this kind.
     """
     try:
         groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)

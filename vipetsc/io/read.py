@@ -57,14 +57,8 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
 
     A dimension is named after its axis' first key; further keys of a zipped axis are coordinates on it. ``member`` is
     the name of each member's folder, empty where the case of a member is no valid one; the attribute ``folder`` is
-    the sweep's.
-
-    Raises
-    ------
-    OSError
-        If ``ensemble.h5`` or ``index.json`` cannot be read.
-    ValueError
-        If it is no ensemble of ours.
+    the sweep's. Raises OSError if ``ensemble.h5`` or ``index.json`` cannot be read, ValueError if it is no ensemble of
+    ours.
     """
     folder = Path(folder)
     with open_netcdf(folder / "ensemble.h5", "sweep's ensemble", ("status", "case")) as file:
@@ -82,12 +76,7 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
     """The first member of ``data`` with these values of swept keys, on each of their axes; other axes stay.
 
     ``select(ensemble, law="hertz", sites=5, cycles=30)["ibtet"]``. Keys of one zipped axis have to meet in one
-    member; numbers match to a relative 1e-5.
-
-    Raises
-    ------
-    KeyError
-        If a name is no coordinate, or no member has the values.
+    member; numbers match to a relative 1e-5. Raises KeyError if a name is no coordinate, or no member has the values.
     """
     matches: dict[str, np.ndarray] = {}
     for name, value in wanted.items():

@@ -16,8 +16,7 @@ from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, corre
 from vipetsc.contact.tracker import Episode, ImpactTracker
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout, create_record
-from vipetsc.dynamics.ts.native import register
-from vipetsc.dynamics.ts.right_hand_side import observe, right_hand_side
+from vipetsc.dynamics.ts.right_hand_side import observe, register, right_hand_side
 from vipetsc.parallel import StopRequest
 
 # PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
@@ -27,8 +26,6 @@ STRETCH = 1.08
 MOST_TRIALS = 200_000
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
-# What is counted.
-COUNTS = ("steps", "rejected", "landings", "switches")
 
 
 class Integrator(Engine):
@@ -53,7 +50,7 @@ class Integrator(Engine):
         self.comm = layout.comm
         self.lattice = create_record(model, layout)
         self.tracker = ImpactTracker(self.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
-        self.counts = dict.fromkeys(COUNTS, 0)
+        self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
         self.time = 0.0
         self.state = layout.create_vector()
         self.saved = self.state.duplicate()
@@ -256,7 +253,7 @@ class Integrator(Engine):
         self.time = float(checkpoint["time"])
         self.step, self.free_step, any_open = checkpoint["steps"].tolist()
         self._any_open = bool(any_open)
-        self.counts = dict(zip(COUNTS, checkpoint["counts"].tolist(), strict=True))
+        self.counts = dict(zip(self.counts, checkpoint["counts"].tolist(), strict=True))
         self.ts.restartStep()
         self.observe(self.tracker.start)
 
