@@ -30,8 +30,7 @@ from vipetsc.dynamics.propagator.collocation import (
 )
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
-from vipetsc.dynamics.propagator.free_motion import apply_impulses, evaluate, expand_free_motion, shift
-from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.series import StepSeries, apply_impulses, evaluate, expand_free_motion, shift
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, gather
 
 ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])

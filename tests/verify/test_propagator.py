@@ -11,8 +11,7 @@ from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.propagator.collocation import collocation
-from vipetsc.dynamics.propagator.free_motion import first_onset
-from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.series import StepSeries, first_onset
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import Chain
 

@@ -16,7 +16,7 @@ less than the tolerance. Both bounds and the entries dropped within the band mak
 no term exceeds the result by much, and the series is as good as rounding allows (Moler and Van Loan 2003). Cells at
 least r from an end share one stencil; the others have rows of their own.
 
-**2. Free motion of the contact DoFs** (``free_motion``). A DoF x = c u is the relative displacement w of a
+**2. Free motion of the contact DoFs** (``series``). A DoF x = c u is the relative displacement w of a
 site or the driven mass's displacement. Its rows c (-A)^m give its free motion x(s) = sum_k a_k s^k beforehand: a site
 with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k (k - 1) |a_k| bounds w by a parabola: on the side sigma
 one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and such steps
@@ -37,7 +37,7 @@ which h is controlled. After the substep the a_i are shifted to its end, and the
 **4. Changes** (``advance``). Substeps are searched for changes of a site's mode on the quintic Hermite interpolant of w
 and repeated so that they end on the first one: see ``vipetsc.contact``.
 
-**5. What forces leave in the lattice** (``free_motion``). K and M are symmetric, and so is (-A)^m M^-1: the motion
+**5. What forces leave in the lattice** (``series``). K and M are symmetric, and so is (-A)^m M^-1: the motion
 after an impulse on a DoF, (-A)^m M^-1 c^T = M^-1 (c (-A)^m)^T, has the rows of 2 again (Maxwell's reciprocity). With
 the moments mu_k = integral of F (1 - s)^k dt over the step,
 

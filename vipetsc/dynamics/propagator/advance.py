@@ -23,7 +23,7 @@ from vipetsc.dynamics.propagator.collocation import (
     evaluate_site_motion,
     update_taylor,
 )
-from vipetsc.dynamics.propagator.free_motion import ROUNDING, first_onset, shift
+from vipetsc.dynamics.propagator.series import ROUNDING, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, or without progress.
 DONE, CHANGED, FAILED = range(3)
@@ -68,11 +68,9 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     fastest = cluster.omega_max_h
     if cluster.taylor.shape[0] > sites.size:
         fastest += cluster.burst.frequency * (1.0 + 1.0 / cluster.burst.cycles) * cluster.interval
-    length = min(1.0 - state.position, (SEARCHED if sites.size > 0 else DRIVEN) / fastest)
+    length = min(1.0 - state.position, state.length, (SEARCHED if sites.size > 0 else DRIVEN) / fastest)
     if trial.active.size > trial.closed.size:
         length = min(length, state.drive_end - state.position)
-    if trial.closed.size > 0:
-        length = min(length, state.length)
     longest = length
     for i in trial.closed:
         # A young contact's force goes as the root of its age.
@@ -168,9 +166,8 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
     depth = max(side * start[0], side * end[0]) - cluster.contacts.sites[i].clearance
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]
-    force, smallest = max(first, last), min(first, last)
     inside = -side * trial.force[i]
-    smallest = min(smallest, inside.min())
+    force, smallest = max(first, last), min(first, last, inside.min())
     if inside.max() > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
         # A turn lies inside.
         depth, force, smallest = extremes(cluster.contacts, i, cluster.site_motion, trial.site_motion, seconds)

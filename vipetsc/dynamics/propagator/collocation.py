@@ -15,8 +15,7 @@ from scipy.special import binom
 from vipetsc.compiled import njit
 from vipetsc.contact.law import Contacts, contact_force
 from vipetsc.dynamics.layout import Burst, drive_force
-from vipetsc.dynamics.propagator.free_motion import evaluate, shift
-from vipetsc.dynamics.propagator.series import MOST_TERMS
+from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
 
 NODES = 8
 PLAIN, ONSET, EXIT = range(3)

@@ -17,11 +17,12 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, FAILED, advance_cluster
 from vipetsc.dynamics.propagator.collocation import Cluster
 from vipetsc.dynamics.propagator.forces import Forces, group_dofs, select_cluster
-from vipetsc.dynamics.propagator.free_motion import DofTables, apply_impulses, expand_free_motion
-from vipetsc.dynamics.propagator.series import LARGEST_OMEGA_H, StepSeries
+from vipetsc.dynamics.propagator.series import DofTables, StepSeries, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, gather
 from vipetsc.parallel import StopRequest
 
+# Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
+LARGEST_OMEGA_H = 3.2
 # Steps a sample interval may be cut into.
 MOST_PARTS = 16
 # Sites of one cluster beyond which plain time stepping costs less.
@@ -122,8 +123,6 @@ class Propagator(Engine):
         assert series is not None, "refused"
         self.series = series
         self._layout, self._stop = layout, stop or StopRequest()
-        self._interval = model.sample_interval
-        self._parts = round(model.sample_interval / series.interval)
         self._halo = HaloRegions(layout)
         self._forces = Forces(model, layout, series, self._halo)
         self._stencil = create_stencil(series, layout, self._halo)
@@ -131,7 +130,8 @@ class Propagator(Engine):
         self._halo.bind_columns()
         self._components = np.zeros((2, layout.size + layout.dofs * len(ghosts)))
         self._states = [layout.create_vector(components) for components in self._components]
-        self._record = States(self._components, layout.owned, len(ghosts), self._parts, self._interval)
+        parts = round(model.sample_interval / series.interval)
+        self._record = States(self._components, layout.owned, len(ghosts), parts, model.sample_interval)
         self._status = np.zeros(2)
         self._start(0)
 
@@ -171,7 +171,7 @@ class Propagator(Engine):
 
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s, a multiple of the sample interval; see ``Engine``."""
-        last = round(target / self._interval) * self._parts
+        last = round(target / self._record.sample_interval) * self._record.parts
         while self.steps < last:
             for event, cluster, now in self._events:
                 if event != CHANGED:

@@ -19,8 +19,7 @@ from vipetsc.contact.tracker import LIMITS, Episode, ImpactTracker
 from vipetsc.dynamics.layout import Layout, create_burst
 from vipetsc.dynamics.propagator.advance import ORDER
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation
-from vipetsc.dynamics.propagator.free_motion import DofTables
-from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.series import DofTables, StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
@@ -116,7 +115,7 @@ class Forces:
         self._clusters = [select_cluster(self.clusters, self.dofs, c) for c in range(len(groups))]
         self.trackers = []
         for group, cluster in zip(groups, self._clusters, strict=True):
-            sites = [dof for dof in group if dof >= 0]
+            sites = group[: cluster.contacts.sites.size]
             self.trackers.append(ImpactTracker(cluster.contacts, sites, model.chain.cell.reduced_mass))
             self.trackers[-1].start = cluster.site_motion
 

@@ -126,19 +126,17 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
         at = halo.add(begin, 2 * r if a < b else 0)
         ends += [series.stencil(series.rows(cell, begin, 2 * r)).transpose(1, 2, 0) for cell in range(a, b)]
         end_cells += [(at, cell - start) for cell in range(a, b)]
-    starts, rows, offsets, values = [0], [], [], []
+    starts, terms = [0], []  # (row, offset, value)
     for entry in series.interior():
         row, column = np.nonzero(entry)
-        padding = [0] * (-len(row) % GROUP)
-        rows += row.tolist() + padding
-        offsets += (column - r).tolist() + padding
-        values += entry[row, column].tolist() + padding
-        starts.append(len(rows))
+        terms += [*zip(row, column - r, entry[row, column], strict=True)] + [(0, 0, 0.0)] * (-len(row) % GROUP)
+        starts.append(len(terms))
+    rows, offsets, values = map(np.array, zip(*terms, strict=True))
     return Stencil(
-        starts=np.array(starts),
-        rows=np.array(rows),
-        offsets=np.array(offsets),
-        values=np.array(values, float),
+        np.array(starts),
+        rows,
+        offsets,
+        values,
         pieces=np.array(pieces, np.int64).reshape(-1, 4),
         ends=np.array(ends).reshape(-1, 2 * layout.dofs, 2 * r, 2 * layout.dofs),
         end_cells=np.array(end_cells, np.int64).reshape(-1, 2),
