@@ -13,7 +13,7 @@ v(T/2; u0, 0) = 0. If f is odd the orbit u(t + T/2) = -u(t) passes the centre u 
 The whole period is there for comparison: its condition is 1e6 times worse. n equations for n + 1 unknowns: a branch.
 
 **Variational equations.** S' = [[0, I], [-M^-1 (K + f'(u)), 0]] S is integrated beside the orbit (``flow``; ``dop853``:
-Dormand and Prince's pair, Hairer et al. 1993; ``tsrk``: PETSc; ``newmark``: the paper's rule). At a contact change
+Dormand and Prince's pair, Hairer et al. 1993; ``reference``: PETSc's, Newmark's rule). At a contact change
 h(u) = |w| - D = 0 the slope f' jumps, and S passes it with the saltation matrix (Leine and Nijmeijer 2004, ch. 7)
 
     S+ = (I + (g+ - g-) grad h^T / (grad h^T g-)) S-,
@@ -29,8 +29,8 @@ stable; c = 1 is a fold of the energy or a branch point; c = -1 breaks the symme
 (others); c = 0 doubles the period of a quarter's orbit (``special`` locates them by arclength and switches branches).
 dE along the tangent vanishes at energy folds, dT at frequency folds.
 
-**Continuation.** Keller (1977): from a point with unit tangent t in the unknowns xi of a ``chart`` (of order one, so
-that an arclength means something) the next one solves H(xi) = 0 and t . (xi - xi0) = s, by Newton's method of PETSc's
+**Continuation.** Keller (1977): from a point with unit tangent t in the unknowns xi of a chart (of order one, so that
+an arclength means something) the next one solves H(xi) = 0 and t . (xi - xi0) = s, by Newton's method of PETSc's
 SNES. The tangent is the null vector of dH/dxi. Charts scale: ``relative`` (gaps over the clearance), ``logarithmic``,
 ``grazing`` (a root of w - D in place of w: an orbit that starts on its largest |w| depends on w - D through one).
 Narrow tongues of internal resonances lie close together, and a residual cannot tell a jump from one arc to another.
