@@ -364,6 +364,24 @@ def test_steps_have_the_arclength_that_they_say(short_branch):
         assert tangent @ chord / np.linalg.norm(tangent) == pytest.approx(b.step, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("bound", "sentence"),
+    [
+        ({"energy": [0.0, 0.0294]}, "left the energy range 0 to 0.0294 J"),
+        ({"frequency": [0.0, 474.5]}, "left the frequency range 0 to 474.5 Hz"),
+        ({"points": 3}, "3 points reached: raise nnm.points and resume to go on"),
+    ],
+)
+def test_a_branch_ends_at_its_bounds_and_says_so(bound, sentence):
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
+    growing = Continuation(problem, linear_start(problem, 1, 0.02), NnmTable(**bound))
+    points = list(growing)
+    assert (growing.ending, growing.finished) == (sentence, "points" not in bound)
+    ((name, limit),) = bound.items()
+    outside = [i for i, p in enumerate(points, 1) if name != "points" and getattr(p, name) > limit[1]]
+    assert outside == ([] if name == "points" else [len(points)])
+
+
 def test_guards_are_what_the_points_obey(short_branch):
     """No step strains a guard beyond its bound; some are held back by the half-trace, and the first by none."""
     guards = Guards()
