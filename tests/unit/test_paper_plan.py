@@ -15,7 +15,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import make
 from vipetsc.paper.figures import TRANSFER
 from vipetsc.paper.make import read_record
-from vipetsc.paper.plan import CLAIMS, DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
+from vipetsc.paper.plan import DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
 from vipetsc.studies.design import search_design
 
 ROOT = Path(__file__).parents[2]
@@ -49,7 +49,8 @@ SMALL = ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11")
 @pytest.fixture
 def searched(tmp_path) -> tuple[Plan, Path]:
     """A plan of the search alone, done."""
-    step = next(step for step in paper_plan(FULL).steps if step.name == "design").changed(*SMALL)
+    step = next(step for step in paper_plan(FULL).steps if step.name == "design")
+    step = replace(step, changes=SMALL)
     search_design(step.case, tmp_path / "design")
     plan = paper_plan(FULL)
     return replace(plan, steps=(step,), figures=[f for f in plan.figures if f.id in ("figS3", "fig10")]), tmp_path
@@ -87,7 +88,7 @@ def test_another_version_of_the_package_is_another_input(searched, monkeypatch):
 
 def test_another_case_is_another_input_and_a_stale_step(searched):
     plan, root = searched
-    step = plan.steps[0].changed("design.eta.count=4")
+    step = replace(plan.steps[0], changes=(*SMALL, "design.eta.count=4"))
     assert step.state(root) == STALE
     assert step.identity(root) != plan.steps[0].identity(root)
     assert plan.steps[0].state(root / "none") == MISSING
@@ -122,7 +123,7 @@ def test_fingerprints_tell_parts_apart():
 def test_the_plan_names_what_it_does_not_know():
     with pytest.raises(FolderError, match=r"--only fig99 C18: figures are fig01"):
         paper_plan(FULL).only(["fig99", "C18", "C1"])
-    assert paper_plan(FULL).only(["c1"]).figures and CLAIMS[-1] == "C17"
+    assert paper_plan(FULL).only(["c1"]).figures
 
 
 def test_a_search_is_done_when_its_file_has_its_case(searched):

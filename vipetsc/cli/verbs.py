@@ -169,7 +169,7 @@ def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
         return DONE
     stop = StopRequest().install()
     result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
-    if result.stopped:
+    if result is None:
         echo(comm, "stopped on request; the same command goes on")
         return FAILED
     echo(comm, claims_table(result.claims))

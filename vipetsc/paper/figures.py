@@ -38,15 +38,6 @@ class Part:
     schematic: str = ""
     arguments: Sequence[Any] = ()
 
-    def offers(self, folders: Mapping[str, Path]) -> Iterator[Drawing]:
-        """Stems and drawings that the ``folders`` (step -> folder) of finished steps allow."""
-        for reading in READINGS if self.schematic else ():
-            yield f"{self.stem}-{reading}", partial(SCHEMATICS[self.schematic], reading, *self.arguments)
-        finished = [folders[step] for step in self.steps if step in folders]
-        for stem, make in drawings(FIGURES[self.figure].source, finished, [self.figure]) if finished else ():
-            if all(f"-{word}-" in f"{stem}-" for word in self.only):
-                yield self.stem.format(stem=stem), make
-
 
 @dataclass(frozen=True)
 class PaperFigure:
@@ -68,16 +59,15 @@ class PaperFigure:
         """The steps whose results the figure shows."""
         return tuple(dict.fromkeys(step for part in self.parts for step in part.steps))
 
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """``steps`` and those that their results are made from."""
-        return (*self.steps, *(RELATED if any(part.figure == "ibtet_backbone" for part in self.parts) else ()))
-
     def offers(self, folders: Mapping[str, Path]) -> Iterator[Drawing]:
         """The stems and drawings that the ``folders`` (step -> folder) of finished steps allow."""
         for part in self.parts:
-            for stem, make in part.offers(folders):
-                yield f"{self.id}-{stem}", make
+            for reading in READINGS if part.schematic else ():
+                yield f"{self.id}-{part.stem}-{reading}", partial(SCHEMATICS[part.schematic], reading, *part.arguments)
+            finished = [folders[step] for step in part.steps if step in folders]
+            for stem, make in drawings(FIGURES[part.figure].source, finished, [part.figure]) if finished else ():
+                if all(f"-{word}-" in f"{stem}-" for word in part.only):
+                    yield f"{self.id}-{part.stem.format(stem=stem)}", make
 
 
 def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:

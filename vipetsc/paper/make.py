@@ -35,14 +35,13 @@ Record = dict[str, Any]
 class PaperResult:
     """What was done: steps ``made``, files ``drawn``; the rows of ``claims.json``.
 
-    ``complete``: every step asked for is there, without failures. ``stopped``: it was asked to leave early.
+    ``complete``: every step asked for is there, without failures.
     """
 
     made: tuple[str, ...]
     drawn: tuple[Path, ...]
-    claims: tuple[dict[str, Any], ...]
+    claims: list[dict[str, Any]]
     complete: bool
-    stopped: bool
 
 
 def make_paper(
@@ -53,8 +52,8 @@ def make_paper(
     only: Sequence[str] = (),
     stop: StopRequest | None = None,
     tell: Tell = lambda text: None,
-) -> PaperResult:
-    """Make what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``.
+) -> PaperResult | None:
+    """Make what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``; None if asked to leave early.
 
     Leaves ``<step>/`` for every step, ``figures/`` (PNG and PDF), ``claims.json`` and ``report.html``. A call that
     was stopped or killed is gone on with by the next one; one with nothing to do takes seconds.
@@ -68,19 +67,18 @@ def make_paper(
     root, stop, part = Path(root), stop or StopRequest(), plan.only(only)
     on_root(comm, lambda: _claim(plan, root))
     made = _make_steps(part, root, comm, stop, tell)
-    drawn: tuple[Path, ...] = ()
-    if not comm.allreduce(stop.requested, MPI.LOR):
-        on_root(comm, lambda: _relate(plan.folders(root)))
-        drawn = draw_paper(part, root, comm, stop, tell)
     if comm.allreduce(stop.requested, MPI.LOR):
-        return PaperResult(made, drawn, (), False, True)
+        return None
+    on_root(comm, lambda: _relate(plan.folders(root)))
+    drawn = draw_paper(part, root, comm, stop, tell)
+    if comm.allreduce(stop.requested, MPI.LOR):
+        return None
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
 
     def is_complete(step: Step) -> bool:
         return step.state(root) == DONE and not step.statistics(root).get("failed")
 
-    complete = on_root(comm, lambda: all(map(is_complete, part.steps)))
-    return PaperResult(made, drawn, claims, complete, False)
+    return PaperResult(made, drawn, claims, on_root(comm, lambda: all(map(is_complete, part.steps))))
 
 
 def _claim(plan: Plan, root: Path) -> None:
@@ -126,8 +124,7 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: 
     The ranks draw pictures from one count, so that they end together whatever a picture costs; none is begun after
     a request to stop.
     """
-    folders = on_root(comm, lambda: plan.folders(root))
-    record = on_root(comm, lambda: _drop_stale(plan, root))
+    folders, record = on_root(comm, lambda: (plan.folders(root), _drop_stale(plan, root)))
     if comm.rank == 0:
         tell("figures")
     counter = SharedCounter(comm)
@@ -175,7 +172,7 @@ def _write_record(root: Path, record: Record) -> None:
         write_text(root / MADE, json.dumps(record, indent=1) + "\n")
 
 
-def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[str, Any], ...]:
+def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> list[dict[str, Any]]:
     """``claims.json`` and ``report.html`` as far as their inputs changed; returns the claims."""
     record, inputs = read_record(root), plan.inputs(root)["claims"]
     path, report = root / "claims.json", root / "report.html"
@@ -195,7 +192,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> tuple[dict[
         write_report(report, plan.note, json.loads(text), pictures, statistics, versions)
         record["report"] = inputs
     _write_record(root, record)
-    return tuple(json.loads(text))
+    return json.loads(text)
 
 
 def duration(seconds: float) -> str:

@@ -6,7 +6,7 @@ How far each step has come, and what figures and claims are made from.
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
@@ -26,6 +26,7 @@ from vipetsc.io.read import open_ensemble
 from vipetsc.modes.follow import follow_all, prepare_folder
 from vipetsc.modes.system import System
 from vipetsc.paper.claims import measure_claims
+from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.design import search_design
@@ -33,11 +34,10 @@ from vipetsc.studies.sweep import run_sweep
 
 FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"
-CLAIMS = tuple(f"C{number}" for number in range(1, 18))
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
 RELATION = "backbone.h5"  # beside a sweep that is laid over branches
 
-# Steps that a claim is measured from besides those of the figures that show it.
+# Steps that a claim is measured from, and figures that bear on it are drawn from, besides those that these show.
 FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
 
 StepCase = Sweep | NnmCase | DesignCase
@@ -61,10 +61,6 @@ class Step:
     def folder(self, root: Path) -> Path:
         """Where the step's files are."""
         return root / self.name
-
-    def changed(self, *changes: str) -> Self:
-        """The same step with further changes to its case."""
-        return replace(self, changes=(*self.changes, *changes))
 
     @cached_property
     def case(self) -> StepCase:
@@ -156,22 +152,20 @@ class Plan:
     note: str = ""
     measure: Callable[[Path], Sequence[Mapping[str, Any]]] = measure_claims
 
-    def only(self, ids: Iterable[str]) -> Self:
+    def only(self, ids: Sequence[str]) -> Self:
         """The part of the plan that figures and claims need; all of it without ``ids``; raises FolderError."""
-        ids = list(ids)
         if not ids:
             return self
         names = {figure.id.lower() for figure in self.figures}
         unknown = [i for i in ids if i.lower() not in names and i.upper() not in CLAIMS]
         if unknown:
-            raise FolderError(
-                f"--only {' '.join(unknown)}: figures are {', '.join(f.id for f in self.figures)}; "
-                f"claims are {CLAIMS[0]} to {CLAIMS[-1]}"
-            )
-        claims, wanted = {i.upper() for i in ids}, {i.lower() for i in ids}
+            known = f"figures are {', '.join(f.id for f in self.figures)}; claims are C1 to C{len(CLAIMS)}"
+            raise FolderError(f"--only {' '.join(unknown)}: {known}")
+        wanted, claims = {i.lower() for i in ids}, {i.upper() for i in ids}
         figures = [f for f in self.figures if f.id.lower() in wanted or claims & set(f.claims)]
-        needed = {step for figure in figures for step in figure.needs}
-        needed |= {step for claim in claims for step in FURTHER_STEPS.get(claim, ())}
+        shown = claims.union(*(figure.claims for figure in figures))
+        needed = {step for figure in figures for step in figure.steps}
+        needed = needed.union(*(FURTHER_STEPS.get(claim, ()) for claim in shown))
         return replace(self, steps=tuple(s for s in self.steps if s.name in needed), figures=figures)
 
     def folders(self, root: Path) -> Mapping[str, Path]:
@@ -182,7 +176,7 @@ class Plan:
         """The claims that rest on a step."""
         claims = {claim for figure in self.figures if step.name in figure.steps for claim in figure.claims}
         claims |= {claim for claim, steps in FURTHER_STEPS.items() if step.name in steps}
-        return sorted(claims, key=CLAIMS.index)
+        return [claim for claim in CLAIMS if claim in claims]
 
     def inputs(self, root: Path) -> dict[str, str]:
         """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
@@ -214,24 +208,23 @@ def _sweep_statistics(folder: Path) -> dict[str, Any]:
     ensemble = open_ensemble(folder)
     status = ensemble["status"].values
     counts = {name: int((status == code).sum()) for code, name in enumerate(("simulated", "scaled", "failed"))}
-    return {"members": int(status.size)} | counts | {
+    return counts | {
+        "members": status.size,
         "episodes": int(np.nansum(ensemble["contact_episodes"].values)),
         "ledger": float(np.nanmax(ensemble["ledger_error"].values, initial=0.0)),
-        "cpu": float(sum(_cpu_times(folder))),
-    }  # fmt: skip
+        "cpu": sum(_cpu_times(folder)),
+    }
 
 
 def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
     """Points, largest residual and endings of the branches, and how many of them failed."""
-    points, residual, endings = 0, 0.0, []
+    residuals, endings = [], []
     for path in paths:
         with open_netcdf(path, "branch", ("kind", "residual", "ending")) as branch:
-            regular = branch["residual"].values[branch["kind"].values == 0]
-            points += len(regular)
-            residual = max(residual, float(regular.max(initial=0.0)))
+            residuals.extend(branch["residual"].values[branch["kind"].values == 0].tolist())
             endings.append(f"{branch.attrs['name']}: {branch.attrs['ending']}")
     failed = sum("failed" in ending for ending in endings)
-    return {"points": points, "residual": residual, "endings": endings, "failed": failed}
+    return {"points": len(residuals), "residual": max(residuals, default=0.0), "endings": endings, "failed": failed}
 
 
 def _cpu_times(folder: Path) -> list[float]:

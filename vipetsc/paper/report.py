@@ -4,6 +4,8 @@ import base64
 import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -35,16 +37,15 @@ def write_report(
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.loader = PackageLoader("vipetsc.paper", ".")
     environment.filters |= {"numbers": numbers, "sources": sources, "picture": picture, "describe": describe}
-    rows = by_reading(claims)
-    readings = [r for r in READINGS if any(claim["reading"] == r for claim in claims)]
-    verdicts = {r: Counter(claim["verdict"] for claim in claims if claim["reading"] == r) for r in readings}
+    verdicts = Counter((claim["reading"], claim["verdict"]) for claim in claims)
+    readings = [r for r in READINGS if any(reading == r for reading, _ in verdicts)]
     page = environment.get_template("report.html").render(
         note=note,
         pictures=pictures,
         versions=versions,
-        rows=rows,
+        rows=by_reading(claims),
         readings=readings,
-        counts={r: [(v, verdicts[r][v]) for v in VERDICTS if verdicts[r][v]] for r in readings},
+        counts={r: [(v, verdicts[r, v]) for v in VERDICTS if verdicts[r, v]] for r in readings},
         figure_of={claim: figure for figure, _ in reversed(pictures) for claim in figure.claims},
         sweeps={name: row for name, row in statistics.items() if "members" in row},
         branches={name: row for name, row in statistics.items() if "points" in row},
@@ -62,20 +63,15 @@ def picture(path: Path) -> tuple[int, int, str]:
     return *small.size, "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
 
 
-def numbers(value: Any) -> list[str]:
-    """Named numbers, or one of them, as short texts; those that could not be had are left out."""
-    named = value if isinstance(value, Mapping) else {"": value}
-    return [f"{name} = {_text(v)}" if name else _text(v) for name, v in named.items() if v is not None]
+def numbers(named: Mapping[str, float | None]) -> list[str]:
+    """Numbers with their names as short texts; those that could not be had are left out."""
+    return [f"{name} = {value:.4g}" for name, value in named.items() if value is not None]
 
 
 def sources(files: Sequence[str]) -> str:
     """The steps that ``files`` belong to, with how many of each."""
     counts = Counter(name.partition("/")[0] for name in files)
     return ", ".join(step if n == 1 else f"{step} ({n} files)" for step, n in counts.items())
-
-
-def _text(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
 
 
 def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
@@ -90,7 +86,4 @@ def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
 
 def by_reading(claims: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Mapping[str, Any]]]:
     """The rows of ``claims.json`` by id and reading."""
-    rows: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for claim in claims:
-        rows.setdefault(claim["id"], {})[claim["reading"]] = claim
-    return rows
+    return {key: {row["reading"]: row for row in rows} for key, rows in groupby(claims, itemgetter("id"))}
