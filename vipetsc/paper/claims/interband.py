@@ -89,17 +89,14 @@ def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 def bands_sum(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C13: energies of the bands and gaps against the total (App. A3, Fig. A3)."""
-    errors: dict[str, list[float]] = {}
-    for law in LAWS:
-        runs = evidence.runs(AMPLITUDES, reading, "bands", "dispersion", law=law)
-        middle = runs[len(runs) // 2].amplitude
-        for run in runs:
-            for quantity, error in split_errors(run).items():
-                errors.setdefault(quantity, []).append(error)
-    result.value |= {quantity: max(values) for quantity, values in errors.items()}
-    result.uncertainty["runs"] = max(map(len, errors.values()))
+    runs = [run for law in LAWS for run in evidence.runs(AMPLITUDES, reading, "bands", "dispersion", law=law)]
+    errors = [split_errors(run) for run in runs]
+    worst = {quantity: max(error[quantity] for error in errors) for quantity in errors[0]}
+    result.value |= worst
+    result.uncertainty["runs"] = len(runs)
+    middle = sorted(run.amplitude for run in runs)[len(runs) // 2]
     result.figure = f"band_energies-hertz-{reading}-5-sites-30-cycles-{middle:.4g}N"
-    beat = max(errors["mean error at an instant after the drive, largest of the runs"])
+    beat = worst["mean error at an instant after the drive, largest of the runs"]
     text = "the parts are orthogonal over time, not at an instant: their sum beats about the total"
     result.reasons.append(f"{text} by {100 * beat:.2g} % on the average in the worst run")
 
