@@ -69,7 +69,7 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
     """All parts asked for."""
     parts = options.only or PARTS
     found: dict = {"mode": "quick" if options.quick else "full", "rounds": options.rounds, "rows": [], "ratios": {}}
-    found |= {"cells": case.lattice.cells, "degrees_of_freedom": case.lattice.cells * case.unit_cell().dofs}
+    found |= {"cells": case.lattice.cells, "degrees_of_freedom": case.lattice.cells * case.lattice.unit_cell().dofs}
     found |= {"case": case.model_dump(by_alias=True, mode="json")}
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

@@ -8,7 +8,7 @@ import time
 import traceback
 from collections.abc import Callable
 from types import FrameType
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -87,16 +87,12 @@ class SharedCounter:
 
 
 class StopRequest:
-    """Turns SIGTERM and SIGINT into a request that a loop can see; a second one ends the process at once."""
+    """A request to stop that a loop can see: SIGTERM or SIGINT, if ``listening``; a second ends the process at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, listening: bool = False) -> None:
         self.requested = False
-
-    def install(self) -> Self:
-        """Listen from now on; returns itself."""
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in (signal.SIGTERM, signal.SIGINT) if listening else ():
             signal.signal(number, self._receive)
-        return self
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         self.requested = True

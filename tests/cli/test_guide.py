@@ -83,7 +83,7 @@ def test_the_guide_has_bands_a_run_a_sweep_a_branch_and_python(desk):
 def test_what_the_guide_says_of_its_lattice_is_so(desk):
     case = Case.load(desk / "my-lattice.toml")
     assert case.drive.frequency == pytest.approx(936, abs=0.5)
-    assert case.unit_cell().dofs == 3
+    assert case.lattice.unit_cell().dofs == 3
     assert len(Sweep.load(desk / "my-lattice.toml").members()) == 7
     assert System.from_case(NnmCase.load(desk / "my-lattice.toml")).branch_name(1) == "out-of-phase"
     with h5py.File(desk / "runs/my-lattice/run.h5") as file:

@@ -51,7 +51,7 @@ def put_sweep(folder, table, content, episodes, work=lambda case: case.drive.amp
             for name, value in content(member.case).items():
                 file[name] = value
                 if name == "bands/energy":
-                    file[name].attrs["parts"] = list(Parts.of(pass_bands(member.case.unit_cell())).names)
+                    file[name].attrs["parts"] = list(Parts.of(pass_bands(member.case.lattice.unit_cell())).names)
         statistics = {"episodes": episodes(member.case), "work": work(member.case), "dissipated": 0.0}
         outcomes.append(Outcome(COMPLETE, "", statistics | {"ledger_error": 0.0}))
     index = {"members": [{"id": m.id} for m in members]}
@@ -420,7 +420,7 @@ def put_scattering(root, new, back, beside=0.0, error=0.006):
 
     def content(case):
         level = amplitudes.index(case.drive.amplitude)
-        model, cell = case.model(), case.unit_cell()
+        model, cell = case.model(), case.lattice.unit_cell()
         time = np.linspace(0, 4 * model.drive.duration, 400)  # the site is 1.5 of them away
         late = time > 1.5 * model.drive.duration
         share = np.where(late[:, None], (1 - new[level]) * packet() + new[level] / len(WAVES), packet())
@@ -579,7 +579,7 @@ def test_medium_amplitude_fills_the_upper_bands(tmp_path, shares, expected):
 
 def tones(case, time, energies):
     """Velocity (t, cell, dof) of travelling waves with the given ``energies`` (rad/s -> J)."""
-    masses, cells = np.asarray(case.unit_cell().masses), case.lattice.cells
+    masses, cells = np.asarray(case.lattice.unit_cell().masses), case.lattice.cells
     v = 0
     for number, (frequency, energy) in enumerate(energies.items(), 1):
         phase = 2 * np.pi * 3 * number * np.arange(cells) / cells
@@ -594,7 +594,7 @@ def noise(case, time):
 
 def on_an_edge(case, time):
     """A tone at the upper edge of band 2 that beats in all cells together."""
-    edge = pass_bands(case.unit_cell())[1].high
+    edge = pass_bands(case.lattice.unit_cell())[1].high
     return (np.cos(20 * time) * np.sin(edge * time))[:, None, None] * np.ones((case.lattice.cells, 4))
 
 
@@ -624,7 +624,7 @@ def put_bands(root, velocity, change):
     """Bands of runs that move as ``velocity`` (case, time) says, with ``change`` done to the energies of the parts."""
 
     def content(case):
-        parts, masses = Parts.of(pass_bands(case.unit_cell())), np.asarray(case.unit_cell().masses)
+        parts, masses = Parts.of(pass_bands(case.lattice.unit_cell())), np.asarray(case.lattice.unit_cell().masses)
         time = np.arange(1500) * 2.5e-4
         v = velocity(case, time)
         spectrum = dispersion(v, masses, time[1]).folded()
@@ -671,8 +671,8 @@ def test_a_beat_across_an_edge_shows_over_a_period_and_not_over_the_record(tmp_p
 
 def test_energy_ends_in_its_own_band(tmp_path):
     case = Case.from_table({"lattice": {"preset": "four-band", "cells": 30}})
-    time, parts = np.arange(1500) * 2.5e-4, Parts.of(pass_bands(case.unit_cell()))
-    energy = part_energies(in_two_bands(case, time), case.unit_cell().masses, time[1], parts.edges).mean(axis=1)
+    time, parts = np.arange(1500) * 2.5e-4, Parts.of(pass_bands(case.lattice.unit_cell()))
+    energy = part_energies(in_two_bands(case, time), case.lattice.unit_cell().masses, time[1], parts.edges).mean(axis=1)
     share = dict(zip(parts.names, energy / energy.sum(), strict=True))
     assert share["band 2"] == pytest.approx(0.7, abs=0.005) and share["band 3"] == pytest.approx(0.3, abs=0.005)
 

@@ -42,7 +42,7 @@ def test_a_key_may_be_written_in_one_piece():
 
 def test_ranges():
     plan = read("[sweep.drive]\namplitude = { log = [0.1, 10], count = 3 }\nfrequency = { linear = [1, 2], count = 5 }")
-    amplitude, frequency = (axis.values[0] for axis in plan.axes)
+    amplitude, frequency = (next(iter(axis.values())) for axis in plan.axes)
     assert amplitude == pytest.approx([0.1, 1.0, 10.0], rel=1e-15)
     assert frequency == (1.0, 1.25, 1.5, 1.75, 2.0)
 
@@ -118,7 +118,7 @@ def test_one_impossible_member_does_not_spoil_the_others():
 @settings(max_examples=50)
 def test_a_range_has_its_ends_and_rises(first, ratio, count, kind):
     plan = read(f"[sweep.drive]\namplitude = {{ {kind} = [{first!r}, {first * ratio!r}], count = {count} }}")
-    values = np.array(plan.axes[0].values[0])
+    values = np.array(plan.axes[0]["drive.amplitude"])
     assert len(values) == count
     assert values[[0, -1]] == pytest.approx([first, first * ratio], rel=1e-12)
     steps = np.diff(np.log(values) if kind == "log" else values)

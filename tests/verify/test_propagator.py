@@ -283,7 +283,7 @@ def cases(draw) -> Case:
     }
     case = Case.from_table(table)
     clearance = case.model().scale * draw(st.floats(0.05, 1.0))
-    nyquist = np.pi / pass_bands(case.unit_cell())[-1].high
+    nyquist = np.pi / pass_bands(case.lattice.unit_cell())[-1].high
     table["contacts"]["clearance"] = clearance
     table["time"]["sample_interval"] = nyquist * draw(st.floats(0.1, 0.95))
     return Case.from_table(table)

@@ -284,9 +284,9 @@ def test_the_linear_ridge_lies_on_the_bloch_branch(folder):
     )
     simulate(case, folder / "run")
     data = datasets(folder / "run" / "run.h5")
-    spectrum = fourier.dispersion(data["velocity"], case.unit_cell().masses, case.model().sample_interval)
+    spectrum = fourier.dispersion(data["velocity"], case.lattice.unit_cell().masses, case.model().sample_interval)
     wavenumbers, ridge = fourier.ridge(spectrum)
-    branch = bloch(case.unit_cell(), np.abs(wavenumbers)).frequency[:, 1]
+    branch = bloch(case.lattice.unit_cell(), np.abs(wavenumbers)).frequency[:, 1]
     assert len(wavenumbers) > 10
     assert np.max(np.abs(ridge / branch - 1)) < 1e-3
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid
-from vipetsc.case.resolve import check_lattice, check_sites, resolved, site_cells, wave_speed, with_preset
+from vipetsc.case.resolve import build_chain, check_lattice, check_sites, resolved, site_cells, wave_speed, with_preset
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, TimeTable
 from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
@@ -85,17 +85,11 @@ class Case(CaseFile):
         if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
             yield Problem("output.window", window, f"must be [first, last] within cells 1 to {length}")
 
-    def unit_cell(self) -> UnitCell:
-        """The unit cell, from the preset in its reading or from ``[lattice.cell]``."""
-        return self.lattice.unit_cell()
-
     def model(self) -> Model:
         """The case in the terms of ``vipetsc.lattice``."""
-        lattice, contacts, drive, time = self.lattice, self.contacts, self.drive, self.time
-        clearances = contacts.clearance if isinstance(contacts.clearance, list) else []
-        sites = contacts.sites if isinstance(contacts.sites, list) else []
+        contacts, drive, time = self.contacts, self.drive, self.time
         assert drive.frequency is not None and time.end != "traverse" and time.sample_interval != "auto"
-        chain = Chain(self.unit_cell(), lattice.cells, lattice.ends, tuple(c - 1 for c in sites), tuple(clearances))
+        chain = build_chain(self.lattice, contacts)
         burst = ToneBurst(drive.amplitude, drive.frequency, drive.cycles, drive.envelope)
         scale = chain.wave_scale(burst, drive.cell - 1, drive.mass - 1)
         if time.atol == "scaled":

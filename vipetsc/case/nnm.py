@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.resolve import check_lattice, check_sites, clearances, site_cells, with_default_preset
+from vipetsc.case.resolve import check_lattice, check_sites, site_cells, with_default_preset
 from vipetsc.case.schema import PRESETS, ContactsTable, Finite, LatticeTable, Positive
-from vipetsc.lattice import Chain, Contact, contact_stiffness
+from vipetsc.lattice import Contact, contact_stiffness
 
 
 class LinearSpringTable(Section):
@@ -148,16 +148,6 @@ class NnmCase(CaseFile):
         given = PRESETS[self.lattice.preset or "four-band"].contacts | self.contacts.model_dump(exclude_none=True)
         material = given["modulus"], given["radius"], given["poisson"]
         return Contact(given["law"], float(given.get("stiffness") or contact_stiffness(*material)))
-
-    def clearance(self) -> float:
-        """The clearance in m of the reduced model's contact."""
-        return clearances(self.lattice, self.contacts, 1)[0]
-
-    def chain(self) -> Chain:
-        """The lattice with its contact sites."""
-        sites = tuple(c - 1 for c in site_cells(self.lattice, self.contacts))
-        gaps = tuple(clearances(self.lattice, self.contacts, len(sites)))
-        return Chain(self.lattice.unit_cell(), self.lattice.cells, self.lattice.ends, sites, gaps)
 
 
 def _check_options(nnm: NnmTable) -> Iterator[Problem]:

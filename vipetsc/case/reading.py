@@ -6,12 +6,11 @@ case is a subclass that declares the sections it reads.
 """
 
 import copy
-import dataclasses
 import difflib
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
 
@@ -165,7 +164,7 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
                 break
             except ValueError:  # not TOML; not a number such as .5
                 continue
-        problems += [dataclasses.replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
+        problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
     return table, problems
 
 

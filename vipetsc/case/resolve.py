@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc.case.reading import Problem, Table
 from vipetsc.case.schema import PRESETS, ContactsTable, LatticeTable, Span
-from vipetsc.lattice import UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import cell_problems
 
 # A key of a case file takes the place of these keys of the preset.
@@ -70,6 +70,13 @@ def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> li
         return []
     first, last = (given.first, given.last) if given else PRESETS[str(lattice.preset)].clearance_span(count)
     return [float(clearance) for clearance in np.geomspace(first, last, count)]
+
+
+def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
+    """The lattice with its contact sites."""
+    sites = site_cells(lattice, contacts)
+    gaps = clearances(lattice, contacts, len(sites))
+    return Chain(lattice.unit_cell(), lattice.cells, lattice.ends, tuple(c - 1 for c in sites), tuple(gaps))
 
 
 def check_lattice(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:

@@ -15,6 +15,8 @@ from vipetsc.case.case import Case, case_id
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.schema import number
 
+Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
+
 
 class SweepTable(Section):
     """What is done with the members of a sweep, besides the keys that vary.
@@ -28,14 +30,6 @@ class SweepTable(Section):
     fields: bool = False
     ranks: int = Field(1, ge=1)
     zip: list[list[str]] = Field([])
-
-
-@dataclass(frozen=True)
-class Axis:
-    """Keys that vary together: ``values[i][j]`` is what key ``keys[i]`` takes at the j-th index."""
-
-    keys: tuple[str, ...]
-    values: tuple[tuple[Any, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -57,7 +51,7 @@ class Sweep(CaseFile):
 
     table: Table
     options: SweepTable
-    axes: tuple[Axis, ...]
+    axes: tuple[Values, ...]
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -73,7 +67,7 @@ class Sweep(CaseFile):
         sections = Case.model_fields.keys() - {"name"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
-        values: dict[str, tuple[Any, ...]] = {}
+        values: Values = {}
         for key, value in _leaves(varying):
             try:
                 values[key] = _values(value)
@@ -88,13 +82,13 @@ class Sweep(CaseFile):
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of values on every axis."""
-        return tuple(len(axis.values[0]) for axis in self.axes)
+        return tuple(len(next(iter(axis.values()))) for axis in self.axes)
 
     def to_toml(self) -> str:
         """The sweep as TOML, every range written out; reading it back gives the same sweep."""
         section = self.options.model_dump()
         for axis in self.axes:
-            for key, values in zip(axis.keys, axis.values, strict=True):
+            for key, values in axis.items():
                 put(section, key, list(values))
         return tomli_w.dumps(self.table | {"sweep": section})
 
@@ -114,19 +108,14 @@ class Sweep(CaseFile):
     def _case_at(self, index: tuple[int, ...]) -> Case:
         table = copy.deepcopy(self.table)
         for axis, i in zip(self.axes, index, strict=True):
-            for key, values in zip(axis.keys, axis.values, strict=True):
+            for key, values in axis.items():
                 if problems := put(table, key, copy.deepcopy(values[i])):
                     raise CaseError(problems, self.name)
         return Case.from_table(table)
 
-    @property
-    def figures(self) -> bool:
-        """Whether the case asks for pictures, ``[output] figures``."""
-        return bool(self.table.get("output", {}).get("figures", True))
-
     def names(self) -> dict[str, str]:
         """A short name for every key that varies: its last part, or all of it where that is not unique."""
-        keys = [key for axis in self.axes for key in axis.keys]
+        keys = [key for axis in self.axes for key in axis]
         short = {key: key.removesuffix(".count").rpartition(".")[2] for key in keys}
         common = {name for name in short.values() if list(short.values()).count(name) > 1}
         return {key: key.replace(".", "_") if name in common else name for key, name in short.items()}
@@ -159,7 +148,7 @@ def _values(value: Any) -> tuple[Any, ...]:
     return tuple((np.geomspace if kind == "log" else np.linspace)(first, last, count).tolist())
 
 
-def _axes(values: dict[str, tuple[Any, ...]], groups: list[list[str]]) -> tuple[tuple[Axis, ...], list[Problem]]:
+def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:
     """One axis a key, or a group of keys that vary together."""
     problems: list[Problem] = []
     group_of: dict[str, tuple[str, ...]] = {}
@@ -175,7 +164,7 @@ def _axes(values: dict[str, tuple[Any, ...]], groups: list[list[str]]) -> tuple[
     if problems:
         return (), problems
     axes = dict.fromkeys(group_of.get(key, (key,)) for key in values)
-    return tuple(Axis(keys, tuple(values[key] for key in keys)) for keys in axes), []
+    return tuple({key: values[key] for key in keys} for keys in axes), []
 
 
 def coordinate(values: Iterable[Any]) -> np.ndarray:

@@ -70,8 +70,7 @@ def main(arguments: list[str]) -> int:
     try:
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
-        code: int = options.function(options, MPI.COMM_WORLD)
-        return code
+        return int(options.function(options, MPI.COMM_WORLD))
     except (CaseError, FolderError) as error:
         verbs.echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return verbs.BAD_INPUT

@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
     case = _load(Case, options, comm)
     for warning in on_root(comm, case.warnings):
         echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
-    folder, stop = _output(options, case.name), StopRequest().install()
+    folder, stop = _output(options, case.name), StopRequest(listening=True)
     result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
     echo(comm, tables.run_table(result))
     if result.resumable:
@@ -71,9 +71,9 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
 
     plan = _load(Sweep, options, comm)
     folder = _output(options, plan.name)
-    result = run_sweep(plan, folder, comm, force=options.force, stop=StopRequest().install(), progress=True)
+    result = run_sweep(plan, folder, comm, force=options.force, stop=StopRequest(listening=True), progress=True)
     echo(comm, tables.sweep_table(result))
-    if plan.figures and (folder / "ensemble.h5").exists():
+    if plan.table.get("output", {}).get("figures", True) and (folder / "ensemble.h5").exists():
         echo_paths(comm, draw_source("sweep", [folder], comm))
     return DONE if result.complete else FAILED
 
@@ -118,7 +118,7 @@ def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
     def report() -> str:
         from vipetsc.figures.registry import draw_bands
 
-        cell = case.unit_cell()
+        cell = case.lattice.unit_cell()
         folder.mkdir(parents=True, exist_ok=True)
         picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
         numbers = tables.bands_table(cell)
@@ -167,7 +167,7 @@ def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
     if options.list:
         echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
         return DONE
-    stop = StopRequest().install()
+    stop = StopRequest(listening=True)
     result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
     if result is None:
         echo(comm, "stopped on request; the same command goes on")

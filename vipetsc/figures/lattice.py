@@ -47,9 +47,9 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
     figure = style.new_figure(style.PAGE, 2.9 + STRIP * len(sites))
     upper, lower = figure.subfigures(2, 1, height_ratios=(2.9, STRIP * len(sites)))
     left, right = upper.subplots(1, 2, width_ratios=(1.55, 1))
-    draw_unit_cell(left, case.unit_cell())
+    draw_unit_cell(left, case.lattice.unit_cell())
     panel_title(left, f"(a) Unit cell, {case.lattice.reading} reading")
-    band_diagram(right, case.unit_cell(), case.drive.frequency)
+    band_diagram(right, case.lattice.unit_cell(), case.drive.frequency)
     panel_title(right, "(b) Bands; gaps shaded, drive dotted")
     table = case.model_dump(by_alias=True, exclude_none=True, exclude={"contacts": {"clearance"}})
     for i, (axes, count) in enumerate(zip(lower.subplots(len(sites), 1, squeeze=False).flat, sites, strict=True)):

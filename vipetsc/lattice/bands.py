@@ -50,18 +50,12 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)
     frequency = np.sqrt(np.maximum(squared, 0))
     eigenvalue, u = np.linalg.eigh(cell.stiffness_matrix(off_zero) * scale)
-    stiffness_slope = _stiffness_slope(cell, off_zero) * scale
-    eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope @ u).real
+    stiffness_slope = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
+    for mass, offset, other, stiffness in cell.couplings():
+        stiffness_slope[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * off_zero * offset)
+    eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope * scale @ u).real
     group_velocity = eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny)))
     return BlochPoint(frequency, vectors * root[:, None], group_velocity)
-
-
-def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
-    """dK/dkappa (..., dofs, dofs)."""
-    k = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
-    for mass, offset, other, stiffness in cell.couplings():
-        k[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * kappa * offset)
-    return k
 
 
 def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:

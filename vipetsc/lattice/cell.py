@@ -36,8 +36,7 @@ class UnitCell:
     resonator: int
 
     def __post_init__(self) -> None:
-        problems = cell_problems(self.masses, self.springs, self.host, self.resonator)
-        if problems:
+        if problems := cell_problems(self.masses, self.springs, self.host, self.resonator):
             raise ValueError("; ".join(message for _, message in problems))
 
     @property

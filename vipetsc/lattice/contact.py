@@ -13,9 +13,6 @@ from numpy.typing import ArrayLike
 Law = Literal["hertz", "bilinear"]
 Adhesion = Literal["allow", "clip"]
 
-# n of the laws: spheres in elastic contact (Hertz) and a linear stop.
-EXPONENTS = {"hertz": 1.5, "bilinear": 1.0}
-
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
     """kc = 2 E sqrt(R) / (3 (1 - nu^2)) for modulus E in Pa, radius R in m; N/m^(3/2).
@@ -41,8 +38,8 @@ class Contact:
 
     @property
     def exponent(self) -> float:
-        """n of the law; raises KeyError for an unknown one."""
-        return EXPONENTS[self.law]
+        """n of the law, for spheres in elastic contact (Hertz) or a linear stop; raises KeyError for another."""
+        return {"hertz": 1.5, "bilinear": 1.0}[self.law]
 
     @property
     def damping(self) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from vipetsc.case.nnm import NnmCase
+from vipetsc.case.resolve import build_chain, clearances
 from vipetsc.lattice import Chain, Contact, UnitCell
 
 
@@ -91,9 +92,9 @@ class System:
         """The system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
         law, table = case.contact(), case.nnm.custom
         if case.nnm.system == "chain":
-            return cls.from_chain(case.chain(), law)
+            return cls.from_chain(build_chain(case.lattice, case.contacts), law)
         if table is None:
-            return cls.reduced(case.lattice.unit_cell(), case.clearance(), law)
+            return cls.reduced(case.lattice.unit_cell(), clearances(case.lattice, case.contacts, 1)[0], law)
         mass = [None, *range(len(table.masses))]  # the table counts them from 1, and 0 is the ground
         return cls.assemble(
             table.masses,

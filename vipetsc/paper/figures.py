@@ -77,7 +77,7 @@ def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:
 
 def two_masses(reading: str) -> Figure:
     """The reduced model of the four-band cell: host and resonator."""
-    cell = _case("four-band", reading).unit_cell()
+    cell = _case("four-band", reading).lattice.unit_cell()
     masses = cell.masses[cell.host], cell.masses[cell.resonator]
     inner = [s.stiffness for s in cell.springs if {s.start, s.end} == {cell.host, cell.resonator}]
     # Half of the total of springs that are held at their middles, as the paper shares them out.

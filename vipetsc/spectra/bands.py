@@ -88,9 +88,9 @@ def part_energies(velocity: np.ndarray, masses: ArrayLike, interval: float, edge
     return energy
 
 
-def front_arrival(energy: np.ndarray, fraction: float = 0.01) -> int:
-    """First sample at which ``energy`` (t) of one cell exceeds ``fraction`` of its largest value."""
-    return int(np.argmax(energy > fraction * energy.max()))
+def front_arrival(energy: np.ndarray) -> int:
+    """First sample at which ``energy`` (t) of one cell exceeds 1 % of its largest value."""
+    return int(np.argmax(energy > 0.01 * energy.max()))
 
 
 def ibtet(energy: np.ndarray, above: np.ndarray, start: int = 0) -> float:

@@ -71,28 +71,27 @@ def dispersion(
     interval: float,
     *,
     cells: slice = slice(None),
-    samples: slice = slice(None),
     tapers: tuple[float, float] = (TAPER, TAPER),
     lengths: tuple[int, int] | None = None,
     highest: float = np.inf,
 ) -> Dispersion:
     """Energy over wavenumber and frequency by 2-D FFT of mass-weighted velocities, added over the masses.
 
-    ``velocity`` (t, cell, dof) in m/s every ``interval`` s, of which the windows ``cells`` and ``samples`` are taken;
-    ``masses`` (dof) in kg, ones for a plain velocity spectrum. ``tapers``: the fractions of the (time, space) window
-    under cosine flanks at its two ends together. ``lengths``: of the transforms (time, space), zero-padded; by
-    default the next that are fast. Frequencies above ``highest`` (rad/s) are dropped.
+    ``velocity`` (t, cell, dof) in m/s every ``interval`` s, of which the window ``cells`` is taken; ``masses`` (dof)
+    in kg, ones for a plain velocity spectrum. ``tapers``: the fractions of the (time, space) window under cosine flanks
+    at its two ends together. ``lengths``: of the transforms (time, space), zero-padded; by default the next that are
+    fast. Frequencies above ``highest`` (rad/s) are dropped.
 
     Returns the energy on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
     """
-    t, x = (len(range(n)[window]) for n, window in zip(velocity.shape, (samples, cells), strict=False))
+    t, x = len(velocity), len(range(velocity.shape[1])[cells])
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
     frequency = frequency[frequency <= highest]
     window = taper(t, tapers[0])[:, None] * taper(x, tapers[1])
     energy = np.zeros((len(frequency), nx))
     for j, mass in enumerate(np.asarray(masses)):
-        spectrum = fft.rfft(np.asarray(velocity[samples, cells, j]) * window, nt, axis=0)[: len(frequency)]
+        spectrum = fft.rfft(np.asarray(velocity[:, cells, j]) * window, nt, axis=0)[: len(frequency)]
         # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
         spectrum = fft.ifft(spectrum, nx, axis=1, norm="forward")
         energy += mass * (spectrum.real**2 + spectrum.imag**2)

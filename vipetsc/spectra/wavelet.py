@@ -138,13 +138,12 @@ class Bank:
     """
 
     transfer: np.ndarray
-    cells: int
     length: int
 
     def split(self, signal: np.ndarray) -> np.ndarray:
         """Parts (bin, ..., cell) of real signals (..., cell), on the lattice alone."""
         spectrum = fft.rfft(signal, self.length)
-        return np.stack([fft.irfft(t * spectrum, self.length)[..., : self.cells] for t in self.transfer])
+        return np.stack([fft.irfft(t * spectrum, self.length)[..., : signal.shape[-1]] for t in self.transfer])
 
 
 @lru_cache(maxsize=16)
@@ -162,7 +161,7 @@ def filter_bank(cells: int, kc: float = 6.0, normalisation: Normalisation = "ana
         transfer[:, ~low] /= transfer[:, ~low].sum(axis=0)
         transfer[:, low] = np.arange(BINS)[:, None] == 0
     transfer.flags.writeable = False
-    return Bank(transfer, cells, length)
+    return Bank(transfer, length)
 
 
 @dataclass(frozen=True)

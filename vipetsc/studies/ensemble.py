@@ -77,9 +77,9 @@ def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Out
     rows = _rows(members, outcomes, folder)
     names, data = plan.names(), {}
     for axis in plan.axes:
-        for key, values in zip(axis.keys, axis.values, strict=True):
-            data[names[key]] = variable(names[axis.keys[0]], coordinate(values), UNITS.get(key, "1"), key)
-    dims = tuple(names[axis.keys[0]] for axis in plan.axes)
+        for key, values in axis.items():
+            data[names[key]] = variable(names[next(iter(axis))], coordinate(values), UNITS.get(key, "1"), key)
+    dims = tuple(names[next(iter(axis))] for axis in plan.axes)
 
     status = np.array([outcome.status for outcome in outcomes], np.int8).reshape(plan.shape)
     flags = {"flag_values": np.arange(MISSING, dtype=np.int8), "flag_meanings": " ".join(STATUS[:MISSING])}

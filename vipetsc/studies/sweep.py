@@ -125,7 +125,7 @@ def conclude(
         told = {"status": STATUS[outcome.status], "reason": outcome.reason}
         rows.append({"place": member.index, "id": member.id} | told)
     names = plan.names()
-    axes = [{"keys": axis.keys, "names": [names[k] for k in axis.keys], "values": axis.values} for axis in plan.axes]
+    axes = [{"keys": [*axis], "names": [names[k] for k in axis], "values": [*axis.values()]} for axis in plan.axes]
     index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}
     write_text(store.folder / "index.json", json.dumps(index, indent=1) + "\n")
     if all(outcome.status != MISSING for outcome in outcomes):

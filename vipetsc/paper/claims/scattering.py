@@ -63,7 +63,7 @@ def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None
         raise MissingEvidence(f"the run at {triple.low.amplitude:g} N is not linear: {triple.low.episodes} contacts")
     spectrum = Dispersion(*triple.low.arrays("wavenumber", "frequency", "dispersion"))
     wavenumber, frequency = ridge(spectrum)
-    branch = bloch(triple.low.case.unit_cell(), wavenumber).frequency[:, OPTICAL - 1]
+    branch = bloch(triple.low.case.lattice.unit_cell(), wavenumber).frequency[:, OPTICAL - 1]
     frequency_bin, wavenumber_bin = (axis[1] - axis[0] for axis in (spectrum.frequency, spectrum.wavenumber))
     distance = np.abs(frequency - branch) / frequency_bin
     strongest = spectrum.wavenumber[np.argmax(spectrum.energy.sum(axis=1))]
@@ -112,7 +112,7 @@ def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> No
 def _branch_share(run: MeasuredRun) -> float:
     """Share of the 2-D spectrum's energy within ``BESIDE`` times the top edge of a branch."""
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
-    cell = run.case.unit_cell()
+    cell = run.case.lattice.unit_cell()
     distance = np.abs(frequency[None, :, None] - bloch(cell, wavenumber).frequency[:, None, :]).min(axis=2)
     return energy[distance <= BESIDE * pass_bands(cell)[-1].high].sum() / energy.sum()
 
@@ -154,7 +154,7 @@ def _reflected_share(triple: AmplitudeTriple, run: MeasuredRun) -> tuple[float, 
 def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C5: share of the packet in its own wavenumber bins before it meets a site (Fig. 4)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "partition")
-    arrival = triple.distance / max_group_velocity(triple.low.case.unit_cell(), OPTICAL)[2]
+    arrival = triple.distance / max_group_velocity(triple.low.case.lattice.unit_cell(), OPTICAL)[2]
     first, last = NATIVE[0] - 1, NATIVE[-1]
     shares = []
     for run in triple.runs.values():
