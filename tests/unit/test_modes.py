@@ -362,6 +362,7 @@ def test_steps_have_the_arclength_that_they_say(short_branch):
         tangent = np.linalg.solve(chart.derivative(xi), a.tangent)
         chord = chart.encode(b.x, b.period) - xi
         assert tangent @ chord / np.linalg.norm(tangent) == pytest.approx(b.step, rel=1e-6)
+        assert b.index == a.index + 1
 
 
 @pytest.mark.parametrize(
