@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from vipetsc.spectra import from_peak, normalised, power_law
+from vipetsc.spectra import normalised, power_law
 from vipetsc.spectra.fits import r2_adjusted
 
 METHODS = ("log-log", "nonlinear")
@@ -81,18 +81,6 @@ def test_a_fit_that_runs_away_is_nan():
     line, curved = (power_law([1.0, 2.0, 3.0, 3.01], [1e-3, 2e-6, 1e-9, 1.0], method) for method in METHODS)
     assert np.isfinite(line.exponent)
     assert np.isnan([curved.exponent, curved.r2_adjusted, *curved.exponent_interval]).all()
-
-
-def test_the_peak_starts_the_decay():
-    y = np.where(X < 1, 0.01, X**-0.7)
-    order = np.random.default_rng(1).permutation(len(X))
-    law = from_peak(X[order], y[order])
-    assert law == power_law(X[X >= 1], y[X >= 1])
-    assert law.exponent == pytest.approx(-0.7)
-    with pytest.raises(ValueError, match="1 points"):
-        from_peak(X, X)
-    with pytest.raises(ValueError, match="NaN"):
-        from_peak(X, np.where(X < 1, np.nan, y))
 
 
 @settings(max_examples=30)

@@ -85,17 +85,6 @@ def _gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
     return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
 
-def from_peak(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
-    """The power law of the points from the largest ``y`` on, in the order of x; raises as ``power_law``."""
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    order = np.argsort(x, kind="stable")
-    x, y = x[order], y[order]
-    if not y.size or np.isnan(y).any():
-        raise ValueError(f"power law: {y.size} points, {np.isnan(y).sum()} of them NaN; drop those first")
-    peak = int(np.argmax(y))
-    return power_law(x[peak:], y[peak:], method)
-
-
 def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
     """A curve (n) scaled linearly so that it runs from ``low`` to ``high``; NaN stays, and a constant raises."""
     y = np.asarray(y, dtype=float)

@@ -13,7 +13,7 @@ import vipetsc
 from vipetsc.case import Sweep, SweepMember
 from vipetsc.case.sweep import coordinate
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
-from vipetsc.spectra import from_peak, normalised
+from vipetsc.spectra import normalised, power_law
 from vipetsc.studies.analysis import LAYOUT
 
 FORMAT_VERSION = 1
@@ -155,18 +155,19 @@ def _fits(data: Variables, along: str) -> Variables:
 
 
 def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict[str, float]:
-    """The entries of ``FIT`` for one curve over ``amplitude`` in N; NaN where it has no power law."""
+    """The entries of ``FIT`` for one curve over ``amplitude`` in N, a fit from its peak on; NaN where there is none."""
     row = dict.fromkeys(FIT, np.nan)
     valid = np.isfinite(curve)
-    x, y = np.abs(amplitude[valid]), curve[valid]
+    order = np.argsort(np.abs(amplitude[valid]), kind="stable")
+    x, y = np.abs(amplitude[valid])[order], curve[valid][order]
     if len(y) < 3 or np.ptp(y) == 0:
         return row
-    row |= {"peak_amplitude": x[np.argmax(y)], "peak": y.max()}
-    row["points"] = len(y) - int(np.argmax(y[np.argsort(x, kind="stable")]))
+    peak = int(np.argmax(y))
+    row |= {"peak_amplitude": x[peak], "peak": y[peak], "points": len(y) - peak}
     if row["points"] < 3:
         return row
     y = normalised(y) if normalise else y
-    line, curved = from_peak(x, y), from_peak(x, y, "nonlinear")
+    line, curved = power_law(x[peak:], y[peak:]), power_law(x[peak:], y[peak:], "nonlinear")
     low, high = line.exponent_interval
     row |= {"exponent": line.exponent, "exponent_low": low, "exponent_high": high, "factor": line.factor}
     row |= {"r2_log_log": line.r2_adjusted, "r2_nonlinear": curved.r2_adjusted}
