@@ -16,6 +16,7 @@ from vipetsc.paper import make
 from vipetsc.paper.figures import TRANSFER
 from vipetsc.paper.make import read_record
 from vipetsc.paper.plan import DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
+from vipetsc.parallel import StopRequest
 from vipetsc.studies.design import search_design
 
 ROOT = Path(__file__).parents[2]
@@ -113,6 +114,13 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
     old.touch()  # drawn from the inputs of now
     record = make._drop_stale(plan, root)
     assert old.exists() and record == read_record(root)
+
+
+def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
+    stop = StopRequest()
+    stop.requested = True
+    assert make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop) is None
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
 
 
 def test_fingerprints_tell_parts_apart():
