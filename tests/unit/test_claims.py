@@ -620,21 +620,22 @@ def swapped(energy):
     return energy[order]
 
 
-def put_bands(root, velocity, change):
-    """Bands of runs that move as ``velocity`` (case, time) says, with ``change`` done to the energies of the parts."""
+def put_bands(root, velocity, change, laws=LAWS):
+    """Bands of runs that move as ``velocity`` (case, time) says, with ``change`` done to those of the ``laws``."""
 
     def content(case):
         parts, masses = Parts.of(pass_bands(case.lattice.unit_cell())), np.asarray(case.lattice.unit_cell().masses)
         time = np.arange(1500) * 2.5e-4
         v = velocity(case, time)
         spectrum = dispersion(v, masses, time[1]).folded()
+        changed = change if case.contacts.law in laws else as_it_is
         return {
             "time": time,
             "frequency": spectrum.frequency,
             "dispersion": spectrum.energy,
             "bands/edges": parts.edges,
             "bands/total": 0.5 * np.einsum("tcd,d->t", v**2, masses),
-            "bands/energy": change(part_energies(v, masses, time[1], parts.edges)),
+            "bands/energy": changed(part_energies(v, masses, time[1], parts.edges)),
             "ibtet": 0.3,
             "bands/share": np.zeros(len(parts.names)),
         }
@@ -660,6 +661,12 @@ def test_bands_sum_where_the_split_is_right_alone(tmp_path, velocity, change, ex
     sums = measure("C13", tmp_path)
     assert sums.verdict == expected, sums
     assert missed in sums.reason and sums.figure.endswith("calibrated-5-sites-30-cycles-24N")
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_runs_of_one_law_that_do_not_add_up_are_enough(tmp_path, law):
+    put_bands(tmp_path, in_two_bands, overlapping, [law])
+    assert measure("C13", tmp_path).verdict == FAILS
 
 
 def test_a_beat_across_an_edge_shows_over_a_period_and_not_over_the_record(tmp_path):

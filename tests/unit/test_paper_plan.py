@@ -117,10 +117,10 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
 
 
 def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
-    stop = StopRequest()
+    stop, told = StopRequest(), []
     stop.requested = True
-    assert make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop) is None
-    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
+    assert make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop, tell=told.append) is None
+    assert told == [] and [path.name for path in tmp_path.iterdir()] == ["plan.json"]
 
 
 def test_fingerprints_tell_parts_apart():
