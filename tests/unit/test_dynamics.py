@@ -88,3 +88,12 @@ def test_rates_motion_and_energies_are_those_of_the_equations(ends, native):
     assert energies.contact == pytest.approx(float(model.contact.potential(3e-5, 1e-5)), rel=1e-10)
     assert (energies.work, energies.dissipated) == (work, lost.sum())
     engine.destroy()
+
+
+def test_energies_below_the_unit_of_the_sums_add_up():
+    model = small_case().model()
+    layout = Layout(model, MPI.COMM_SELF)
+    meter, state = EnergyMeter(model, layout), layout.create_vector()
+    first = layout.dofs * layout.owned
+    state.array[first : first + layout.owned] = np.sqrt(2 * 0.4 * meter.unit / model.chain.cell.masses[0])
+    assert meter.measure(state).kinetic == pytest.approx(0.4 * meter.unit * layout.owned, rel=1e-10)
