@@ -426,6 +426,9 @@ def test_branch_file_round_trip(short_branch, tmp_path):
     assert (again.ending, again.complete, again.findings) == ("done", True, ["a", "b"])
     rows = list(csv.DictReader(io.StringIO((tmp_path / "branch-out-of-phase.csv").read_text())))
     assert [float(r["energy"]) for r in rows] == [p.energy for p in short_branch.points]
+    told = [(float(r["slope"]), int(r["contacts"]), r["kind"]) for r in rows[1:]]
+    assert told == [(p.slope, p.episodes, p.kind) for p in short_branch.points[1:]]
+    assert [int(r["region"]) for r in rows] == short_branch.regions().tolist()
     assert list(rows[0])[-6:] == ["half_trace", "multiplier_max", "slope", "contacts", "region", "kind"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["branch-out-of-phase.csv", "branch-out-of-phase.h5"]
 

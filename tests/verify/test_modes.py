@@ -305,6 +305,7 @@ def test_without_guards_the_branch_jumps_and_the_detector_says_so():
     assert found
     guarded = [start, *Continuation(problem, start, NnmTable(points=150))]
     assert not list(suspects(guarded))
+    assert not is_jump(problem, guarded[60], guarded[62], control)  # it is followed again with the guards on
 
 
 def test_cubic_benchmark():
