@@ -104,6 +104,7 @@ def test_parts_name_bands_and_gaps():
     assert merged.bands == ((1, 2), (), (3,), ())
     assert merged.edges.tolist() == [0, 3, 5, 6, np.inf]
     assert Parts.of([Band(1, 4.0, 6.0)]).names == ("gap 1", "band 1", "above")
+    assert list(Parts.of([Band(1, 0.0, 5.0), Band(2, 1.0, 3.0), Band(3, 6.0, 7.0)]).edges) == [0, 5, 6, 7, np.inf]
     assert Parts.of([Band(1, 1e-9, 6.0)]).names == ("band 1", "above")  # a free lattice's zero, rounded
 
 
