@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import panel_title
 from vipetsc.io.atomic import atomic_write
 
 _LOOKS = {
@@ -121,7 +120,7 @@ def work_precision_figure(found: dict[str, Any]) -> Figure:
     axes.set_xlabel("relative error of the sampled velocities")
     axes.set_ylabel("CPU time (s)")
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-    panel_title(axes, f"{found['cells']} cells, {found['reference']['end']:g} s, one core")
+    axes.set_title(f"{found['cells']} cells, {found['reference']['end']:g} s, one core")
     return figure
 
 
@@ -143,7 +142,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
     right.set_ylabel("peak memory a rank (GiB)")
     for axes, title in ((left, "(a) time"), (right, "(b) memory")):
         axes.set_xlabel("cells")
-        panel_title(axes, title)
+        axes.set_title(title)
     right.legend(*left.get_legend_handles_labels(), loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
 

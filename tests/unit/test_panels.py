@@ -74,7 +74,7 @@ def test_gaps_are_shaded_and_pass_bands_are_not(axes):
     shaded = [(low, high) for (_, low), (_, high) in spans(axes)]
     np.testing.assert_allclose(shaded, np.array(gaps(bands)) / 1e3)
     *branches, drive = axes.lines
-    assert [to_rgba(line.get_color()) for line in branches] == [to_rgba(c) for c in style.SERIES[:4]]
+    assert [to_rgba(line.get_color()) for line in branches] == [to_rgba(f"C{i}") for i in range(4)]
     assert list(drive.get_ydata()) == [1.0, 1.0]
     for line, band in zip(branches, bands, strict=True):
         assert line.get_ydata().min() == pytest.approx(band.low / 1e3, abs=1e-6)

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib import rcParams
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from vipetsc.case import Case
 from vipetsc.figures.lattice import lattice_page, reduced_model
-from vipetsc.figures.style import DPI, NOTE, draw_each, new_figure, rc_style, save
+from vipetsc.figures.style import NOTE, draw_each, new_figure, rc_style, save
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.figures import PAPER_FIGURES, describe
 from vipetsc.paper.report import numbers, sources
@@ -70,7 +71,7 @@ def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
         figure = new_figure(2, 1)
         figure.subplots().plot([0, 1])
         plain, noted = (imread(save(figure, tmp_path / f"{note or 'plain'}.png", note)) for note in ("", "coarse"))
-    strip = round(NOTE * DPI)
+        strip = round(NOTE * rcParams["savefig.dpi"])
     assert noted.shape[0] == pytest.approx(plain.shape[0] + strip, abs=1)
     assert noted.shape[1] == plain.shape[1]
     assert np.ptp(noted[-strip:, :, :3]) > 0.2

@@ -9,13 +9,10 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import portraits
-from vipetsc.figures.portraits import ContactMotion
+from vipetsc.figures import runs, transfer_curves
 from vipetsc.figures.registry import FIGURES, draw
-from vipetsc.figures.study import read_sweeps
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.transfer import closing_error
-from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
 from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
@@ -67,7 +64,8 @@ def whole(tmp_path_factory):
 def drawn(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     with rc_style():
-        found = {suffix: make() for suffix, make in FIGURES[name].function(read_sweeps(folders))}
+        sweeps = [open_ensemble(folder) for folder in folders]
+        found = {suffix: make() for suffix, make in FIGURES[name].function(sweeps)}
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
     return found
 
@@ -107,7 +105,7 @@ def test_ibtet_shows_the_ensembles_values(reduced):
 
 
 def test_floor_is_that_of_members_without_contact(reduced):
-    found = list(transfer_curves(read_sweeps([reduced])))
+    found = list(transfer_curves.transfer_curves([open_ensemble(reduced)]))
     assert [c.case.contacts.law for c in found] == ["hertz", "bilinear"]
     for curve in found:
         transfer, peak = curve.data["ibtet"].values, curve.data["peak"]
@@ -248,7 +246,7 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     np.testing.assert_array_equal(points[:, 0], ensemble["amplitude"])
     np.testing.assert_array_equal(points[:, 1], ensemble["ibtet"].values.ravel())
     folder = member_folder(ensemble.isel(law=0, amplitude=1))
-    motion = ContactMotion.read(folder)
+    motion = transfer_curves.ContactMotion.read(folder)
     with open_run(folder / "run.h5") as run:
         u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
         w, clearance = u[:, 2] - u[:, 1], run["sites/clearance"].values[0]
@@ -261,13 +259,13 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
 
 
 def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatch):
-    monkeypatch.setattr(portraits, "PERIODS", 0.1)
+    monkeypatch.setattr(transfer_curves, "PERIODS", 0.1)
     folder = member_folder(open_ensemble(whole).isel(law=0, amplitude=1))
     with open_run(folder / "run.h5") as run:
         u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
-    shown = ContactMotion.read(folder).displacement
+    shown = transfer_curves.ContactMotion.read(folder).displacement
     assert np.abs(shown[:, 1] - shown[:, 0]).max() >= np.abs(u[:, 2] - u[:, 1]).max()
-    assert len(shown) < 0.1 * len(u) * portraits.REFINE
+    assert len(shown) < 0.1 * len(u) * runs.REFINE
 
 
 def test_regimes_without_an_ensemble_beside_them(whole):

@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from string import ascii_lowercase
 
 import numpy as np
 import xarray as xr
@@ -10,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, note, panel_title, shade_regions
+from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, note, shade_regions
 from vipetsc.io.netcdf import open_netcdf
 
 NEEDS = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
@@ -44,23 +45,26 @@ def backbone(paths: Sequence[Path]) -> Figure:
         any(str(name).startswith(group) for branch in branches for name in branch.variables)
         for group in ("flows/", "orbits/number")
     )
-    heights = (1.5, 1.0) + (1.0,) * has_flows + (0.95,) * has_orbits
-    figure = style.new_figure(style.COLUMN if len(branches) == 1 else style.PAGE, 1.55 * sum(heights))
-    rows = figure.subfigures(len(heights), len(branches), squeeze=False, height_ratios=heights)
-    for column, branch in enumerate(branches):
-        upper = rows[0, column].subplots()
-        frequency_energy(upper, branch)
+    heights = (1.5, 1.0) + (1.0,) * has_flows
+    tall = sum(heights) + 0.95 * has_orbits
+    figure = style.new_figure(style.COLUMN if len(branches) == 1 else style.PAGE, 1.55 * tall)
+    shares = (sum(heights), 0.95)[: 1 + has_orbits]
+    columns = figure.subfigures(1, len(branches), squeeze=False)[0]
+    for column, tag, branch in zip(columns, ascii_lowercase, branches, strict=False):
+        upper, *lower = column.subfigures(1 + has_orbits, 1, squeeze=False, height_ratios=shares)[:, 0]
+        panels = upper.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+        for axes, draw in zip(panels, (frequency_energy, slope, flow_differences), strict=False):
+            draw(axes, branch)
         # The reading is one of the paper's parameters only, not of a cell or system of one's own.
         table = tomllib.loads(branch.attrs.get("case", ""))
         custom = "cell" in table.get("lattice", {}) or table.get("nnm", {}).get("system") == "own"
         law = table.get("contacts", {}).get("law", "") if len(branches) > 1 else ""
         heading = branch.attrs["name"], law, "" if custom else table.get("lattice", {}).get("reading", "")
-        panel_title(upper, f"({'abcdef'[column]}) {', '.join(filter(None, heading))}")
-        slope(rows[1, column].subplots(), branch)
-        if has_flows:
-            flow_differences(rows[2, column].subplots(), branch)
-        if has_orbits:
-            portraits(rows[-1, column], branch)
+        panels[0].set_title(f"({tag}) {', '.join(filter(None, heading))}")
+        energy = branch["energy"].values
+        panels[-1].set(xscale="log", xlim=(energy.min(), energy.max()), xlabel="energy (J)")
+        for page in lower:
+            portraits(page, branch)
     return figure
 
 
@@ -70,8 +74,6 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
     few = np.isin(kind, list(MARKS)).sum() <= MOST_MARKS
     _shade(axes, branch)
     _line(axes, branch)
-    scale = "log" if frequency.max() > 3 * frequency.min() else "linear"
-    axes.set(xscale="log", yscale=scale, xlabel="energy (J)", ylabel="frequency (Hz)")
     for name, (mark, label) in MARKS.items() if few else ():
         at = kind == name
         if at.any():
@@ -84,11 +86,9 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
                 tip = tongue.isel(point=int(np.argmax(tongue["frequency"].values)))
                 at = float(tip["energy"]), float(tip["frequency"])
                 note(axes, f"{number}:1", at, (1, 3), fontsize=5.5, color=style.GREY, ha="center")
-    axes.plot([], [], color=style.BLUE, label="stable")
-    if np.any(branch["multiplier_max"] > UNSTABLE):
-        axes.plot([], [], color=style.VERMILION, label="unstable")
-    if scale == "log":
-        axes.set_ylim(top=1.8 * frequency.max())  # room for the regions' numerals
+    axes.set(ylabel="frequency (Hz)")
+    if frequency.max() > 3 * frequency.min():
+        axes.set(yscale="log", ylim=(None, 1.8 * frequency.max()))  # room for the regions' numerals
     touched = np.nonzero(branch["contacts"].values > 0)[0]
     if few and touched.size:
         axes.legend(loc="upper left", fontsize=5.5, bbox_to_anchor=(0, 0.93))
@@ -101,11 +101,10 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
 def slope(axes: Axes, branch: xr.Dataset) -> None:
     """|df/dE| over energy at the regular points where contacts act, at all without contact."""
     _shade(axes, branch)
-    energy, touches = branch["energy"].values, branch["contacts"].values > 0
-    shown = (touches | (not touches.any())) & (branch["kind"].values == "regular")
-    axes.plot(energy[shown], np.abs(branch["slope"].values[shown]), color=style.BLUE, lw=0.9)
-    axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel=r"|d$f$/d$E$| (Hz/J)")
-    axes.set_xlim(energy.min(), energy.max())
+    touches = branch["contacts"].values > 0
+    shown = branch.isel(point=(touches | (not touches.any())) & (branch["kind"].values == "regular"))
+    axes.loglog(shown["energy"], np.abs(shown["slope"]), lw=0.9)
+    axes.set_ylabel(r"|d$f$/d$E$| (Hz/J)")
 
 
 def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
@@ -118,11 +117,9 @@ def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
     for name, colour in zip(flows, (style.VERMILION, style.GREEN, style.PURPLE), strict=False):
         for key, face in (("frequency", colour), ("energy", "white")):
             difference = np.maximum(np.abs(branch[f"flows/{name}/{key}_difference"].values), 1e-17)
-            axes.plot(branch[f"flows/{name}/energy"], difference, "o", ms=2.2, mec=colour, mfc=face, mew=0.5,
-                      label=f"{name}: {key}")  # fmt: skip
-    axes.set(xscale="log", yscale="log", xlabel="energy (J)", ylabel="relative difference")
-    axes.set_xlim(float(branch["energy"].min()), float(branch["energy"].max()))
-    axes.set_ylim(top=10.0)  # room for the legend
+            axes.loglog(branch[f"flows/{name}/energy"], difference, "o", ms=2.2, mec=colour, mfc=face, mew=0.5,
+                        label=f"{name}: {key}")  # fmt: skip
+    axes.set(ylabel="relative difference", ylim=(None, 10.0))  # room for the legend
     axes.legend(fontsize=5.5, ncols=2, loc="upper right")
 
 
@@ -133,7 +130,7 @@ def portraits(page: SubFigure, branch: xr.Dataset) -> None:
         return
     orbits = branch.isel(orbit=slice(4))
     regular = branch.isel(point=branch["kind"].values == "regular")
-    grid = page.subplots(1, orbits.sizes["orbit"], squeeze=False)[0]
+    grid = page.subplots(1, orbits.sizes["orbit"], sharey=True, squeeze=False)[0]
     for k, axes in enumerate(grid):
         energy, u, v = (orbits[f"orbits/{name}"].values[k] for name in ("energy", "displacement", "velocity"))
         closed = np.append(np.arange(len(u)), 0)
@@ -144,8 +141,6 @@ def portraits(page: SubFigure, branch: xr.Dataset) -> None:
         region = REGIONS[int(regular["region"][nearest])]
         axes.set_title(f"{region}\n{energy:.2g} J", loc="center", fontsize=7)
         axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
-        if k:
-            axes.set_yticklabels([])
     grid[0].set_ylabel(r"$\dot u$/max")
     page.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
 
@@ -154,8 +149,10 @@ def _line(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
     """The branch, blue where stable and vermilion where not."""
     energy, frequency = branch["energy"].values, branch["frequency"].values
     unstable = branch["multiplier_max"].values > UNSTABLE
-    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2)
-    axes.plot(energy, np.where(unstable, frequency, np.nan), color=style.VERMILION, lw=width * 1.3, zorder=3)
+    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label="stable")
+    if unstable.any():
+        line = {"color": style.VERMILION, "lw": 1.3 * width, "zorder": 3, "label": "unstable"}
+        axes.plot(energy, np.where(unstable, frequency, np.nan), **line)
 
 
 def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
@@ -165,13 +162,12 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     last = int(folds[-1]) if folds.size else first
     last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
     last = min(max(last, first + 3), len(energy) - 1)
-    start = max(first - 1, 0)
+    near = branch.isel(point=slice(max(first - 1, 0), last + 1))
     inset = axes.inset_axes([0.55, 0.1, 0.41, 0.36])
-    _line(inset, branch, 0.9)
-    at = folds[(folds >= start) & (folds <= last)]
-    inset.plot(energy[at], frequency[at], "o", ms=2.5, **HOLLOW)
-    x, y = energy[start : last + 1], frequency[start : last + 1]
-    inset.set(xlim=(x.min() - 0.15 * np.ptp(x), x.max() + 0.1 * np.ptp(x)), ylim=(y.min() - 0.1 * np.ptp(y), y.max()))
+    _line(inset, near, 0.9)
+    at = near["kind"].values == "fold-energy"
+    inset.plot(near["energy"][at], near["frequency"][at], "o", ms=2.5, **HOLLOW)
+    inset.margins(0.1)
     inset.tick_params(labelsize=5, pad=1.5)
     inset.locator_params(axis="both", nbins=3)
     inset.set_title("grazing", fontsize=6, pad=1.5)
@@ -182,4 +178,3 @@ def _shade(axes: Axes, branch: xr.Dataset) -> None:
     energy, region = branch["energy"].values, branch["region"].values
     if np.any(region == 3):
         shade_regions(axes, energy, region, energy[region == region.min()].min(), at_top=True)
-        axes.set_xlim(energy.min(), energy.max())

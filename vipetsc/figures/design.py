@@ -1,7 +1,5 @@
 """The (lambda, eta) search: Bloch deflections, cost maps with optima, dispersion against the parameters (Fig. S3)."""
 
-from itertools import cycle
-
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
@@ -9,7 +7,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import KAPPA, colour_bar, draw_map, panel_title
+from vipetsc.figures.panels import KAPPA, colour_bar, draw_map
 
 WEIGHTED = 2  # index of the weighted cost
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
@@ -23,17 +21,16 @@ def deflections(search: xr.Dataset) -> Figure:
     """Bloch displacements of the masses and the resonator's deflection on each band at the weighted optimum."""
     optimum, kappa = search.isel(cost=WEIGHTED), search["wavenumber"].values / np.pi
     figure, grid = _grid(search, search.sizes["band"], 1.1, 1.55, KAPPA)
+    labels = "$u_1$", "$u_2$", "$u_3$, negative where against $u_2$", "$u_4$"
     for (i, j), axes in np.ndenumerate(grid):
         cell = optimum.isel(reading=i, band=j)
-        u, w = cell["optimum_amplitude"].values, cell["optimum_deflection"].values
-        against = np.where(w > 0, -1.0, 1.0)
+        u, w = cell["optimum_amplitude"].values.copy(), cell["optimum_deflection"].values
+        u[:, 2] = np.where(w > 0, -u[:, 2], u[:, 2])
         axes.axhline(0, color=style.GREY, lw=0.5)
         axes.plot(kappa, np.abs(w), color=style.BLACK, lw=1.6, label="w = |$u_3 - u_2$|")
-        axes.plot(kappa, u[:, 0], color=style.ORANGE, label="$u_1$")
-        axes.plot(kappa, u[:, 1], color=style.BLUE, label="$u_2$")
-        axes.plot(kappa, against * u[:, 2], color=style.VERMILION, label="$u_3$, negative where against $u_2$")
-        axes.plot(kappa, u[:, 3], color=style.GREEN, ls=(0, (3, 2)), label="$u_4$")
-        panel_title(axes, f"Band {cell['band'].item()}")
+        *_, last = axes.plot(kappa, u, label=labels)
+        last.set_linestyle("--")  # it often lies on that of the first mass
+        axes.set_title(f"Band {cell['band'].item()}")
         if j == 0:
             best = f"λ = {cell['optimum_lambda'].item():.3g}, η = {cell['optimum_eta'].item():.3g}"
             axes.set_ylabel(f"{cell['reading'].item().capitalize()}\n{best}\n|u| (unit norm)")
@@ -59,43 +56,30 @@ def cost_maps(search: xr.Dataset) -> Figure:
         shown = values if cost == "group_velocity" else np.where(feasible, values, np.nan)
         image = draw_map(axes, lam, eta, shown, Normalize(judged.min(), judged.max()), "viridis")
         veil = np.ma.masked_where(feasible, np.zeros(feasible.shape))
-        axes.imshow(veil, extent=image.get_extent(), origin="lower", aspect="auto", alpha=0.75,
-                    cmap=ListedColormap([style.PALE]), interpolation="nearest")  # fmt: skip
-        colour_bar(figure, image, axes, LABELS[cost], pad=0.02, extend="neither")
+        axes.imshow(veil, extent=image.get_extent(), alpha=0.75, cmap=ListedColormap([style.PALE]))
+        colour_bar(image, axes, LABELS[cost], extend="neither")
         best = tuple(of_reading[f"optimum_{name}"].values[j] for name in SYMBOLS)
         if np.isnan(best).any():
-            panel_title(axes, f"{TITLES[cost]}: none is out of phase")
+            axes.set_title(f"{TITLES[cost]}: none is out of phase")
         else:
             axes.plot(*best, "s", color="red", mec="white", mew=0.6, ms=5, clip_on=False, zorder=5)
-            panel_title(axes, f"{TITLES[cost]}: ({best[0]:.3g}, {best[1]:.3g})")
+            axes.set_title(f"{TITLES[cost]}: ({best[0]:.3g}, {best[1]:.3g})")
             # The dispersion of the best cell, in the corner where cells are veiled.
             cell = of_reading.sel({"lambda": best[0], "eta": best[1]}, method="nearest")
             inset = axes.inset_axes((0.5, 0.1, 0.46, 0.46))
-            for branch, colour in zip(cell["frequency"].values.T / 1e3, cycle(style.SERIES), strict=False):
-                inset.plot(cell["wavenumber"].values / np.pi, branch, color=colour, lw=0.8)
-            inset.set(xlim=(0, 1), ylim=(0, None), xticks=(), yticks=())
-            inset.set_xlabel("κ", labelpad=1, fontsize=6.5)
-            inset.set_ylabel("ω", labelpad=1, fontsize=6.5)
+            inset.plot(cell["wavenumber"] / np.pi, cell["frequency"].values, lw=0.8)
+            inset.set(xlim=(0, 1), ylim=(0, None), xticks=(), yticks=(), xlabel="κ", ylabel="ω")
         if j == 0:
             axes.set_ylabel(f"{of_reading['reading'].item().capitalize()}\nη")
     return figure
 
 
-def dispersion_against_lambda(search: xr.Dataset) -> Figure:
-    """Bands of cells from the smallest to the largest lambda: least, best or middle, and greatest eta."""
-    return _dispersions(search, "lambda", "eta")
-
-
-def dispersion_against_eta(search: xr.Dataset) -> Figure:
-    """Bands of cells from the smallest to the largest eta: least, best or middle, and greatest lambda."""
-    return _dispersions(search, "eta", "lambda")
-
-
-def _dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
-    """Cells along one parameter, with the ``other`` at its least, best (or middle) and greatest value."""
+def dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
+    """Bands of cells from the least to the greatest of one parameter, at the least, best and greatest of the other."""
     kappa, values = search["wavenumber"].values / np.pi, search[along].values
-    plasma, norm = mpl.colormaps["plasma"], Normalize(values[0], values[-1] + 0.08 * (values[-1] - values[0]))
     lines = np.unique(np.round(np.linspace(0, len(values) - 1, min(LINES, len(values)))).astype(int))
+    shades = ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.93, 256)))  # without what paper swallows
+    colours = mpl.cm.ScalarMappable(Normalize(values[0], values[-1]), shades)
     figure, grid = _grid(search, 3, 0.6, 2.0, KAPPA)
     for i, row in enumerate(grid):
         of_reading = search.isel(reading=i)
@@ -110,14 +94,13 @@ def _dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
             cells = of_reading.isel({other: index})
             frequency = cells["frequency"].values / 1e3
             for line in lines:
-                axes.plot(kappa, frequency[line], color=plasma(norm(values[line])), lw=0.7)
-            panel_title(axes, f"{SYMBOLS[other]} = {cells[other].item():.3g}")
+                axes.plot(kappa, frequency[line], color=colours.to_rgba(values[line]), lw=0.7)
+            axes.set_title(f"{SYMBOLS[other]} = {cells[other].item():.3g}")
             if frequency.max() > top:
-                axes.set_title(f"up to {frequency.max():.3g} krad/s ↑", loc="right", pad=3, fontsize=6.5)
+                axes.set_title(f"up to {frequency.max():.3g} krad/s ↑", loc="right", fontsize=6.5)
         row[0].set(ylabel=f"{of_reading['reading'].item().capitalize()}\nω (krad/s)", ylim=(0, top))
     grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
-    shades = mpl.cm.ScalarMappable(Normalize(values[0], values[-1]), ListedColormap(plasma(np.linspace(0, 0.93, 256))))
-    colour_bar(figure, shades, grid.flat, SYMBOLS[along], extend="neither")
+    colour_bar(colours, grid, SYMBOLS[along], extend="neither")
     return figure
 
 
@@ -125,5 +108,5 @@ def _grid(search: xr.Dataset, columns: int, margin: float, height: float, xlabel
     """A page with a row of panels, ``height`` inches each, for every reading; ``xlabel`` stands below all."""
     rows = search.sizes["reading"]
     figure = style.new_figure(style.PAGE, margin + height * rows)
-    figure.supxlabel(xlabel, fontsize=8)
+    figure.supxlabel(xlabel)
     return figure, figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)

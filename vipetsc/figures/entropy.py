@@ -12,16 +12,15 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import label_outer, panel_title, percentile_norm
+from vipetsc.figures.panels import percentile_norm
 from vipetsc.figures.study import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes as axes_of
-from vipetsc.io.read import member_folder
+from vipetsc.io.read import member_folder, select
+from vipetsc.spectra import normalised
 
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
-LOW, HIGH = 0.01, 1.0  # what a normalised curve runs between
-LABELS = 5  # most labels of the legend: three averages, another reading, the power law
 FACETS = ("reading", "wavenumber")
 SPAN = 4e-3, 40.0  # of the logarithmic axes: room for what is written above the peak
 FEWEST = 4  # amplitudes that show a peak and a power law
@@ -29,10 +28,7 @@ MOST_COLUMNS = 3  # of histories
 
 
 class EntropyCurve(NamedTuple):
-    """One configuration's mean entropy over ``amplitude`` in N, normalised to [.01, 1], and its power law.
-
-    ``error`` is the deviation over the cells on the same scale; ``fit`` what ``/fits`` says of the curve.
-    """
+    """Mean entropy over the amplitude (N), normalised to [.01, 1], its deviation over the cells, its power law."""
 
     amplitude: np.ndarray
     value: np.ndarray
@@ -46,11 +42,10 @@ class EntropyCurve(NamedTuple):
         valid = np.isfinite(value)
         if valid.sum() < 2 or np.ptp(value[valid]) == 0:
             return None
-        scale = (HIGH - LOW) / np.ptp(value[valid])
         names = ("factor", "exponent", "peak_amplitude", "r2_log_log", "r2_nonlinear")
         fit = {name: float(row[f"fits/entropy/{average}/{name}"]) for name in names}
-        normalised = LOW + scale * (value[valid] - value[valid].min())
-        return cls(row[AMPLITUDE].values[valid], normalised, scale * error[valid], fit)
+        deviation = 0.99 * error[valid] / np.ptp(value[valid])
+        return cls(row[AMPLITUDE].values[valid], normalised(value[valid]), deviation, fit)
 
 
 def entropy(sweeps: Sweeps) -> Iterator[style.Drawing]:
@@ -86,16 +81,12 @@ def _facets(
     measured = [e for e in sweeps if "entropy/energy_weighted" in e and AMPLITUDE in axes_of(e)]
     measured = [e for e in measured if e.sizes[AMPLITUDE] >= FEWEST]
     for ensemble in (e for e in measured if needs in e):
+        others = [name for name in axes_of(ensemble) if name != AMPLITUDE]
+        ordered = ensemble.sortby(AMPLITUDE)
+        indices = np.ndindex(*(ensemble.sizes[name] for name in others))
+        rows = (ordered.isel(dict(zip(others, index, strict=True))) for index in indices)
         stem = partial(suffix, ensemble=ensemble, named=len(measured) > 1, dims=names)
-        yield from ((ensemble, rows, name) for name, rows in grouped(_rows(ensemble), stem).items())
-
-
-def _rows(ensemble: xr.Dataset) -> list[xr.Dataset]:
-    """The members of each configuration over rising amplitude; the values of all other axes are scalars."""
-    others = [name for name in axes_of(ensemble) if name != AMPLITUDE]
-    ordered = ensemble.sortby(AMPLITUDE)
-    shape = [ensemble.sizes[name] for name in others]
-    return [ordered.isel(dict(zip(others, map(int, index), strict=True))) for index in np.ndindex(*shape)]
+        yield from ((ensemble, of_facet, name) for name, of_facet in grouped(rows, stem).items())
 
 
 def _averages(rows: Sequence[xr.Dataset]) -> list[str]:
@@ -126,11 +117,9 @@ def _heading(row: xr.Dataset, ensemble: xr.Dataset, shown: str, wave: bool = Tru
 
 
 def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
-    heading = _heading(rows[0], ensemble, f"{AVERAGES[average]} mean entropy")
-    legend_columns = 3 if len(rows) > 4 else 2
-    figure, grid = _panels(2, len(rows), 1.42, heading, 0.38, -(-LABELS // legend_columns))
+    figure, grid = _panels(2, len(rows), 1.55, _heading(rows[0], ensemble, f"{AVERAGES[average]} mean entropy"))
     for (upper, lower), row in zip(grid.T, rows, strict=True):
-        panel_title(upper, _row_title(row, ensemble))
+        upper.set_title(_row_title(row, ensemble))
         curve = _curve_or_reason(upper, row, average)
         if curve is None:
             lower.set_axis_off()
@@ -140,35 +129,37 @@ def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> 
             if other and name != average:
                 upper.plot(other.amplitude, other.value, color=COLOURS[name], lw=0.6, alpha=0.5, label=label)
         _points(upper, curve, average, 2.2)
-        same = [name for name in axes_of(ensemble) if name not in ("reading", AMPLITUDE)]
-        for other_row in _rows(ensemble) if "reading" in axes_of(ensemble) else ():
-            other = EntropyCurve.of(other_row, average)
-            if other and other_row["reading"] != row["reading"] and all(other_row[name] == row[name] for name in same):
-                label = f"{other_row['reading'].item()} reading"
-                lower.plot(other.amplitude, other.value, color=style.GREY, lw=0.7, ls=(0, (3, 1.5)), label=label)
-        _log_panel(lower, curve, average, 2.2, 6.0)
+        same = {name: row[name].item() for name in axes_of(ensemble) if name != AMPLITUDE}
+        for reading in ensemble["reading"].values if "reading" in same else ():
+            other = EntropyCurve.of(select(ensemble, **same | {"reading": reading}).sortby(AMPLITUDE), average)
+            if other and reading != same["reading"]:
+                line = {"color": style.GREY, "lw": 0.7, "ls": (0, (3, 1.5)), "label": f"{reading} reading"}
+                lower.plot(other.amplitude, other.value, **line)
+        _log_panel(lower, curve, average, 2.2)
         upper.set(xlim=(0, 1.04 * curve.amplitude[-1]), ylim=(-0.05, 1.45))
-    label_outer(grid, "A (N)", "Normalised entropy")
+    figure.supylabel("Normalised entropy")
     pairs = [pair for axes in grid.flat for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in pairs}
-    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=legend_columns)
+    columns = 3 if len(rows) > 4 else 2
+    strip = (0.05 + 0.13 * -(-len(handles) // columns)) / figure.get_figheight()
+    figure.get_layout_engine().set(rect=(0, strip, 1, 1 - strip))
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=columns)
     return figure
 
 
 def _entropy_all(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
     by_wavenumber = grouped(rows, partial(_driven_wavenumber, ensemble=ensemble))
     heading = _heading(rows[0], ensemble, f"{AVERAGES[average]} mean entropy", wave=False)
-    figure, grid = _panels(len(by_wavenumber), len(rows) // len(by_wavenumber), 1.15, heading)
-    label_outer(grid, "A (N)", "")
+    figure, grid = _panels(len(by_wavenumber), len(rows) // len(by_wavenumber), 1.25, heading)
     for line, (wavenumber, of_wavenumber) in zip(grid, by_wavenumber.items(), strict=True):
         line[0].set_ylabel(wavenumber)
         for axes, row in zip(line, of_wavenumber, strict=True):
-            if axes in grid[0]:
-                panel_title(axes, _row_title(row, ensemble))
             curve = _curve_or_reason(axes, row, average)
             if curve is not None:
-                _log_panel(axes, curve, average, 1.6, 5.5)
-                axes.tick_params(labelbottom=axes in grid[-1])
+                _log_panel(axes, curve, average, 1.6)
+            axes.label_outer()
+    for axes, row in zip(grid[0], rows, strict=False):
+        axes.set_title(_row_title(row, ensemble))
     return figure
 
 
@@ -181,33 +172,22 @@ def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve 
     return curve
 
 
-def _panels(
-    rows: int, columns: int, height: float, heading: str, gap: float = 0.1, legend_rows: int = 0
-) -> tuple[Figure, np.ndarray]:
-    """A grid of panels of ``height`` inches, ``gap`` apart, and room for a legend of ``legend_rows``.
-
-    Laid out by hand, since fitting dozens of panels takes long.
-    """
-    left, right, top, bottom = 0.52, 0.06, 0.45, 0.42 + 0.15 * legend_rows
-    width = style.PAGE * max(columns, 4) / 6
-    tall = top + bottom + rows * height + (rows - 1) * gap
-    figure = style.new_figure(width, tall, fitted=False)
-    figure.suptitle(heading, fontsize=8, y=1 - 0.05 / tall, va="top")
+def _panels(rows: int, columns: int, height: float, heading: str) -> tuple[Figure, np.ndarray]:
+    """A page with a grid of panels over the amplitude, each row ``height`` inches."""
+    figure = style.new_figure(style.PAGE * max(columns, 4) / 6, 0.6 + rows * height, heading)
     grid = figure.subplots(rows, columns, sharex="row", sharey="row", squeeze=False)
-    edges = left / width, bottom / tall, 1 - right / width, 1 - top / tall
-    figure.subplots_adjust(*edges, wspace=0.12, hspace=gap / height)
+    for axes in grid[-1]:
+        axes.set_xlabel("A (N)")
     return figure, grid
 
 
 def _points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
     pale = tuple(0.5 + 0.5 * np.array(to_rgb(COLOURS[average])))
-    axes.errorbar(
-        curve.amplitude, curve.value, curve.error, fmt="o-", color=COLOURS[average], ecolor=pale, ms=size, mew=0,
-        lw=0.6, elinewidth=0.4, capsize=1.0, capthick=0.4, label=f"{AVERAGES[average]}, ± std over the cells",
-    )  # fmt: skip
+    axes.errorbar(curve.amplitude, curve.value, curve.error, fmt="o-", color=COLOURS[average], ecolor=pale, ms=size,
+                  mew=0, lw=0.6, elinewidth=0.4, label=f"{AVERAGES[average]}, ± std over the cells")  # fmt: skip
 
 
-def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float, fontsize: float) -> None:
+def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
     """The curve in logarithms, the power law from the peak on as a thick black line with both adjusted R^2."""
     _points(axes, curve, average, size)
     amplitude, fit = curve.amplitude, curve.fit
@@ -216,9 +196,9 @@ def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float, fonts
         label = "power law, adjusted R² (of nonlinear fit)"
         axes.plot(x, fit["factor"] * x ** fit["exponent"], color=style.BLACK, lw=2.0, zorder=4, label=label)
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
-        axes.text(0.04, 0.97, text, transform=axes.transAxes, ha="left", va="top", fontsize=fontsize)
+        axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", fontsize=6)
     else:
-        axes.text(0.04, 0.04, "no power law", transform=axes.transAxes, fontsize=fontsize, color=style.GREY)
+        axes.text(0.04, 0.04, "no power law", transform=axes.transAxes, color=style.GREY)
     axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * amplitude[0], 1.25 * amplitude[-1]))
 
 
@@ -236,20 +216,19 @@ def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figu
         times, history, amplitude = (row[name].values for name in ("entropy/time", "entropy/history", AMPLITUDE))
         time = times[np.argmax(np.isfinite(times).sum(axis=1))]
         finite = np.isfinite(time)
-        time, history = time[finite], history[:, finite]
-        image = axes.pcolormesh(time, amplitude, history, norm=norm, shading="nearest", rasterized=True)
-        axes.set(yscale="log", xlim=time[[0, -1]])
+        image = axes.pcolormesh(time[finite], amplitude, history[:, finite], norm=norm, rasterized=True)
+        axes.set(title=_row_title(row, ensemble), yscale="log", xlim=time[finite][[0, -1]])
         touched = row["contact_episodes"].values > 0
         if touched.any() and not touched.all():
             first = int(np.argmax(touched))
             axes.axhline(np.sqrt(amplitude[first - 1] * amplitude[first]), color="white", lw=0.8, ls=":")
         if start > 0:
             axes.axvline(start, color="white", lw=0.7, ls="--")
-        panel_title(axes, _row_title(row, ensemble))
     for axes in grid.flat[len(configurations) :]:
         axes.set_axis_off()
-    label_outer(grid, "Time (s)", "Amplitude A (N)")
-    panels.colour_bar(figure, image, grid.flat, "H(t) (bit)", extend="both")
+    figure.supxlabel("Time (s)")
+    figure.supylabel("Amplitude A (N)")
+    panels.colour_bar(image, grid, "H(t) (bit)", extend="both")
     return figure
 
 

@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order
+from scipy.sparse.csgraph import shortest_path
 
 from vipetsc.case import Case
 from vipetsc.figures import style
-from vipetsc.figures.panels import band_diagram, note, panel_title
+from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.study import counted
 from vipetsc.figures.style import with_prefix
-from vipetsc.lattice import Chain, Spring, UnitCell
+from vipetsc.lattice import Chain, UnitCell
 
 PITCH = 2.0  # distance between neighbouring masses of the drawing
 HALF = 0.34  # half the side of a mass
@@ -25,6 +25,7 @@ WIDE, TALL = 1.0, 0.62  # half the width and height of a host that holds its res
 GAP = 0.17  # clearance as drawn
 SIDE = 0.5  # half the side of a mass of the reduced model
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
+LEGEND = "cell above, clearance in mm below; driven at the arrow"
 ROD = {"color": style.BLACK, "lw": 0.7}
 
 Point = tuple[float, float]
@@ -37,8 +38,8 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
     draw_unit_cell(upper, model.chain.cell)
     draw_lattice(lower, model.chain, model.drive_cell)
-    panel_title(upper, "(a) Unit cell")
-    panel_title(lower, f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends")
+    upper.set_title("(a) Unit cell")
+    lower.set_title(f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends; sites: {LEGEND}")
     return figure
 
 
@@ -48,16 +49,15 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
     upper, lower = figure.subfigures(2, 1, height_ratios=(2.9, STRIP * len(sites)))
     left, right = upper.subplots(1, 2, width_ratios=(1.55, 1))
     draw_unit_cell(left, case.lattice.unit_cell())
-    panel_title(left, f"(a) Unit cell, {case.lattice.reading} reading")
+    left.set_title(f"(a) Unit cell, {case.lattice.reading} reading")
     band_diagram(right, case.lattice.unit_cell(), case.drive.frequency)
-    panel_title(right, "(b) Bands; gaps shaded, drive dotted")
+    right.set_title("(b) Bands; gaps shaded, drive dotted")
     table = case.model_dump(by_alias=True, exclude_none=True, exclude={"contacts": {"clearance"}})
     for i, (axes, count) in enumerate(zip(lower.subplots(len(sites), 1, squeeze=False).flat, sites, strict=True)):
         table["contacts"]["sites"] = count
         model = Case.from_table(table).model()
-        draw_lattice(axes, model.chain, model.drive_cell, brief=True)
-        legend = "; cell above, clearance in mm below; driven at the arrow" if i == 0 else ""
-        panel_title(axes, f"(c.{i + 1}) {counted(count, 'contact site')}{legend}")
+        draw_lattice(axes, model.chain, model.drive_cell)
+        axes.set_title(f"(c.{i + 1}) {counted(count, 'contact site')}{f'; {LEGEND}' if i == 0 else ''}")
     return figure
 
 
@@ -75,15 +75,13 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
     for edge, stop in ((start, middle - gap), (end, middle + gap)):
         axes.plot([edge, stop], [-0.3, -0.3], color=style.VERMILION, lw=1.0)
         axes.plot([stop, stop], [-0.46, -0.14], color=style.VERMILION, lw=2.0)
-    below = {"ha": "center", "va": "top", "fontsize": 6.5}
+    below = {"ha": "center", "va": "top"}
     axes.text(middle, -0.56, f"contact on both sides, Δ = {1e3 * clearance:.4g} mm", color=style.VERMILION, **below)
     for i, (x, mass, colour) in enumerate(zip((host, resonator), masses, (style.SKY, style.ORANGE), strict=True)):
         _mass(axes, (x, 0), SIDE, i, colour)
         axes.text(x, -SIDE - 0.06, with_prefix(1e3 * mass, "g"), **below)
-        arrow = {"arrowstyle": "-|>", "lw": 0.8, "color": style.BLUE, "shrinkA": 0, "shrinkB": 0}
-        axes.annotate("", (x + 0.9, 0.85), (x, 0.85), arrowprops=arrow)
-        axes.plot([x, x], [0.72, 0.98], color=style.BLUE, lw=0.8)
-        axes.text(x + 0.95, 0.85, f"$u_{i + 1}$", va="center", fontsize=7, color=style.BLUE)
+        arrow = {"arrowstyle": "<|-", "lw": 0.8, "color": style.BLUE, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate(f"$u_{i + 1}$", (x, 0.85), (x + 0.95, 0.85), va="center", color=style.BLUE, arrowprops=arrow)
     axes.set(xlim=(-0.5, 8.0), ylim=(-0.95, 1.2), aspect="equal")
     axes.set_axis_off()
     return figure
@@ -98,9 +96,22 @@ class _Layout(NamedTuple):
     right: float
     nested: bool
 
-    def blocked(self, low: float, high: float, y: float) -> bool:
-        """Whether a mass stands between ``low`` and ``high`` at height ``y``."""
-        return any(low < p < high and abs(q - y) < 0.1 for p, q in self.centre.values())
+    def corners(self, a: tuple[float, float, float], b: tuple[float, float, float], level: float) -> list[Point]:
+        """The way of a spring between two ends, at the height ``level`` where masses stand between them.
+
+        An end is x and y of a mass and half its width, which is 0 for the cell's border.
+        """
+        (xa, ya, half_a), (xb, yb, half_b) = sorted((a, b))
+        if abs(xa - xb) < 0.1:  # b stands above
+            return [(xb, yb - (TALL if half_b == WIDE else HALF)), (xa, ya + HALF)]
+        if abs(ya - yb) >= 0.1:
+            short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
+            return [(xa + short[0], ya + short[1]), (xb - short[0], yb - short[1])]
+        if any(xa < x < xb and abs(y - ya) < 0.1 for x, y in self.centre.values()):
+            # Above the masses on the line, below those that hang from it.
+            edge, round_them = (ya + HALF, level) if ya == 0 else (ya - HALF, ya - 2.4 * HALF)
+            return [(xa, edge)] * (half_a > 0) + [(xa, round_them), (xb, round_them)] + [(xb, edge)] * (half_b > 0)
+        return [(xa + half_a, ya), (xb - half_b, yb)]
 
 
 def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
@@ -108,19 +119,30 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     layout = _layout(cell)
     nested_pair = {cell.host, cell.resonator} if layout.nested else set()
     level, highest = TALL + 0.6, TALL
-    for spring in cell.springs:
+    for spring in (s for s in cell.springs if s.next_cell or {s.start, s.end} != nested_pair):
+        start, end = ((*layout.centre[i], layout.half[i]) for i in (spring.start, spring.end))
+        text = with_prefix(spring.stiffness, "N/m")
         if spring.next_cell:
-            highest = max(highest, _outer_spring(axes, layout, spring, level))
-        elif {spring.start, spring.end} != nested_pair:
-            used = _inner_spring(axes, layout, spring, level)
-            highest, level = max(highest, used), level + 0.55 * (used > 0)
+            # One zigzag up to the right border, and the end of that of the cell before.
+            leaving = layout.corners(start, (layout.right, start[1], 0), level)
+            arriving = layout.corners((layout.left, end[1], 0), end, level)
+            _spring(axes, leaving, text)
+            _spring(axes, arriving, "", turns=0)
+            for (x, y), side in ((leaving[-1], 1), (arriving[0], -1)):
+                axes.plot([x, x + 0.4 * side], [y, y], ls=(0, (1, 1.5)), zorder=2, **ROD)
+            goes_round = len(leaving) > 2 or len(arriving) > 2
+        else:
+            corners = layout.corners(start, end, level)
+            _spring(axes, corners, text)
+            goes_round = len(corners) > 2
+        highest, level = max(highest, level * goes_round), level + 0.55 * goes_round
     for i, centre in layout.centre.items():
         if i not in nested_pair:
             colour = {cell.host: style.SKY, cell.resonator: style.ORANGE}.get(i, style.PALE)
             _mass(axes, centre, HALF, i, colour)
             # Beside the mass's lower left corner, clear of what hangs below it and of the spring on its left.
             corner = centre[0] - HALF - 0.05, centre[1] - HALF
-            axes.text(*corner, with_prefix(1e3 * cell.masses[i], "g"), ha="right", va="center", fontsize=6.5, zorder=4)
+            axes.text(*corner, with_prefix(1e3 * cell.masses[i], "g"), ha="right", va="center", zorder=4)
     host, resonator = layout.centre[cell.host], layout.centre[cell.resonator]
     if layout.nested:
         _host_with_resonator(axes, host, cell)
@@ -132,86 +154,39 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
         middle = np.mean([host, resonator], axis=0)
         note(axes, "contact, Δ", middle, (-16, 0), ha="right", va="center", color=style.VERMILION)
     low, high = min(y for _, y in layout.centre.values()) - TALL - 0.55, highest + 0.5
-    for wall in (layout.left, layout.right):
-        axes.plot([wall, wall], [low + 0.15, high - 0.1], color=style.GREY, lw=0.6, ls=(0, (4, 3)))
-    axes.text(layout.left + 0.07, low + 0.1, "one cell", color=style.GREY, fontsize=6.5, va="bottom")
+    axes.vlines([layout.left, layout.right], low + 0.15, high - 0.1, color=style.GREY, lw=0.6, ls=style.DASHED)
+    axes.text(layout.left + 0.07, low + 0.1, "one cell", color=style.GREY, va="bottom")
     axes.set(xlim=(layout.left - 0.5, layout.right + 0.5), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
 
 
 def _layout(cell: UnitCell) -> _Layout:
-    """The shortest way through the cell on one line, the other masses below it."""
+    """The shortest way through the cell on one line; the others as far along by number of springs, below it."""
     pairs = [({s.start, s.end}, s.next_cell) for s in cell.springs if cell.resonator in (s.start, s.end)]
     nested = bool(pairs) and all(pair == {cell.host, cell.resonator} and not out for pair, out in pairs)
     joined = np.zeros((cell.dofs, cell.dofs), bool)
     for spring in cell.springs:
-        if not spring.next_cell:
-            joined[spring.start, spring.end] = joined[spring.end, spring.start] = True
+        joined[spring.start, spring.end] |= not spring.next_cell
     through = next(s for s in cell.springs if s.next_cell)
-    _, before = breadth_first_order(csr_array(joined), through.end)
-    line = [through.start] if through.start == through.end or before[through.start] >= 0 else [through.end]
-    while line[0] != through.end:
-        line.insert(0, int(before[line[0]]))
+    ends = [through.end, through.start]
+    passed, ahead = shortest_path(csr_array(joined), directed=False, unweighted=True, indices=ends)
+    # What no spring inside the cell holds stands at its end.
+    depth = np.where(np.isfinite(passed), passed, np.max(passed, where=np.isfinite(passed), initial=0) + 1)
+    extra = (WIDE - HALF) * nested
     centre: dict[int, Point] = {}
-    x = 0.0
-    for i in line:
-        extra = (WIDE - HALF) * (nested and i == cell.host)
-        centre[i] = (x + extra, 0.0)
-        x += PITCH + 2 * extra
+    for i in range(cell.dofs):
+        x = PITCH * depth[i] + extra * (1 + np.sign(depth[i] - depth[cell.host]))
+        y = 0.0 if passed[i] + ahead[i] == passed[through.start] else -0.75 * PITCH
+        while (x, y) in centre.values():
+            y -= 0.75 * PITCH
+        if not (nested and i == cell.resonator):
+            centre[i] = (x, y)
     if nested:
-        centre[cell.resonator] = centre.setdefault(cell.host, (x, 0.0))
-    while len(centre) < cell.dofs:
-        # A mass off the line hangs below one that has its position, or stands at the end of the line.
-        missing = [i for i in range(cell.dofs) if i not in centre]
-        hanging = [(i, j) for i in missing for j in centre if joined[i, j]]
-        if not hanging:
-            centre[missing[0]] = (max(p for p, _ in centre.values()) + PITCH, 0.0)
-            continue
-        x, y = centre[hanging[0][1]]
-        while (x, y - 0.75 * PITCH) in centre.values():
-            x += 0.5 * PITCH
-        centre[hanging[0][0]] = (x, y - 0.75 * PITCH)
+        centre[cell.resonator] = centre[cell.host]
     half = {i: WIDE if nested and i == cell.host else HALF for i in centre}
     left = min(x - half[i] for i, (x, _) in centre.items()) - 0.9
     right = max(x + half[i] for i, (x, _) in centre.items()) + 1.5
     return _Layout(centre, half, left, right, nested)
-
-
-def _inner_spring(axes: Axes, layout: _Layout, spring: Spring, level: float) -> float:
-    """A spring between two masses of the cell; returns the height at which it goes round others, else 0."""
-    a, b = sorted((spring.start, spring.end), key=lambda i: layout.centre[i])
-    (xa, ya), (xb, yb) = layout.centre[a], layout.centre[b]
-    text = with_prefix(spring.stiffness, "N/m")
-    if abs(xa - xb) < 0.1:  # b stands above a
-        drop = TALL if layout.half[b] == WIDE else HALF
-        _spring(axes, [(xb, yb - drop), (xa, ya + HALF)], text)
-    elif abs(ya - yb) >= 0.1:
-        short = 1.3 * HALF * np.array([xb - xa, yb - ya]) / np.hypot(xb - xa, yb - ya)
-        _spring(axes, [(xa + short[0], ya + short[1]), (xb - short[0], yb - short[1])], text)
-    elif layout.blocked(xa, xb, ya):
-        _spring(axes, [(xa, ya + HALF), (xa, level), (xb, level), (xb, yb + HALF)], text)
-        return level
-    else:
-        _spring(axes, [(xa + layout.half[a], ya), (xb - layout.half[b], yb)], text)
-    return 0.0
-
-
-def _outer_spring(axes: Axes, layout: _Layout, spring: Spring, level: float) -> float:
-    """A spring to the next cell and the end of the last one's; returns the height at which it goes round masses."""
-    used, text = 0.0, with_prefix(spring.stiffness, "N/m")
-    for mass, wall, side in ((spring.start, layout.right, 1), (spring.end, layout.left, -1)):
-        x, y = layout.centre[mass]
-        if layout.blocked(min(x, side * np.inf), max(x, side * np.inf), y):
-            _spring(axes, [(x, y + HALF), (x, level), (wall, level)], text)
-            used = level
-            continue
-        start = x + side * layout.half[mass]
-        if side > 0:
-            _spring(axes, [(start, y), (wall, y)], text)
-        else:
-            axes.plot([start, wall], [y, y], zorder=2, **ROD)
-        axes.plot([wall, wall + 0.4 * side], [y, y], ls=(0, (1, 1.5)), zorder=2, **ROD)
-    return used
 
 
 def _mass(axes: Axes, centre: Point, half: float, index: int, colour: str) -> None:
@@ -246,7 +221,7 @@ def _host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None:
                   fontsize=7, color=style.VERMILION, zorder=7, arrowprops=line)  # fmt: skip
     masses = (f"$m_{{{i + 1}}}$ {with_prefix(1e3 * cell.masses[i], 'g')}" for i in (cell.host, cell.resonator))
     text = f"{',  '.join(masses)}\ninner spring {with_prefix(stiffness, 'N/m')}"
-    axes.text(x, y - TALL - 0.08, text, ha="center", va="top", fontsize=6.5, linespacing=1.3)
+    axes.text(x, y - TALL - 0.08, text, ha="center", va="top", linespacing=1.3)
 
 
 def _spring(axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, height: float = 0.13) -> None:
@@ -264,11 +239,11 @@ def _spring(axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, hei
     axes.plot(*points.T, zorder=2 if height > 0.1 else 6, solid_joinstyle="round", **ROD)
     upright = abs(along[1]) > abs(along[0])
     shift, alignment = ((0.2, 0), ("left", "center")) if upright else ((0, 0.2), ("center", "bottom"))
-    axes.text(*(start + along / 2 + shift), text, fontsize=6.5, ha=alignment[0], va=alignment[1])
+    axes.text(*(start + along / 2 + shift), text, ha=alignment[0], va=alignment[1])
 
 
-def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = False) -> None:
-    """The lattice as a strip: its ends, drive (0-based cell) and contacts; a ``brief`` one says less."""
+def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
+    """The lattice as a strip: its ends, drive (0-based cell) and contacts with their cells and clearances."""
     n = chain.cells
     axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
     if n <= 150:
@@ -278,21 +253,16 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, brief: bool = Fa
             _wall(axes, (wall, -0.25), 0.02 * n, 1.5)
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
     arrow = {"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8}
-    axes.annotate("" if brief else "drive", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), ha="left",
-                  va="center", fontsize=7, color=style.BLUE, arrowprops=arrow)  # fmt: skip
-    below = {"ha": "center", "va": "top", "fontsize": 6.5}
+    axes.annotate("", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), arrowprops=arrow)
     last, width = -np.inf, max(0.006 * n, 1)
     for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
         axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
         # Labels need about a tenth of the strip each; neighbouring sites go without.
         if site - last > 0.085 * n:
             axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
-            axes.text(site + 1, -0.2, f"{clearance * 1e3:#.3g}", color=style.VERMILION, **below)
+            axes.text(site + 1, -0.2, f"{clearance * 1e3:#.3g}", color=style.VERMILION, ha="center", va="top")
             last = site
     if not chain.sites:
-        axes.text(n / 2, -0.2, "no contact sites", color=style.GREY, **below)
-    elif not brief:
-        middle = (chain.sites[0] + chain.sites[-1]) / 2 + 1
-        axes.text(middle, -0.95, "clearance Δ (mm) of the contact sites", color=style.VERMILION, **below)
-    axes.set(xlim=(-0.035 * n, 1.035 * n), ylim=(-1.7, 2.3))
+        axes.text(n / 2, -0.2, "no contact sites", color=style.GREY, ha="center", va="top")
+    axes.set(xlim=(-0.035 * n, 1.035 * n), ylim=(-1.2, 2.3))
     axes.set_axis_off()

@@ -1,15 +1,13 @@
 """Panels that figures share: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
 
 from collections.abc import Iterable, Sequence
-from itertools import cycle
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike
 
@@ -21,12 +19,7 @@ PIXELS = 600  # most rows and columns of a map: a printed page shows no more
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
-KAPPA, OMEGA = "Wavenumber κ (π rad/cell)", "Angular frequency ω (krad/s)"
-
-
-def panel_title(axes: Axes, text: str) -> None:
-    """Title of a panel at its left, such as "(a) Before the first site"."""
-    axes.set_title(text, pad=3)
+KAPPA, OMEGA = "Wavenumber κ (π rad/cell)", "Frequency ω (krad/s)"
 
 
 def annotate_empty(axes: Axes, reason: str) -> None:
@@ -45,11 +38,9 @@ def empty_figure(reason: str) -> Figure:
 def block_means(values: np.ndarray) -> np.ndarray:
     """Means over blocks of ``values`` (row, column), so that at most ``PIXELS`` rows and columns are left."""
     for axis, length in enumerate(values.shape):
-        block = -(-length // PIXELS)
-        if block > 1:
-            starts = np.arange(0, length, block)
-            sizes = np.diff(np.append(starts, length))
-            values = np.add.reduceat(values, starts, axis=axis) / np.expand_dims(sizes, 1 - axis)
+        starts = np.arange(0, length, -(-length // PIXELS))
+        sizes = np.diff(np.append(starts, length))
+        values = np.add.reduceat(values, starts, axis=axis) / np.expand_dims(sizes, 1 - axis)
     return values
 
 
@@ -63,8 +54,7 @@ def log_norm(*fields: ArrayLike, decades: float = DECADES) -> LogNorm:
 def percentile_norm(fields: Iterable[xr.DataArray]) -> Normalize:
     """Colours from the lowest to the highest percentile of what is finite in the ``fields``."""
     values = np.concatenate([np.ravel(field) for field in fields])
-    finite = values[np.isfinite(values)]
-    low, high = np.percentile(finite if len(finite) else [0, 1], (2, 99.8))
+    low, high = np.percentile(values[np.isfinite(values)] if np.isfinite(values).any() else 0, (2, 99.8))
     return Normalize(low, high if high > low else low + 1)
 
 
@@ -72,10 +62,9 @@ def draw_map(
     axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize, cmap: str = "inferno"
 ) -> AxesImage:
     """Image of ``values`` (y, x) at evenly spaced positions, pooled to what a printed page can show."""
-    half = [0.5 * (axis[-1] - axis[0]) / max(len(axis) - 1, 1) or 0.5 for axis in (x, y)]
-    extent = x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]
-    options = {"extent": extent, "origin": "lower", "aspect": "auto", "interpolation": "nearest"}
-    return axes.imshow(block_means(values), norm=norm, cmap=cmap, **options)
+    halves = [0.5 * (axis[-1] - axis[0]) / max(len(axis) - 1, 1) or 0.5 for axis in (x, y)]
+    extent = [edge for axis, half in zip((x, y), halves, strict=True) for edge in (axis[0] - half, axis[-1] + half)]
+    return axes.imshow(block_means(values), norm=norm, cmap=cmap, extent=extent)
 
 
 def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, run: xr.Dataset | None = None) -> AxesImage:
@@ -90,8 +79,10 @@ def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, run: xr.Dat
 
 def content_map(axes: Axes, content: xr.DataArray, norm: Normalize) -> AxesImage:
     """Map of ``content`` (t, wavenumber), time to the right, wavenumbers in pi rad/cell."""
-    time, kappa = content["time"].values, content["wavenumber"].values / np.pi
-    return draw_map(axes, time, kappa, content.values.T, norm, "viridis")
+    kappa = content["wavenumber"].values / np.pi
+    image = draw_map(axes, content["time"].values, kappa, content.values.T, norm, "viridis")
+    axes.set(ylim=(0, kappa[-1]), xlabel="Time (s)", ylabel=KAPPA)
+    return image
 
 
 def recorded_sites(run: xr.Dataset) -> np.ndarray:
@@ -103,16 +94,15 @@ def recorded_sites(run: xr.Dataset) -> np.ndarray:
 def mark_sites(axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y") -> None:
     """Dotted lines at the contact sites, triangles on the edge of the axis ``along`` ("x" or "y") of cells."""
     sites = recorded_sites(run)
-    marks = {"color": style.SKY, "mec": "white", "mew": 0.3, "ms": 3.5, "ls": "", "label": "contact sites"}
     for site in sites:
-        line = axes.axhline if along == "y" else axes.axvline
-        line(site, color=colour, lw=0.5, ls=style.DOTTED, alpha=0.8)
-    if along == "y":
-        edge = np.full(len(sites), 0.015)
-        axes.plot(edge, sites, marker=">", transform=axes.get_yaxis_transform(), **marks)
-    else:
-        edge = np.full(len(sites), 0.03)
-        axes.plot(sites, edge, marker="^", transform=axes.get_xaxis_transform(), **marks)
+        (axes.axhline if along == "y" else axes.axvline)(site, color=colour, lw=0.5, ls=style.DOTTED, alpha=0.8)
+    edge = np.full(len(sites), 0.02)
+    points, transform, marker = {
+        "x": ((sites, edge), axes.get_xaxis_transform(), "^"),
+        "y": ((edge, sites), axes.get_yaxis_transform(), ">"),
+    }[along]
+    marks = {"color": style.SKY, "mec": "white", "mew": 0.3, "ms": 3.5, "ls": "", "label": "contact sites"}
+    axes.plot(*points, marker=marker, transform=transform, **marks)
 
 
 def below_cutoff(analysis: xr.Dataset, cell: UnitCell, names: Sequence[str]) -> xr.Dataset:
@@ -126,15 +116,14 @@ def dispersion_map(axes: Axes, spectrum: xr.DataArray, norm: Normalize, cell: Un
     image = draw_map(axes, wavenumber, frequency, spectrum.values.T, norm)
     kappa = np.linspace(0, np.pi, 181)
     axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color="white", lw=0.5, ls=(0, (4, 3)), alpha=0.75)
-    axes.set(xlim=(0, wavenumber[-1]), ylim=(0, frequency[-1]))
+    axes.set(xlim=(0, wavenumber[-1]), ylim=(0, frequency[-1]), xlabel=KAPPA, ylabel=OMEGA)
     return image
 
 
 def band_diagram(axes: Axes, cell: UnitCell, frequency: float | None = None) -> None:
     """Bloch branches of ``cell`` in colours, gaps shaded, the drive's ``frequency`` (rad/s) dotted."""
     kappa, bands = np.linspace(0, np.pi, 361), pass_bands(cell)
-    for branch, colour in zip(bloch(cell, kappa).frequency.T, cycle(style.SERIES), strict=False):
-        axes.plot(kappa / np.pi, branch / 1e3, color=colour)
+    axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3)
     shade_bands(axes, gaps(bands))
     if frequency is not None:
         axes.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
@@ -147,23 +136,15 @@ def shade_bands(axes: Axes, spans: Iterable[tuple[float, float]], along: str = "
         (axes.axhspan if along == "y" else axes.axvspan)(low / 1e3, high / 1e3, color=style.PALE, alpha=0.7, lw=0)
 
 
-def label_outer(grid: np.ndarray, xlabel: str, ylabel: str) -> None:
-    """Label the x axes of the lowest row and the y axes of the first column of a ``grid`` of panels."""
-    for axes in grid[-1]:
-        axes.set_xlabel(xlabel)
-    for axes in grid[:, 0]:
-        axes.set_ylabel(ylabel)
-
-
-def colour_bar(figure: FigureBase, image: Any, axes: Axes | Iterable[Axes], label: str, **options: Any) -> Colorbar:
-    """Colour bar of a map, by default one whose lowest colour stands for what is below it as well."""
-    panels = axes if isinstance(axes, Axes) else list(axes)
-    return figure.colorbar(image, ax=panels, label=label, **{"pad": 0.01, "extend": "min"} | options)
+def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
+    """Colour bar of a map beside one or several axes; its lowest colour stands for what is below it as well."""
+    panels = np.ravel(axes).tolist()
+    panels[0].figure.colorbar(image, ax=panels, label=label, **{"pad": 0.01, "extend": "min"} | options)
 
 
 def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float], **options: Any) -> None:
     """A small text beside the point ``at``, ``shift`` points away from it."""
-    axes.annotate(text, at, shift, textcoords="offset points", **{"fontsize": 6.5} | options)
+    axes.annotate(text, at, shift, textcoords="offset points", **options)
 
 
 def shade_regions(axes: Axes, energy: np.ndarray, region: np.ndarray, left: float, at_top: bool) -> None:
@@ -174,10 +155,8 @@ def shade_regions(axes: Axes, energy: np.ndarray, region: np.ndarray, left: floa
     low = left
     for number in range(1, 5):
         high = energy[region == number].max(initial=0.0)
-        if high <= low:
-            continue
-        axes.axvspan(low, high, color=REGION_SHADES[number], lw=0, zorder=0)
-        axes.text(np.sqrt(low * high), 0.985 if at_top else 0.015, REGIONS[number], ha="center",
-                  va="top" if at_top else "bottom", fontsize=6.5, color=style.GREY,
-                  transform=axes.get_xaxis_transform())  # fmt: skip
-        low = high
+        if high > low:
+            axes.axvspan(low, high, color=REGION_SHADES[number], lw=0, zorder=0)
+            axes.text(np.sqrt(low * high), 0.985 if at_top else 0.015, REGIONS[number], ha="center", color=style.GREY,
+                      va="top" if at_top else "bottom", transform=axes.get_xaxis_transform())  # fmt: skip
+            low = high

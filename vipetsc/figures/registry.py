@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vipetsc.figures import backbone, design, entropy, lattice, portraits, runs, scattering, transfer, transfer_curves
-from vipetsc.figures.study import read_sweeps, table
+from vipetsc.figures import backbone, design, entropy, lattice, runs, scattering, transfer, transfer_curves
+from vipetsc.figures.study import table
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import open_run
+from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 
 RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
@@ -36,17 +36,18 @@ def _specs(source: str, *functions: Callable[..., Any], measure: str = "") -> di
 
 # The dearest of a run first, so that ranks which share the work finish together.
 FIGURES = {
-    **_specs(RUN, runs.spacetime, runs.dispersion, portraits.phase, lattice.unit_cell, runs.impacts, runs.ledger),
+    **_specs(RUN, runs.spacetime, runs.dispersion, runs.phase, lattice.unit_cell, runs.impacts, runs.ledger),
     **_specs(SWEEP, scattering.amplitudes, scattering.wavelets, scattering.partition, measure="entropy"),
     **_specs(SWEEP, scattering.partition_explained, scattering.reconstruction, measure="entropy"),
     **_specs(SWEEP, entropy.entropy, entropy.entropy_all, measure="entropy"),
     **_specs(SWEEP, scattering.entropy_maps, entropy.entropy_history, measure="entropy"),
     **_specs(SWEEP, transfer.transfer, transfer.transfer_dispersions, transfer.band_energies, measure="transfer"),
     **_specs(SWEEP, transfer_curves.ibtet, transfer_curves.ibtet_backbone, measure="transfer"),
-    **_specs(SWEEP, portraits.phase_regimes, measure="transfer"),
+    **_specs(SWEEP, transfer_curves.phase_regimes, measure="transfer"),
     "branch": FigureSpec(backbone.backbone, BRANCHES),
     **_specs(DESIGN, design.deflections, design.cost_maps),
-    **_specs(DESIGN, design.dispersion_against_lambda, design.dispersion_against_eta),
+    "dispersion_against_lambda": FigureSpec(partial(design.dispersions, along="lambda", other="eta"), DESIGN),
+    "dispersion_against_eta": FigureSpec(partial(design.dispersions, along="eta", other="lambda"), DESIGN),
 }
 
 
@@ -111,7 +112,7 @@ def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None =
     folder = folders[0]
     with ExitStack() as stack:
         if source == SWEEP:
-            ensembles = read_sweeps(folders)
+            ensembles = [open_ensemble(path) for path in folders if (path / "ensemble.h5").exists()]
             for name, spec in specs.items():
                 measured = [e for e in ensembles if spec.measure in table(e)["sweep"]["measures"]]
                 for suffix, make in spec.function(measured):

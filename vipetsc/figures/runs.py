@@ -1,14 +1,17 @@
-"""Pictures of one run: where its energy is, its dispersion, impacts and energy ledger; the bands of a cell."""
-
-from itertools import cycle
+"""Pictures of one run: where its energy is, its dispersion, impacts, ledger, phase portraits; a cell's bands."""
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from scipy.interpolate import CubicHermiteSpline
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import KAPPA, empty_figure, panel_title
+from vipetsc.figures.panels import empty_figure
+from vipetsc.io.read import field_time, leading_site
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
 CELLS = {
@@ -17,6 +20,7 @@ CELLS = {
     "dispersion": ("All cells", style.BLACK),
 }
 LARGEST_RESIDUAL = 1e-8  # of the ledger, over the work of the drive
+REFINE = 4  # points of a phase portrait drawn for each sample
 
 
 def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -28,20 +32,19 @@ def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     figure = style.new_figure(style.PAGE if has_content else style.COLUMN, 2.5)
     left, *right = np.atleast_1d(figure.subplots(1, 1 + has_content))
     if len(cells) == 1:
-        left.plot(time, energy[:, 0], color=style.BLUE, lw=0.6)
+        left.plot(time, energy[:, 0], lw=0.6)
         left.set(xlabel="Time (s)", ylabel=f"Kinetic energy of cell {cells[0]} (J)", xlim=time[[0, -1]])
     else:
         image = panels.space_time_map(left, energy, panels.log_norm(energy), run)
-        panels.colour_bar(figure, image, left, "Kinetic energy of a cell (J)", pad=0.02)
+        panels.colour_bar(image, left, "Kinetic energy of a cell (J)")
         if len(panels.recorded_sites(run)):
             left.legend(loc="upper left", labelcolor="white", handletextpad=0.3)
     for axes in right:
         content = analysis["wavenumber_content"].load()
         image = panels.content_map(axes, content, panels.log_norm(content, decades=4))
-        axes.set(xlabel="Time (s)", ylabel=KAPPA, ylim=(0, content["wavenumber"][-1] / np.pi))
-        panel_title(left, "(a) Kinetic energy")
-        panel_title(axes, "(b) Wavenumber content")
-        panels.colour_bar(figure, image, axes, "Kinetic energy per bin (J)", pad=0.02)
+        left.set_title("(a) Kinetic energy")
+        axes.set_title("(b) Wavenumber content")
+        panels.colour_bar(image, axes, "Kinetic energy per bin (J)")
     return figure
 
 
@@ -53,31 +56,27 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     model = Case.of(run).model()
     cell = model.chain.cell
     spectra = panels.below_cutoff(analysis, cell, [name for name in measured if name != "dispersion"] or measured)
-    norm = panels.log_norm(*spectra.values())
+    norm, largest = panels.log_norm(*spectra.values()), float(spectra.sum("wavenumber").to_array().max()) or 1.0
 
     figure = style.new_figure(style.PAGE if len(spectra) > 1 else 5.0, 3.2)
     widths = [1.0] * len(spectra) + [0.55]
     *maps, side = figure.subplots(1, len(spectra) + 1, sharey=True, width_ratios=widths)
-    for axes, tag, (name, spectrum) in zip(maps, "ab", spectra.items(), strict=False):
-        image = panels.dispersion_map(axes, spectrum, norm, cell)
-        axes.set_xlabel(KAPPA)
-        panel_title(axes, f"({tag}) {CELLS[str(name)][0]}")
-    maps[0].set_ylabel(panels.OMEGA)
-    panels.colour_bar(figure, image, [*maps, side], "Mean kinetic energy per bin (J)")
-
     # In sums over the wavenumber what reaches the upper bands can be read off.
     panels.shade_bands(side, ((band.low, band.high) for band in pass_bands(cell)))
-    sums = {str(name): spectrum.sum("wavenumber") for name, spectrum in spectra.items()}
-    for name, energy in sums.items():
-        text, colour = CELLS[name]
-        side.plot(np.maximum(energy, 1e-300), energy["frequency"] / 1e3, color=colour, lw=0.7,
-                  label=text.split()[0].lower())  # fmt: skip
-    drive, largest = model.drive.frequency / 1e3, max(float(energy.max()) for energy in sums.values()) or 1.0
+    for axes, tag, (name, spectrum) in zip(maps, "ab", spectra.items(), strict=False):
+        text, colour = CELLS[str(name)]
+        image = panels.dispersion_map(axes, spectrum, norm, cell)
+        axes.set_title(f"({tag}) {text}")
+        axes.label_outer()
+        energy = np.maximum(spectrum.sum("wavenumber"), 1e-300)
+        side.plot(energy, energy["frequency"] / 1e3, color=colour, lw=0.7, label=text.split()[0].lower())
+    panels.colour_bar(image, [*maps, side], "Mean kinetic energy per bin (J)")
+    drive = model.drive.frequency / 1e3
     side.axhline(drive, color=style.BLACK, lw=0.6, ls=":")
-    side.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")
     panels.note(side, "drive", (1, drive), (-2, 2), xycoords=("axes fraction", "data"), ha="right", va="bottom")
+    side.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")
+    side.set_title(f"({'abc'[len(spectra)]}) Sum over κ")
     side.legend(loc="lower right")
-    panel_title(side, f"({'abc'[len(spectra)]}) Sum over κ")
     return figure
 
 
@@ -100,18 +99,18 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
                                cmap="viridis_r", rasterized=True)  # fmt: skip
     number = np.arange(1, len(sites) + 1)
     raster.set_yticks(number, [f"{c}" for c in sites])
-    raster.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=run["time"][[0, -1]], ylim=(0.4, len(sites) + 0.6))
+    title = f"(a) {len(site)} contact episodes (▲ positive side, ▼ negative side)"
+    raster.set(title=title, xlabel="Time (s)", ylabel="Contact site (cell)", xlim=run["time"][[0, -1]])
+    raster.set_ylim(0.4, len(sites) + 0.6)
     raster.grid(axis="y", color=style.PALE, lw=0.5)
     raster.set_axisbelow(True)
-    panels.colour_bar(figure, image, raster, "Approach speed (m/s)")
-    panel_title(raster, f"(a) {len(site)} contact episodes (▲ positive side, ▼ negative side)")
+    panels.colour_bar(image, raster, "Approach speed (m/s)")
 
     index = site.astype(int) - 1
     loss, episodes = np.bincount(index, np.nan_to_num(lost), len(sites)), np.bincount(index, minlength=len(sites))
-    bars.bar_label(bars.barh(number, loss, 0.6, color=style.VERMILION), episodes, padding=2, fontsize=6.5)
-    bars.set(xlabel="Energy lost (J)", xlim=(0, 1.25 * max(loss.max(), 1e-300)))
+    bars.bar_label(bars.barh(number, loss, 0.6, color=style.VERMILION), episodes, padding=2)
+    bars.set(title="(b) Loss, episodes", xlabel="Energy lost (J)", xlim=(0, 1.25 * max(loss.max(), 1e-300)))
     bars.tick_params(left=False)
-    panel_title(bars, "(b) Loss, episodes")
     return figure
 
 
@@ -119,27 +118,28 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Energies over time, and below them the residual relative to the work done, on a log scale."""
     time = run["time"].values
     names = "kinetic", "spring", "contact", "work", "dissipated"
-    kinetic, spring, contact, work, dissipated = (run[f"energy/{name}"].values for name in names)
-    largest = np.abs(work).max()
+    kinetic, spring, contact, work, dissipated = (run[f"energy/{name}"] for name in names)
+    largest = float(np.abs(work).max())
     if len(time) < 2 or largest == 0:
         return empty_figure("Energy ledger: the drive has done no work")
     figure = style.new_figure(style.COLUMN, 3.3)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
-    factor, prefix = style.si_prefix(largest)
     # Both swing at twice the drive's frequency, which no page can resolve; means over two periods can be seen.
-    window = int(np.ceil(4 * np.pi / Case.of(run).model().drive.frequency / (time[1] - time[0])))
+    window = min(int(np.ceil(4 * np.pi / Case.of(run).model().drive.frequency / (time[1] - time[0]))), len(time))
+    means = run[["energy/kinetic", "energy/spring"]].rolling(time=window, center=True, min_periods=1).mean()
     stored = kinetic + spring + contact
     curves = (
         ("work of the drive", work, style.BLACK, "-"),
         ("kinetic + potential", stored, style.BLUE, "-"),
         ("dissipated", dissipated, style.VERMILION, "-"),
-        ("kinetic, mean", _running_mean(kinetic, window), style.SKY, "-"),
-        ("springs, mean", _running_mean(spring, window), style.GREEN, (0, (3, 1.5))),
+        ("kinetic, mean", means["energy/kinetic"], style.SKY, "-"),
+        ("springs, mean", means["energy/spring"], style.GREEN, (0, (3, 1.5))),
         ("contacts", contact, style.PURPLE, "-"),
     )
     for label, energy, colour, dashes in curves:
-        upper.plot(time, energy / factor, color=colour, ls=dashes, label=label, lw=0.9)
-    upper.set(ylabel=f"Energy ({prefix}J)", ylim=(-0.03 * largest / factor, 1.4 * largest / factor))
+        upper.plot(time, energy, color=colour, ls=dashes, label=label, lw=0.9)
+    upper.set(ylabel="Energy", xlim=time[[0, -1]], ylim=(-0.03 * largest, 1.4 * largest))
+    upper.yaxis.set_major_formatter(EngFormatter("J"))
     upper.legend(loc="upper center", ncol=2, columnspacing=1.2, labelspacing=0.25)
 
     residual = np.abs(work - dissipated - stored) / largest
@@ -147,15 +147,67 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     lower.axhline(LARGEST_RESIDUAL, color=style.VERMILION, lw=0.7, ls=style.DASHED)
     panels.note(lower, "limit 1e-8", (0.99, LARGEST_RESIDUAL), (0, 1.5), xycoords=("axes fraction", "data"),
                 ha="right", va="bottom", color=style.VERMILION)  # fmt: skip
-    lower.set(xlabel="Time (s)", ylabel="|Residual| / work", xlim=time[[0, -1]])
-    lower.set_ylim(1e-15, max(1e-6, 10 * residual.max()))
+    lower.set(xlabel="Time (s)", ylabel="|Residual| / work", ylim=(1e-15, max(1e-6, 10 * float(residual.max()))))
     return figure
 
 
-def _running_mean(values: np.ndarray, samples: int) -> np.ndarray:
-    """Mean over ``samples``, over fewer at the ends."""
-    window = np.ones(min(samples, len(values)))
-    return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")
+def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
+    """Velocity against displacement at the first site: grey before the first contact, then by time."""
+    site = leading_site(run)
+    if site is None:
+        return empty_figure("Phase portraits: the lattice has no contact sites")
+    cell, clearance = int(run["sites/cell"][site]), 1e3 * float(run["sites/clearance"][site])
+    if cell not in run["cell"].values:
+        return empty_figure(f"Phase portraits: cell {cell}, the first site, was not recorded")
+    if "displacement" not in run or "velocity" not in run:
+        return empty_figure("Phase portraits: they need displacement and velocity, and one was not recorded")
+    pair, motion = Case.of(run).model().chain.cell, run.sel(cell=cell)
+    u, v, time = refined(motion["displacement"].values, motion["velocity"].values, field_time(run))
+    onsets = run["impacts/onset"].values[run["impacts/site"].values == site + 1]
+    before = int(np.searchsorted(time, onsets.min(initial=np.inf)))
+
+    figure = style.new_figure(style.PAGE, 2.4)
+    grid = figure.subplots(1, 3)
+    h, r = pair.host, pair.resonator
+    portraits = (
+        (u[:, h], v[:, h], "(a) Host", "u_h"),
+        (u[:, r], v[:, r], "(b) Resonator", "u_r"),
+        (u[:, r] - u[:, h], v[:, r] - v[:, h], "(c) Relative motion", "w"),
+    )
+    for axes, (x, y, title, symbol) in zip(grid, portraits, strict=True):
+        points = np.stack([1e3 * x, y], axis=1)
+        segments = list(np.stack([points[:-1], points[1:]], axis=1)[before:])
+        after = LineCollection(segments, array=time[before:-1], cmap="viridis", lw=0.4, rasterized=True)
+        axes.add_collection(after)
+        axes.plot(*points[: before + 1].T, color=style.GREY, lw=0.4, rasterized=True)
+        centre_axes(axes, points[:, 0], points[:, 1])
+        axes.set(title=f"{title}, cell {cell}", xlabel=f"${symbol}$ (mm)", ylabel=rf"$\dot{{{symbol}}}$ (m/s)")
+    wide = max(axes.get_xlim()[1], 1.15 * clearance)
+    axes.set_xlim(-wide, wide)
+    axes.vlines([-clearance, clearance], *axes.get_ylim(), color=style.VERMILION, lw=0.8, ls=style.DASHED)
+    panels.note(axes, "clearance", (clearance, 1), (-2, -2), xycoords=("data", "axes fraction"), ha="right", va="top",
+                color=style.VERMILION)  # fmt: skip
+    if len(onsets):
+        panels.colour_bar(after, grid, "Time (s)", extend="neither")
+    else:
+        axes.text(0.5, 0.03, "no contact", ha="center", color=style.GREY, transform=axes.transAxes)
+    return figure
+
+
+def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Displacement, velocity and time on a finer grid, so that fast turns at the stops are not polygons."""
+    if len(time) < 2:
+        return u, v, time
+    fine = np.interp(np.arange((len(time) - 1) * REFINE + 1) / REFINE, np.arange(len(time)), time)
+    motion = CubicHermiteSpline(time, u, v, axis=0)
+    return motion(fine), motion(fine, 1), fine
+
+
+def centre_axes(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    """Limits symmetric about zero that hold ``x`` and ``y`` with a margin."""
+    for set_limits, values in ((axes.set_xlim, x), (axes.set_ylim, y)):
+        reach = 1.07 * np.abs(values).max() or 1.0
+        set_limits(-reach, reach)
 
 
 def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
@@ -164,17 +216,13 @@ def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
     figure = style.new_figure(style.PAGE * 0.72, 3.0)
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.3, 1))
     panels.band_diagram(left, cell, frequency)
-    for branch, speed, band, colour in zip(
-        point.frequency.T, point.group_velocity.T, passing, cycle(style.SERIES), strict=False
-    ):
-        right.plot(speed, branch / 1e3, color=colour)
-        at = 1.0, (band.low + band.high) / 2e3
-        panels.note(left, f"{band.number}", at, (3, 0), va="center", fontsize=8, color=colour)
+    right.plot(point.group_velocity, point.frequency / 1e3)
     panels.shade_bands(right, gaps(passing))
     if frequency is not None:
         right.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
-    right.set(xlabel="Group velocity dω/dκ (cells/s)")
     right.axvline(0, color=style.GREY, lw=0.5)
-    panel_title(left, "(a) Bands; gaps shaded")
-    panel_title(right, "(b) Group velocity")
+    for i, band in enumerate(passing):
+        panels.note(left, f"{band.number}", (1, (band.low + band.high) / 2e3), (3, 0), va="center", color=f"C{i}")
+    left.set_title("(a) Bands; gaps shaded")
+    right.set(title="(b) Group velocity", xlabel="Group velocity dω/dκ (cells/s)")
     return figure

@@ -11,7 +11,7 @@ from matplotlib.patches import ConnectionPatch
 from scipy.ndimage import gaussian_filter
 
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import KAPPA, ROMAN, panel_title
+from vipetsc.figures.panels import ROMAN
 from vipetsc.figures.study import AmplitudeSeries, MeasuredRun, from_series
 from vipetsc.io.read import field_time
 from vipetsc.lattice import bloch, pass_bands
@@ -30,7 +30,7 @@ ROWS = {
     "wavenumber_content": "Energy of a wavenumber",
     "dispersion": "Mean energy of a bin",
 }
-MOMENTS = ("before the first site", "at the first site", "past the last site", "near the end")
+MOMENTS = ("Before the first site", "At the first site", "Past the last site", "Near the end")
 
 
 @from_series(*ROWS)
@@ -40,13 +40,11 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
     Energies are divided by the square of the amplitude: one scale serves a row, and what differs between its
     panels is nonlinear.
     """
-    figure = style.new_figure(style.PAGE, 6.4, series.title)
-    grid = figure.subplots(3, 3, sharey="row")
-    cell = series.runs[0].model.chain.cell
-    for row, (name, label) in enumerate(ROWS.items()):
-        fields = [member.analysis[name].load() / member.amplitude**2 for member in series.runs]
+    figure, grid = series.page(3, 6.4, sharey="row")
+    for row, (name, label) in zip(grid, ROWS.items(), strict=True):
+        fields = [member.analysis[name].load() / member.case.drive.amplitude**2 for member in series.runs]
         norm = panels.log_norm(*fields)
-        for axes, field, (tag, member, heading) in zip(grid[row], fields, series.headings(row), strict=True):
+        for axes, field, member in zip(row, fields, series.runs, strict=True):
             if name == "kinetic_energy":
                 image = panels.space_time_map(axes, field, norm, member.run)
             elif name == "wavenumber_content":
@@ -54,13 +52,11 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
                 axes.plot(0.015, series.wave.wavenumber / np.pi, ">", color=style.SKY, mec="white", mew=0.3, ms=4,
                           transform=axes.get_yaxis_transform())  # fmt: skip
             else:
-                image = panels.dispersion_map(axes, field, norm, cell)
-            axes.set(xlabel=KAPPA if name == "dispersion" else "Time (s)", ylabel="")
-            panel_title(axes, f"{tag} {heading}" if row == 0 else tag)
-        panels.colour_bar(figure, image, grid[row], f"{label} / A² (J/N²)")
-    grid[0, 0].set(ylabel="Cell")
-    grid[1, 0].set(ylabel=KAPPA, ylim=(0, 1))
-    grid[2, 0].set(ylabel="Frequency ω (krad/s)", ylim=(0, 1.1e-3 * pass_bands(cell)[-1].high))
+                image = panels.dispersion_map(axes, field, norm, member.model.chain.cell)
+                axes.set_ylim(0, 1.1e-3 * pass_bands(member.model.chain.cell)[-1].high)
+        panels.colour_bar(image, row, f"{label} / A² (J/N²)")
+    for axes in grid[:, 1:].flat:
+        axes.set_ylabel("")
     return figure
 
 
@@ -76,24 +72,21 @@ def wavelets(series: AmplitudeSeries) -> Figure:
         time = field_time(member.run)
         samples = [int(np.argmin(np.abs(time - t))) for t in series.snapshot_times()]
         host = member.run["velocity"][samples, :, member.model.chain.cell.host].values
-        values = np.abs(transform(host, kappa, KC)[..., : host.shape[-1]]) / abs(member.amplitude)
+        values = np.abs(transform(host, kappa, KC)[..., : host.shape[-1]]) / abs(member.case.drive.amplitude)
         transforms.append((time[samples], values))
     norm = panels.log_norm(*(values for _, values in transforms), decades=2.5)
 
-    figure = style.new_figure(style.PAGE, 6.6, series.title)
-    grid = figure.subplots(4, 3, sharex=True, sharey=True)
+    figure, grid = series.page(4, 6.6, sharex=True, sharey=True)
     for row, moment in enumerate(MOMENTS):
-        columns = zip(grid[row], transforms, series.headings(row), strict=True)
-        for axes, (time, values), (tag, member, heading) in columns:
+        for axes, (time, values), member in zip(grid[row], transforms, series.runs, strict=True):
             image = panels.draw_map(axes, member.run["cell"].values, kappa / np.pi, values[row], norm, "magma_r")
             axes.axhline(series.wave.wavenumber / np.pi, color=style.BLACK, lw=0.7)
             panels.mark_sites(axes, member.run, style.GREY, "x")
             axes.text(0.97, 0.94, f"t = {time[row]:.3g} s", transform=axes.transAxes, ha="right", va="top",
                       bbox={"facecolor": "white", "alpha": 0.6, "lw": 0, "pad": 1.0})  # fmt: skip
-            panel_title(axes, f"{tag} {moment}" if row else f"{heading}\n{tag} {moment}")
-    grid[0, 0].set(ylim=(0, 1))
-    panels.label_outer(grid, "Cell", "κ (π rad/cell)")
-    panels.colour_bar(figure, image, grid.flat, "Wavelet transform |X| / A (m/s/N)", aspect=50)
+        grid[row, 0].set(ylabel=f"{moment}\nκ (π rad/cell)", ylim=(0, 1))
+    figure.supxlabel("Cell")
+    panels.colour_bar(image, grid, "Wavelet transform |X| / A (m/s/N)", aspect=50)
     return figure
 
 
@@ -108,23 +101,21 @@ def entropy_maps(series: AmplitudeSeries) -> Figure:
         weight = member.analysis["entropy/weight"]
         fields.append(member.analysis["entropy/local"].where(weight > LEAST_WEIGHT * weight.max()))
     norm = panels.percentile_norm(fields)
-    figure = style.new_figure(style.PAGE, 2.7, series.title)
-    grid = figure.subplots(1, 3, sharey=True)
-    for axes, field, (tag, member, heading) in zip(grid, fields, series.headings(), strict=True):
+    figure, grid = series.page(1, 2.7, sharey=True)
+    for axes, field, member in zip(grid[0], fields, series.runs, strict=True):
         time, history = (member.analysis[f"entropy/{name}"].values for name in ("snapshot", "history"))
         image = panels.space_time_map(axes, field, norm)
         image.set_cmap("viridis")
         panels.mark_sites(axes, member.run, style.GREY)
+        axes.label_outer()
         # The line shares the colours' limits, so that the colour bar is its axis too.
         over = axes.twinx()
         over.plot(time, history, color="white", lw=2.0)
         over.plot(time, history, color=style.VERMILION, lw=0.9, label="H(t)")
         over.axvline(member.analysis.attrs["entropy/start"], color=style.BLACK, lw=0.7, ls="--", label="averages begin")
         over.set(ylim=(norm.vmin, norm.vmax), xlim=time[[0, -1]], yticks=[])
-        panel_title(axes, f"{tag} {heading}")
-        axes.set_ylabel("Cell" if axes is grid[0] else "")
     over.legend(loc="upper left")
-    panels.colour_bar(figure, image, grid, "H(x, t) and line: H(t) (bit)", extend="both")
+    panels.colour_bar(image, grid, "H(x, t) and line: H(t) (bit)", extend="both")
     return figure
 
 
@@ -156,38 +147,33 @@ def partition(series: AmplitudeSeries) -> Figure:
     field = medium.analysis[FIELD].load()
     bins, colours = shown_bins(wave.wavenumber, len(field)), bin_colours(len(field))
     norm = panels.log_norm(field[bins], decades=BINS_DECADES)
-    figure = style.new_figure(style.PAGE, 6.6, f"{series.title}; maps: medium amplitude, {medium.amplitude:g} N")
+    figure = style.new_figure(style.PAGE, 6.6, f"{series.title}; maps at {medium.case.drive.amplitude:g} N")
     upper, lower = figure.subfigures(2, 1, height_ratios=(2, 1.1))
     grid = upper.subplots(2, 4)
     *maps, band = grid.flat
     for axes, b, roman in zip(maps, bins, ROMAN, strict=False):
         image = panels.space_time_map(axes, field[b], norm, medium.run)
-        panel_title(axes, f"(a.{roman}) $K_{{{b + 1}}}$")
-        axes.set_ylabel("Cell" if axes in grid[:, 0] else "")
+        axes.set(title=f"(a.{roman}) $K_{{{b + 1}}}$", ylabel="Cell" if axes in grid[:, 0] else "")
         axes.tick_params(labelleft=axes in grid[:, 0])
     for axes in maps[len(bins) :]:
         axes.set_axis_off()
-    panels.colour_bar(upper, image, grid.flat, "Energy of a bin in a cell (J)", aspect=40)
+    panels.colour_bar(image, grid, "Energy of a bin in a cell (J)", aspect=40)
 
     for ends, colour in zip(itertools.pairwise(medium.analysis["partition/bounds"].values), colours, strict=True):
         kappa = np.linspace(*ends, 31)
         branch = bloch(medium.model.chain.cell, kappa).frequency[:, wave.band - 1]
         band.plot(kappa / np.pi, branch / 1e3, color=colour, lw=3, solid_capstyle="butt")
     band.axvline(wave.wavenumber / np.pi, color=style.BLACK, lw=0.6, ls=":")
-    band.set(xlabel="κ (π rad/cell)", ylabel="ω (krad/s)", xlim=(0, 1))
-    panel_title(band, f"(c) Band {wave.band} by bin")
+    band.set(title=f"(c) Band {wave.band} by bin", xlabel="κ (π rad/cell)", ylabel="ω (krad/s)", xlim=(0, 1))
 
     contours = lower.subplots(1, 3, sharey=True)
-    for axes, roman, (_, member, heading) in zip(contours, ROMAN, series.headings(), strict=False):
+    for axes, roman, heading, member in zip(contours, ROMAN, series.headings, series.runs, strict=False):
         _contours(axes, member, colours)
-        panel_title(axes, f"(b.{roman}) {heading}")
-        axes.set_xlabel("Time (s)")
+        axes.set(title=f"(b.{roman}) {heading}", xlabel="Time (s)")
     contours[0].set_ylabel("Cell")
-    edges = np.arange(len(colours) + 1) + 0.5
-    keys = mpl.cm.ScalarMappable(BoundaryNorm(edges, len(colours)), ListedColormap(colours))
-    bar = lower.colorbar(keys, ax=contours, label="Bin", pad=0.01, ticks=np.arange(1, len(colours) + 1))
-    bar.ax.tick_params(length=0, labelsize=6)
-    bar.minorticks_off()
+    number = np.arange(1, len(colours) + 1)
+    keys = mpl.cm.ScalarMappable(BoundaryNorm(np.append(0, number) + 0.5, len(colours)), ListedColormap(colours))
+    panels.colour_bar(keys, contours, "Bin", ticks=number, extend="neither")
     return figure
 
 
@@ -210,29 +196,23 @@ def _contours(axes: Axes, member: MeasuredRun, colours: np.ndarray) -> None:
 @from_series("partition/reconstructed")
 def reconstruction(series: AmplitudeSeries) -> Figure:
     """Total and reconstructed energy over time, relative error, the share between bins (paper, Fig. A1)."""
-    figure = style.new_figure(style.PAGE, 5.0, series.title)
-    grid = figure.subplots(3, 3, sharex="col", sharey="row")
+    figure, grid = series.page(3, 5.0, sharex="col", sharey="row")
     for (energies, errors, shares), member in zip(grid.T, series.runs, strict=True):
         names = "snapshot", "kinetic", "reconstructed", "error", "cross_share", "energy"
         time, kinetic, reconstructed, error, cross, parts = (member.analysis[f"partition/{n}"].values for n in names)
-        square = member.amplitude**2
+        square = member.case.drive.amplitude**2
         energies.plot(time, kinetic / square, color=style.BLACK, lw=1.4, label="KE of the lattice")
-        energies.plot(time, reconstructed / square, color=style.ORANGE, lw=0.8, ls=(0, (3, 2)),
-                      label="KE of the bins' sum")  # fmt: skip
+        energies.plot(time, reconstructed / square, color=style.ORANGE, lw=0.8, ls="--", label="KE of the bins' sum")
         energies.plot(time, parts.sum(axis=0) / square, color=style.BLUE, lw=0.7, label="sum of the twelve KE")
-        errors.semilogy(time, np.where(error > 0, error, np.nan), color=style.BLUE, lw=0.7)
+        errors.semilogy(time, np.where(error > 0, error, np.nan), lw=0.7)
         errors.axhline(0.01, color=style.VERMILION, lw=0.8, ls="--")
         shares.plot(time, cross, color=style.GREEN, lw=0.8)
         shares.set(ylim=(0, 1), xlabel="Time (s)", xlim=time[[0, -1]])
         shares.locator_params(axis="x", nbins=5)
-    for row, line in enumerate(grid):
-        for axes, (tag, _, heading) in zip(line, series.headings(row), strict=True):
-            panel_title(axes, f"{tag} {heading}" if row == 0 else tag)
     grid[0, 0].set(ylabel="Kinetic energy / A² (J/N²)", ylim=(0, None))
     grid[0, 0].legend(loc="upper left")
     grid[1, 0].set(ylabel="Relative error")
-    panels.note(grid[1, 0], "1 %", (1, 0.01), (-2, -2), xycoords=("axes fraction", "data"), fontsize=8,
-                ha="right", va="top", color=style.VERMILION)  # fmt: skip
+    panels.note(grid[1, 0], "1 %", (1, 0.01), (-2, -2), xycoords=("axes fraction", "data"), ha="right", va="top")
     grid[2, 0].set(ylabel="Share of KE between bins")
     return figure
 
@@ -252,49 +232,40 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     parts = inverse(transformed, nodes, BINS_KC)[:, : len(cells)]
     bins, colours = shown_bins(series.wave.wavenumber, len(field), EXPLAINED), bin_colours(len(field))
 
-    figure = style.new_figure(style.PAGE, 4.6, f"{series.title}; medium amplitude, {member.amplitude:g} N")
-    # The empty column leaves room for the arrows.
-    grid = figure.add_gridspec(EXPLAINED, 4, width_ratios=(1.15, 0.25, 1, 1.05))
-    above, below = (figure.add_subplot(rows) for rows in (grid[: EXPLAINED // 2, 0], grid[EXPLAINED // 2 :, 0]))
+    figure = style.new_figure(style.PAGE, 4.6, f"{series.title}; {member.case.drive.amplitude:g} N")
+    left, right = figure.subfigures(1, 2, width_ratios=(1, 1.8), wspace=0.1)  # apart, for the arrows
+    above, below = left.subplots(2, 1, sharex=True)
     above.plot(cells, signal, color=style.BLACK, lw=0.4)
-    above.set(ylabel="Host velocity (m/s)", xlim=cells[[0, -1]])
-    above.tick_params(labelbottom=False)
-    panel_title(above, f"(a) Snapshot at t = {time:.3g} s")
+    above.set(title=f"(a) Snapshot at t = {time:.3g} s", ylabel="Host velocity (m/s)", xlim=cells[[0, -1]])
     _domain(below, cells, transformed[:, : len(cells)], nodes, bounds)
     largest, norm = 1.1 * np.abs(parts[bins]).max(), panels.log_norm(field[bins], decades=BINS_DECADES)
+    grid = right.subplots(EXPLAINED, 2, sharex="col", sharey="col")
     # Bins rise upwards, as in the wavelet domain.
-    traces, maps = ([figure.add_subplot(grid[row, column]) for row in range(EXPLAINED)] for column in (2, 3))
-    for roman, b, trace, energy in zip(ROMAN, reversed(bins), traces, maps, strict=False):
+    for roman, b, (trace, energy) in zip(ROMAN, reversed(bins), grid, strict=False):
         trace.plot(cells, parts[b], color=colours[b], lw=0.5)
-        trace.set(xlim=cells[[0, -1]], ylim=(-largest, largest))
+        trace.set(title=f"(c.{roman}) Velocity (m/s) of $K_{{{b + 1}}}$", xlim=cells[[0, -1]], ylim=(-largest, largest))
         trace.yaxis.tick_right()
         image = panels.space_time_map(energy, field[b], norm, member.run)
         energy.axvline(time, color="white", lw=0.6)
-        for axes, tag, what in ((trace, "c", "Velocity (m/s)"), (energy, "d", "Energy")):
-            panel_title(axes, f"({tag}.{roman}) {what} of $K_{{{b + 1}}}$")
-            axes.tick_params(labelbottom=axes in (traces[-1], maps[-1]))
-            axes.set_xlabel("")
+        energy.set(title=f"(d.{roman}) Energy of $K_{{{b + 1}}}$", xlabel="")
         middle = float(np.clip(0.5 * (bounds[b] + bounds[b + 1]), nodes.kappa[0], np.pi)) / np.pi
         ends = (1.0, middle), (0.0, 0.5), below.get_yaxis_transform(), trace.transAxes
-        figure.add_artist(ConnectionPatch(*ends, arrowstyle="-|>", color=colours[b], lw=0.7, mutation_scale=6))
-    traces[-1].set_xlabel("Cell")
-    maps[-1].set_xlabel("Time (s)")
-    panels.colour_bar(figure, image, maps, "Energy of a bin in a cell (J)", pad=0.02, aspect=40)
+        right.add_artist(ConnectionPatch(*ends, arrowstyle="-|>", color=colours[b], lw=0.7, mutation_scale=6))
+    grid[-1, 0].set_xlabel("Cell")
+    grid[-1, 1].set_xlabel("Time (s)")
+    panels.colour_bar(image, grid[:, 1], "Energy of a bin in a cell (J)", aspect=40)
     return figure
 
 
 def _domain(axes: Axes, cells: np.ndarray, x: np.ndarray, nodes: Nodes, bounds: np.ndarray) -> None:
     """|X| over cells and wavenumber with the bounds of the bins, each named on the right edge."""
     inside = nodes.kappa <= np.pi
-    magnitude = np.abs(x[inside])
-    kappa = np.linspace(0, np.pi, 301)[1:]
-    nearest = np.abs(nodes.kappa[inside][None, :] - kappa[:, None]).argmin(axis=1)
-    panels.draw_map(axes, cells, kappa / np.pi, magnitude[nearest], panels.log_norm(magnitude, decades=2), "magma_r")
-    for bound in bounds[1:-1]:
-        axes.axhline(bound / np.pi, color=style.GREY, lw=0.4)
+    kappa, magnitude = nodes.kappa[inside] / np.pi, np.abs(x[inside])
+    colours = {"norm": panels.log_norm(magnitude, decades=2), "cmap": "magma_r", "rasterized": True}
+    axes.pcolormesh(cells, kappa, magnitude, shading="nearest", **colours)
+    axes.hlines(bounds[1:-1] / np.pi, *cells[[0, -1]], color=style.GREY, lw=0.4)
     middles = 0.5 * (bounds[:-1] + bounds[1:]) / np.pi
-    for b, (middle, colour) in enumerate(zip(middles, bin_colours(len(middles)), strict=True)):
-        axes.text(0.985, middle, f"{b + 1}", transform=axes.get_yaxis_transform(), ha="right", va="center",
+    for b, (middle, colour) in enumerate(zip(middles, bin_colours(len(middles)), strict=True), 1):
+        axes.text(0.985, middle, f"{b}", transform=axes.get_yaxis_transform(), ha="right", va="center",
                   fontsize=5.5, fontweight="bold", color=colour)  # fmt: skip
-    axes.set(xlabel="Cell", ylabel="κ (π rad/cell)", ylim=(0, 1))
-    panel_title(axes, "(b) Wavelets |X| and bins")
+    axes.set(title="(b) Wavelets |X| and bins", xlabel="Cell", ylabel="κ (π rad/cell)", ylim=(0, 1))

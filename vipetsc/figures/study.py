@@ -3,9 +3,8 @@
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property, partial, wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -14,10 +13,11 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model
+from vipetsc.figures import style
 from vipetsc.figures.panels import ROMAN, recorded_sites
 from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import axes, curves, field_time, open_ensemble, open_run, whole_members
+from vipetsc.io.read import axes, curves, field_time, open_run, whole_members
 from vipetsc.lattice import waves_at
 
 AMPLITUDE = "amplitude"
@@ -27,21 +27,13 @@ T = TypeVar("T")
 Sweeps = Sequence[xr.Dataset]
 """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`."""
 
-SweepFigure = Callable[[Sweeps], Iterator[Drawing]]
-"""Offers the drawings that the data of sweeps allow, each with a suffix for its file's name."""
 
-
-def read_sweeps(folders: Iterable[Path]) -> Sweeps:
-    """The finished sweeps among ``folders``; raises OSError or ValueError."""
-    return [open_ensemble(folder) for folder in folders if (folder / "ensemble.h5").exists()]
-
-
-@dataclass(frozen=True)
-class MeasuredRun:
-    """A member of a sweep with its fields: its case, ``run.h5`` and ``analysis.h5``."""
+class MeasuredRun(NamedTuple):
+    """A member of a sweep with its fields: its case, in the lattice's own terms (0-based) too, and its files."""
 
     folder: Path
     case: Case
+    model: Model
     run: xr.Dataset
     analysis: xr.Dataset
 
@@ -50,17 +42,8 @@ class MeasuredRun:
     def open(cls, folder: Path) -> Iterator[Self]:
         """The member in ``folder``, its files open for the time of the block; raises OSError or ValueError."""
         with open_run(folder / "run.h5") as run, open_netcdf(folder / "analysis.h5", "analysis") as analysis:
-            yield cls(folder, Case.of(run), run, analysis)
-
-    @cached_property
-    def model(self) -> Model:
-        """The case in the lattice's own terms (0-based)."""
-        return self.case.model()
-
-    @property
-    def amplitude(self) -> float:
-        """The drive's amplitude in N."""
-        return self.case.drive.amplitude
+            case = Case.of(run)
+            yield cls(folder, case, case.model(), run, analysis)
 
 
 def transfer_members(sweeps: Sweeps) -> Iterator[MeasuredRun]:
@@ -99,11 +82,21 @@ class AmplitudeSeries(NamedTuple):
     runs: tuple[MeasuredRun, ...]
     wave: Wave
 
-    def headings(self, row: int | None = None) -> Iterator[tuple[str, MeasuredRun, str]]:
-        """For each column of a figure: the tag of its panel in a ``row``, such as "(a.ii)", the run, its heading."""
-        for column, level, member in zip("abc", LEVELS, self.runs, strict=True):
-            tag = f"({column})" if row is None else f"({column}.{ROMAN[row]})"
-            yield tag, member, f"{level} amplitude, {member.amplitude:g} N"
+    @property
+    def headings(self) -> list[str]:
+        """What stands above each amplitude's panels."""
+        return [
+            f"{level} amplitude, {run.case.drive.amplitude:g} N" for level, run in zip(LEVELS, self.runs, strict=True)
+        ]
+
+    def page(self, rows: int, height: float, **shared: Any) -> tuple[Figure, np.ndarray]:
+        """A figure with a column of panels (row, column) for each amplitude, lettered and headed."""
+        figure = style.new_figure(style.PAGE, height, self.title)
+        grid = figure.subplots(rows, len(self.runs), squeeze=False, **shared)
+        for (row, column), panel in np.ndenumerate(grid):
+            tag = "abc"[column] + f".{ROMAN[row]}" * (rows > 1)
+            panel.set_title(f"({tag})" if row else f"({tag}) {self.headings[column]}")
+        return figure, grid
 
     def snapshot_times(self) -> np.ndarray:
         """Four times in s, from the linear wave: half way to the first site, at it, past the last, near the end.
@@ -117,15 +110,13 @@ class AmplitudeSeries(NamedTuple):
         return np.minimum(np.array([0.5 * burst + 0.5 * near, 0.5 * burst + near, burst + far, 0.95 * end]), end)
 
 
-def from_series(
-    *needs: str, wave: bool = False, sites: bool = False
-) -> Callable[[Callable[[AmplitudeSeries], Figure]], SweepFigure]:
+def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callable[..., Any]:
     """Decorator of a figure of an `AmplitudeSeries`: offers one picture a series whose analyses hold ``needs``.
 
     Of those only series that drive a ``wave`` of a pass band, or that recorded contact ``sites`` and cells beside them.
     """
 
-    def decorate(page: Callable[[AmplitudeSeries], Figure]) -> SweepFigure:
+    def decorate(page: Callable[[AmplitudeSeries], Figure]) -> Callable[[Sweeps], Iterator[Drawing]]:
         @wraps(page)
         def offer(sweeps: Sweeps) -> Iterator[Drawing]:
             for series in series_of(sweeps, *needs):

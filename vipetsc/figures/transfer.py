@@ -1,19 +1,19 @@
 """Inter-band transfer: nine panels of a run (paper, Figs. 7, S6), dispersions (Fig. 8), energies of bands (A3)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from itertools import cycle
+from itertools import count, cycle
 from pathlib import Path
 from string import ascii_lowercase
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import KAPPA, panel_title
 from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, transfer_members
 from vipetsc.figures.transfer_curves import Curve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
@@ -39,87 +39,76 @@ def transfer(sweeps: Sweeps) -> Iterator[style.Drawing]:
 def nine_panels(member: MeasuredRun) -> Figure:
     """(a) All energy, (b-e) that of every pass band, (f, g) both segments, (h, i) spectra of two cells."""
     run, cell = member.run, member.model.chain.cell
-    velocity = run["velocity"].values
-    figure = style.new_figure(style.PAGE, 7.6, Labels.of(member.case).member, left=True)
+    velocity, tags = run["velocity"].values, iter(ascii_lowercase)
+    figure = style.new_figure(style.PAGE, 7.6, Labels.of(member.case).member)
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
-    letters = iter(ascii_lowercase)
-    _space_time(upper, member, velocity, letters)
+    _space_time(upper, member, velocity, tags)
     spectra, maps = panels.below_cutoff(member.analysis, cell, list(SEGMENTS)), middle.subplots(1, 2, sharey=True)
     norm = panels.log_norm(*spectra.values())
     for axes, (name, (label, colour)) in zip(maps, SEGMENTS.items(), strict=True):
         image = panels.dispersion_map(axes, spectra[name], norm, cell)
-        axes.set_xlabel(KAPPA)
-        panel_title(axes, f"({next(letters)}) {label}")
+        axes.set_title(f"({next(tags)}) {label}")
         axes.plot([0.03, 0.03], [0.03, 0.97], color=colour, lw=2.2, transform=axes.transAxes)
-    maps[0].set_ylabel("Frequency ω (krad/s)")
-    panels.colour_bar(middle, image, maps, "Energy per bin (J)")
+        axes.label_outer()
+    panels.colour_bar(image, maps, "Energy per bin (J)")
     shown = INPUT_CELL, member.model.chain.cells // 2
     for axes, index in zip(lower.subplots(1, 2, sharey=True), (nearest_cell(run, n) for n in shown), strict=True):
         _spectra(axes, member, velocity[:, index])
-        panel_title(axes, f"({next(letters)}) Velocity spectra, cell {run['cell'].values[index]}")
+        axes.set_title(f"({next(tags)}) Velocity spectra, cell {run['cell'].values[index]}")
         axes.label_outer()
     return figure
 
 
-def _space_time(page: SubFigure, member: MeasuredRun, velocity: np.ndarray, letters: Iterator[str]) -> None:
+def _space_time(page: SubFigure, member: MeasuredRun, velocity: np.ndarray, tags: Iterator[str]) -> None:
     """Kinetic energy of all frequencies beside that of each pass band, to one scale; segments and sites marked."""
     run, cell, energy = member.run, member.model.chain.cell, member.analysis["kinetic_energy"]
-    parts, cells, time = Parts.of(pass_bands(cell)), run["cell"].values, field_time(run)
+    parts, cells, norm = Parts.of(pass_bands(cell)), run["cell"].values, panels.log_norm(energy)
     bands = [p for p, inside in enumerate(parts.bands) if inside]
     columns = -(-len(bands) // 2)
     grid = page.add_gridspec(2, 1 + columns, width_ratios=(1.35, *[1.0] * columns))
     whole = page.add_subplot(grid[:, 0])
-    norm = panels.log_norm(energy)
-    image = panels.space_time_map(whole, energy, norm)
-    panel_title(whole, f"({next(letters)}) Kinetic energy")
-    maps = [whole]
+    image = panels.space_time_map(whole, energy, norm, run)
+    whole.set_title(f"({next(tags)}) Kinetic energy")
     for i, p in enumerate(bands):
         axes = page.add_subplot(grid[i // columns, 1 + i % columns], sharex=whole, sharey=whole)
         (part,) = split(velocity, field_interval(run), parts.edges[p : p + 2])
-        panels.draw_map(axes, time, cells, kinetic_energy(part, cell.masses).T, norm)
-        panel_title(axes, f"({next(letters)}) {parts.names[p].capitalize()}")
-        axes.set_xlabel("Time (s)")
+        panels.draw_map(axes, field_time(run), cells, kinetic_energy(part, cell.masses).T, norm)
+        axes.set(title=f"({next(tags)}) {parts.names[p].capitalize()}", xlabel="Time (s)")
         axes.label_outer()
-        maps.append(axes)
-    whole.set(ylim=(cells[0] - 0.5, cells[-1] + 0.5), xlim=time[[0, -1]])
-    panels.colour_bar(page, image, maps, "Kinetic energy of a cell (J)", aspect=35)
+    panels.colour_bar(image, page.axes, "Kinetic energy of a cell (J)", aspect=35)
 
-    across, sites = whole.get_yaxis_transform(), run["sites/cell"].values
-    first = sites[leading_site(run)]
+    across, first = whole.get_yaxis_transform(), run["sites/cell"].values[leading_site(run)]
     spans = (cells[0], first - 1), (first + 1, cells[-1])
     in_order = spans if member.model.drive_cell + 1 <= first else spans[::-1]
     for (name, colour), (low, high) in zip(SEGMENTS.values(), in_order, strict=True):
-        whole.plot([0.02, 0.02], [low + 1, high - 1], color=colour, lw=2.2, solid_capstyle="butt", transform=across)
-        whole.text(0.045, 0.5 * (low + high), name.split()[0].lower(), color=colour, rotation=90, va="center",
-                   fontsize=7, transform=across)  # fmt: skip
-    edge = np.full(len(sites), 0.985)
-    whole.plot(edge, sites, "<", color="white", mec=style.BLACK, mew=0.3, ms=3.5, transform=across)
+        whole.plot([0.98, 0.98], [low + 1, high - 1], color=colour, lw=2.2, solid_capstyle="butt", transform=across)
+        whole.text(0.955, 0.5 * (low + high), name.split()[0].lower(), color=colour, rotation=90, ha="right",
+                   va="center", transform=across)  # fmt: skip
 
 
 def _spectra(axes: Axes, member: MeasuredRun, velocity: np.ndarray) -> None:
     """Amplitude spectra of the masses of one cell, ``velocity`` (t, dof); pass bands shaded, history inset."""
-    cell, time = member.model.chain.cell, field_time(member.run)
-    step, bands = field_interval(member.run), pass_bands(cell)
+    cell, step = member.model.chain.cell, field_interval(member.run)
+    bands = pass_bands(cell)
     frequency = 2e-3 * np.pi * np.fft.rfftfreq(len(velocity), step)
     spectrum = np.abs(np.fft.rfft(velocity * taper(len(velocity), TAPER)[:, None], axis=0)) * step
     shown = frequency <= 1.1e-3 * bands[-1].high
     panels.shade_bands(axes, ((band.low, band.high) for band in bands), "x")
     for band in bands:
-        panels.note(axes, str(band.number), (0.5e-3 * (band.low + band.high), 0), (0, 2), ha="center", color=style.GREY,
-                    xycoords=("data", "axes fraction"))  # fmt: skip
-    inset = axes.inset_axes([0.42, 0.70, 0.56, 0.28])
+        middle, across = 0.5e-3 * (band.low + band.high), axes.get_xaxis_transform()
+        axes.text(middle, 0.02, str(band.number), ha="center", color=style.GREY, transform=across)
     roles = {cell.host: " (host)", cell.resonator: " (resonator)"}
-    for j, colour in zip(range(cell.dofs), cycle(style.SERIES), strict=False):
-        line = {"color": colour, "lw": 0.5, "alpha": 0.85, "rasterized": True}
-        label = f"mass {j + 1}{roles.get(j, '')}"
-        axes.plot(frequency[shown], np.maximum(spectrum[shown, j], 1e-300), label=label, **line)
-        inset.plot(time, velocity[:, j], **line)
+    labels = [f"mass {j + 1}{roles.get(j, '')}" for j in range(cell.dofs)]
+    line = {"lw": 0.5, "alpha": 0.85, "rasterized": True}
+    axes.plot(frequency[shown], np.maximum(spectrum[shown], 1e-300), label=labels, **line)
     peak = spectrum.max() or 1.0
     low = min(10.0**-panels.DECADES * peak, axes.get_ylim()[1])
     axes.set(yscale="log", xlim=(0, frequency[shown][-1]), ylim=(low, ROOM * peak))
-    axes.set(xlabel="Frequency ω (krad/s)", ylabel="Velocity spectrum (m)")
+    axes.set(xlabel=panels.OMEGA, ylabel="Velocity spectrum (m)")
     axes.legend(loc="upper left", fontsize=5.5, handlelength=1.0, labelspacing=0.2)
-    inset.set_xlim(time[[0, -1]])
+    inset = axes.inset_axes([0.42, 0.70, 0.56, 0.28])
+    inset.plot(field_time(member.run), velocity, **line)
+    inset.margins(x=0)
     inset.tick_params(labelsize=5, pad=1)
     inset.set_ylabel("m/s", fontsize=5.5, labelpad=0)
     inset.set_xlabel("s", fontsize=5.5, labelpad=-4, loc="right")
@@ -136,7 +125,7 @@ def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
     """One panel a member; colours run over five decades below each panel's own largest value."""
     runs = {(case.contacts.law, case.drive.amplitude): folder for case, folder in members}
     laws, amplitudes = sorted({law for law, _ in runs}, reverse=True), sorted({amplitude for _, amplitude in runs})
-    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * len(laws), Labels.of(members[0][0]).page, left=True)
+    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * len(laws), Labels.of(members[0][0]).page)
     grid = figure.subplots(len(laws), len(amplitudes), sharex=True, sharey=True, squeeze=False)
     for (i, j), axes in np.ndenumerate(grid):
         if (laws[i], amplitudes[j]) not in runs:
@@ -147,11 +136,11 @@ def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
             energy = panels.below_cutoff(member.analysis, cell, ["dispersion"])["dispersion"]
             energy = energy / (float(energy.max()) or 1.0)
             image = panels.dispersion_map(axes, energy, panels.log_norm(energy), cell)
+            axes.label_outer()
             transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
-        panel_title(axes, f"({'abcdef'[i]}.{j + 1}) {laws[i].capitalize()}, {amplitudes[j]:.4g} N")
-        axes.text(0.03, 0.41, transferred, color="white", fontsize=6.5, transform=axes.transAxes)
-    panels.label_outer(grid, KAPPA, "Frequency ω (krad/s)")
-    panels.colour_bar(figure, image, grid.flat, "Energy per bin over its largest", aspect=35)
+        axes.set_title(f"({'abcdef'[i]}.{j + 1}) {laws[i].capitalize()}, {amplitudes[j]:.4g} N")
+        axes.text(0.03, 0.41, transferred, color="white", transform=axes.transAxes)
+    panels.colour_bar(image, grid, "Energy per bin over its largest", aspect=35)
     return figure
 
 
@@ -162,7 +151,7 @@ def band_energies(sweeps: Sweeps) -> Iterator[style.Drawing]:
             yield Labels.of(member.case).member_stem, partial(energies_over_time, member)
     with_shares = (curve for curve in transfer_curves(sweeps) if "bands/share" in curve.data)
     for name, curves in grouped(with_shares, lambda curve: Labels.of(curve.case).page_stem).items():
-        yield f"shares-{name}", partial(shares, curves)
+        yield f"shares-{name}", partial(columns_of_laws, curves, "Mean share of the energy (1)", _shares)
 
 
 def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndarray:
@@ -172,66 +161,56 @@ def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndar
     drive is what an energy of a part means. NaN where the total is below 1e-3 of its largest.
     """
     samples = max(min(samples, len(total)), 1)
-    together, whole = (_running_mean(energy, samples) for energy in (parts.sum(axis=0), total))
+    energies = np.stack([parts.sum(axis=0), total])
+    together, whole = sliding_window_view(energies, samples, axis=1).mean(axis=2)
     above_threshold = whole > LEAST_SHARE * whole.max()
     return np.divide(np.abs(together - whole), whole, out=np.full_like(whole, np.nan), where=above_threshold)
-
-
-def _running_mean(values: np.ndarray, samples: int) -> np.ndarray:
-    return np.convolve(values, np.full(samples, 1.0 / samples), "valid")
 
 
 def energies_over_time(member: MeasuredRun) -> Figure:
     """The parts and their sum against the total (mean over a period of the drive), and how far they miss it."""
     analysis = member.analysis
     time, parts, total = (analysis[name].values for name in ("time", "bands/energy", "bands/total"))
-    names = list(np.atleast_1d(analysis["bands/energy"].attrs["parts"]))
     samples = max(round(2 * np.pi / member.model.drive.frequency / (time[1] - time[0])), 1)
-    means = (_running_mean(values, samples) for values in (time, total, parts.sum(axis=0), *parts))
-    time, mean_total, mean_sum, *mean_parts = means
-    figure = style.new_figure(style.PAGE * 0.8, 4.2, Labels.of(member.case).member, left=True)
+    series = np.stack([time, total, parts.sum(axis=0), *parts])
+    time, mean_total, mean_sum, *mean_parts = sliding_window_view(series, samples, axis=1).mean(axis=2)
+    figure = style.new_figure(style.PAGE * 0.8, 4.2, Labels.of(member.case).member)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1))
-    for line, name, part in zip(_lines(names), names, mean_parts, strict=True):
-        upper.plot(time, part, label=name, **line)
+    _draw_parts(upper, time, analysis["bands/energy"].attrs["parts"], mean_parts)
     upper.plot(time, mean_total, color=style.BLACK, lw=1.6, label="total")
     upper.plot(time, mean_sum, color=style.YELLOW, lw=0.8, ls="--", label="sum of parts")
     top = total.max() or 1.0
     upper.set(yscale="log", ylim=(top * 10.0**-SHARE_DECADES, 3 * top), ylabel="Kinetic energy (J)")
-    upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
-    panel_title(upper, "(a) Parts of the frequency axis, mean over a period of the drive")
+    upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    upper.set_title("(a) Parts of the frequency axis, mean over a period of the drive")
 
     error = closing_error(parts, total, samples)
-    lower.plot(time, 100 * np.maximum(error, 1e-12), color=style.BLUE, lw=0.7)
+    lower.plot(time, 100 * np.maximum(error, 1e-12), lw=0.7)
     lower.axhline(100 * LARGEST_ERROR, color=style.VERMILION, lw=0.7, ls="--")
     whole = abs(parts.sum() / (total.sum() or 1.0) - 1)
     below = np.mean(error[np.isfinite(error)] <= LARGEST_ERROR)
     text = f"whole record: {100 * whole:.2g} %; at most 1 % for {100 * below:.3g} % of the time"
-    lower.text(0.5, 0.93, text, ha="center", va="top", fontsize=6.5, transform=lower.transAxes)
+    lower.text(0.5, 0.93, text, ha="center", va="top", transform=lower.transAxes)
     lower.set(yscale="log", ylim=(1e-4, 1e3), xlim=analysis["time"][[0, -1]], xlabel="Time (s)", ylabel="Error (%)")
-    panel_title(lower, "(b) Sum of the parts against the total")
-    return figure
-
-
-def shares(curves: Sequence[Curve]) -> Figure:
-    """Mean share of every part after the wave's arrival against the amplitude; a column a law."""
-    figure = columns_of_laws(curves, 4.6, 2.7, "Mean share of the energy (1)", _shares)
-    figure.axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
+    lower.set_title("(b) Sum of the parts against the total")
     return figure
 
 
 def _shares(axes: Axes, curve: Curve) -> str:
+    """Mean share of every part after the wave's arrival against the amplitude."""
     share = curve.data["bands/share"]
-    names = list(np.atleast_1d(share.attrs["parts"]))
-    for line, name, part in zip(_lines(names), names, share.values.T, strict=True):
-        axes.plot(curve.data["amplitude"], np.maximum(part, 1e-300), label=name, **line)
+    _draw_parts(axes, curve.data["amplitude"], share.attrs["parts"], np.maximum(share.values.T, 1e-300))
     axes.plot(curve.data["amplitude"], share.values.sum(axis=1), color=style.BLACK, lw=0.6, ls=":", label="sum")
     axes.set(xscale="log", yscale="log", ylim=(10.0**-SHARE_DECADES, 2), xlabel="Amplitude of the drive (N)")
+    if axes.get_subplotspec().is_last_col():
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return Labels.of(curve.case).law
 
 
-def _lines(names: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _draw_parts(axes: Axes, x: ArrayLike, names: ArrayLike, energies: Iterable[np.ndarray]) -> None:
     """A colour for each pass band, grey dashes for each gap and for what lies above."""
-    bands, gaps = cycle(style.SERIES), cycle(GAPS)
-    for name in names:
+    bands, gaps = (f"C{i}" for i in count()), cycle(GAPS)
+    for name, energy in zip(np.atleast_1d(names), energies, strict=True):
         is_band = name.startswith("band")
-        yield {"color": next(bands), "lw": 1.0} if is_band else {"color": style.GREY, "lw": 0.7, "ls": next(gaps)}
+        line = {"color": next(bands)} if is_band else {"color": style.GREY, "lw": 0.7, "ls": next(gaps)}
+        axes.plot(x, energy, label=name, **line)

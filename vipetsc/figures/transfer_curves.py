@@ -1,9 +1,10 @@
-"""Inter-band transfer against the amplitude (paper, Fig. 9) and against the slope of a branch (Figs. 12, S7, S8)."""
+"""Inter-band transfer over the amplitude (paper, Fig. 9), beside a branch (Figs. 12, S7, S8), and its regimes."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from string import ascii_lowercase
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,13 +12,15 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case
 from vipetsc.figures import style
-from vipetsc.figures.panels import label_outer, panel_title, shade_regions
-from vipetsc.figures.study import AMPLITUDE, Labels, Sweeps, grouped, sites_of
+from vipetsc.figures.panels import note, recorded_sites, shade_regions
+from vipetsc.figures.runs import centre_axes, refined
+from vipetsc.figures.study import AMPLITUDE, Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import curves
+from vipetsc.io.read import curves, field_interval, field_time
 
-LINES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.PURPLE, "D"), (style.ORANGE, "v"))
+MARKERS = "os^Dv"  # of configurations
 FEWEST = 6  # amplitudes that make a curve
+PERIODS = 10  # of the drive that a phase portrait shows
 
 
 class Curve(NamedTuple):
@@ -42,73 +45,50 @@ def transfer_curves(sweeps: Sweeps) -> Iterator[Curve]:
                 yield Curve(case, data.assign(floor=floor, peak=int(np.nanargmax(transfer))))
 
 
-def columns_of_laws(
-    shown: Sequence[Curve], narrow: float, height: float, ylabel: str, panel: Callable[[Axes, Curve], str]
-) -> Figure:
-    """A page of one configuration: a column a law, drawn by ``panel``, which returns the column's title.
-
-    A single column is ``narrow`` inches wide.
-    """
+def columns_of_laws(shown: Sequence[Curve], ylabel: str, panel: Callable[[Axes, Curve], str]) -> Figure:
+    """A page of one configuration: a column a law, drawn by ``panel``, which returns the column's title."""
     shown = sorted(shown, key=lambda curve: curve.case.contacts.law, reverse=True)
-    width = style.PAGE if len(shown) > 1 else narrow
-    figure = style.new_figure(width, height, Labels.of(shown[0].case).page, left=True)
+    figure = style.new_figure(style.PAGE if len(shown) > 1 else 4.3, 2.9, Labels.of(shown[0].case).page)
     grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for tag, axes, curve in zip("abcdef", grid, shown, strict=False):
-        panel_title(axes, f"({tag}) {panel(axes, curve)}")
+    for tag, axes, curve in zip(ascii_lowercase, grid, shown, strict=False):
+        axes.set_title(f"({tag}) {panel(axes, curve)}")
     grid[0].set_ylabel(ylabel)
     return figure
 
 
 def ibtet(sweeps: Sweeps) -> Iterator[style.Drawing]:
-    """One page a reading: laws in columns, linear and log-log scales in rows."""
+    """One page a reading, a column a law: about the peaks on linear scales, all amplitudes in logarithms."""
     for reading, of_reading in grouped(transfer_curves(sweeps), lambda curve: curve.case.lattice.reading).items():
         yield reading, partial(_page, reading, of_reading)
 
 
 def _page(reading: str, of_reading: Sequence[Curve]) -> Figure:
     laws = sorted({c.case.contacts.law for c in of_reading}, reverse=True)
-    kinds = dict(zip(dict.fromkeys(Labels.of(c.case).configuration for c in of_reading), LINES * 5, strict=False))
+    kinds = list(dict.fromkeys(Labels.of(c.case).configuration for c in of_reading))
     figure = style.new_figure(style.PAGE if len(laws) > 1 else style.COLUMN, 4.6)
     grid = figure.subplots(2, len(laws), sharey="row", squeeze=False)
-    for column, law in enumerate(laws):
+    figure.supxlabel("Amplitude of the drive (N)")
+    figure.supylabel("Inter-band transfer (1)")
+    for tag, (linear, logarithmic), law in zip(ascii_lowercase, grid.T, laws, strict=False):
         of_law = [c for c in of_reading if c.case.contacts.law == law]
-        linear, logarithmic = grid[:, column]
-        for row, axes in enumerate((linear, logarithmic)):
-            _draw(axes, of_law, kinds)
-            panel_title(axes, f"({'ab'[column % 2]}.{row + 1}) {law.capitalize()}, {reading}")
-        linear.set(xlim=(0, None), ylim=(0, None))
-        logarithmic.set(xscale="log", yscale="log", ylim=(None, 6.0))
-        logarithmic.legend(loc="upper right", fontsize=6)
-
-        # The curves about their peaks: a ring round the largest value of each, and what it is.
-        inset = linear.inset_axes([0.40, 0.30, 0.57, 0.64])
-        _draw(inset, of_law, kinds, size=1.8)
-        peaks = [tuple(float(c.data[name][c.data["peak"]]) for name in (AMPLITUDE, "ibtet")) for c in of_law]
-        nearest = min(
-            float(c.data[AMPLITUDE][c.data["ibtet"] > 0.1 * largest][0])
-            for c, (_, largest) in zip(of_law, peaks, strict=True)
-        )
-        right, top = np.max(peaks, axis=0)
-        inset.set(xlim=(0.0, max(10 * nearest, 2 * right)), ylim=(0, 1.18 * top))
-        inset.tick_params(labelsize=6, pad=1.5)
-        for line, (curve, (amplitude, largest)) in enumerate(zip(of_law, peaks, strict=True)):
-            colour, _ = kinds[Labels.of(curve.case).configuration]
-            inset.plot(amplitude, largest, "o", mfc="none", mec=colour, ms=6, mew=0.7)
-            inset.text(0.97, 0.95 - 0.11 * line, f"largest: {largest:.3f} at {amplitude:.3g} N", ha="right", va="top",
-                       fontsize=6, color=colour, transform=inset.transAxes)  # fmt: skip
-    for row in grid:
-        label_outer(row[None], "Amplitude of the drive (N)", "Inter-band transfer (1)")
+        for line, curve in enumerate(of_law):
+            number = kinds.index(Labels.of(curve.case).configuration)
+            amplitudes, transfer = (np.asarray(curve.data[name]) for name in (AMPLITUDE, "ibtet"))
+            line_style = {"color": f"C{number}", "marker": MARKERS[number % len(MARKERS)], "ms": 2.2, "lw": 0.7}
+            for axes in (linear, logarithmic):
+                axes.plot(amplitudes, transfer, label=kinds[number], **line_style)
+                if np.isfinite(curve.data["floor"]):
+                    axes.axhline(float(curve.data["floor"]), color=f"C{number}", lw=0.6, ls=style.DASHED, zorder=1)
+            # A ring round the largest value of each, and what it is.
+            amplitude, largest = amplitudes[curve.data["peak"]], transfer[curve.data["peak"]]
+            linear.plot(amplitude, largest, "o", mfc="none", mec=f"C{number}", ms=6, mew=0.7)
+            linear.text(0.97, 0.94 - 0.09 * line, f"largest: {largest:.3f} at {amplitude:.3g} N", ha="right", va="top",
+                        color=f"C{number}", transform=linear.transAxes)  # fmt: skip
+        reach = max(6 * c.data[AMPLITUDE][c.data["peak"]] for c in of_law)
+        linear.set(title=f"({tag}.1) {law.capitalize()}, {reading}", xlim=(0, float(reach)), ylim=(0, None))
+        logarithmic.set(title=f"({tag}.2) {law.capitalize()}, {reading}", xscale="log", yscale="log", ylim=(None, 6.0))
+        logarithmic.legend(loc="upper right")
     return figure
-
-
-def _draw(axes: Axes, shown: Sequence[Curve], kinds: dict[str, tuple[str, str]], size: float = 2.2) -> None:
-    """The curves, each with its floor dashed; ``kinds`` has colour and mark by configuration."""
-    for curve in shown:
-        kind = Labels.of(curve.case).configuration
-        colour, mark = kinds[kind]
-        axes.plot(curve.data[AMPLITUDE], curve.data["ibtet"], color=colour, marker=mark, ms=size, lw=0.7, label=kind)
-        if np.isfinite(curve.data["floor"]):
-            axes.axhline(float(curve.data["floor"]), color=colour, lw=0.6, ls=(0, (4, 3)), zorder=1)
 
 
 def ibtet_backbone(sweeps: Sweeps) -> Iterator[style.Drawing]:
@@ -117,19 +97,15 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[style.Drawing]:
         path = Path(ensemble.attrs["folder"]) / "backbone.h5"
         if not path.exists():
             continue
-        groups: dict[str, dict[str, Any]] = {}
         with open_netcdf(path, "backbone", ("case",)) as file:
-            variables = ((name, variable.values) for name, variable in file.variables.items())
-            if file.attrs["case"] != ensemble.attrs["case"]:
-                continue
-            for name, value in (*file.attrs.items(), *variables):
-                group, _, rest = str(name).partition("/")
-                if rest:
-                    groups.setdefault(group, {})[rest] = value
-        aligned = [Curve(Case.from_toml(values["case"]), values) for values in groups.values()]
-        ylabel = "Inter-band transfer, normalised slope (1)"
+            values = {**file.attrs, **{name: variable.values for name, variable in file.variables.items()}}
+        if values["case"] != ensemble.attrs["case"]:
+            continue
+        names = grouped((str(name) for name in values if "/" in str(name)), lambda name: name.partition("/")[0])
+        tables = ({name.partition("/")[2]: values[name] for name in of_group} for of_group in names.values())
+        aligned = [Curve(Case.from_toml(table["case"]), table) for table in tables]
         for name, columns in grouped(aligned, lambda curve: Labels.of(curve.case).page_stem).items():
-            yield name, partial(columns_of_laws, columns, 4.0, 3.0, ylabel, _superposition)
+            yield name, partial(columns_of_laws, columns, "Inter-band transfer, normalised slope (1)", _superposition)
 
 
 def _superposition(axes: Axes, aligned: Curve) -> str:
@@ -154,3 +130,75 @@ def _superposition(axes: Axes, aligned: Curve) -> str:
     axes.set(xscale="log", yscale="log", xlabel="Normalised energy (J)", xlim=(left, right), ylim=(0.25 * floor, 4.0))
     axes.legend(loc="upper right", fontsize=6)
     return f"{Labels.of(aligned.case).law}; branch of the {curve['branch_reading']} reading"
+
+
+class ContactMotion(NamedTuple):
+    """Displacement in m and velocity in m/s (t, 2) of host and resonator of the contact cell, and the transfer."""
+
+    case: Case
+    displacement: np.ndarray
+    velocity: np.ndarray
+    ibtet: float
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """The member in ``folder`` for ``PERIODS`` of the drive about its largest relative displacement."""
+        with MeasuredRun.open(folder) as member:
+            run, cell = member.run, member.model.chain.cell
+            motion = run.sel(cell=run["sites/cell"].values[0]).isel(dof=[cell.host, cell.resonator])
+            displacement, velocity = motion["displacement"].values, motion["velocity"].values
+            middle = int(np.argmax(np.abs(displacement[:, 1] - displacement[:, 0])))
+            half = round(PERIODS * np.pi / member.model.drive.frequency / field_interval(run))
+            shown = slice(max(middle - half, 0), middle + half + 1)
+            u, v, _ = refined(displacement[shown], velocity[shown], field_time(run)[shown])
+            return cls(member.case, u, v, float(member.analysis["ibtet"]))
+
+
+def phase_regimes(sweeps: Sweeps) -> Iterator[style.Drawing]:
+    """Trajectories of one embedded contact cell, for every law and reading, beside the transfer curve."""
+    folders: dict[str, list[Path]] = {}
+    for member in transfer_members(sweeps):
+        run = member.run
+        if len(recorded_sites(run)) == run.sizes["site"] == 1 and "displacement" in run and "velocity" in run:
+            folders.setdefault(_settings(member.case), []).append(member.folder)
+    curves = {(_settings(curve.case), *sites_of(curve.case)): curve for curve in transfer_curves(sweeps)}
+    for name, of_setting in folders.items():
+        yield name, partial(_regimes, of_setting, curves)
+
+
+def _settings(case: Case) -> str:
+    return f"{case.contacts.law}-{Labels.of(case).page_stem}"
+
+
+def _regimes(folders: Sequence[Path], curves: Mapping[tuple[Any, ...], Curve]) -> Figure:
+    motions = sorted(map(ContactMotion.read, folders), key=lambda motion: motion.case.drive.amplitude)
+    case = motions[0].case
+    labels, (site,) = Labels.of(case), sites_of(case)
+    columns = -(-len(motions) // 2)
+    shown = f"{PERIODS} periods of the drive about the largest $|w|$"
+    heading = f"{labels.law}, {case.lattice.reading}, {labels.configuration}, cell {site}; {shown}"
+    figure = style.new_figure(style.PAGE, 3.4, heading)
+    left, right = figure.subfigures(1, 2, width_ratios=(1, 0.62 * columns))
+    transfer, panels = left.subplots(), right.subplots(2, columns, squeeze=False).ravel()
+    curve = curves.get((_settings(case), site))
+    if curve is not None:
+        transfer.plot(curve.data["amplitude"], curve.data["ibtet"], "-o", color=style.GREY, ms=2, lw=0.7)
+    for number, (axes, motion) in enumerate(zip(panels, motions, strict=False), 1):
+        point = motion.case.drive.amplitude, motion.ibtet
+        transfer.plot(*point, "o", color=style.RED, ms=4, zorder=3)
+        note(transfer, str(number), point, (4, 3), fontsize=7.5, color=style.RED)
+        displacement = 1e3 * motion.displacement
+        for j, colour in ((1, style.BLUE), (0, style.RED)):
+            axes.plot(displacement[:, j], motion.velocity[:, j], color=colour, lw=0.5, label=("host", "resonator")[j])
+        centre_axes(axes, displacement, motion.velocity)
+        axes.tick_params(labelsize=6, pad=1.5)
+        axes.set(title=f"{number}: {point[0]:.4g} N", box_aspect=1)
+    right.supxlabel("Displacement $u$ (mm)")
+    right.supylabel(r"Velocity $\dot u$ (m/s)")
+    transfer.set(xscale="log", yscale="log", xlabel="Amplitude of the drive (N)", ylabel="Inter-band transfer (1)")
+    transfer.margins(x=0.08, y=0.12)
+    transfer.set_title("Transfer to higher bands")
+    for axes in panels[len(motions) :]:
+        axes.set_axis_off()
+    right.legend(handles=panels[0].get_lines(), loc="lower right", ncols=2)
+    return figure
