@@ -31,7 +31,7 @@ from vipetsc.dynamics.propagator.collocation import (
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.series import StepSeries, apply_impulses, evaluate, expand_free_motion, shift
-from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, gather
+from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil
 
 ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 
@@ -58,7 +58,6 @@ def fetch(layout: Layout, halo: HaloRegions, state: np.ndarray) -> None:
     vector = layout.create_vector()
     vector.array[: state.size] = state.ravel()
     halo.exchange(vector)
-    gather(halo.record, state)
     vector.destroy()
 
 
@@ -74,7 +73,7 @@ def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, toleran
         state, out = np.zeros((rows, n)), np.empty((rows, n))
         state.ravel()[column] = 1.0
         fetch(layout, halo, state)
-        apply_propagator(stencil, state, halo.record.columns, out)
+        apply_propagator(stencil, state, halo.columns, out)
         matrix[:, column] = out.ravel()
     half = rows * n // 2
     scale = np.where(np.arange(rows * n) < half, series.omega_max_h / interval, 1.0)  # a velocity counts as omega u
@@ -104,7 +103,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends):
     dofs = contact_dofs(model)[[dof for group in groups for dof in group]]
     taylor = np.zeros((len(dofs), 2 * series.terms))
     for c in range(len(groups)):
-        expand_free_motion(tables, c, halo.record.columns, taylor)
+        expand_free_motion(tables, c, halo.columns, taylor)
     for s in (0.3, 1.0):
         exact = (exponential(series.chain, s * series.interval) @ state.ravel()).reshape(2 * d, n)
         for i, dof in enumerate(dofs):
@@ -137,7 +136,7 @@ def test_clusters_that_cannot_touch_are_left_alone():
     for reached, expected in ((0.9 * clearance, []), (1.001 * clearance, [2]), (np.nan, [2])):
         state[resonator, 11] = reached
         fetch(layout, halo, state)
-        assert [c for c in range(4) if expand_free_motion(tables, c, halo.record.columns, taylor)] == expected
+        assert [c for c in range(4) if expand_free_motion(tables, c, halo.columns, taylor)] == expected
 
 
 def test_contacts_that_cannot_be_followed_end_the_run():

@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
-from petsc4py import PETSc
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from vipetsc.dynamics.propagator.advance import CHANGED, DONE, FAILED, advance_c
 from vipetsc.dynamics.propagator.collocation import Cluster
 from vipetsc.dynamics.propagator.forces import Forces, group_dofs, select_cluster
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries, apply_impulses, expand_free_motion
-from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, gather
+from vipetsc.dynamics.propagator.stencil import HaloRegions, Stencil, apply_propagator, create_stencil
 from vipetsc.parallel import StopRequest
 
 # Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
@@ -63,7 +62,7 @@ class States(NamedTuple):
     """Two states that steps read and write in turn; a sample interval in s has ``parts`` steps.
 
     ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, ``ghosts`` the
-    neighbouring ones, the last columns of the halo.
+    neighbouring ones, the last columns of ``HaloRegions``.
     """
 
     components: np.ndarray
@@ -75,25 +74,24 @@ class States(NamedTuple):
 
 @njit(error_model="numpy")
 def take_steps(
-    states: States, steps: int, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster
+    states: States, steps: int, stencil: Stencil, columns: np.ndarray, dofs: DofTables, clusters: Cluster
 ) -> Iterator[tuple[int, int, float]]:
     """Go on after so many linear ``steps``; hand over to Python where needed: why, for which cluster, the time in s.
 
-    ``ARRIVED``: the state is complete. ``STEPPED``: a step is done, cells of other ranks are to be fetched.
+    ``ARRIVED``: the state is complete. ``STEPPED``: a step is done, the columns are to be exchanged.
     ``CHANGED``: sites of a cluster are to be switched. ``FAILED``: the contacts of a cluster cannot be followed.
     """
-    rows, owned = halo.columns.shape[0], states.owned
+    rows, owned = columns.shape[0], states.owned
     while True:
         state, out = states.components[steps % 2], states.components[1 - steps % 2]
         cells, next_cells = state[: rows * owned].reshape(rows, owned), out[: rows * owned].reshape(rows, owned)
         begin = steps // states.parts * states.sample_interval + steps % states.parts * clusters.interval
-        gather(halo, cells)
-        ghosts = halo.columns[: rows // 2, halo.columns.shape[1] - states.ghosts :]
+        ghosts = columns[: rows // 2, columns.shape[1] - states.ghosts :]
         state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
         yield ARRIVED, -1, begin
-        apply_propagator(stencil, cells, halo.columns, next_cells)
+        apply_propagator(stencil, cells, columns, next_cells)
         for c in range(clusters.state.size):
-            may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
+            may_touch = expand_free_motion(dofs, c, columns, clusters.taylor)
             is_driven = dofs.first[c + 1] - 1 == dofs.driven and begin < clusters.burst.duration
             if not (may_touch or is_driven):
                 continue
@@ -138,11 +136,12 @@ class Propagator(Engine):
     def _start(self, steps: int) -> None:
         """Go on from the state after so many ``steps``."""
         self.steps, forces = steps, self._forces
-        self._events = take_steps(self._record, steps, self._stencil, self._halo.record, forces.dofs, forces.clusters)
+        self._events = take_steps(self._record, steps, self._stencil, self._halo.columns, forces.dofs, forces.clusters)
         self._arrive()
 
     def _arrive(self) -> None:
-        """Complete the state with what other ranks have."""
+        """Exchange cells, and complete the state with the ghosts and the ledger."""
+        self.state = self._states[self.steps % 2]
         self._halo.exchange(self.state)
         _, _, self.time = next(self._events)
 
@@ -163,11 +162,6 @@ class Propagator(Engine):
                 f" another (at most {MOST_SITES} may)"
             )
         return None
-
-    @property
-    def state(self) -> PETSc.Vec:
-        """The state at ``time``, as ``Layout`` orders it."""
-        return self._states[self.steps % 2]
 
     def advance(self, target: float) -> bool:
         """Step until the time is exactly ``target`` in s, a multiple of the sample interval; see ``Engine``."""

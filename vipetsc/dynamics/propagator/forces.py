@@ -45,7 +45,7 @@ def group_dofs(model: Model, reach: int) -> list[list[int]]:
 
     In each group the sites' numbers come first, in their own order, then -1 for the driven mass.
     """
-    cells = [*model.chain.sites, model.drive_cell]
+    cells = contact_dofs(model)["cell"].tolist()
     groups: list[list[int]] = []
     for dof in sorted(range(-1, len(cells) - 1), key=lambda dof: cells[dof]):
         if groups and cells[dof] - cells[groups[-1][-1]] <= reach:
@@ -94,7 +94,7 @@ class Forces:
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
         count, terms = len(self.dofs.column), series.terms
         self.clusters = Cluster(
-            contacts=create_contacts(model.contact, [dofs["clearance"][dof] for dof in chain(*groups)]),
+            contacts=create_contacts(model.contact, dofs["clearance"][list(chain(*groups))].tolist()),
             burst=create_burst(model.drive),
             response=_responses(groups, self.dofs, model, series),
             nodes=collocation(2 * terms),

@@ -21,31 +21,18 @@ CHUNK = 512
 GROUP = 8
 
 
-class Halo(NamedTuple):
-    """Copies of ranges of cells side by side in ``columns`` (2 dof, column).
+class HaloRegions:
+    """Copies of ranges of cells that a rank reads, its own and those of other ranks, side by side.
 
-    ``sources`` (column,) number the rank's own cells and, behind them, those of other ranks in ``fetched`` (2 dof,
-    cell).
+    ``add`` the ranges and call ``bind_columns`` once; after every step, ``exchange`` fills ``columns`` (2 dof, column).
+    Cells beyond an end of a lattice that is not periodic are replaced by its last one.
     """
 
     columns: np.ndarray
-    fetched: np.ndarray
-    sources: np.ndarray
-
-
-class HaloRegions:
-    """Ranges of cells that a rank reads.
-
-    ``add`` the ranges and call ``bind_columns`` once; after every step, ``exchange`` and then ``gather`` fill the
-    ``record``. Cells beyond an end of a lattice that is not periodic are replaced by its last one.
-    """
-
-    record: Halo
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
         self._ranges: list[np.ndarray] = [np.zeros(0, int)]
-        self._scatter: PETSc.Scatter | None = None
 
     def add(self, first: int, count: int) -> int:
         """Add ``count`` cells from ``first`` on; returns the column of the first one."""
@@ -53,43 +40,27 @@ class HaloRegions:
         return sum(map(len, self._ranges[:-1]))
 
     def bind_columns(self) -> None:
-        """Give every cell of the ranges its column and its source; all ranks must call it."""
+        """Give every cell of the ranges its column; all ranks must call it."""
         layout, rows, cells = self._layout, 2 * self._layout.dofs, np.concatenate(self._ranges)
         cells = cells % layout.cells if layout.periodic else np.clip(cells, 0, layout.cells - 1)
-        owned = (cells >= layout.start) & (cells < layout.stop)
-        others = np.unique(cells[~owned])
-        sources = np.where(owned, cells - layout.start, layout.owned + np.searchsorted(others, cells))
-        self.record = Halo(np.zeros((rows, len(cells))), np.zeros((rows, len(others))), sources)
-        if layout.comm.allreduce(len(others)):
-            # By component, as the rows of ``fetched`` are.
-            indices = np.array([layout.state_indices(int(cell)) for cell in others], PETSc.IntType)
-            wanted = PETSc.IS().createGeneral(indices.reshape(-1, rows).T.ravel(), comm=layout.comm)
-            self._vector = PETSc.Vec().createWithArray(self.record.fetched, comm=PETSc.COMM_SELF)
-            like = layout.create_vector()
-            self._scatter = PETSc.Scatter().create(like, wanted, self._vector, None)
-            like.destroy()
-            wanted.destroy()
+        self.columns = np.zeros((rows, len(cells)))
+        self._vector = PETSc.Vec().createWithArray(self.columns, comm=PETSc.COMM_SELF)
+        indices = np.array([layout.state_indices(int(cell)) for cell in cells], PETSc.IntType)
+        # By component, as the rows of ``columns`` are.
+        wanted = PETSc.IS().createGeneral(indices.reshape(-1, rows).T.ravel(), comm=layout.comm)
+        like = layout.create_vector()
+        self._scatter = PETSc.Scatter().create(like, wanted, self._vector, None)
+        like.destroy()
+        wanted.destroy()
 
     def exchange(self, state: PETSc.Vec) -> None:
-        """Fetch the other ranks' cells of ``state``; collective."""
-        if self._scatter is not None:
-            self._scatter.scatter(state, self._vector, PETSc.InsertMode.INSERT_VALUES)
+        """Bring the columns up to date with ``state``; collective."""
+        self._scatter.scatter(state, self._vector, PETSc.InsertMode.INSERT_VALUES)
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
-        if self._scatter is not None:
-            self._scatter.destroy()
-            self._vector.destroy()
-
-
-@njit(error_model="numpy")
-def gather(halo: Halo, owned: np.ndarray) -> None:
-    """Bring the columns up to date with the rank's cells ``owned`` (2 dof, cell) and those fetched."""
-    count = owned.shape[1]
-    for i in range(owned.shape[0]):
-        for k in range(halo.sources.size):
-            c = halo.sources[k]
-            halo.columns[i, k] = owned[i, c] if c < count else halo.fetched[i, c - count]
+        self._scatter.destroy()
+        self._vector.destroy()
 
 
 class Stencil(NamedTuple):
