@@ -28,8 +28,6 @@ class HaloRegions:
     Cells beyond an end of a lattice that is not periodic are replaced by its last one.
     """
 
-    columns: np.ndarray
-
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
         self._ranges: list[np.ndarray] = [np.zeros(0, int)]
