@@ -139,7 +139,7 @@ def shade_bands(axes: Axes, spans: Iterable[tuple[float, float]], along: str = "
 def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
     """Colour bar of a map beside one or several axes; its lowest colour stands for what is below it as well."""
     panels = np.ravel(axes).tolist()
-    panels[0].figure.colorbar(image, ax=panels, label=label, **{"pad": 0.01, "extend": "min"} | options)
+    panels[0].figure.colorbar(image, ax=panels, label=label, **{"pad": 0.02, "extend": "min"} | options)
 
 
 def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float], **options: Any) -> None:
