@@ -64,6 +64,7 @@ def test_the_dispersion_has_every_branch_over_it(axes, cell):
     np.testing.assert_array_equal(image.get_array(), energy.T)
     assert image.get_extent() == pytest.approx((-0.025, 1.025, -4 / 60, 4 + 4 / 60))
     assert len(axes.lines) == cell.dofs
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 1), (0, 4))
     for j, line in enumerate(axes.lines):
         np.testing.assert_allclose(1e3 * line.get_ydata(), bloch(cell, np.pi * line.get_xdata()).frequency[:, j])
 
@@ -74,7 +75,9 @@ def test_gaps_are_shaded_and_pass_bands_are_not(axes):
     shaded = [(low, high) for (_, low), (_, high) in spans(axes)]
     np.testing.assert_allclose(shaded, np.array(gaps(bands)) / 1e3)
     *branches, drive = axes.lines
-    assert [to_rgba(line.get_color()) for line in branches] == [to_rgba(f"C{i}") for i in range(4)]
+    assert [to_rgba(line.get_color()) for line in branches] == [
+        to_rgba(c) for c in (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE)
+    ]
     assert list(drive.get_ydata()) == [1.0, 1.0]
     for line, band in zip(branches, bands, strict=True):
         assert line.get_ydata().min() == pytest.approx(band.low / 1e3, abs=1e-6)
