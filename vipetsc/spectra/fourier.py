@@ -84,7 +84,7 @@ def dispersion(
 
     Returns the energy on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
     """
-    t, x = len(velocity), len(range(velocity.shape[1])[cells])
+    t, x = velocity.shape[0], len(range(velocity.shape[1])[cells])
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
     frequency = frequency[frequency <= highest]
