@@ -284,7 +284,8 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.mpirun)])
+@pytest.mark.mpirun
+@pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize("limit", [300_000, 440_000])
 def test_a_disk_that_fills_ends_all_and_loses_nothing(vipetsc, in_process, case, tmp_path, ranks, limit):
     """No file may grow beyond the limit: the first part does not fit, or the parts do and run.h5 does not."""

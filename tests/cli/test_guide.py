@@ -66,6 +66,7 @@ def run(command: list[str], folder: Path) -> None:
     assert ended.returncode == 0, f"{' '.join(command)}\n{ended.stdout}\n{ended.stderr}"
 
 
+@pytest.mark.mpirun
 def test_the_guide_has_bands_a_run_a_sweep_a_branch_and_python(desk):
     commands = " ".join(text for language, text in blocks() if language == "sh")
     assert {v for v in ("bands", "validate", "run", "sweep", "nnm") if f"vipetsc {v} " in commands} >= {"bands", "nnm"}
@@ -78,6 +79,7 @@ def test_the_guide_has_bands_a_run_a_sweep_a_branch_and_python(desk):
         assert (desk / "runs" / name).stat().st_size > 1000, name
 
 
+@pytest.mark.mpirun
 def test_what_the_guide_says_of_its_lattice_is_so(desk):
     case = Case.load(desk / "my-lattice.toml")
     assert case.drive.frequency == pytest.approx(936, abs=0.5)
