@@ -101,3 +101,18 @@ def test_only_checkpoints_that_all_ranks_wrote_count(folder):
     assert again.count == 3
     with pytest.raises(FolderError, match="resume with mpirun -n 2"):
         RunFolder(folder, MPI.COMM_SELF).last_state()
+
+
+@pytest.mark.parallel(2)
+def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
+    case = small_case().to_toml()
+    output = RunFolder(folder / "run", COMM)
+    output.begin(case, force=False, resume=False)
+    output.append({"x": np.zeros(1)})
+    output.save_state({"number": np.array(1)})
+    if COMM.rank == 1:
+        (state,) = (folder / "run" / "parts").glob("state-*-1-2.npy")
+        state.write_bytes(state.read_bytes()[:20])
+    COMM.barrier()
+    with pytest.raises((OSError, ValueError)):
+        RunFolder(folder / "run", COMM).last_state()

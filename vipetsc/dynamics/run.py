@@ -138,7 +138,7 @@ class Run:
             except (StalledError, RunawayError) as error:
                 reason = f"stalled: {error}" if isinstance(error, StalledError) else str(error)
                 good = "none" if self.last is None else f"t = {self.last:.6g} s"
-                fastest = fastest_place(self.setup)
+                fastest = fastest_cell(self.setup)
                 return FAILED, f"{reason}, at t = {engine.time:.6g} s ({fastest}); last good sample: {good}"
             self.samples, self.last = self.samples + 1, t
             if any(observer.due for observer in self.observers):
@@ -174,7 +174,7 @@ class Run:
         return Result(ending == COMPLETE, ending == STOPPED, sentence, attributes["statistics"], output.folder)
 
 
-def fastest_place(setup: Setup) -> str:
+def fastest_cell(setup: Setup) -> str:
     """The cell that moves fastest, or is not finite, and the site nearest to it; all ranks must call it."""
     layout = setup.layout
     u, v = setup.engine.state.array_r[: 2 * layout.dofs * layout.owned].reshape(2, layout.dofs, layout.owned)

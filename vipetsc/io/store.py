@@ -115,8 +115,12 @@ class RunFolder:
     def save_state(self, state: Arrays) -> None:
         """Keep this rank's checkpoint after the last chunk, and the one before; as ``append``."""
         number = self.count - 1
-        on_every_rank(self.comm, lambda: save_arrays(self._state(number), state))
-        self._state(number - 2).unlink(missing_ok=True)
+
+        def replace_oldest() -> None:
+            save_arrays(self._state(number), state)
+            self._state(number - 2).unlink(missing_ok=True)
+
+        on_every_rank(self.comm, replace_oldest)
 
     def last_state(self) -> Arrays | None:
         """Go back to the last checkpoint that all ranks wrote, if there is one: ``count``, and this rank's share.
@@ -135,7 +139,7 @@ class RunFolder:
 
         number = on_root(self.comm, last_complete)
         self.count = number + 1
-        return load_arrays(self._state(number)) if number >= 0 else None
+        return on_every_rank(self.comm, lambda: load_arrays(self._state(number))) if number >= 0 else None
 
     def _chunk(self, number: int, rank: int) -> Path:
         return self._parts / f"part-{number:06d}-{rank}.npy"

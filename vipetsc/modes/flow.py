@@ -4,6 +4,7 @@ The set of closed contacts is frozen inside a step, so that the force is smooth 
 contact is searched, and the step is repeated so that it ends on the first change (see the package's docstring).
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -171,7 +172,7 @@ class Arc:
     closed: float
 
 
-class Flow:
+class Flow(ABC):
     """What every flow offers; a subclass gives its ``name`` and ``_advance``."""
 
     name: ClassVar[str]
@@ -206,6 +207,6 @@ class Flow:
         episodes = int(np.sum(system.gaps(start[:n]) > 0) + np.sum(events[:, 3] == 1))
         return Arc(duration, start, end, sensitivity, acceleration, events, episodes, closed)
 
+    @abstractmethod
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
         """State and variations (2n, 1 + 2n) after ``duration``, the arc's ``events`` and ``closed``; ``y`` is lost."""
-        raise NotImplementedError

@@ -128,8 +128,9 @@ class Follower:
                     branch.write(self.folder, self.about)
                 last = point
         finally:
-            said = branch.findings
-            said += [jump for jump in jumps(branch.regular(), problem, control) if jump not in said]
+            branch.findings += [
+                jump for jump in jumps(branch.regular(), problem, control) if jump not in branch.findings
+            ]
         branch.ending, branch.complete = finding or points.ending, finding is not None or points.finished
 
     def _empty(self, name: str) -> Branch:
@@ -144,8 +145,8 @@ class Follower:
 
     def _typical(self, branch: Branch) -> list[Point]:
         """The regular points in the middle of every region, and at the energies asked for."""
-        places = [(p, at) for p, at in zip(branch.points, branch.regions(), strict=True) if p.kind == "regular"]
-        groups = ([p for p, at in places if at == region] for region in range(5))
+        regular = [(p, at) for p, at in zip(branch.points, branch.regions(), strict=True) if p.kind == "regular"]
+        groups = ([p for p, at in regular if at == region] for region in range(5))
         chosen = [group[len(group) // 2] for group in groups if group]
         for energy in self.options.orbits_at:
             chosen.append(min(branch.regular(), key=lambda p: abs(math.log(p.energy / energy))))

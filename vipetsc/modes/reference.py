@@ -6,8 +6,6 @@ discrete flow as sensitivities (Peeters et al., Nonlinear normal modes, part II,
 App. A). It meets contacts at the ends of steps only, which is its error.
 """
 
-from dataclasses import replace
-
 from petsc4py import PETSc
 
 import numpy as np
@@ -15,7 +13,7 @@ import numpy as np
 from vipetsc.compiled import njit
 from vipetsc.modes import flow
 from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
-from vipetsc.modes.flow import Arc, CompiledSystem, Flow, FlowError, close, restore
+from vipetsc.modes.flow import CompiledSystem, Flow, FlowError, close, restore
 from vipetsc.modes.system import System
 
 # Errors that TSRK allows per step, relative to the size of the orbit and of each variation.
@@ -212,12 +210,12 @@ class FiniteDifferences(Flow):
         super().__init__(flow.system)
         self.flow, self.step = flow, step
 
-    def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
-        """See ``Flow.arc``."""
-        n, rate = self.system.dofs, 2 * np.pi / period
+    def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
+        n, rate, start = self.system.dofs, 2 * np.pi / period, y[:, 0]
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / rate)
         columns = []
         for move in np.diag(self.step * size * np.repeat([1.0, rate], n)):
             later, earlier = (self.flow.arc(start + s * move, duration, period).end for s in (1, -1))
             columns.append((later - earlier) / (2 * move.max()))
-        return replace(self.flow.arc(start, duration, period), sensitivity=np.column_stack(columns))
+        arc = self.flow.arc(start, duration, period)
+        return np.column_stack([arc.end, *columns]), arc.events, arc.closed

@@ -122,8 +122,8 @@ def conclude(
             status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
             outcome = Outcome(status, summary["status"], summary["statistics"])
         outcomes.append(outcome)
-        told = {"status": STATUS[outcome.status], "reason": outcome.reason}
-        rows.append({"place": member.index, "id": member.id} | told)
+        ending = {"status": STATUS[outcome.status], "reason": outcome.reason}
+        rows.append({"place": member.index, "id": member.id} | ending)
     names = plan.names()
     axes = [{"keys": [*axis], "names": [names[k] for k in axis], "values": [*axis.values()]} for axis in plan.axes]
     index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}

@@ -96,9 +96,9 @@ def take_steps(
             if not (may_touch or is_driven):
                 continue
             cluster = select_cluster(clusters, dofs, c)
-            stand = cluster.state[0]
-            stand.begin, stand.position = begin, 0.0
-            stand.drive_end = (clusters.burst.duration - begin) / clusters.interval
+            substep_state = cluster.state[0]
+            substep_state.begin, substep_state.position = begin, 0.0
+            substep_state.drive_end = (clusters.burst.duration - begin) / clusters.interval
             cluster.moments[:] = 0.0
             for change in range(MOST_CHANGES):
                 outcome = advance_cluster(cluster)
