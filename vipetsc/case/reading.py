@@ -8,6 +8,7 @@ case is a subclass that declares the sections it reads.
 import copy
 import difflib
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -131,6 +132,7 @@ class CaseFile(Section):
 
 def read_toml(path: str | Path) -> Table:
     """The table in a TOML file, named after the file if it has no name; raises CaseError."""
+    sys.audit("vipetsc.read", str(path))
     path = Path(path)
     try:
         return {"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8"))

@@ -5,6 +5,7 @@ tells how far it is, ``recorder`` keeps what is written. A further observer is a
 which ``simulate`` is given.
 """
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -230,6 +231,7 @@ class Recorder(Observer):
         Rank 0's chunk holds times, energies and all ranks' episodes, the ``last`` one those that are still open, too;
         the fields are those of a rank's own cells, or on rank 0 of all.
         """
+        sys.audit("vipetsc.flush")
         episodes = self.setup.engine.take_episodes(unfinished=last)
         layout, comm, output = self.setup.layout, self.setup.layout.comm, self.setup.output
         columns = output.recording.columns

@@ -1,5 +1,6 @@
 """A case in, a result out: the loop over a run's samples."""
 
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -87,6 +88,7 @@ def simulate(
     output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
     model = case.model()
     output.begin(case.to_toml(), force, resume)
+    sys.audit("vipetsc.set-up", case.name)
     layout = Layout(model, output.comm)
     kind, refusal = select_engine(case.time.engine, model)
     setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
@@ -129,6 +131,7 @@ class Run:
         engine, model = self.setup.engine, self.setup.model
         while self.samples < model.samples:
             t = self.samples * model.sample_interval
+            sys.audit("vipetsc.step")
             try:
                 if not engine.advance(t):
                     return STOPPED, f"stopped on request at t = {engine.time:.6g} s"
@@ -149,6 +152,7 @@ class Run:
         """Write what a resumed run needs."""
         for observer in self.observers:
             observer.flush()
+        sys.audit("vipetsc.checkpoint")
         state = self.setup.engine.checkpoint() | {"samples": np.array(self.samples)}
         for observer in self.observers:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}

@@ -2,6 +2,7 @@
 
 import difflib
 import itertools
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -99,6 +100,7 @@ def draw(
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
     """Draw the dispersion diagram of ``cell`` into ``path``; ``frequency`` in rad/s marks a drive."""
+    sys.audit("vipetsc.draw", "bands")
     with rc_style():
         return save(runs.bands(cell, frequency), Path(path))
 

@@ -1,5 +1,6 @@
 """Sizes, type and colours of all pictures; an empty figure; how figures become files, and which rank draws which."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -81,6 +82,7 @@ def draw_each(
             continue
         paths = [target / f"{stem}.{suffix}" for suffix in formats]
         if not all(map(keep, paths)):
+            sys.audit("vipetsc.draw", stem)
             figure = make()
             written += [save(figure, path, note) for path in paths]
         turn = next(turns, None)

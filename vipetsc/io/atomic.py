@@ -1,6 +1,7 @@
 """Files that are whole or not there: written under a temporary name, renamed when complete."""
 
 import os
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,8 +16,10 @@ Arrays = Mapping[str, np.ndarray]
 def atomic_write(path: Path) -> Iterator[Path]:
     """A temporary path that replaces ``path`` when the block succeeds and vanishes when it fails."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    sys.audit("vipetsc.write", str(path))
     try:
         yield aside
+        sys.audit("vipetsc.replace", str(path))
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)

@@ -79,6 +79,7 @@ def claim_folder(
         If it is a file, holds anything but results of ``kind``, or those where neither ``force`` nor ``resume``
         tells what to do with them.
     """
+    sys.audit("vipetsc.claim", str(path))
     if path.exists() and not path.is_dir():
         raise FolderError(f"{path}: is a file, not a folder; choose another --out")
     marker = path / kind.marker

@@ -9,6 +9,7 @@ The dataset is flat rather than a ``DataTree`` because there a group inherits th
 """
 
 import json
+import sys
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
@@ -82,6 +83,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     attributes without which it is no such file. Raises OSError if it cannot be opened as HDF5, ValueError if it is not
     of this kind.
     """
+    sys.audit("vipetsc.read", str(path))
     try:
         groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
     except OSError as error:

@@ -9,6 +9,7 @@ are too large to be held whole: they are copied chunk by chunk, to a file of one
 import json
 import os
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -156,6 +157,7 @@ class RunFolder:
         target, aside, columns = self.folder / "run.h5", self.folder / ".run.h5.part", self.recording.columns
 
         def write() -> None:
+            sys.audit("vipetsc.assemble", str(target))
             if columns is None and self.comm.rank:
                 return
             data = dataset_without_fields(self, attributes)
@@ -173,9 +175,11 @@ class RunFolder:
                 raise OSError(message) from error
 
         def conclude() -> None:
+            sys.audit("vipetsc.conclude", str(self.folder))
             os.replace(aside, target)
             text = json.dumps({**attributes, **summary}, indent=2, allow_nan=False)
             write_text(self.folder / "summary.json", text + "\n")
+            sys.audit("vipetsc.clean", str(self._parts))
             shutil.rmtree(self._parts)
 
         try:

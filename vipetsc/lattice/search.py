@@ -1,6 +1,7 @@
 """The search of the supplement for the four-band cell: which (lambda, eta) suit inter-band transfer best."""
 
 import itertools
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +67,7 @@ def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLi
     lams, etas, kappa = (np.atleast_1d(np.asarray(values, float)) for values in (lam, eta, wavenumber))
     cells = []  # of each, what is kept of its Bloch waves
     for of_lam, of_eta in itertools.product(lams, etas):
+        sys.audit("vipetsc.step")
         cell = four_band(reading, of_lam, of_eta)
         point = bloch(cell, kappa)
         deflection = signed_deflection(cell, point)[:, DRIVEN - 1]

@@ -1,5 +1,6 @@
 """A branch: its points in order, special ones among them, its regions and power laws, and the files that hold it."""
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -65,6 +66,7 @@ class Branch:
 
     def write(self, folder: Path, about: dict[str, Any]) -> None:
         """Write ``branch-<name>.h5`` and ``.csv``, each complete or as it was; ``about`` are further attributes."""
+        sys.audit("vipetsc.save", self.name)
         write_netcdf(folder / f"branch-{self.name}.h5", self.to_dataset().assign_attrs(about))
         write_text(folder / f"branch-{self.name}.csv", self.to_csv())
 

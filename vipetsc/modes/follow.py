@@ -1,6 +1,7 @@
 """Follow the branches of a case: one by one or shared over ranks, saved as they grow, resumed where they ended."""
 
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -62,6 +63,7 @@ class Follower:
 
     def __init__(self, case: NnmCase, folder: Path, about: dict[str, Any], listener: Listener | None = None) -> None:
         self.case, self.options, self.folder, self.about, self.listener = case, case.nnm, folder, about, listener
+        sys.audit("vipetsc.set-up", case.name)
         options, self.system = case.nnm, System.from_case(case)
         flow: Flow = FLOWS[options.flow](self.system)
         automatic = "quarter" if self.system.odd else "half"
@@ -71,6 +73,7 @@ class Follower:
 
     def follow(self, mode: int, resume: bool = False) -> list[Branch]:
         """The branch of ``mode`` (0-based), then the branches that cross it if the case asks for them."""
+        sys.audit("vipetsc.member", mode + 1)
         name, options = self.system.branch_name(mode), self.options
         branch, path = self._empty(name), self.folder / f"branch-{name}.h5"
         if resume and path.exists():
@@ -114,6 +117,7 @@ class Follower:
         branch.points = branch.points or [last]
         try:
             for point in points:
+                sys.audit("vipetsc.step")
                 if self.options.locate:
                     branch.points += locate(problem, last, point, control.chart, self.options.locate_grazing)
                 branch.points.append(point)
@@ -159,6 +163,7 @@ class Follower:
         for kind in self.options.switch:
             for number, point in enumerate((p for p in branch.points if p.kind == kind), 1):
                 crossing = self._empty(f"{branch.name}-{kind}-{number}")
+                sys.audit("vipetsc.switch", crossing.name)
                 try:
                     problem, first = switch(self.problem, point, self.options.switch_amplitude)
                     self.grow(crossing, problem, first, control)

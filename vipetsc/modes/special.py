@@ -1,5 +1,6 @@
 """Special points between two points of a branch, located and not interpolated, and the branches that cross there."""
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -49,6 +50,7 @@ def locate(problem: Shooting, left: Point, right: Point, chart: str = "relative"
         a, b = test(left), test(right)
         folded = kind == "branch-point" and any(p.kind == "fold-energy" for p in points)
         if a * b < 0 and min(abs(a), abs(b)) > floor and not folded:
+            sys.audit("vipetsc.landing", kind)
             points += segment.root(kind, test)
     if grazing and left.episodes != right.episodes:
         points += segment.root("grazing", lambda p: 1.0 if p.episodes == right.episodes else -1.0, 1e-11)

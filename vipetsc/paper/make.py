@@ -5,6 +5,7 @@ their results, the version of the package. ``made.json`` keeps the hashes.
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -64,6 +65,7 @@ def make_paper(
     Raises FolderError if ``root`` holds the paper on another grid, or something else, or for an unknown id, CaseError
     if a case file cannot be used.
     """
+    sys.audit("vipetsc.plan", str(root))
     root, stop, part = Path(root), stop or StopRequest(), plan.only(only)
     on_root(comm, lambda: _claim(plan, root))
     made = _make_steps(part, root, comm, stop, tell)
@@ -106,6 +108,7 @@ def _make_steps(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell:
         if state != DONE:
             if comm.rank == 0:
                 tell(f"{step.name}: about {duration(left / comm.size)}")
+            sys.audit("vipetsc.member", step.name)
             step.make(root, comm, stop, state == STALE)
             made.append(step.name)
     return tuple(made)
@@ -178,6 +181,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> list[dict[s
     path, report = root / "claims.json", root / "report.html"
     if not path.exists() or record.get("claims") != inputs:
         tell("claims")
+        sys.audit("vipetsc.claims")
         write_claims(plan.measure(root), path)
         record["claims"] = inputs
     text = path.read_text(encoding="utf-8")
@@ -185,6 +189,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> list[dict[s
     inputs = fingerprint(text, json.dumps([inputs, record["figures"], versions]))
     if not report.exists() or record.get("report") != inputs:
         tell("report")
+        sys.audit("vipetsc.report")
         stems = {key: entry["pictures"] for key, entry in record["figures"].items()}
         paths = [[root / "figures" / f"{stem}.png" for stem in stems.get(f.id, ())] for f in plan.figures]
         pictures = [(f, list(filter(Path.exists, ps))) for f, ps in zip(plan.figures, paths, strict=True)]

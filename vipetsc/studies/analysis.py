@@ -5,6 +5,7 @@ after the first site), wavenumber partition and entropy (wavelets over the cells
 gaps, and the inter-band targeted energy transfer. The measures themselves stand in ``vipetsc.spectra``.
 """
 
+import sys
 from collections.abc import Collection
 from functools import cached_property
 from typing import Any
@@ -78,6 +79,7 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
     estimated from the group velocity: half the burst and the way to the site. What the run cannot give (no sites, a
     single cell) is left out and named in the attribute ``left_out``.
     """
+    sys.audit("vipetsc.analyse")
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
     about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}
     if "velocity" not in run:

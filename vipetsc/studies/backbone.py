@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sys
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -207,6 +208,7 @@ def relate_folders(folders: Sequence[Path]) -> list[Path]:
             raise FolderError(f"{folder}: holds no {BRANCH}; the verb nnm makes it, with [nnm] modes = [2]")
     written = []
     for folder in sweeps if branches else ():
+        sys.audit("vipetsc.relate", str(folder))
         try:
             written.append(_relate(open_ensemble(folder), branches))
         except (KeyError, OSError, ValueError) as error:

@@ -1,5 +1,6 @@
 """The (lambda, eta) search of the supplement: a case in, ``design.h5`` out."""
 
+import sys
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
@@ -55,6 +56,7 @@ def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> 
     """
     folder, options = Path(folder), case.design
     claim_folder(folder, SEARCH, case.to_toml(), force=force)
+    sys.audit("vipetsc.set-up", case.name)
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
     lam, eta = options.lam.values(), options.eta.values()
     searches = {reading: search(reading, lam, eta, wavenumber) for reading in options.readings}

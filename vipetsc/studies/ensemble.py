@@ -1,5 +1,6 @@
 """``ensemble.h5``: what was measured of every member of a sweep, over the swept keys, with power-law fits."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,6 +75,7 @@ def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Out
     A dimension for every axis, named after its first key, with a coordinate for every key; NaN where a member
     failed. The file depends on the members alone, not on when or on how many ranks they were made.
     """
+    sys.audit("vipetsc.merge", str(folder))
     rows = _rows(members, outcomes, folder)
     names, data = plan.names(), {}
     for axis in plan.axes:

@@ -4,6 +4,7 @@ The measures of runs already made, of one or of all members of a sweep whose fie
 """
 
 import json
+import sys
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -75,6 +76,7 @@ def run_sweep(
     """
     folder, stop = Path(folder), stop or StopRequest()
     begin = time.perf_counter()
+    sys.audit("vipetsc.plan", plan.name)
     members = plan.members()
     on_root(comm, lambda: claim_folder(folder, SWEEP, plan.to_toml(), force=force, resume=None))
     team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
@@ -113,6 +115,7 @@ def conclude(
 
     ``reasons`` names the members (by id) that failed just now, and why.
     """
+    sys.audit("vipetsc.conclude", str(store.folder))
     outcomes, rows = [], []
     for member in members:
         outcome = Outcome(MISSING)
@@ -153,6 +156,7 @@ class TaskPool:
                 break
             job, begin = jobs[number], time.perf_counter()
             try:
+                sys.audit("vipetsc.member", str(job))
                 work(job)
                 reasons[job] = ""
             except StoppedError:

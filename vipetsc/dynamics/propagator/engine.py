@@ -1,5 +1,6 @@
 """The engine of exact linear steps; the package's docstring has the method."""
 
+import sys
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -170,6 +171,7 @@ class Propagator(Engine):
             for event, cluster, now in self._events:
                 if event != CHANGED:
                     break
+                sys.audit("vipetsc.landing")
                 self._forces.switch(cluster, now)
             # Any rank's failure or request counts on all.
             self._status[:] = self._stop.requested, event == FAILED

@@ -3,6 +3,7 @@
 The method stands in the package's docstring.
 """
 
+import sys
 from typing import Any
 
 from mpi4py import MPI
@@ -184,6 +185,7 @@ class Integrator(Engine):
         owner = comm.allreduce(comm.rank if change.share == share else comm.size, MPI.MIN)
         attempt, outcome = Landing(share * h, h, np.inf, 0), RETRY
         self.counts["landings"] += 1
+        sys.audit("vipetsc.landing")
         while outcome == RETRY:
             length = attempt.length
             self.saved.copy(self.state)
