@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -115,7 +114,6 @@ def in_process(capsys, monkeypatch):
 
     ``in_process("run", ..., cwd=None)`` returns what the fixture ``vipetsc`` returns.
     """
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
     def call(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess:
         words = list(map(str, arguments))
@@ -129,9 +127,7 @@ def in_process(capsys, monkeypatch):
                 code = end.code
         return subprocess.CompletedProcess(words, code, *capsys.readouterr())
 
-    yield call
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+    return call
 
 
 @pytest.fixture

@@ -6,9 +6,10 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -17,6 +18,7 @@ from tqdm import tqdm
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
+STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 
 
 def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
@@ -86,17 +88,52 @@ class SharedCounter:
         self._window.Free()
 
 
+class StoppedError(Exception):
+    """Work was left on request, to be gone on with; says how."""
+
+
 class StopRequest:
-    """A request to stop that a loop can see: SIGTERM or SIGINT, if ``listening``; a second ends the process at once."""
+    """A request to stop: ``requested`` once this rank has got one, which is not yet a reason to leave the others.
 
-    def __init__(self, listening: bool = False) -> None:
-        self.requested = False
-        for number in (signal.SIGTERM, signal.SIGINT) if listening else ():
-            signal.signal(number, self._receive)
+    A loop that all ranks go through asks whether it is ``agreed``, or calls ``check``; work that one rank does alone
+    looks at ``requested``, and the ranks agree when they meet again.
+    """
 
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
-        signal.signal(number, signal.SIG_DFL)
+    requested = False
+
+    def agreed(self, comm: MPI.Comm) -> bool:
+        """Whether any rank of ``comm`` got a request; all must call it."""
+        return bool(comm.allreduce(self.requested, MPI.LOR))
+
+    def check(self, comm: MPI.Comm) -> None:
+        """Raise StoppedError on all ranks of ``comm`` if any got a request; all must call it."""
+        if self.agreed(comm):
+            raise StoppedError("stopped on request; the same command goes on")
+
+    @contextmanager
+    def listening(self, at_once: bool = False) -> Iterator[Self]:
+        """Take SIGTERM, SIGINT, SIGHUP and SIGUSR1 for requests within the block; a second ends the process.
+
+        ``at_once``: the first one ends the work where it is, for what has nothing to save: StoppedError is raised.
+        """
+
+        def receive(number: int, frame: FrameType | None) -> None:
+            self.requested = True
+            for number in earlier:
+                signal.signal(number, signal.SIG_DFL)
+            if at_once and MPI.COMM_WORLD.size > 1:
+                MPI.COMM_WORLD.Abort(os.EX_TEMPFAIL)  # the others may wait for this rank
+            if at_once:
+                raise StoppedError("stopped on request")
+
+        # What nohup has set stays.
+        taken = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+        earlier = {number: signal.signal(number, receive) for number in taken}
+        try:
+            yield self
+        finally:
+            for number, handler in earlier.items():
+                signal.signal(number, handler)
 
 
 class Progress:

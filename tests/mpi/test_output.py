@@ -15,7 +15,7 @@ from vipetsc.dynamics import simulate
 from vipetsc.io import store
 from vipetsc.io.folder import FolderError
 from vipetsc.io.store import RunFolder, RunMemory
-from vipetsc.parallel import on_every_rank
+from vipetsc.parallel import StoppedError, StopRequest, on_every_rank
 
 COMM = MPI.COMM_WORLD
 
@@ -77,6 +77,16 @@ def test_what_one_rank_raises_all_raise():
 
     with pytest.raises(KeyError, match="only here"):
         on_every_rank(COMM, fails)
+
+
+@pytest.mark.parallel([2, 3])
+def test_a_request_that_one_rank_got_stops_all():
+    stop = StopRequest()
+    assert not stop.agreed(COMM)
+    stop.requested = COMM.rank == COMM.size - 1
+    assert stop.agreed(COMM)
+    with pytest.raises(StoppedError):
+        stop.check(COMM)
 
 
 @pytest.mark.parallel(2)

@@ -12,8 +12,11 @@ import vipetsc
 from vipetsc.case import CaseError
 from vipetsc.cli import verbs
 from vipetsc.io.folder import FolderError
+from vipetsc.parallel import StoppedError, StopRequest
 
-Verb = Callable[[argparse.Namespace, MPI.Comm], int]
+Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
+# Verbs that look at a request to stop, to save first; others end where they are.
+STOPPABLE = ("run", "sweep", "paper")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
 ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -70,10 +73,14 @@ def main(arguments: list[str]) -> int:
     try:
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
-        return int(options.function(options, MPI.COMM_WORLD))
+        with StopRequest().listening(at_once=options.verb not in STOPPABLE) as stop:
+            return int(options.function(options, MPI.COMM_WORLD, stop))
     except (CaseError, FolderError) as error:
         verbs.echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return verbs.BAD_INPUT
+    except StoppedError as error:
+        verbs.echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
+        return verbs.STOPPED
 
 
 def _parser() -> Parser:

@@ -1,10 +1,11 @@
-"""The verbs: each takes the parsed options and the communicator, and returns the exit code; all ranks call it.
+"""The verbs: each takes the parsed options, the communicator and a request to stop, and returns the exit code.
 
-What a verb alone needs is imported inside it: compiled kernels and matplotlib take seconds to load.
+All ranks call it. What a verb alone needs is imported inside it: compiled kernels and matplotlib take seconds to load.
 """
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +20,7 @@ from vipetsc.cli.plot import draw_source, source_of
 from vipetsc.io.atomic import write_text
 from vipetsc.parallel import StopRequest, on_root
 
-DONE, FAILED, BAD_INPUT = 0, 1, 2
+DONE, FAILED, BAD_INPUT, STOPPED = 0, 1, 2, os.EX_TEMPFAIL
 
 AnyCase = TypeVar("AnyCase", bound=CaseFile)
 
@@ -45,7 +46,7 @@ def _output(options: argparse.Namespace, name: str) -> Path:
     return options.out or Path("runs") / name
 
 
-def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """One simulation, its analysis and pictures."""
     from vipetsc.dynamics import simulate
     from vipetsc.studies.sweep import measure_run
@@ -53,32 +54,37 @@ def run(options: argparse.Namespace, comm: MPI.Comm) -> int:
     case = _load(Case, options, comm)
     for warning in on_root(comm, case.warnings):
         echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
-    folder, stop = _output(options, case.name), StopRequest(listening=True)
+    folder = _output(options, case.name)
     result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
     echo(comm, tables.run_table(result))
     if result.resumable:
-        return FAILED
+        return STOPPED
+    stop.check(comm)
     if case.output.fields and result.statistics["samples"] > 1:
         on_root(comm, lambda: measure_run(folder))
+        stop.check(comm)
         if case.output.figures:
             echo_paths(comm, draw_source("run", [folder], comm))
     return DONE if result.complete else FAILED
 
 
-def sweep(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Every combination in the section [sweep] of a case; goes on where it was stopped."""
     from vipetsc.studies.sweep import run_sweep
 
     plan = _load(Sweep, options, comm)
     folder = _output(options, plan.name)
-    result = run_sweep(plan, folder, comm, force=options.force, stop=StopRequest(listening=True), progress=True)
+    result = run_sweep(plan, folder, comm, force=options.force, stop=stop, progress=True)
     echo(comm, tables.sweep_table(result))
+    if result.resumable:
+        return STOPPED
+    stop.check(comm)
     if plan.table.get("output", {}).get("figures", True) and (folder / "ensemble.h5").exists():
         echo_paths(comm, draw_source("sweep", [folder], comm))
     return DONE if result.complete else FAILED
 
 
-def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
     from vipetsc.modes.follow import follow_all, prepare_folder
 
@@ -93,7 +99,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return FAILED if failed else DONE
 
 
-def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Check a case and print what follows from it."""
     case = _load(Case, options, comm)
 
@@ -110,7 +116,7 @@ def validate(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE
 
 
-def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Pass bands, gaps and group velocities of a case's cell; a table and a picture."""
     case = _load(Case, options, comm)
     folder = _output(options, f"{case.name}-bands")
@@ -130,7 +136,7 @@ def bands(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE
 
 
-def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def design(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """The (lambda, eta) search of the four-band cell: ``design.h5``, its pictures, a table of the optima."""
     from vipetsc.studies.design import search_design
 
@@ -141,7 +147,7 @@ def design(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE
 
 
-def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
     from vipetsc.studies.sweep import reanalyse_folders
 
@@ -149,14 +155,14 @@ def analyse(options: argparse.Namespace, comm: MPI.Comm) -> int:
     return DONE
 
 
-def plot(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Pictures of what folders hold again, from their files."""
     source, folders = on_root(comm, lambda: source_of(options.path))
     echo_paths(comm, draw_source(source, folders, comm, options.fig, tuple(options.format or ("png",))))
     return DONE
 
 
-def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Every figure and claim of the paper: what is missing is computed, drawn, measured, and put into a report."""
     from vipetsc.paper.make import make_paper, plan_table
     from vipetsc.paper.plan import FULL, QUICK, paper_plan
@@ -167,17 +173,16 @@ def paper(options: argparse.Namespace, comm: MPI.Comm) -> int:
     if options.list:
         echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
         return DONE
-    stop = StopRequest(listening=True)
     result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
     if result is None:
         echo(comm, "stopped on request; the same command goes on")
-        return FAILED
+        return STOPPED
     echo(comm, claims_table(result.claims))
     echo(comm, f"  {len(result.made)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
     return DONE if result.complete else FAILED
 
 
-def doctor(options: argparse.Namespace, comm: MPI.Comm) -> int:
+def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Versions, MPI, HDF5 and ranks; what is missing and how to get it."""
     text, healthy = tables.doctor_table(comm)
     echo(comm, text)

@@ -69,11 +69,11 @@ def make_paper(
     root, stop, part = Path(root), stop or StopRequest(), plan.only(only)
     on_root(comm, lambda: _claim(plan, root))
     made = _make_steps(part, root, comm, stop, tell)
-    if comm.allreduce(stop.requested, MPI.LOR):
+    if stop.agreed(comm):
         return None
     on_root(comm, lambda: _relate(plan.folders(root)))
     drawn = draw_paper(part, root, comm, stop, tell)
-    if comm.allreduce(stop.requested, MPI.LOR):
+    if stop.agreed(comm):
         return None
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
 
@@ -103,7 +103,7 @@ def _make_steps(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell:
     made = []
     for step in plan.steps:
         state, left = on_root(comm, lambda step=step: (step.state(root), step.left(root)))  # type: ignore[misc]
-        if comm.allreduce(stop.requested, MPI.LOR):
+        if stop.agreed(comm):
             break
         if state != DONE:
             if comm.rank == 0:

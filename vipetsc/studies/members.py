@@ -25,7 +25,7 @@ from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import field_time, open_run
 from vipetsc.io.store import RunMemory
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.analysis import FULL, analyse
 
 # A member is scaled where its linear wave stays below this share of every clearance: the largest w between samples
@@ -38,10 +38,6 @@ LAYOUT = {
     "envelope": ("cell", "m", "largest relative displacement at 1 N"),
     "arrival": ("cell", "s", "time of the largest host velocity"),
 }
-
-
-class StoppedError(Exception):
-    """A member was left because the sweep was asked to stop."""
 
 
 class MemberStore:
@@ -122,7 +118,7 @@ class MemberStore:
     def _simulate(self, case: Case, output: Path | RunMemory, **options: Any) -> Result:
         result = simulate(case, output, self.team, stop=self.stop, **options)
         if result.resumable:
-            raise StoppedError
+            raise StoppedError(result.sentence)
         if not result.complete:
             raise RuntimeError(result.sentence)
         return result

@@ -21,10 +21,10 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, FolderError, claim_folder
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
-from vipetsc.parallel import Progress, SharedCounter, StopRequest, on_every_rank, on_root
+from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Outcome, assemble
-from vipetsc.studies.members import MemberStore, StoppedError, arrival_at, linear_folder, reached, read_wave
+from vipetsc.studies.members import MemberStore, arrival_at, linear_folder, reached, read_wave
 
 FORMAT_VERSION = 1
 # What a member may raise and leave the others to go on: the machine's limits, a solver's or a file's refusal.
@@ -51,6 +51,11 @@ class SweepResult:
     def complete(self) -> bool:
         """Whether every member is there."""
         return not self.count(FAILED) and not self.count(MISSING)
+
+    @property
+    def resumable(self) -> bool:
+        """Whether it was stopped before every member was made or had failed."""
+        return self.count(MISSING) > 0
 
     def count(self, status: int) -> int:
         """Number of members that ended so."""
