@@ -236,7 +236,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, in_process, case, whole,
     await_checkpoints(process, out, ranks, 2)
     if number == signal.SIGKILL:
         os.killpg(process.pid, number)
-    else:  # mpirun passes SIGUSR1 on; SIGTERM it sends as well, but ends all a second later, with an exit code of its own
+    else:  # after SIGTERM mpirun gives its ranks one second, and has an exit code of its own
         process.send_signal(signal.SIGUSR1 if ranks else number)
     process.communicate(timeout=60)
     assert process.returncode == 75 if number == signal.SIGTERM else process.returncode != 0
