@@ -1,6 +1,9 @@
 """Files that are whole or not there: written under a temporary name, renamed when complete."""
 
 import os
+import platform
+import re
+import secrets
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,15 +17,29 @@ Arrays = Mapping[str, np.ndarray]
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """A temporary path that replaces ``path`` when the block succeeds and vanishes when it fails."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    """A temporary path that replaces ``path`` when the block succeeds and vanishes when it fails.
+
+    Raises OSError that names ``path``.
+    """
+    # Of two hosts that share the files, or two containers, processes may have the same number.
+    aside = path.with_name(f".{path.name}.{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}.part")
     sys.audit("vipetsc.write", str(path))
     try:
         yield aside
         sys.audit("vipetsc.replace", str(path))
         os.replace(aside, path)
+    except OSError as error:
+        raise unwritten(path, error) from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def unwritten(path: Path, error: Exception) -> OSError:
+    """``error``, from Python or from HDF5, that names the file which could not be written, and keeps its number."""
+    told = re.search(r"errno = (\d+)", str(error))
+    number = getattr(error, "errno", None) or (int(told[1]) if told else 0)
+    reason = os.strerror(number) if number else str(error)
+    return OSError(number, f"{path} could not be written: {reason}; the same command goes on when that is mended")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -34,19 +51,18 @@ def write_text(path: Path, text: str) -> None:
 def save_arrays(path: Path, arrays: Arrays) -> None:
     """Write ``arrays`` as the fields of one record, in numpy's format; a zip file costs three times that."""
     record = np.dtype([(name, values.dtype, values.shape) for name, values in arrays.items()])
-    try:
-        with atomic_write(path) as aside, aside.open("wb") as file:
-            header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
-            npy.write_array_header_2_0(file, header)
-            # Through ``write``, which says what is wrong where numpy's own way of writing to disk does not.
-            for values in arrays.values():
-                file.write(np.ascontiguousarray(values).data)
-    except OSError as error:
-        message = f"{path} could not be written; make room and go on with --resume: {error.strerror}"
-        raise OSError(error.errno, message) from error
+    with atomic_write(path) as aside, aside.open("wb") as file:
+        header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
+        npy.write_array_header_2_0(file, header)
+        # Through ``write``, which says what is wrong where numpy's own way of writing to disk does not.
+        for values in arrays.values():
+            file.write(np.ascontiguousarray(values).data)
 
 
 def load_arrays(path: Path, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """What ``save_arrays`` wrote, or the ``wanted`` arrays of it."""
-    record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
-    return {name: np.array(record[name]) for name in (record.dtype.names if wanted is None else wanted)}
+    """What ``save_arrays`` wrote, or the ``wanted`` arrays of it; raises OSError that names the file."""
+    try:
+        record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
+        return {name: np.array(record[name]) for name in (record.dtype.names if wanted is None else wanted)}
+    except (OSError, ValueError) as error:
+        raise OSError(f"{path} cannot be read: {error}") from error

@@ -40,8 +40,13 @@ def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
 
     Raises OSError if the file cannot be written, ValueError if a dimension has no coordinate.
     """
-    with atomic_write(Path(path)) as aside, h5py.File(aside, "w") as file:
+    # HDF5 crashes after a full disk: it works in memory, and Python writes what comes out.
+    with h5py.File(Path(path).name, "w", driver="core", backing_store=False) as file:
         put_dataset(file, data)
+        file.flush()
+        image = file.id.get_file_image()
+    with atomic_write(Path(path)) as aside:
+        aside.write_bytes(image)
 
 
 def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
@@ -86,7 +91,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     sys.audit("vipetsc.read", str(path))
     try:
         groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
-    except OSError as error:
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise OSError(f"{path} cannot be opened as a {kind}: {error}") from error
     data, closing = _flat(groups), ExitStack()
     for group in groups.values():

@@ -67,7 +67,10 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
     data = data.set_coords(
         [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in keys]
     )
-    rows = json.loads((folder / "index.json").read_text(encoding="utf-8"))["members"]
+    try:
+        rows = json.loads((folder / "index.json").read_text(encoding="utf-8"))["members"]
+    except (OSError, ValueError, KeyError) as error:
+        raise OSError(f"{folder / 'index.json'} cannot be read: {error}") from error
     ids = np.array([row["id"] for row in rows], dtype=object).reshape(data["status"].shape)
     return data.assign(member=(data["status"].dims, ids, {"long_name": "name of the member's folder"}))
 

@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from vipetsc.io.atomic import Arrays, load_arrays, save_arrays, write_text
+from vipetsc.io.atomic import Arrays, load_arrays, save_arrays, unwritten, write_text
 from vipetsc.io.folder import RUN, FolderError, claim_folder
 from vipetsc.io.netcdf import add_variable, put_dataset, tabulated
 from vipetsc.parallel import on_every_rank, on_root
@@ -171,8 +171,7 @@ class RunFolder:
                     for name, field in fields.items():
                         put_chunks(field, self, name, columns or slice(None))
             except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
-                message = f"{target} could not be written; make room and go on with --resume: {error}"
-                raise OSError(message) from error
+                raise unwritten(target, error) from error
 
         def conclude() -> None:
             sys.audit("vipetsc.conclude", str(self.folder))
