@@ -11,12 +11,23 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid
-from vipetsc.case.resolve import build_chain, check_lattice, check_sites, resolved, site_cells, wave_speed, with_preset
+from vipetsc.case.resolve import (
+    build_chain,
+    check_lattice,
+    check_sites,
+    check_stiffness,
+    check_traverse,
+    resolved,
+    site_cells,
+    wave_speed,
+    with_preset,
+)
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, TimeTable
 from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
+MOST_SAMPLES = 1e9
 
 
 @dataclass(frozen=True)
@@ -64,6 +75,10 @@ class Case(CaseFile):
         if problems:
             return sections, problems
         tables, samples = resolved(sections), sections["time"].samples
+        count = tables["time"]["end"] / tables["time"]["sample_interval"]
+        if count > MOST_SAMPLES:
+            remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} can be taken, and the bands need so many"
+            return tables, [Problem("time.end", sections["time"].end, remedy)]
         if samples is not None:
             cell, interval = sections["lattice"].unit_cell(), tables["time"]["sample_interval"]
             problems = _too_coarse(cell, interval, "time.samples", samples)
@@ -77,9 +92,12 @@ class Case(CaseFile):
         yield from problems
         if valid("lattice.cells", "contacts.sites"):
             yield from check_sites(lattice, contacts)
-            yield from _check_stiffness(contacts, bool(site_cells(lattice, contacts)), valid)
+            yield from check_stiffness(contacts, bool(site_cells(lattice, contacts)), valid)
         length = lattice.cells if valid("lattice.cells") else None
-        yield from _check_drive(sections["drive"], length, cell, valid)
+        of_drive = list(_check_drive(sections["drive"], length, cell, valid))
+        yield from of_drive
+        if cell and not of_drive and valid("lattice", "drive", "time.end"):
+            yield from check_traverse(cell, sections["drive"], sections["time"])
         yield from _check_sampling(sections["time"], cell, valid)
         window = sections["output"].window
         if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
@@ -122,17 +140,6 @@ class Case(CaseFile):
         if model.end <= model.drive.duration:
             sentences.append(f"time.end = {model.end:.6g} s comes before the burst is over")
         return sentences
-
-
-def _check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
-    """The contact stiffness is given once: as a number, or by the material."""
-    material = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
-    given = [key for key, value in material.items() if value is not None]
-    missing = [key for key in material if key not in given]
-    if contacts.stiffness is not None and given:
-        yield Problem("contacts.stiffness", contacts.stiffness, f"give it or {', '.join(given)}, not both")
-    if contacts.stiffness is None and missing and any_sites and valid(*(f"contacts.{key}" for key in material)):
-        yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
 
 
 def _check_drive(drive: DriveTable, length: int | None, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "design")
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
+LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
 
@@ -97,8 +98,7 @@ class CaseFile(Section):
         valid = ("name", *SECTIONS)
         problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
-        if not isinstance(name, str) or not name:
-            problems.append(Problem("name", name, "must be a non-empty string"))
+        problems += name_problems(name)
         fields, wrong = cls.read(table)
         if problems + wrong:
             raise CaseError(problems + wrong, source)
@@ -135,12 +135,23 @@ def read_toml(path: str | Path) -> Table:
     sys.audit("vipetsc.read", str(path))
     path = Path(path)
     try:
-        return {"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8"))
+        return {"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         remedy = f"{error.strerror}; a case file (TOML) is needed"
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # tomllib's and the decoder's errors are ValueErrors
         remedy = f"not a TOML file ({error})"
     raise CaseError([Problem(str(path), None, remedy)])
+
+
+def name_problems(name: Any) -> list[Problem]:
+    """What is wrong with a case's name: a folder in runs/ bears it, so it is one component of a path."""
+    if not isinstance(name, str) or not name:
+        return [Problem("name", name, "must be a non-empty string")]
+    printable = name.isprintable() and len(name.encode()) <= LONGEST_NAME
+    if printable and name == name.strip() and name[0] not in ".-" and not {*"/\\"} & {*name}:
+        return []
+    remedy = f"names the output folder: at most {LONGEST_NAME} bytes, without / or \\, no dot or dash at the beginning"
+    return [Problem("name", name, remedy)]
 
 
 def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
@@ -152,19 +163,25 @@ def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
 
 
 def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[Problem]]:
-    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and what cannot be."""
+    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and what cannot be.
+
+    ``section.key=`` takes the key out.
+    """
     table, problems = copy.deepcopy(table), []
     for override in overrides:
         path, equals, text = (part.strip() for part in override.partition("="))
         if not equals or not all(path.split(".")):
             problems.append(Problem("--set", override, "write section.key=value"))
             continue
+        if not text:
+            problems += [replace(p, key=f"--set {p.key}") for p in _take_out(table, path)]
+            continue
         value: Any = text  # a bare word
         for read in (lambda text: tomllib.loads(f"value = {text}")["value"], float):
             try:
                 value = read(text)
                 break
-            except ValueError:  # not TOML; not a number such as .5
+            except (ValueError, RecursionError):  # not TOML; not a number such as .5
                 continue
         problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
     return table, problems
@@ -179,6 +196,18 @@ def put(table: Table, path: str, value: Any) -> list[Problem]:
     if not isinstance(section, dict):
         return [Problem(path, value, f"{'.'.join(parents)} is a value, not a section")]
     section[key] = value
+    return []
+
+
+def _take_out(table: Table, path: str) -> list[Problem]:
+    """Remove the key ``path`` ("a.b.c") of ``table`` in place; the problem if it is not there."""
+    *parents, key = path.split(".")
+    section: Any = table
+    for parent in parents:
+        section = section.get(parent) if isinstance(section, dict) else None
+    if not isinstance(section, dict) or key not in section:
+        return [Problem(path, None, "is not in the case, so there is nothing to take out")]
+    del section[key]
     return []
 
 

@@ -1,15 +1,18 @@
 """From the choices of a case file to plain numbers: presets, cell, sites, clearances, stiffness, frequency, times."""
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from vipetsc.case.reading import Problem, Table
-from vipetsc.case.schema import PRESETS, ContactsTable, LatticeTable, Span
+from vipetsc.case.reading import Problem, Table, Valid
+from vipetsc.case.schema import PRESETS, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
 from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import cell_problems
 
+LARGEST_INDEX = 2**31 - 1
+STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 # A key of a case file takes the place of these keys of the preset.
 REPLACES = {
     "stiffness": {"modulus", "radius", "poisson"},
@@ -89,7 +92,13 @@ def check_lattice(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]
             problems.append(Problem(key, value, "only the four-band preset has it"))
     wrong = cell_problems(*lattice.cell.arguments()) if lattice.cell else []
     problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
-    return None if problems else lattice.unit_cell(), problems
+    if problems:
+        return None, problems
+    cell = lattice.unit_cell()
+    if 2 * lattice.cells * cell.dofs > LARGEST_INDEX:
+        remedy = f"has more than the {LARGEST_INDEX} displacements and velocities that PETSc's 32-bit indices count"
+        problems = [Problem("lattice.cells", lattice.cells, remedy)]
+    return cell, problems
 
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
@@ -99,7 +108,7 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
         yield Problem("contacts.sites", outside, f"outside the lattice; cells count from 1 to {lattice.cells}")
     if isinstance(sites, Span) and None not in (sites.last, sites.spacing):
         yield Problem("contacts.sites.spacing", None, "give last or spacing, not both")
-    if twice := sorted({c for c in cells if cells.count(c) > 1}):
+    if twice := sorted(cell for cell, times in Counter(cells).items() if times > 1):
         yield Problem("contacts.sites", twice, "named twice; a cell carries one contact pair")
     if isinstance(sites, int) and sites > 0 and lattice.preset is None:
         yield Problem("contacts.sites", sites, "a count needs a preset; list the cells or give {first, last, count}")
@@ -107,6 +116,17 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
         yield Problem("contacts.clearance", clearance, f"one clearance for each of the {len(cells)} sites is needed")
     if clearance is None and lattice.preset is None and cells:
         yield Problem("contacts.clearance", None, "missing; give the clearance in m")
+
+
+def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
+    """The contact stiffness is given once: as a number, or by the material."""
+    material = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
+    given = [key for key, value in material.items() if value is not None]
+    missing = [key for key in material if key not in given]
+    if contacts.stiffness is not None and given:
+        yield Problem("contacts.stiffness", contacts.stiffness, f"give it or {', '.join(given)}, not both")
+    if contacts.stiffness is None and missing and any_sites and valid(*(f"contacts.{key}" for key in material)):
+        yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
 
 
 def resolved(sections: dict[str, Any]) -> dict[str, Table]:
@@ -117,11 +137,7 @@ def resolved(sections: dict[str, Any]) -> dict[str, Table]:
     law |= {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
     if contacts.stiffness is None and law.keys() >= REPLACES["stiffness"]:
         law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law.pop("radius"), law.pop("poisson")))
-    frequency, end, interval = drive.frequency, time.end, time.sample_interval
-    if drive.wavenumber is not None:
-        frequency = float(bloch(cell, drive.wavenumber).frequency[drive.band - 1])
-    elif drive.at is not None:
-        frequency = max_group_velocity(cell, drive.band)[1]
+    frequency, end, interval = drive_frequency(cell, drive), time.end, time.sample_interval
     if end == "traverse":
         end = 2 * np.pi * drive.cycles / frequency + lattice.cells / wave_speed(cell, frequency)
     if time.samples is not None:
@@ -133,6 +149,33 @@ def resolved(sections: dict[str, Any]) -> dict[str, Table]:
     tables["time"] |= {"sample_interval": float(interval), "end": float(end)}
     tables["time"].pop("samples", None)
     return tables
+
+
+def drive_frequency(cell: UnitCell, drive: DriveTable) -> float:
+    """The frequency in rad/s that a valid ``drive`` gives as a number, by wavenumber and band, or by a band."""
+    if drive.frequency is not None:
+        return drive.frequency
+    assert drive.band is not None
+    if drive.wavenumber is not None:
+        return float(bloch(cell, drive.wavenumber).frequency[drive.band - 1])
+    return max_group_velocity(cell, drive.band)[1]
+
+
+def check_traverse(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
+    """What is wrong with a valid drive that is to make a wave, and with a wave that is to cross the lattice."""
+    frequency = drive_frequency(cell, drive)
+    key = "frequency" if drive.frequency else "wavenumber" if drive.wavenumber else "band"
+    value = getattr(drive, key)
+    if not frequency > 0:
+        yield Problem(f"drive.{key}", value, "the frequency there is 0; drive another wavenumber or band")
+        return
+    fastest = max(max_group_velocity(cell, band + 1)[2] for band in range(cell.dofs))
+    speed = wave_speed(cell, frequency)
+    if drive.wavenumber and drive.band:
+        speed = abs(float(bloch(cell, drive.wavenumber).group_velocity[drive.band - 1]))
+    if time.end == "traverse" and not speed > STANDING * fastest:
+        remedy = f"the wave at {frequency:.6g} rad/s stands (group velocity 0) and never crosses the lattice"
+        yield Problem(f"drive.{key}", value, f"{remedy}; give time.end in s, or another wavenumber")
 
 
 def wave_speed(cell: UnitCell, frequency: float) -> float:

@@ -29,9 +29,27 @@ def _not_zero(value: float) -> float:
     return value
 
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Wavenumber = Annotated[float, BeforeValidator(number), Field(gt=0, le=np.pi)]
+def _in_range(value: float) -> float:
+    if value and not 1 / LARGEST <= abs(value) <= LARGEST:
+        raise ValueError(f"must be of a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
+    return value
+
+
+def once(values: list[Any]) -> list[Any]:
+    """``values`` if none of them comes twice; raises ValueError."""
+    if twice := [value for value in dict.fromkeys(values) if values.count(value) > 1]:
+        raise ValueError(f"names {', '.join(map(repr, twice))} more than once")
+    return values
+
+
+LARGEST = 1e50  # products of such numbers are numbers still
+MOST_SITES = 1_000_000
+Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_in_range)]
+Positive = Annotated[Finite, Field(gt=0)]
+NotNegative = Annotated[Finite, Field(ge=0)]
+Whole = Annotated[int, Field(ge=-(10**12), le=10**12)]
+Count = Annotated[int, Field(ge=1, le=10**12)]
+Wavenumber = Annotated[Finite, BeforeValidator(number), Field(gt=0, le=np.pi)]
 
 
 @dataclass(frozen=True)
@@ -75,8 +93,8 @@ PRESETS: dict[str, Preset] = {
 class SpringTable(Section):
     """A spring from mass ``start`` to mass ``end`` (1-based), of the next cell if ``next_cell``."""
 
-    start: int
-    end: int
+    start: Whole
+    end: Whole
     stiffness: Finite
     next_cell: bool = False
 
@@ -86,7 +104,7 @@ class CellTable(Section):
 
     masses: list[Finite] = Field(min_length=2)
     springs: list[SpringTable] = Field(min_length=1)
-    contact: list[int] = Field(min_length=2, max_length=2)
+    contact: list[Whole] = Field(min_length=2, max_length=2)
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int]:
         """Those of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
@@ -99,11 +117,11 @@ class LatticeTable(Section):
 
     preset: Literal["four-band", "diatomic"] | None = None
     cell: CellTable | None = None
-    cells: int = Field(300, ge=2)
+    cells: int = Field(300, ge=2, le=10**12)
     ends: Literal["fixed", "free", "periodic"] = "fixed"
     reading: Literal["printed", "calibrated"] = "calibrated"
     lam: Positive | None = Field(None, alias="lambda")
-    eta: Annotated[float, Field(gt=0, lt=1)] | None = None
+    eta: Annotated[Positive, Field(lt=1)] | None = None
 
     def unit_cell(self) -> UnitCell:
         """The unit cell: ``cell``, or the preset's in its reading; raises ValueError for an invalid one."""
@@ -116,10 +134,10 @@ class LatticeTable(Section):
 class Span(Section):
     """``count`` sites evenly from cell ``first`` to cell ``last`` (1-based), or every ``spacing``-th from ``first``."""
 
-    first: int
-    last: int | None = None
-    spacing: int | None = Field(None, ge=1)
-    count: int = Field(ge=1)
+    first: Whole
+    last: Whole | None = None
+    spacing: Count | None = None
+    count: int = Field(ge=1, le=MOST_SITES)
 
 
 class ClearanceSpan(Section):
@@ -138,24 +156,24 @@ class ContactsTable(Section):
     poisson: Annotated[float, Field(gt=-1, le=0.5)] | None = None
     stiffness: Positive | None = None
     restitution: Annotated[float, Field(ge=0, le=1)] = 1.0
-    sites: Annotated[int, Field(ge=0)] | list[int] | Span = 0
+    sites: Annotated[int, Field(ge=0, le=MOST_SITES)] | list[Whole] | Span = 0
     clearance: Positive | list[Positive] | ClearanceSpan | None = None
     adhesion: Literal["allow", "clip"] = "allow"
-    approach_floor: Annotated[float, Field(ge=0)] = 0.0
+    approach_floor: NotNegative = 0.0
 
 
 class DriveTable(Section):
     """A tone burst: ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``."""
 
     amplitude: Annotated[Finite, AfterValidator(_not_zero)] = 1.0
-    cycles: int = Field(30, ge=1)
+    cycles: Count = 30
     envelope: Literal["paper", "hann"] = "paper"
     frequency: Positive | None = None
     wavenumber: Wavenumber | None = None
-    band: Annotated[int, Field(ge=1)] | None = None
+    band: Count | None = None
     at: Literal["max-group-velocity"] | None = None
-    cell: int = Field(1, ge=1)
-    mass: int = Field(1, ge=1)
+    cell: Count = 1
+    mass: Count = 1
 
 
 class TimeTable(Section):
@@ -175,7 +193,7 @@ class TimeTable(Section):
     rtol: Annotated[float, Field(ge=1e-14, le=1e-2)] = 1e-10
     atol: Positive | Literal["scaled", "paper"] = "scaled"
     sample_interval: Positive | Literal["auto"] = "auto"
-    samples: int | None = Field(None, ge=2)
+    samples: int | None = Field(None, ge=2, le=10**9)
 
 
 class OutputTable(Section):
@@ -185,9 +203,11 @@ class OutputTable(Section):
     ``auto`` takes ``parallel`` when a run's fields exceed 2 GiB.
     """
 
-    fields: list[Literal["displacement", "velocity"]] = Field(["displacement", "velocity"])
-    window: list[int] | None = Field(None, min_length=2, max_length=2)
-    every: int = Field(1, ge=1)
-    stride: int = Field(1, ge=1)
+    fields: Annotated[list[Literal["displacement", "velocity"]], AfterValidator(once)] = Field(
+        ["displacement", "velocity"]
+    )
+    window: list[Whole] | None = Field(None, min_length=2, max_length=2)
+    every: Count = 1
+    stride: Count = 1
     writer: Literal["auto", "gather", "parallel"] = "auto"
     figures: bool = True

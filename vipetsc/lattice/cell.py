@@ -100,7 +100,22 @@ def cell_problems(
         problems.append(("contact", "host and resonator must be two different masses"))
     if not any(s.next_cell for s in springs):
         problems.append(("springs", "no spring has next_cell = true, so cells are not connected"))
+    elif not problems:
+        loose = [str(mass + 1) for mass in _loose_masses(n, springs)]
+        if loose:
+            text = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
+            problems.append(("springs", text))
     return problems
+
+
+def _loose_masses(n: int, springs: tuple[Spring, ...]) -> list[int]:
+    """Those of ``n`` masses that no chain of springs joins to one with a spring to the next cell."""
+    group = list(range(n))  # of every mass, which masses it hangs together with
+    for s in springs:
+        old, new = group[s.end], group[s.start]
+        group = [new if g == old else g for g in group]
+    held = {group[s.start] for s in springs if s.next_cell}
+    return [mass for mass in range(n) if group[mass] not in held]
 
 
 def diatomic(reading: Reading = "printed") -> UnitCell:
