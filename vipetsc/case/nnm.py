@@ -6,12 +6,15 @@ The system itself is built by ``vipetsc.modes.system.System.from_case``.
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.resolve import check_lattice, check_sites, site_cells, with_default_preset
-from vipetsc.case.schema import PRESETS, ContactsTable, Finite, LatticeTable, Positive
+from vipetsc.case.resolve import check_lattice, check_sites, check_stiffness, site_cells, with_default_preset
+from vipetsc.case.schema import PRESETS, ContactsTable, Count, Finite, LatticeTable, Positive, once
 from vipetsc.lattice import Contact, contact_stiffness
+from vipetsc.lattice.cell import groups_of
+
+MOST_MASSES = 4000
 
 
 class LinearSpringTable(Section):
@@ -74,7 +77,7 @@ class NnmTable(Section):
 
     system: Literal["reduced", "chain", "own"] = "reduced"
     custom: SystemTable | None = Field(None, alias="own")
-    modes: list[Annotated[int, Field(ge=1)]] = Field([1, 2], min_length=1)
+    modes: Annotated[list[Count], AfterValidator(once)] = Field([1, 2], min_length=1)
     map: Literal["auto", "quarter", "half", "whole"] = "auto"
     flow: Literal["compiled", "tsrk", "newmark"] = "compiled"
     jacobian: Literal["variational", "differences"] = "variational"
@@ -117,14 +120,21 @@ class NnmCase(CaseFile):
         if not valid("lattice", "contacts", "nnm"):
             return []
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
-        problems, dofs = [*_check_options(nnm)], 2
+        problems, dofs, rigid = [*_check_options(nnm)], 2, 0
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
+            if nnm.custom and not problems:
+                group = groups_of(dofs + 1, ((s.start, s.end) for s in nnm.custom.springs))
+                rigid = len(set(group)) - 1
         else:
             cell, wrong = check_lattice(lattice)
             problems += wrong
         if nnm.system == "chain":
             dofs = cell.dofs * lattice.cells if cell else 2
+            rigid = int(lattice.ends != "fixed")
+            if dofs > MOST_MASSES:
+                remedy = f"makes {dofs} masses; orbits are solved for with dense matrices, at most {MOST_MASSES}"
+                return [*problems, Problem("lattice.cells", lattice.cells, remedy)]
             if not site_cells(lattice, contacts):
                 problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
             problems += check_sites(lattice, contacts)
@@ -133,6 +143,10 @@ class NnmCase(CaseFile):
                 problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
             if contacts.clearance is None and lattice.preset is None:
                 problems.append(Problem("contacts.clearance", None, "missing; give the clearance in m"))
+        problems += check_stiffness(contacts, nnm.system != "own" and lattice.cell is not None, valid)
+        if still := [mode for mode in nnm.modes if mode <= rigid]:
+            remedy = f"the system is free to move as a whole: its first {rigid} have no period"
+            problems.append(Problem("nnm.modes", still, remedy.replace("first 1 have", "first mode has")))
         beyond = [mode for mode in nnm.modes if mode > dofs]
         if beyond and not problems:
             problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))

@@ -1,5 +1,6 @@
 """The unit cell: masses, springs inside it and to the next cell, and the pair that may collide."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -101,21 +102,21 @@ def cell_problems(
     if not any(s.next_cell for s in springs):
         problems.append(("springs", "no spring has next_cell = true, so cells are not connected"))
     elif not problems:
-        loose = [str(mass + 1) for mass in _loose_masses(n, springs)]
-        if loose:
+        group = groups_of(n, ((s.start, s.end) for s in springs))
+        held = {group[s.start] for s in springs if s.next_cell}
+        if loose := [str(mass) for mass, g in enumerate(group, 1) if g not in held]:
             text = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
             problems.append(("springs", text))
     return problems
 
 
-def _loose_masses(n: int, springs: tuple[Spring, ...]) -> list[int]:
-    """Those of ``n`` masses that no chain of springs joins to one with a spring to the next cell."""
-    group = list(range(n))  # of every mass, which masses it hangs together with
-    for s in springs:
-        old, new = group[s.end], group[s.start]
+def groups_of(n: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """Of every one of ``n`` masses (0-based) the number of the group that ``pairs`` tie it to."""
+    group = list(range(n))
+    for start, end in pairs:
+        old, new = group[end], group[start]
         group = [new if g == old else g for g in group]
-    held = {group[s.start] for s in springs if s.next_cell}
-    return [mass for mass in range(n) if group[mass] not in held]
+    return group
 
 
 def diatomic(reading: Reading = "printed") -> UnitCell:

@@ -1,0 +1,269 @@
+"""Case files spoilt at random from a seed, read in process as ``validate`` reads them.
+
+``mutations(seed)`` never ends; ``judge`` reads one file and says how that went. The campaign and a short test use both.
+"""
+
+from __future__ import annotations
+
+import copy
+import random
+import signal
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import tomli_w
+from pydantic import BaseModel
+
+from vipetsc.case import Case, CaseError, CaseFile, DesignCase, NnmCase
+from vipetsc.case.every import load_every
+from vipetsc.case.sweep import SweepTable
+
+RUNS = Path(__file__).parents[2] / "runs"
+HOSTILE: list[Any] = [
+    0, 1, 2, -1, 0.0, -1.0, 0.5, 1.5, float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 1e-320, 1e-300, 1e300,
+    1e17, 1e-17, 10**9, 10**12, 10**30, -(10**30), 10**400, True, "", " ", "pi", "0pi", "1e9", "foo", "traverse", "naïve ‮∞",
+    "\u0000", "../..", [], [[]], [0], [1, 1], [1, 2, 3], [1e-3], ["velocity", "velocity"], [float("nan")], list(range(1, 400)),
+    {}, {"a": 1}, {"first": 1, "count": 10**9}, {"first": 1, "last": 10**9, "count": 5}, {"first": 5, "count": 3, "spacing": 10**9},
+    {"log": [1.0, 100.0], "count": 3}, {"linear": [0, 1], "count": 10**9}, {"log": [0, 0], "count": 2}, [{"start": 1, "end": 9}],
+    {"first": 1e-3, "last": 1e-320},
+]  # fmt: skip
+OWN: dict[str, Any] = {
+    "lattice": {
+        "cells": 20,
+        "cell": {
+            "masses": [0.01, 0.02],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 9e3, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 9e3},
+            ],
+            "contact": [1, 2],
+        },
+    },
+    "contacts": {"sites": [5], "clearance": 1e-4, "stiffness": 1e6},
+    "drive": {"frequency": 300.0},
+    "time": {"end": 0.2},
+}
+Path_ = tuple[Any, ...]  # keys and list positions that lead to a value
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """A spoilt case file: its ``text``, the case it was made from, what was done to it."""
+
+    parent: str
+    changes: tuple[str, ...]
+    text: bytes
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How the reading of a file ended: the ``cases`` if it is valid, the refusal, or the defect."""
+
+    cases: tuple[CaseFile, ...] = ()
+    refusal: str = ""
+    defect: str = ""
+    seconds: float = 0.0
+
+
+def parents() -> dict[str, dict[str, Any]]:
+    """The tables that are spoilt, by name."""
+    files = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(RUNS.glob("*.toml"))}
+    return {"builtin": copy.deepcopy(Case.builtin_table), "own": OWN} | files
+
+
+def known_keys() -> dict[Path_, list[Any]]:
+    """Every key of every section with values of its kind: the choices of a literal, or none."""
+    found: dict[Path_, list[Any]] = {}
+    for kind in (Case, NnmCase, DesignCase):
+        for name, field in kind.model_fields.items():
+            if name != "name":
+                _collect(field.annotation, (name,), found)
+    _collect(SweepTable, ("sweep",), found)
+    return found
+
+
+def _collect(annotation: Any, path: Path_, found: dict[Path_, list[Any]]) -> None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        for name, field in annotation.model_fields.items():
+            _collect(field.annotation, (*path, field.alias or name), found)
+        return
+    choices = found.setdefault(path, [])
+    if get_origin(annotation) is Literal:
+        choices += get_args(annotation)
+    for argument in get_args(annotation):
+        if get_origin(annotation) is not Literal:
+            _collect(argument, path, found)
+
+
+def mutations(seed: int) -> Iterator[Mutation]:
+    """Spoilt case files for ever, the same ones from the same seed."""
+    rng, sources, keys = random.Random(seed), parents(), known_keys()
+    names = sorted(sources)
+    while True:
+        parent = rng.choice(names)
+        table, changes = copy.deepcopy(sources[parent]), []
+        for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 5))):
+            change: Callable[..., str] = rng.choice((_replace, _replace, _scale, _remove, _misspell, _lists, _put, _put))
+            changes.append(change(rng, table, keys))
+        try:
+            text = tomli_w.dumps(table).encode("utf-8", "surrogatepass")
+        except (ValueError, TypeError):  # tomli_w refuses some numbers and keys
+            continue
+        if rng.random() < 0.1:
+            text, change_of_text = _spoil_text(rng, text)
+            changes.append(change_of_text)
+        yield Mutation(parent, tuple(changes), text)
+
+
+def _places(node: Any, path: Path_ = ()) -> Iterator[Path_]:
+    """The path of every value, sections and elements of lists included."""
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from _places(value, (*path, key))
+
+
+def _at(table: Any, path: Path_) -> Any:
+    for key in path:
+        table = table[key]
+    return table
+
+
+def _choose(rng: random.Random, table: Any, wanted: Callable[[Any], bool] = lambda value: True) -> Path_ | None:
+    places = [path for path in _places(table) if wanted(_at(table, path))]
+    return rng.choice(places) if places else None
+
+
+def _replace(rng: random.Random, table: Any, keys: Any) -> str:
+    path = _choose(rng, table)
+    if path is None:
+        return "nothing to replace"
+    value = copy.deepcopy(rng.choice(HOSTILE))
+    _at(table, path[:-1])[path[-1]] = value
+    return f"{path} = {value!r:.60}"
+
+
+def _scale(rng: random.Random, table: Any, keys: Any) -> str:
+    path = _choose(rng, table, lambda value: type(value) in (int, float))
+    if path is None:
+        return "nothing to scale"
+    factor = rng.choice((-1, 0.5, 2, 10, 100, 1e3, 1e6, 1e12, 0.1, 1e-3, 1e-6, 1e-12))
+    old = _at(table, path)
+    new = type(old)(old * factor) if abs(old) < 1e300 else old
+    _at(table, path[:-1])[path[-1]] = new
+    return f"{path} = {new!r:.60}"
+
+
+def _remove(rng: random.Random, table: Any, keys: Any) -> str:
+    path = _choose(rng, table)
+    if path is None:
+        return "nothing to remove"
+    del _at(table, path[:-1])[path[-1]]
+    return f"del {path}"
+
+
+def _misspell(rng: random.Random, table: Any, keys: Any) -> str:
+    path = _choose(rng, table)
+    if path is None or not isinstance(path[-1], str):
+        return "nothing to misspell"
+    section = _at(table, path[:-1])
+    name = rng.choice((path[-1][:-1], path[-1] + "s", path[-1].upper(), path[-1] + ".x", "", "ключ", "self", "model_config"))
+    section[name] = section.pop(path[-1])
+    return f"{path} -> {name!r}"
+
+
+def _lists(rng: random.Random, table: Any, keys: Any) -> str:
+    path = _choose(rng, table, lambda value: isinstance(value, list))
+    if path is None:
+        return "no list"
+    values = _at(table, path)
+    what = rng.choice(("double", "cut", "empty", "mix", "nest"))
+    if what == "double":
+        values += copy.deepcopy(values)
+    elif what == "cut" and values:
+        values.pop(rng.randrange(len(values)))
+    elif what == "empty":
+        values.clear()
+    elif what == "mix":
+        values.append(copy.deepcopy(rng.choice(HOSTILE)))
+    else:
+        values[:] = [copy.deepcopy(values)]
+    return f"{what} {path}"
+
+
+def _put(rng: random.Random, table: Any, keys: dict[Path_, list[Any]]) -> str:
+    """A key that some section has, with one of its choices, a plausible number or nonsense; sometimes elsewhere."""
+    path = rng.choice(sorted(keys))
+    numbers = (1, 2, 3, 5, 40, 0.3, 0.9, 1e-3, 1e4, [1], [1, 2], [2, 1], [1.0, 2.0], True)
+    value = rng.choice(keys[path] or numbers) if rng.random() < 0.6 else copy.deepcopy(rng.choice(HOSTILE))
+    if rng.random() < 0.15:
+        path = ("sweep", *path)
+        value = value if isinstance(value, list) else [value, value]
+    section = table
+    for key in path[:-1]:
+        section = section.setdefault(key, {}) if isinstance(section, dict) else section
+    if isinstance(section, dict):
+        section[path[-1]] = value
+    return f"{path} := {value!r:.60}"
+
+
+def _spoil_text(rng: random.Random, text: bytes) -> tuple[bytes, str]:
+    lines = text.splitlines(keepends=True) or [b"\n"]
+    i = rng.randrange(len(lines))
+    what = rng.choice(("BOM", "twice", "cut", "bytes", "brackets", "digits", "crlf"))
+    if what == "BOM":
+        return b"\xef\xbb\xbf" + text, what
+    if what == "twice":
+        return b"".join([*lines[: i + 1], lines[i], *lines[i + 1 :]]), what
+    if what == "cut":
+        return text[: rng.randrange(len(text) + 1)], what
+    if what == "bytes":
+        place = rng.randrange(len(text) + 1)
+        return text[:place] + bytes(rng.randrange(256) for _ in range(3)) + text[place:], what
+    if what == "brackets":
+        return text + b"\nx = " + b"[" * 3000, what
+    if what == "digits":
+        return text + b"\n[drive]\namplitude = " + b"9" * 5000 + b"\n", what
+    return text.replace(b"\n", b"\r\n"), what
+
+
+@contextmanager
+def limit(seconds: int) -> Iterator[None]:
+    """Raise TimeoutError in the block after ``seconds``."""
+
+    def expire(number: int, frame: Any) -> None:
+        raise TimeoutError(f"longer than {seconds} s")
+
+    earlier = signal.signal(signal.SIGALRM, expire)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, earlier)
+
+
+def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
+    """Read ``mutation`` from ``path``, as ``validate`` does; anything but cases or a CaseError is a defect."""
+    from vipetsc.cli.tables import case_table
+
+    path.write_bytes(mutation.text)
+    begin = time.perf_counter()
+    try:
+        with limit(seconds):
+            cases = load_every(path)
+            for case in cases:
+                case_table(case, 1)
+                if isinstance(case, Case):
+                    case.warnings()
+                assert type(case).from_toml(case.to_toml()) == case
+    except CaseError as error:
+        return Verdict(refusal=str(error), seconds=time.perf_counter() - begin)
+    except Exception as error:
+        return Verdict(defect=f"{type(error).__name__}: {error}", seconds=time.perf_counter() - begin)
+    return Verdict(tuple(cases), seconds=time.perf_counter() - begin)
