@@ -18,7 +18,6 @@ from vipetsc.case.resolve import (
     check_stiffness,
     check_traverse,
     resolved,
-    site_cells,
     wave_speed,
     with_preset,
 )
@@ -92,7 +91,8 @@ class Case(CaseFile):
         yield from problems
         if valid("lattice.cells", "contacts.sites"):
             yield from check_sites(lattice, contacts)
-            yield from check_stiffness(contacts, bool(site_cells(lattice, contacts)), valid)
+            counted = isinstance(contacts.sites, int) and lattice.preset is None  # which needs a preset to place them
+            yield from check_stiffness(contacts, bool(contacts.sites) and not counted, valid)
         length = lattice.cells if valid("lattice.cells") else None
         of_drive = list(_check_drive(sections["drive"], length, cell, valid))
         yield from of_drive

@@ -152,6 +152,13 @@ class NnmCase(CaseFile):
             problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))
         return problems
 
+    @property
+    def masses(self) -> int:
+        """How many masses the system has."""
+        if self.nnm.custom is not None:
+            return len(self.nnm.custom.masses)
+        return 2 if self.nnm.system == "reduced" else self.lattice.cells * self.lattice.unit_cell().dofs
+
     def physics(self) -> tuple[Any, ...]:
         """What a branch that is resumed must keep: the system, the shooting map and the flow."""
         nnm = self.nnm

@@ -38,7 +38,8 @@ class Problem:
     remedy: str
 
     def __str__(self) -> str:
-        value = "" if self.value is None else f" = {self.value!r}"
+        text = repr(self.value)
+        value = "" if self.value is None else f" = {text[:200]}{' ...' * (len(text) > 200)}"
         return f"{self.key}{value}: {self.remedy}"
 
 
@@ -124,6 +125,10 @@ class CaseFile(Section):
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterable[Problem]:
         """What is wrong between keys; those that are not ``valid`` are reported already and hold their defaults."""
         return ()
+
+    def warnings(self) -> list[str]:
+        """What is allowed but likely not meant, one sentence each."""
+        return []
 
     def to_toml(self) -> str:
         """The resolved case as TOML; reading it back gives the same case."""

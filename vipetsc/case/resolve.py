@@ -103,7 +103,12 @@ def check_lattice(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
     """What is wrong with where the contacts are, and with their clearances."""
-    cells, sites, clearance = site_cells(lattice, contacts), contacts.sites, contacts.clearance
+    sites, clearance = contacts.sites, contacts.clearance
+    count = sites.count if isinstance(sites, Span) else sites if isinstance(sites, int) else 0
+    if count > lattice.cells:
+        yield Problem("contacts.sites", count, f"more sites than the lattice has cells, {lattice.cells}")
+        return
+    cells = site_cells(lattice, contacts)
     if outside := [c for c in cells if not 1 <= c <= lattice.cells]:
         yield Problem("contacts.sites", outside, f"outside the lattice; cells count from 1 to {lattice.cells}")
     if isinstance(sites, Span) and None not in (sites.last, sites.spacing):

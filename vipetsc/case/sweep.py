@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,8 +14,9 @@ from pydantic import Field
 
 from vipetsc.case.case import Case, case_id
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, put, read_section
-from vipetsc.case.schema import number
+from vipetsc.case.schema import LARGEST, number
 
+MOST_MEMBERS = 20_000
 Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
 
 
@@ -77,6 +79,9 @@ class Sweep(CaseFile):
             remedy = "names no key that varies, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
         axes, wrong = _axes(values, options.zip)
+        count = math.prod(len(next(iter(axis.values()))) for axis in axes)
+        if count > MOST_MEMBERS:
+            wrong.append(Problem("sweep", None, f"makes {count} members; at most {MOST_MEMBERS}, so divide it"))
         return {"table": table, "options": options, "axes": axes}, problems + wrong
 
     @property
@@ -94,6 +99,10 @@ class Sweep(CaseFile):
 
     def members(self) -> list[SweepMember]:
         """All members in the order of the axes, the last varying fastest; raises CaseError if none is valid."""
+        return list(self._members)
+
+    @cached_property
+    def _members(self) -> list[SweepMember]:
         members, errors = [], []
         for index in np.ndindex(self.shape):
             try:
@@ -140,8 +149,10 @@ def _values(value: Any) -> tuple[Any, ...]:
     (kind,) = value.keys() - {"count"}
     ends, count = value[kind], value["count"]
     numbers = isinstance(ends, list) and len(ends) == 2 and all(type(e) in (int, float) for e in ends)
-    if not numbers or type(count) is not int or count < 1:
-        raise ValueError(remedy)
+    if not numbers or type(count) is not int or not 1 <= count <= MOST_MEMBERS:
+        raise ValueError(remedy + f", n from 1 to {MOST_MEMBERS}" * numbers)
+    if not all(abs(end) <= LARGEST for end in ends):
+        raise ValueError(f"the ends of a range must be numbers up to {LARGEST:g}")
     if kind == "log" and min(ends) <= 0:
         raise ValueError("the ends of a log range must be positive")
     first, last = map(float, ends)

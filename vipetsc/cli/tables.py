@@ -13,7 +13,7 @@ from mpi4py import MPI
 import h5py
 import numpy as np
 
-from vipetsc.case import Case
+from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
 from vipetsc.io.folder import provenance
 from vipetsc.io.store import GATHER_LIMIT
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
@@ -79,8 +79,30 @@ def sweep_table(result: "SweepResult") -> str:
     return table(rows)
 
 
-def validate_table(case: Case, ranks: int) -> str:
-    """What follows from a case: bands, drive, times, samples, file size, cost."""
+def case_table(case: CaseFile, ranks: int) -> str:
+    """What follows from the case of a verb."""
+    if isinstance(case, Case):
+        return run_case_table(case, ranks)
+    if isinstance(case, Sweep):
+        impossible, counts = sum(member.case is None for member in case.members()), " x ".join(map(str, case.shape))
+        rows = [("sweep", f"{np.prod(case.shape)} members ({counts}), {impossible} of them impossible")]
+    elif isinstance(case, DesignCase):
+        search = case.design
+        cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
+        rows = [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]
+    else:
+        assert isinstance(case, NnmCase)
+        contact, (low, high) = case.contact(), case.nnm.energy
+        rows = [
+            ("nnm", f"{case.nnm.system} system of {case.masses} masses, modes {_first_few(case.nnm.modes)}"),
+            ("nnm contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.exponent:g}"),
+            ("nnm energies", f"{low:g} to {high:g} J, at most {case.nnm.points} points a branch"),
+        ]
+    return table(rows)
+
+
+def run_case_table(case: Case, ranks: int) -> str:
+    """What follows from a case of a run: bands, drive, times, samples, file size, cost."""
     model = case.model()
     cell, chain, contact = model.chain.cell, model.chain, model.contact
     bands, waves = pass_bands(cell), waves_at(cell, model.drive.frequency)

@@ -14,7 +14,7 @@ from typing import TextIO, TypeVar
 from mpi4py import MPI
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
-from vipetsc.case.reading import read_toml
+from vipetsc.case.every import load_every
 from vipetsc.cli import tables
 from vipetsc.cli.plot import draw_source, source_of
 from vipetsc.io.atomic import write_text
@@ -100,17 +100,12 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 
 
 def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Check a case and print what follows from it."""
-    case = _load(Case, options, comm)
+    """Check a case as every verb whose section it has, and print what follows from it."""
 
     def report() -> str:
-        lines = [tables.validate_table(case, comm.size)]
-        if options.case is not None and "sweep" in read_toml(options.case):
-            plan = Sweep.load(options.case, options.set)
-            members, counts = plan.members(), " x ".join(map(str, plan.shape))
-            impossible = sum(member.case is None for member in members)
-            lines.append(f"  sweep        {len(members)} members ({counts}), {impossible} of them impossible")
-        return "\n".join(lines + [f"warning: {warning}" for warning in case.warnings()])
+        cases = load_every(options.case, options.set)
+        lines = [tables.case_table(case, comm.size) for case in cases]
+        return "\n".join(lines + [f"warning: {warning}" for case in cases for warning in case.warnings()])
 
     echo(comm, on_root(comm, report))
     return DONE

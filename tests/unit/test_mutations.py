@@ -1,0 +1,93 @@
+"""Spoilt case files end in a case or in sentences that name the key, never in a traceback, never late."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import pytest
+
+from tests.faults.mutations import judge, mutations
+from vipetsc.case import CaseError
+from vipetsc.case.every import load_every
+
+SWEEPS = ("interband", "scattering", "scattering-neighbours")  # of thousands of members, seconds each
+CELL = "[lattice]\ncells = 20\n[lattice.cell]\nmasses = [1.0, 2.0, 3.0]\ncontact = [1, 2]\nsprings = [{}]\n"
+CHAIN = "{ start = 1, end = 1, stiffness = 3.0, next_cell = true }, { start = 1, end = 2, stiffness = 4.0 }"
+TIED = CELL.format(CHAIN + ", { start = 1, end = 3, stiffness = 4.0 }")
+OWN = '[nnm]\nsystem = "own"\nmodes = [1]\n[nnm.own]\nmasses = [1.0, 1.0]\nsprings = [{}]\n'
+
+
+def read(path, text, *overrides):
+    path.write_text(text, encoding="utf-8")
+    return load_every(path, overrides)
+
+
+def test_spoilt_cases_are_read_or_refused(tmp_path):
+    verdicts = [(m, judge(m, tmp_path / "case.toml")) for m in islice(mutations(11, without=SWEEPS), 150)]
+    assert [(m.parent, m.changes, v.defect) for m, v in verdicts if v.defect] == []
+    assert len([v for _, v in verdicts if v.refusal]) > 75
+    assert len([v for _, v in verdicts if v.cases]) > 15
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[nnm]\nmodes = 'foo'", "nnm.modes = 'foo'"),
+        ("[nnm]\nmodes = [2, 2]", "nnm.modes = [2, 2]: names 2 more than once"),
+        ("[design]\nwavenumbers = 1\n[drive]\nampltude = 1.0", "design.wavenumbers = 1"),
+        ("[design]\nwavenumbers = 1\n[drive]\nampltude = 1.0", "did you mean drive.amplitude?"),
+        ("[sweep.drive]\namplitude = 3", "sweep.drive.amplitude = 3"),
+        ("[sweep.drive]\namplitude = { linear = [1, 2], count = 1000000000 }", "n from 1 to 20000"),
+        ("[sweep.drive]\namplitude = { linear = [1, 2], count = 2000 }\nfrequency = { linear = [900, 990], count = 11 }",
+         "sweep: makes 22000 members"),
+        ("[lattice]\ncells = 1000000000", "lattice.cells = 1000000000: has more than"),
+        ("[lattice]\ncells = 1000000000000", "lattice.cells = 1000000000000: has more than"),
+        ("[contacts]\nsites = 1000000000000", "contacts.sites = 1000000000000"),
+        ("[contacts]\nsites = 301", "contacts.sites = 301: more sites than the lattice has cells, 300"),
+        ("[time]\nend = 1e308", "time.end = 1e+308: must be of a magnitude"),
+        ("[time]\nend = 1e40", "time.end = 1e+40: makes 5e+43 samples"),
+        ("[lattice]\neta = 1e-320", "lattice.eta = 1e-320: must be of a magnitude"),
+        ("[drive]\namplitude = 1e300", "drive.amplitude = 1e+300: must be of a magnitude"),
+        ("[drive]\nband = 2\nwavenumber = 'pi'", "stands (group velocity 0) and never crosses the lattice; give"),
+        ("[output]\nfields = ['velocity', 'velocity']", "names 'velocity' more than once"),
+        ("name = '../../evil'", "name = '../../evil': names the output folder"),
+        ("name = '.hidden'", "no dot or dash at the beginning"),
+        ("name = 'a\\b'", "without / or \\"),
+        (CELL.format(CHAIN), "lattice.cell.springs: nothing ties mass 3 to the next cell"),
+        (TIED + "[contacts]\nclearance = 1.0\n[nnm]", "contacts.stiffness: missing"),
+        (OWN.format("{ start = 1, end = 2, stiffness = 1.0 }"), "nnm.modes = [1]: the system is free to move"),
+        (OWN.format("{ start = 0, end = 3, stiffness = 1.0 }"), "not a pair of the system's 2 masses"),
+        ("[lattice]\ncells = 100000\n[contacts]\nsites = 1\n[nnm]\nsystem = 'chain'", "makes 400000 masses"),
+        ("x = " + "[" * 5000, "not a TOML file"),
+        ("x = " + "9" * 5000, "not a TOML file"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_named_with_its_remedy(tmp_path, text, said):
+    with pytest.raises(CaseError) as caught:
+        read(tmp_path / "case.toml", text)
+    assert said in str(caught.value)
+
+
+def test_a_byte_order_mark_is_no_key(tmp_path):
+    (case,) = read(tmp_path / "case.toml", "\ufeff[lattice]\ncells = 40\n")
+    assert case.lattice.cells == 40
+
+
+def test_a_standing_wave_may_be_driven_for_a_given_time(tmp_path):
+    (case,) = read(tmp_path / "case.toml", "[drive]\nband = 2\nwavenumber = 'pi'\n[time]\nend = 0.1\n")
+    assert case.drive.frequency == pytest.approx(1414.2136)
+
+
+def test_a_key_can_be_taken_out(tmp_path):
+    text = "[drive]\nband = 2\nwavenumber = 1.0\n"
+    (case,) = read(tmp_path / "case.toml", text, "drive.wavenumber=", "drive.band=", "drive.frequency=1000")
+    assert case.drive.frequency == 1000
+    with pytest.raises(CaseError, match=r"--set drive\.bnad: is not in the case"):
+        read(tmp_path / "case.toml", text, "drive.bnad=")
+
+
+def test_a_sweep_may_give_what_a_run_lacks(tmp_path):
+    text = TIED + "[time]\nend = 1.0\nsample_interval = 0.1\n[sweep.drive]\nfrequency = [0.5, 1.0]\n"
+    run, sweep = read(tmp_path / "case.toml", text)
+    assert run.drive.frequency == 0.5
+    assert sweep.shape == (2,)
