@@ -1,0 +1,145 @@
+"""Faults in number, with a report: ``scripts/campaign faults | kills | cases``."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.faults import trials
+from tests.faults.inject import KINDS
+from tests.faults.phases import phases
+from tests.faults.scenarios import SCENARIOS
+from tests.faults.trials import Crew, judge, last_words, matrix, references
+from vipetsc.case import Case
+
+KILLED = ("run", "run-ts", "run-resumed", "run-force", "sweep", "sweep-team", "nnm", "design", "paper")
+
+
+def faults(options: argparse.Namespace) -> dict[str, Any]:
+    """Every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
+    rows, reached = [], set()
+    with tempfile.TemporaryDirectory(prefix="faults-") as work:
+        for ranks in options.ranks:
+            crew = Crew(Path(work) / str(ranks), ranks, options.patience)
+            counts = references(crew, options.only or list(SCENARIOS))
+            reached |= {phase for by_rank in counts.values() for count in by_rank for phase in count}
+            tasks = [t for t in matrix(counts, options.kinds) if not options.phases or t["phase"] in options.phases]
+            crew.do(tasks)
+            for task in tasks:
+                stages = crew.results[task["id"]]
+                wrong = judge(task, stages, options.allowed)
+                rows.append(task | {"ranks": ranks, "wrong": wrong, "last": last_words(stages) if wrong else ""})
+                if wrong:
+                    print(f"{task['id']}: {'; '.join(wrong)}\n    {rows[-1]['last']}", flush=True)
+    missed = sorted(phases() - reached) if not options.only else []
+    print(fault_table(rows, options.kinds, options.ranks))
+    if missed:
+        print(f"phases that no case comes to: {', '.join(missed)}")
+    bad = sum(bool(row["wrong"]) for row in rows)
+    print(f"{len(rows)} faults, {bad} of them not as they should be")
+    return {"rows": rows, "missed": missed, "bad": bad + len(missed)}
+
+
+def kills(options: argparse.Namespace) -> dict[str, Any]:
+    """Signals at random times to whole calls and to single ranks; then the same command, and its bits."""
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="kills-") as work:
+        crews = {ranks: Crew(Path(work) / str(ranks), ranks, options.patience) for ranks in options.ranks}
+        seconds = {}
+        for ranks, crew in crews.items():
+            references(crew, options.only)
+            for name in options.only:
+                seconds[name, ranks] = crew.results[f"{name} unbroken"]["finished"]["seconds"]
+        tasks = list(trials.kills(seconds, options.seed, options.count))
+        for ranks, crew in crews.items():
+            crew.do([task for task in tasks if task["ranks"] == ranks])
+        for task in tasks:
+            stages = crews[task["ranks"]].results[task["id"]]
+            wrong, came = judge(task, stages, options.allowed), stages["ended"]["fired"]
+            rows.append(task | {"came": came, "code": stages["ended"]["code"], "wrong": wrong})
+            if wrong:
+                print(f"{task['id']}: {'; '.join(wrong)}\n    {last_words(stages)}", flush=True)
+    bad = sum(bool(row["wrong"]) for row in rows)
+    for name in options.only:
+        of_name = [row for row in rows if row["scenario"] == name]
+        in_time, lost = (sum(bool(row[key]) for row in of_name) for key in ("came", "wrong"))
+        print(f"{name:<13}{len(of_name):>5} kills, {in_time:>4} before the end, {lost} not as they should be")
+    print(f"seed {options.seed}: {len(rows)} kills, {bad} of them not as they should be")
+    return {"seed": options.seed, "rows": rows, "bad": bad}
+
+
+def cases(options: argparse.Namespace) -> dict[str, Any]:
+    """Random changes of case files, read as every verb reads them: a sentence, never a traceback or a long wait."""
+    from tests.faults import mutations
+
+    rows, endings = [], Counter()
+    with tempfile.TemporaryDirectory(prefix="cases-") as work:
+        for mutation in itertools.islice(mutations.mutations(options.seed), options.count):
+            verdict = mutations.judge(mutation, Path(work) / "case.toml", options.seconds)
+            defect, runs = verdict.defect, [case for case in verdict.cases if isinstance(case, Case)]
+            if runs and endings["valid"] % options.every == 0:
+                defect = mutations.run_shortly(runs[0], options.seconds)
+            endings["valid" if verdict.cases else "refused"] += 1
+            if defect:
+                rows.append({"parent": mutation.parent, "changes": mutation.changes, "defect": defect})
+                print(f"{mutation.parent}, {'; '.join(mutation.changes)}: {defect}", flush=True)
+    counts = f"{endings['valid']} of them valid, {len(rows)} with a traceback or longer than {options.seconds} s"
+    print(f"seed {options.seed}: {options.count} cases, {counts}")
+    return {"seed": options.seed, "count": options.count, **endings, "rows": rows, "bad": len(rows)}
+
+
+def fault_table(rows: Sequence[dict[str, Any]], kinds: Sequence[str], ranks: Sequence[int]) -> str:
+    """Phases of every verb against kinds of faults and numbers of ranks: a dot for as it should be, else a cross."""
+    cells = {(row["scenario"], row["phase"], row["kind"], row["ranks"]): "x" if row["wrong"] else "." for row in rows}
+    columns = [(kind, n) for kind in kinds for n in ranks]
+    lines = [f"{'verb':<13}{'phase':<12}" + "".join(f"{kind + ' ' + str(n):>13}" for kind, n in columns)]
+    for name, phase in dict.fromkeys((row["scenario"], row["phase"]) for row in rows):
+        marks = (cells.get((name, phase, kind, n), "") for kind, n in columns)
+        lines.append(f"{name:<13}{phase:<12}" + "".join(f"{mark:>13}" for mark in marks))
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Do one campaign; 1 if anything was not as it should be."""
+    parser = argparse.ArgumentParser(prog="scripts/campaign", description=__doc__)
+    parser.add_argument("--patience", type=float, default=40.0, metavar="S", help="time in which a call has to end")
+    parser.add_argument("--allowed", type=float, default=10.0, metavar="S", help="time from a fault to the end of all")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="leave all results there as JSON")
+    kinds = parser.add_subparsers(required=True, metavar="KIND")
+    part = kinds.add_parser("faults", help=faults.__doc__, description=faults.__doc__)
+    part.add_argument("--only", nargs="+", choices=SCENARIOS, help="scenarios; all if left out")
+    part.add_argument("--phases", nargs="+", help="phases; all if left out")
+    part.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    part.add_argument("--ranks", nargs="+", type=int, default=[2, 3])
+    part.set_defaults(function=faults)
+    part = kinds.add_parser("kills", help=kills.__doc__, description=kills.__doc__)
+    part.add_argument("--seed", type=int, default=1)
+    part.add_argument("--count", type=int, default=200)
+    part.add_argument("--only", nargs="+", choices=SCENARIOS, default=KILLED)
+    part.add_argument("--ranks", nargs="+", type=int, default=[1, 2, 3])
+    part.set_defaults(function=kills)
+    part = kinds.add_parser("cases", help=cases.__doc__, description=cases.__doc__)
+    part.add_argument("--seed", type=int, default=1)
+    part.add_argument("--count", type=int, default=2000)
+    part.add_argument("--seconds", type=int, default=20, metavar="S", help="time that a case may take")
+    part.add_argument("--every", type=int, default=10, metavar="N", help="simulate every N-th valid case for a while")
+    part.set_defaults(function=cases)
+    options = parser.parse_args()
+    begin = time.monotonic()
+    report = options.function(options)
+    print(f"{time.monotonic() - begin:.0f} s")
+    if options.report:
+        options.report.write_text(json.dumps(report, indent=1) + "\n")
+    return 1 if report["bad"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

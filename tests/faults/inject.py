@@ -1,0 +1,87 @@
+"""A fault at one phase: ``python -m tests.faults.inject PHASE NUMBER RANK KIND -- ARGUMENTS`` of the command line.
+
+At the NUMBER-th time (from 1) that world rank RANK comes to PHASE it meets a fault of KIND: ``exception``, ``memory``
+(MemoryError), ``full-disk`` (OSError), ``sigterm`` or ``sigkill``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import signal
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+from tests.faults.phases import PREFIX
+
+KINDS = ("exception", "memory", "full-disk", "sigterm", "sigkill")
+
+
+class InjectedError(Exception):
+    """An exception that no part of the program expects."""
+
+
+class Injector:
+    """Counts the phases that this rank comes to, and strikes once at the one that it is armed for."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.armed: tuple[str, int, str] | None = None
+        self.mark: Path | None = None
+        sys.addaudithook(self._hook)
+
+    def arm(self, phase: str, number: int, kind: str, mark: Path | None = None) -> None:
+        """Strike with ``kind`` at the ``number``-th time from now on; the time is then written to ``mark``."""
+        self.counts.clear()
+        self.armed, self.mark = (phase, number, kind), mark
+
+    def disarm(self) -> Counter[str]:
+        """Do nothing any more; returns how often every phase has come since the last call or ``arm``."""
+        counts, self.counts, self.armed = self.counts, Counter(), None
+        return counts
+
+    def _hook(self, event: str, arguments: tuple) -> None:
+        if not event.startswith(PREFIX):
+            return
+        phase = event.removeprefix(PREFIX)
+        self.counts[phase] += 1
+        if self.armed and self.armed[:2] == (phase, self.counts[phase]):
+            kind, self.armed = self.armed[2], None
+            if self.mark:
+                self.mark.write_text(str(time.time()))
+            strike(kind, phase)
+
+
+def strike(kind: str, where: str) -> None:
+    """Meet the fault."""
+    if kind == "exception":
+        raise InjectedError(f"a fault at {where}")
+    if kind == "memory":
+        raise MemoryError(f"Unable to allocate 1.00 TiB at {where}")
+    if kind == "full-disk":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), where)
+    os.kill(os.getpid(), {"sigterm": signal.SIGTERM, "sigkill": signal.SIGKILL}[kind])
+
+
+def main() -> int:
+    """Arm the rank that is meant, then go in by the front door."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.inject", description=__doc__)
+    parser.add_argument("phase")
+    parser.add_argument("number", type=int)
+    parser.add_argument("rank", type=int)
+    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("arguments", nargs="*", help="after --: what vipetsc is called with")
+    options = parser.parse_args()
+    injector = Injector()
+    if int(os.environ.get("OMPI_COMM_WORLD_RANK", "0")) == options.rank:
+        injector.arm(options.phase, options.number, options.kind)
+    from vipetsc.__main__ import main as vipetsc
+
+    return vipetsc(options.arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""Tiny cases of every verb: what is called, with what before it, and how two outcomes are told to be the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+
+RUN = """
+[lattice]
+preset = "diatomic"
+cells = 40
+[contacts]
+sites = 2
+clearance = 1e-4
+[drive]
+cycles = 5
+amplitude = 10.0
+[time]
+engine = "propagator"
+samples = 101
+rtol = 1e-8
+"""
+TS = RUN.replace("propagator", "ts") + '[output]\nfigures = false\nwriter = "parallel"\n'
+SWEEP = """
+[lattice]
+preset = "diatomic"
+cells = 40
+[drive]
+cycles = 5
+[contacts]
+clearance = 1e-4
+[time]
+samples = 101
+rtol = 1e-7
+[output]
+figures = false
+[sweep]
+measures = ["entropy"]
+[sweep.contacts]
+sites = [1]
+[sweep.drive]
+amplitude = [0.1, 5.0, 10.0]
+"""
+TEAM = SWEEP.replace("[sweep]", "[sweep]\nranks = 2\nfields = true")
+BRANCHES = """
+[nnm]
+system = "own"
+modes = [1, 2]
+start_energy = 20.0
+energy = [10.0, 60.0]
+switch = ["symmetry-breaking"]
+switch_points = 3
+[nnm.own]
+masses = [1.0, 1.0]
+springs = [
+    { start = 0, end = 1, stiffness = 1.0 },
+    { start = 1, end = 2, stiffness = 1.0 },
+    { start = 0, end = 2, stiffness = 1.0 },
+]
+smooth = [{ start = 0, end = 1, cubic = 0.5 }]
+"""
+DESIGN = """
+[design]
+lambda = { first = 0.1, last = 1.0, count = 2 }
+eta = { count = 3 }
+wavenumbers = 11
+"""
+# A picture for each kind of folder is enough, and costs the least.
+DRAWN = ("ledger", "branch", "deflections", "amplitudes")
+SAMPLES_A_CHUNK = 20
+
+# The paper's steps that are left in it, and what makes them tiny.
+PAPER = {
+    "design": ("design.lambda.count=2", "design.eta.count=3"),
+    "nnm-hertz-calibrated": ("nnm.energy=[0.0, 1.0]", "nnm.locate_grazing=false"),
+    "interband": (
+        'sweep.contacts.law=["hertz"]', "sweep.contacts.sites=[1]", "sweep.drive.cycles=[5]",
+        "sweep.drive.amplitude=[0.5, 5.0, 10.0]", "time.end=0.05",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A call of the program: ``words`` with {case} and {out} in them.
+
+    ``before``: the words of a call that comes first, undisturbed, and ``stop`` the number of the step at which it is
+    asked to stop.
+    """
+
+    name: str
+    case: str
+    words: str
+    before: str = ""
+    stop: int = 0
+
+
+OUT = "{case} --out {out}"
+PLAIN = "--set output.figures=false"
+SCENARIOS = {
+    scenario.name: scenario
+    for scenario in (
+        Scenario("run", RUN, f"run {OUT}"),
+        Scenario("run-ts", TS, f"run {OUT}"),
+        Scenario("run-resumed", TS, f"run {OUT}", f"run {OUT}", stop=70),
+        Scenario("run-force", RUN, f"run {OUT} {PLAIN} --force", f"run {OUT} {PLAIN} --set drive.amplitude=9.0"),
+        Scenario("sweep", SWEEP, f"sweep {OUT}"),
+        Scenario("sweep-team", TEAM, f"sweep {OUT}"),
+        Scenario("nnm", BRANCHES, f"nnm {OUT}"),
+        Scenario("design", DESIGN, f"design {OUT}"),
+        Scenario("analyse", TEAM.replace("ranks = 2", ""), "analyse {out}", f"sweep {OUT}"),
+        Scenario("plot", RUN, "plot {out}", f"run {OUT} {PLAIN}"),
+        Scenario("bands", RUN, f"bands {OUT}"),
+        Scenario("validate", SWEEP, "validate {case}"),
+        Scenario("paper", "", "paper --quick --out {out}"),
+    )
+}
+
+
+def shrink() -> None:
+    """Make the program's own pieces as small as the cases: pictures, chunks, the paper."""
+    import vipetsc.paper.plan as plan
+    from tests.cli.tiny_paper import tiny_plan
+    from vipetsc.dynamics import observers
+    from vipetsc.figures import registry
+
+    for name in registry.FIGURES.keys() - {*DRAWN}:
+        del registry.FIGURES[name]
+    observers.CHUNK_SAMPLES = SAMPLES_A_CHUNK
+    small = tiny_plan()
+    steps = [s for s in small.steps if s.name in PAPER]
+    steps = [replace(step, changes=(*step.changes, *PAPER[step.name])) for step in steps]
+    figures = [figure for figure in small.figures if figure.id == "fig10"]
+    small = replace(small, steps=tuple(steps), figures=tuple(figures))
+    plan.paper_plan = lambda grid: small
+
+
+def words_of(text: str, case: Path, out: Path) -> list[str]:
+    """The words of a call of ``Scenario``."""
+    return [word.format(case=case, out=out) for word in text.split()]
+
+
+def prepare(scenario: Scenario, work: Path) -> Path:
+    """Write the scenario's case into ``work``; returns its path."""
+    case = work / f"{scenario.name}.toml"
+    case.write_text(scenario.case)
+    return case
+
+
+def unreadable(folder: Path) -> list[str]:
+    """The files of results in ``folder`` that are not whole, the hidden ones and those of parts left out."""
+    broken = []
+    for path in sorted(folder.rglob("*")):
+        if any(part.startswith(".") for part in path.relative_to(folder).parts):
+            continue
+        try:
+            if path.suffix == ".h5":
+                h5py.File(path).close()
+            elif path.suffix == ".json":
+                json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            broken.append(f"{path.relative_to(folder)}: {error}")
+    return broken
+
+
+def difference(wanted: Path, found: Path) -> str:
+    """What differs between two outcomes of the same case, in words; empty if nothing does.
+
+    The files that are there; every bit of the datasets, tables and claims; the numbers of the summaries but for times.
+    """
+    names = [{str(path.relative_to(folder)) for path in folder.rglob("*")} for folder in (wanted, found)]
+    if names[0] != names[1]:
+        return f"files {sorted(names[0] ^ names[1])[:5]}"
+    for name in sorted(names[0]):
+        contents = [_content(folder / name) for folder in (wanted, found)]
+        if contents[0] != contents[1]:
+            return f"{name}: {[key for key in contents[0] if contents[0][key] != contents[1].get(key)][:5]}"
+    return ""
+
+
+def _content(path: Path) -> dict:
+    """What has to be the same in a file."""
+    found: dict = {}
+    if path.suffix == ".h5":
+        with h5py.File(path) as file:
+            file.visititems(lambda name, item: found.update({name: _bits(item)}))
+    elif path.suffix == ".csv" or path.name == "claims.json":
+        found["text"] = path.read_bytes()
+    elif path.name == "summary.json":
+        numbers = json.loads(path.read_text())["statistics"]
+        found = {key: value for key, value in numbers.items() if not key.endswith("_seconds")}
+    return found
+
+
+def _bits(item: h5py.Dataset | h5py.Group) -> object:
+    if not isinstance(item, h5py.Dataset):
+        return None
+    values = item[...]
+    return values.shape, values.tolist() if values.dtype == object else values.tobytes()
+
+
+def copy(source: Path, target: Path) -> None:
+    """``target`` as ``source`` is, which may be missing."""
+    shutil.rmtree(target, ignore_errors=True)
+    if source.exists():
+        shutil.copytree(source, target)

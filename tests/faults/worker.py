@@ -1,0 +1,192 @@
+"""Does trials one after the other, all ranks of mpirun together: ``python -m tests.faults.worker FOLDER TASKS``.
+
+A trial calls the program in this process while one rank meets a fault, looks at what is left, calls the program again
+as nothing had happened, and compares with an unbroken call. What ends the process ends all; ``trials`` then starts a
+new one, whose first task is to call again. Lines of JSON in FOLDER/results.jsonl say how far the trials are.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import petsc4py
+
+petsc4py.init(["faults", "-no_signal_handler"])
+
+from mpi4py import MPI
+
+from tests.faults.inject import Injector
+from tests.faults.scenarios import SCENARIOS, copy, difference, prepare, shrink, unreadable, words_of
+from vipetsc.cli.main import main as vipetsc
+from vipetsc.parallel import install_abort_hook
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
+Task = dict[str, Any]
+
+
+class _Quiet:
+    """A communicator for the abort hook whose processes go on after it."""
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        self.rank, self.size = comm.rank, comm.size
+
+    def Abort(self, code: int) -> None:
+        raise SystemExit(code)
+
+
+@dataclass
+class Worker:
+    """Does tasks in ``folder``; ``patience`` is the time in s in which a call has to end."""
+
+    folder: Path
+    patience: float
+
+    def __post_init__(self) -> None:
+        self.comm = MPI.COMM_WORLD.Dup()
+        self.injector = Injector()
+        self.errors = self.folder / f"errors-{self.comm.rank}"
+
+    def do(self, task: Task) -> None:
+        """Do one task; all ranks call it."""
+        scenario = SCENARIOS[task["scenario"]]
+        case, out, before, wanted = (self.folder / f"{scenario.name}{end}" for end in (".toml", "", "-before", "-done"))
+        if task["do"] == "reference":
+            self._reference(task, case, before, wanted)
+            return
+        words = words_of(scenario.words, case, out)
+        if task["do"] == "trial":
+            if self.comm.rank == 0:
+                copy(before, out)
+                (self.folder / "fired").unlink(missing_ok=True)
+            self.comm.Barrier()
+            if self.comm.rank == task["rank"] and "phase" in task:
+                self.injector.arm(task["phase"], task["number"], task["kind"], self.folder / "fired")
+            self._tell(task, "begun", processes=self.comm.allgather(os.getpid()))
+            ended = self._call(words)
+            self.injector.disarm()
+            self._tell(task, "ended", **ended, **self._left_behind(out))
+            if "delay" in task:
+                raise SystemExit(0)  # another worker calls again: this one may have a signal on its way
+        ended = self._call(words)
+        differs = difference(wanted, out) if self.comm.rank == 0 else ""
+        self._tell(task, "finished", **ended, differs=differs)
+
+    def _reference(self, task: Task, case: Path, before: Path, wanted: Path) -> None:
+        scenario = SCENARIOS[task["scenario"]]
+        if self.comm.rank == 0:
+            prepare(scenario, self.folder)
+            copy(self.folder / "nothing", before)
+        self.comm.Barrier()
+        if scenario.before:
+            if scenario.stop and self.comm.rank == 0:
+                self.injector.arm("step", scenario.stop, "sigterm")
+            self._call(words_of(scenario.before, case, before))
+        if self.comm.rank == 0:
+            copy(before, wanted)
+        self.comm.Barrier()
+        self.injector.disarm()
+        ended = self._call(words_of(scenario.words, case, wanted))
+        counts = self.comm.gather(self.injector.disarm())
+        self._tell(task, "finished", **ended, counts=counts)
+
+    def _left_behind(self, out: Path) -> dict[str, Any]:
+        fired = self.folder / "fired"
+        since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
+        return {"fired": fired.exists(), "since": since, "broken": unreadable(out) if self.comm.rank == 0 else []}
+
+    def _call(self, words: list[str]) -> dict[str, Any]:
+        """Call the program as its front door does: code, lines on stderr and time of all ranks, on all ranks."""
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        begin, code, error = time.monotonic(), 1, None
+        with self._redirected():
+            faulthandler.dump_traceback_later(self.patience, exit=True)
+            try:
+                code = vipetsc(list(words))
+            except SystemExit as end:
+                code = end.code
+            except BaseException as raised:
+                error = raised
+            if not self._all_are_here(1.0 if error else 2 * self.patience):
+                sys.excepthook(type(error), error, error.__traceback__)  # as at the end of a process: it ends all
+            self._report(error)
+            faulthandler.cancel_dump_traceback_later()
+        errors = self.comm.allgather(self.errors.read_text(errors="replace"))
+        codes = self.comm.allgather(code)
+        return {"code": max(codes), "errors": "".join(errors), "seconds": time.monotonic() - begin}
+
+    def _report(self, error: BaseException | None) -> None:
+        """Say what all ranks raised as the abort hook does, but go on."""
+        agreed = getattr(error, "from_root", False)
+        everywhere = all(self.comm.allgather(agreed))
+        if error is None or (agreed and everywhere and self.comm.rank):
+            return
+        hook = sys.excepthook
+        install_abort_hook(_Quiet(self.comm))
+        try:
+            sys.excepthook(type(error), error, error.__traceback__)
+        except SystemExit:
+            pass
+        finally:
+            sys.excepthook = hook
+
+    def _all_are_here(self, patience: float) -> bool:
+        request, deadline = self.comm.Ibarrier(), time.monotonic() + patience
+        while not request.Test():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.002)
+        return True
+
+    @contextmanager
+    def _redirected(self) -> Iterator[None]:
+        """Both streams into the file of this rank's errors."""
+        sys.stdout.flush()
+        sys.stderr.flush()
+        saved = [os.dup(number) for number in (1, 2)]
+        nothing, target = os.open(os.devnull, os.O_WRONLY), os.open(self.errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(nothing, 1)
+        os.dup2(target, 2)
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            for number, old in enumerate(saved, 1):
+                os.dup2(old, number)
+                os.close(old)
+            os.close(nothing)
+            os.close(target)
+
+    def _tell(self, task: Task, stage: str, **more: Any) -> None:
+        if self.comm.rank == 0:
+            with (self.folder / "results.jsonl").open("a") as file:
+                file.write(json.dumps({"id": task["id"], "stage": stage, "time": time.time(), **more}) + "\n")
+
+
+def main() -> int:
+    """Do the tasks in the file."""
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("vipetsc").setLevel(logging.INFO)
+    install_abort_hook()
+    folder, tasks, patience = Path(sys.argv[1]), json.loads(sys.argv[2]), float(sys.argv[3])
+    shrink()
+    worker = Worker(folder, patience)
+    for task in tasks:
+        worker.do(task)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
