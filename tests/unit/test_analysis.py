@@ -1,5 +1,7 @@
 """The analysis of a run measures the host's wave from its arrival on, in memory or in its file alike."""
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,6 +12,7 @@ from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.studies import analysis
 from vipetsc.studies.analysis import analyse
+from vipetsc.studies.members import leading_cell
 
 
 @pytest.fixture
@@ -51,3 +54,44 @@ def test_cells_before_and_after_the_first_site_are_told_apart(run):
     measured = analyse(run, ("wavenumber", "dispersion"))
     assert measured["dispersion_before"].values.max() > 0
     assert measured["dispersion_after"].values.max() == 0
+
+
+def test_what_was_kept_too_coarsely_is_named_and_not_measured(run):
+    # The top band ends at 3645 rad/s: a sample every .8 ms resolves it, one every 1 ms does not.
+    resolved, aliased = (analyse(run.isel(time=slice(None, None, stride))) for stride in (4, 5))
+    assert {"ibtet", "dispersion"} <= set(resolved.variables) and json.loads(resolved.attrs["warnings"]) == []
+    assert not {"ibtet", "bands/energy", "dispersion"} & set(aliased.variables)
+    assert {"entropy/masked", "partition/energy", "kinetic_energy"} <= set(aliased.variables)
+    (warning,) = json.loads(aliased.attrs["warnings"])
+    assert "every 0.001 s resolve 3141.6 of 3644.8 rad/s: dispersion, bands and ibtet are not" in warning
+    assert warning in aliased.attrs["left_out"]
+    thinned = analyse(run.isel(cell=slice(None, None, 2)))
+    names = {name.partition("/")[0] for name in map(str, thinned.variables)}
+    assert not names & {"wavenumber_content", "dispersion", "entropy", "partition"} and "ibtet" in names
+    assert "one cell in 2 do not resolve waves shorter than 4 cells" in json.loads(thinned.attrs["warnings"])[0]
+
+
+def test_the_ends_of_a_record_are_not_in_the_means(run):
+    measured = analyse(run, ("bands", "maps"))
+    about, energy = measured["ibtet"].attrs, measured["bands/energy"].values
+    first, last = (round(about[key] / 2e-4) for key in ("start", "end"))
+    assert first >= 8 and last == 391 and "before the last 2% of the record" in about["ends_when"]
+    judged = energy[:, first : last + 1]
+    above = measured["bands/above"].values.astype(bool)
+    assert measured["ibtet"].item() == np.mean(judged[above].sum(axis=0) / judged.sum(axis=0))
+    assert measured["bands/share"].values == pytest.approx((judged / judged.sum(axis=0)).mean(axis=1))
+
+
+def test_on_a_ring_the_first_site_is_the_nearest_either_way(run):
+    # From cell 3 it is 6 cells to cell 9, and 5 to cell 22 the other way around.
+    run["sites/cell"].values[:] = [22, 9]
+    ring = Case.load(overrides=["lattice.cells=24", "contacts.sites=[22, 9]", "drive.cell=3", "drive.cycles=3",
+                                "lattice.ends=periodic"])  # fmt: skip
+    assert leading_cell(ring) == 22 and leading_cell(Case.of(run)) == 9
+    joined = analyse(run.assign_attrs(case=ring.to_toml()))
+    assert "cell 22" in joined["ibtet"].attrs["starts_when"]
+    assert not {"dispersion_before", "dispersion_after"} & set(joined.variables)
+    assert "dispersion_before, dispersion_after: on a ring the wave goes both ways" in joined.attrs["left_out"]
+    model = ring.model()
+    estimate = 0.5 * model.drive.duration + 5 / model.speed
+    assert estimate <= joined.attrs["entropy/start"] < estimate + 2e-4

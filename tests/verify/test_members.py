@@ -67,3 +67,13 @@ def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
                 assert large["ibtet"].item() == small["ibtet"].item()
                 assert large["bands/edges"].values.tolist() == small["bands/edges"].values.tolist()
     assert select(ensemble, amplitude=amplitude[0])["work"].item() > 0
+
+
+def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
+    _, ensemble, _ = sweep
+    amplitudes = ensemble["amplitude"].values[2:5].tolist()  # those that a coarse linear wave might take for quiet
+    table = TABLE | {"sweep": {"drive": {"amplitude": amplitudes}}, "output": {"stride": 10, "every": 2}}
+    assert run_sweep(Sweep.from_table(table), tmp_path / "thin").complete
+    thin = open_ensemble(tmp_path / "thin")
+    for name in ("status", "contact_episodes", "ibtet", "entropy/energy_weighted", "entropy/masked", "bands/share"):
+        np.testing.assert_array_equal(thin[name].values, ensemble[name].values[2:5], name)

@@ -19,6 +19,7 @@ from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_run, whole_members
 from vipetsc.lattice import waves_at
+from vipetsc.lattice.chain import cells_between
 
 AMPLITUDE = "amplitude"
 LEVELS = ("Low", "Medium", "High")
@@ -104,7 +105,8 @@ class AmplitudeSeries(NamedTuple):
         The packet's middle leaves the driven cell when half the burst is over.
         """
         member = self.runs[0]
-        delay = np.abs(recorded_sites(member.run) - 1 - member.model.drive_cell) / self.wave.speed
+        sites, chain = recorded_sites(member.run), member.model.chain
+        delay = cells_between(sites - 1, member.model.drive_cell, chain.cells, chain.ends) / self.wave.speed
         burst, end = member.model.drive.duration, field_time(member.run)[-1]
         near, far = delay.min(), delay.max()
         return np.minimum(np.array([0.5 * burst + 0.5 * near, 0.5 * burst + near, burst + far, 0.95 * end]), end)

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.io.netcdf import open_netcdf
+from vipetsc.lattice.chain import cells_between
 
 Selectable = TypeVar("Selectable", xr.Dataset, xr.DataArray)
 
@@ -43,8 +44,9 @@ def field_interval(run: xr.Dataset) -> float:
 def leading_site(run: xr.Dataset) -> int | None:
     """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
     cells = run["sites/cell"].values
-    drive = tomllib.loads(run.attrs["case"])["drive"]["cell"]
-    return int(np.argmin(np.abs(cells - drive))) if len(cells) else None
+    case = tomllib.loads(run.attrs["case"])
+    lattice, drive = case["lattice"], case["drive"]["cell"]
+    return int(np.argmin(cells_between(cells, drive, lattice["cells"], lattice["ends"]))) if len(cells) else None
 
 
 def nearest_cell(run: xr.Dataset, cell: int) -> int:

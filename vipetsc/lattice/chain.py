@@ -96,3 +96,9 @@ class Chain:
         force[driven * self.cell.dofs + mass] = 1.0
         response = float(np.abs(spsolve(dynamic.tocsc(), force)).max())
         return response * 2 * abs(drive.window_amplitude)
+
+
+def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:
+    """Number of cells from ``cell`` to ``other`` in a lattice of ``cells``; the shorter way around a ring."""
+    way = np.abs(np.asarray(cell, np.int64) - other)
+    return np.asarray(np.minimum(way, cells - way) if ends == "periodic" else way)

@@ -5,6 +5,7 @@ after the first site), wavenumber partition and entropy (wavelets over the cells
 gaps, and the inter-band targeted energy transfer. The measures themselves stand in ``vipetsc.spectra``.
 """
 
+import json
 import sys
 from collections.abc import Collection
 from functools import cached_property
@@ -20,6 +21,7 @@ from vipetsc.case import Case
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
+from vipetsc.lattice.chain import cells_between
 
 FORMAT_VERSION = 2
 IN_MEMORY = 2**30  # bytes of velocity that are read at once; larger fields are read mass by mass
@@ -27,6 +29,7 @@ MAP_SIZE = 20_000_000  # values of a (t, cell) map that are kept; longer records
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
 SNAPSHOTS = 500  # at most this many samples are transformed by wavelets; averages over time need no more
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those who window the record
+ENDS = 0.02  # share of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 
 # What is measured of a run whose fields are kept; "maps" are the space-time maps of the other measures.
 FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "maps")
@@ -77,7 +80,8 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
     Of ``FULL`` those ``measures`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
     estimated from the group velocity: half the burst and the way to the site. What the run cannot give (no sites, a
-    single cell) is left out and named in the attribute ``left_out``.
+    single cell) is left out and named in the attribute ``left_out``; what the samples and cells that were kept do not
+    resolve is named in the list ``warnings`` as well.
     """
     sys.audit("vipetsc.analyse")
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
@@ -86,13 +90,14 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
         return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
     record = _Record(run)
     nt, cells = record.velocity.shape[:2]
+    measures = set(measures) - record.unresolved()
     step = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
     values: dict[str, Any] = {"time": record.time, "cell": record.cells}
     if "kinetic" in measures:
         values["kinetic_energy"] = record.kinetic
     if "wavenumber" in measures and cells > 1:
-        wavenumber, values["wavenumber_content"] = spectra.wavenumber_content(record.velocity, record.masses)
-        values["wavenumber"] = wavenumber / int(record.cells[1] - record.cells[0])
+        content = spectra.wavenumber_content(record.velocity, record.masses)
+        values["wavenumber"], values["wavenumber_content"] = content
     if nt < 2:
         record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
@@ -101,7 +106,9 @@ def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | 
         values |= _wavelets(record, measures, arrival) if cells > 1 else {}
     if cells == 1:
         record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
-    about |= {"thinning": step, "left_out": "; ".join(record.left_out)} | record.attributes.pop("", {})
+    left_out = "; ".join(record.left_out + record.warnings)
+    about |= {"thinning": step, "left_out": left_out, "warnings": json.dumps(record.warnings)}
+    about |= record.attributes.pop("", {})
     data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
     for name, attributes in record.attributes.items():
         data[name].attrs.update(attributes)
@@ -124,6 +131,21 @@ class _Record:
         self.site = None if leading is None else int(run["sites/cell"].values[leading])
         self.attributes: dict[str, dict[str, Any]] = {}
         self.left_out: list[str] = []
+        self.warnings: list[str] = []
+
+    def unresolved(self) -> set[str]:
+        """Measures that would take waves for longer or slower ones in what was kept; warns of them."""
+        top, every = pass_bands(self.model.chain.cell)[-1].high, int(np.diff(self.cells).max(initial=1))
+        names: set[str] = set()
+        if self.interval * top >= np.pi:
+            kept = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
+            self.warnings.append(f"{kept}: dispersion, bands and ibtet are not measured")
+            names |= {"dispersion", "bands"}
+        if every > 1:
+            kept = f"fields of one cell in {every} do not resolve waves shorter than {2 * every} cells"
+            self.warnings.append(f"{kept}: wavenumber_content, dispersion, partition and entropy are not measured")
+            names |= {"wavenumber", "dispersion", "partition", "entropy"}
+        return names
 
     @cached_property
     def kinetic(self) -> np.ndarray:
@@ -151,6 +173,8 @@ def _dispersions(record: _Record) -> dict[str, Any]:
     windows = {"dispersion": slice(None)}
     if record.site is None:
         record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
+    elif record.model.chain.ends == "periodic":
+        record.left_out.append("dispersion_before, dispersion_after: on a ring the wave goes both ways")
     else:
         low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
         sides = slice(0, low), slice(high, cells)
@@ -182,10 +206,15 @@ def _bands(record: _Record) -> dict[str, Any]:
         at = int(np.argmin(np.abs(record.cells - record.site)))
         first = spectra.front_arrival(record.kinetic[:, at])
         reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
-    total = energy[:, first:].sum(axis=0)
+    # The filters see less than the waves' length at the record's ends.
+    nt, ends = len(record.time), int(np.ceil(ENDS * len(record.time)))
+    first = min(max(first, ends), nt - 1)
+    last = max(nt - ends, first + 1)
+    total = energy[:, first:last].sum(axis=0)
     moving = total > 0
-    record.attributes["bands/energy"] = {"parts": list(parts.names)}
-    record.attributes["ibtet"] = {"start": record.time[first], "starts_when": reason}
+    about = {"start": record.time[first], "starts_when": f"{reason}, or after the first {ENDS:.0%} of the record"}
+    about |= {"end": record.time[last - 1], "ends_when": f"before the last {ENDS:.0%} of the record"}
+    record.attributes |= {"bands/energy": {"parts": list(parts.names)}, "bands/share": about, "ibtet": about}
     return {
         "bands/edge": np.arange(len(parts.edges)),
         "bands/part": np.arange(1, len(parts.names) + 1),
@@ -193,8 +222,8 @@ def _bands(record: _Record) -> dict[str, Any]:
         "bands/energy": energy,
         "bands/above": above.astype(np.int8),
         "bands/total": record.kinetic.sum(axis=1),
-        "bands/share": (energy[:, first:][:, moving] / total[moving]).mean(axis=1),
-        "ibtet": spectra.ibtet(energy, above, first),
+        "bands/share": (energy[:, first:last][:, moving] / total[moving]).mean(axis=1),
+        "ibtet": spectra.ibtet(energy[:, :last], above, first),
     }
 
 
@@ -210,8 +239,9 @@ def _wavelets(record: _Record, measures: Collection[str], arrival: float | None)
     if "entropy" in measures:
         reason = "the largest host velocity at the first site in the linear run"
         if arrival is None:
-            distance = 0 if record.site is None else abs(record.site - 1 - record.model.drive_cell)
-            arrival = 0.5 * record.model.drive.duration + distance / record.model.speed
+            chain, start = record.model.chain, record.model.drive_cell
+            distance = 0 if record.site is None else cells_between(record.site - 1, start, chain.cells, chain.ends)
+            arrival = float(0.5 * record.model.drive.duration + distance / record.model.speed)
             reason = "half the burst and the way to the first site at the group velocity"
         # A record that ends before keeps its last snapshot.
         start = min(int(np.searchsorted(time, arrival)), len(time) - 1)

@@ -25,6 +25,7 @@ from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import field_time, open_run
 from vipetsc.io.store import RunMemory
+from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.analysis import FULL, analyse
 
@@ -154,8 +155,8 @@ class MemberStore:
 
 
 def _gathered(case: Case, *fields: str) -> Case:
-    """``case`` with these fields of all cells, gathered on one rank."""
-    output = {"fields": list(fields), "window": None, "every": 1, "writer": "gather"}
+    """``case`` with these fields of all cells at all samples, gathered on one rank."""
+    output = {"fields": list(fields), "window": None, "every": 1, "stride": 1, "writer": "gather"}
     return case.model_copy(update={"output": case.output.model_copy(update=output)})
 
 
@@ -210,7 +211,8 @@ def arrival_at(wave: xr.Dataset | None, case: Case) -> float | None:
 def leading_cell(case: Case) -> int:
     """Cell (1-based) of the site nearest to the drive; 0 without sites."""
     cells = np.asarray(case.contacts.sites, np.int64)
-    return int(cells[np.argmin(np.abs(cells - case.drive.cell))]) if cells.size else 0
+    distance = cells_between(cells, case.drive.cell, case.lattice.cells, case.lattice.ends)
+    return int(cells[np.argmin(distance)]) if cells.size else 0
 
 
 def linear_case(case: Case) -> Case:
@@ -218,7 +220,7 @@ def linear_case(case: Case) -> Case:
     table = case.model_dump(by_alias=True, exclude_none=True)
     table["contacts"] = {"sites": 0}
     table["drive"]["amplitude"] = 1.0
-    table["output"] = {"stride": case.output.stride}
+    table["output"] = {}
     return Case.from_table(table | {"name": "linear"})
 
 
