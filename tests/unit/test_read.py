@@ -50,7 +50,7 @@ def run(tmp_path):
         "velocity": (("field_time", "cell", "dof"), np.arange(5 * len(cells) * 2.0).reshape(5, -1, 2)),
     }
     path = tmp_path / "run.h5"
-    write_netcdf(path, xr.Dataset(data, attrs={"case": "[lattice]\ncells = 30\nends = \"fixed\"\n[drive]\ncell = 12"}))
+    write_netcdf(path, xr.Dataset(data, attrs={"case": '[lattice]\ncells = 30\nends = "fixed"\n[drive]\ncell = 12'}))
     return path
 
 
