@@ -8,7 +8,9 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case.nnm import NnmCase
+from vipetsc.modes.branch import Branch
 from vipetsc.modes.follow import follow_all
+from vipetsc.parallel import StopRequest
 
 
 def three_cells(**nnm) -> NnmCase:
@@ -55,3 +57,29 @@ def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
             assert "nnm.guards.half_trace" in b.ending
             rows = (folder / f"branch-{b.name}.csv").read_text().splitlines()
             assert len(rows) == len(b.points) + 1 > 2
+
+
+@pytest.mark.parallel([1, 2])
+def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
+    """A request that one rank gets ends its branch at the next point, whole on disk; the other rank goes on."""
+    comm = MPI.COMM_WORLD
+    case, stop = three_cells(points=20), StopRequest()
+
+    def listener(branch, point):
+        stop.requested = branch.name == "mode-1" and point.index == 13
+
+    stopped = follow_all(case, folder, comm, listener=listener, stop=stop)
+    comm.Barrier()
+    whole = folder / "whole"
+    if comm.rank == 0:
+        first, second = stopped
+        assert first.ending == "stopped on request after point 13; resume goes on"
+        assert len(Branch.read(folder / "branch-mode-1.h5").points) == 14
+        assert second.ending.startswith("20 points reached")
+        whole.mkdir()
+    comm.Barrier()
+    follow_all(case, folder, comm, resume=True)
+    follow_all(case, whole, comm)
+    comm.Barrier()
+    for name in ("branch-mode-1.h5", "branch-mode-2.h5"):
+        assert_same_bits(datasets(folder / name), datasets(whole / name))

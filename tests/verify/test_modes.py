@@ -238,8 +238,8 @@ def test_in_phase_through_the_first_tongues(in_phase):
     assert graze.energy == pytest.approx(GRAZING[IN_PHASE], rel=1e-10)
     assert max(p.residual for p in points) <= 1e-11
     assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
-    assert not list(suspects(points))
-    monitor = BranchMonitor(problem.system)
+    assert not list(suspects(problem, points))
+    monitor = BranchMonitor(problem, Guards())
     assert not [s for s in map(monitor.check, points) if s]
 
 
@@ -250,7 +250,7 @@ def test_in_phase_through_every_odd_tongue_to_the_limit(in_phase):
     assert points[-1].energy > 6e9
     assert max(p.residual for p in points) <= 3e-12
     assert max(abs(a.episodes - b.episodes) for a, b in itertools.pairwise(points)) == 1
-    assert not list(suspects(points))
+    assert not list(suspects(problem, points))
     limit = system.closed_frequencies()[0] / (2 * np.pi)
     tail = [p for p in points[-30:] if p.energy > 1e8]
     distance = np.array([(limit - p.frequency) * np.sqrt(p.energy) for p in tail])
@@ -283,7 +283,7 @@ def test_both_directions_give_the_same_curve():
     problem, points, _ = follow(system, OUT_OF_PHASE, 1e-2, energy=[1e-4, 0.5])
     down = Continuation(problem, points[-1], NnmTable(points=2000, energy=[1e-3, 1.0]), step=1e-3)
     down.point = dataclasses.replace(points[-1], tangent=-points[-1].tangent)
-    monitor, back, said = BranchMonitor(problem.system), [], None
+    monitor, back, said = BranchMonitor(problem, Guards()), [], None
     for point in down:
         back.append(point)
         said = monitor.check(point)
@@ -298,13 +298,13 @@ def test_both_directions_give_the_same_curve():
 def test_without_guards_the_branch_jumps_and_the_detector_says_so():
     problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
     start = linear_start(problem, IN_PHASE, 3e-3)
-    control = NnmTable(points=150, guards=Guards(half_trace=0, contacts=0, corrector=0, turn=0))
+    control = NnmTable(points=150, guards=Guards(half_trace=0, contacts=0, corrector=0, turn=0, turn_relative=0))
     points = [start, *Continuation(problem, start, control)]
     assert max(p.residual for p in points) <= 1e-12  # no residual tells
-    found = [(i, why) for i, why in suspects(points) if is_jump(problem, points[i], points[i + 1], control)]
+    found = [(i, why) for i, why in suspects(problem, points) if is_jump(problem, points[i], points[i + 1], control)]
     assert found
     guarded = [start, *Continuation(problem, start, NnmTable(points=150))]
-    assert not list(suspects(guarded))
+    assert not list(suspects(problem, guarded))
     assert not is_jump(problem, guarded[60], guarded[62], control)  # it is followed again with the guards on
 
 

@@ -55,14 +55,20 @@ class Guards(Section):
     """Bounds on one step that keep a branch from jumping to another arc; 0 switches one off.
 
     Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc, length of the
-    correction over the step's length, angle in rad between consecutive tangents. Residuals cannot tell a jump: both
-    arcs satisfy the equations to rounding.
+    correction over the step's length, angle in rad between consecutive tangents: in the chart of the step, and in the
+    chart ``relative`` whatever the step's, since near grazing another chart hides the angle between two branches that
+    cross. Residuals cannot tell a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill``
+    points are all within ``advance`` of each other, in units of the orbit's size, is ended: orbits are corrected to
+    1e-13 or so, and no branch of the paper's models moves by less than 2e-6 in 200 points.
     """
 
     half_trace: Annotated[float, Field(ge=0)] = 0.5
     contacts: Annotated[int, Field(ge=0)] = 1
     corrector: Annotated[float, Field(ge=0)] = 0.05
     turn: Annotated[float, Field(ge=0)] = 0.2
+    turn_relative: Annotated[float, Field(ge=0)] = 0.25
+    standstill: Annotated[int, Field(ge=0)] = 200
+    advance: Positive = 1e-9
 
 
 class NnmTable(Section):

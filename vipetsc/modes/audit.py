@@ -8,22 +8,26 @@ import numpy as np
 
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.modes.continuation import Continuation, ContinuationError, half_trace_change
+from vipetsc.modes.continuation import Continuation, ContinuationError, half_trace_change, relative_turn
 from vipetsc.modes.flow import Flow, FlowError
-from vipetsc.modes.point import Point, sample_orbit
+from vipetsc.modes.point import Point, repetitions, sample_orbit
 from vipetsc.modes.shooting import Relative, Shooting
-from vipetsc.modes.system import System
+
+# Points between two looks whether a branch has passed on to another one.
+REPETITIONS_EVERY = 25
 
 
-def suspects(points: list[Point]) -> Iterator[tuple[int, str]]:
+def suspects(problem: Shooting, points: list[Point]) -> Iterator[tuple[int, str]]:
     """Steps of a branch that violate a default guard: (place of the left point, which guard and by how much)."""
     guards = Guards()
     for i, (a, b) in enumerate(itertools.pairwise(points)):
-        change = half_trace_change(a, b)
+        change, turn = half_trace_change(a, b), relative_turn(problem, a, b)
         if abs(a.episodes - b.episodes) > guards.contacts:
             yield i, f"contacts {a.episodes} -> {b.episodes}"
         elif change > 2 * guards.half_trace:
             yield i, f"asinh of a half-trace changes by {change:.2g}"
+        elif turn > 2 * guards.turn_relative:
+            yield i, f"the branch turns by {turn:.2g} rad"
 
 
 def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> bool:
@@ -53,7 +57,7 @@ def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> 
 
 def jumps(points: list[Point], problem: Shooting, control: NnmTable) -> Iterator[str]:
     """Sentences about steps that jumped to another arc; only suspicious ones are followed again."""
-    for i, why in suspects(points):
+    for i, why in suspects(problem, points):
         a, b = points[i], points[i + 1]
         if is_jump(problem, a, b, control):
             yield (
@@ -72,11 +76,12 @@ def _nearest(place: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[n
 
 
 class BranchMonitor:
-    """Tells when a growing branch retraces itself and when it returns to a linear mode."""
+    """Tells when a growing branch retraces itself, stands still, returns to a linear mode or passes on to another."""
 
-    def __init__(self, system: System) -> None:
-        self._linear = system.linear_modes()[0] / (2 * np.pi)
-        self._track = np.empty((0, system.dofs + 2))
+    def __init__(self, problem: Shooting, guards: Guards) -> None:
+        self._problem, self._guards = problem, guards
+        self._linear = problem.system.linear_modes()[0] / (2 * np.pi)
+        self._track = np.empty((0, problem.system.dofs + 2))
         self._touched = False
 
     def check(self, point: Point) -> str | None:
@@ -90,6 +95,11 @@ class BranchMonitor:
         elif self._touched and detuning.min() < 1e-9:
             where = f"at E = {point.energy:.6g} J (point {point.index})"
             return f"returned to linear mode {detuning.argmin() + 1} {where}"
+        places = self._guards.standstill
+        if 0 < places <= len(track) and np.ptp(self._track[-places:], axis=0).max() <= self._guards.advance:
+            return f"does not advance: {places} points up to {point.index} are one, at E = {point.energy:.9g} J"
+        if point.index % REPETITIONS_EVERY == 0 and (times := repetitions(self._problem, point)) > 1:
+            return f"left its branch: the orbit of point {point.index} is another one passed {times} times"
         if len(track) < 10 or not self._touched:
             return None
         starts, ends = track[:-6], track[1:-5]

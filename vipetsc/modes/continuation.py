@@ -20,6 +20,7 @@ GUARDED = {
     "contacts": "more than one contact appears or goes",
     "corrector": "the corrector goes too far",
     "turn": "the branch turns too sharply",
+    "turn_relative": "the branch turns too sharply in the relative chart",
 }
 
 
@@ -113,6 +114,7 @@ class Continuation:
             "contacts": abs(point.episodes - last.episodes),
             "corrector": float(np.linalg.norm(attempt.xi - frame.xi - step * frame.tangent)) / step,
             "turn": float(np.arccos(min(direction @ frame.tangent, 1.0))),
+            "turn_relative": relative_turn(self.problem, last, point),
         }
         strains = {guard: change / (getattr(self.control.guards, guard) or np.inf) for guard, change in changes.items()}
         if strains["contacts"] <= 1:  # one contact more is no reason to slow down
@@ -139,6 +141,16 @@ def half_trace_change(a: Point, b: Point) -> float:
 
     distance = np.abs(squashed(a.half_traces)[:, None] - squashed(b.half_traces)[None, :])
     return float(max(distance.min(axis=axis, initial=np.inf).max(initial=0.0) for axis in (0, 1)))
+
+
+def relative_turn(problem: Shooting, a: Point, b: Point) -> float:
+    """Angle in rad between the tangents of two points in the chart ``relative`` at the first; 0 without a tangent."""
+    if not (a.tangent.size and b.tangent.size):
+        return 0.0
+    chart = Relative(problem.system, a.x, a.period, rest=problem.map.start == "rest")
+    scale = chart.derivative(chart.encode(a.x, a.period))
+    before, after = np.linalg.solve(scale, np.column_stack([a.tangent, b.tangent])).T
+    return float(np.arccos(min(unit(before) @ unit(after), 1.0)))
 
 
 def first_tangent(problem: Shooting, start: Point, direction: int) -> np.ndarray:

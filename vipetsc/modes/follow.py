@@ -2,6 +2,7 @@
 
 import math
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,14 +23,19 @@ from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import System
+from vipetsc.parallel import StopRequest
 
 # The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
-# Points between two writings of a growing branch.
-SAVE_EVERY = 500
+# Seconds between two writings of a growing branch.
+SAVE_EVERY = 10.0
 FAILURES = (ContinuationError, FlowError, ValueError)
 
 Listener = Callable[[Branch, Point], None]
+
+
+class StoppedError(RuntimeError):
+    """A branch was stopped on request; it holds the points so far and can be resumed."""
 
 
 def prepare_folder(case: NnmCase, folder: Path, force: bool, resume: bool) -> None:
@@ -43,17 +49,24 @@ def prepare_folder(case: NnmCase, folder: Path, force: bool, resume: bool) -> No
 
 
 def follow_all(
-    case: NnmCase, folder: Path, comm: MPI.Comm, resume: bool = False, listener: Listener | None = None
+    case: NnmCase,
+    folder: Path,
+    comm: MPI.Comm,
+    resume: bool = False,
+    listener: Listener | None = None,
+    stop: StopRequest | None = None,
 ) -> list[Branch]:
     """All branches of ``case``, written into ``folder``; rank r follows every size-th one, from r on.
 
     Each branch is computed on one rank, so that its bits do not depend on their number. A branch that fails is
-    written as far as it came, says why in its ``ending``, and the others go on. Returns all branches on rank 0, in the
-    order of ``nnm.modes``; an empty list on the others.
+    written as far as it came, says why in its ``ending``, and the others go on. A ``stop`` ends each branch at its next
+    point, with an ending that begins with "stopped"; ``resume`` goes on from there, to the same bits. Returns all
+    branches on rank 0, in the order of ``nnm.modes``; an empty list on the others.
     """
     mine = {}
     for job in range(comm.rank, len(case.nnm.modes), comm.size):
-        mine[job] = Follower(case, folder, provenance(comm), listener).follow(case.nnm.modes[job] - 1, resume)
+        follower = Follower(case, folder, provenance(comm), listener, stop, resume)
+        mine[job] = follower.follow(case.nnm.modes[job] - 1)
     branches = {job: group for part in comm.gather(mine) or [] for job, group in part.items()}
     return [branch for job in sorted(branches) for branch in branches[job]]
 
@@ -61,9 +74,18 @@ def follow_all(
 class Follower:
     """Follows the branches of a case into a folder; ``about`` are attributes of the files."""
 
-    def __init__(self, case: NnmCase, folder: Path, about: dict[str, Any], listener: Listener | None = None) -> None:
-        self.case, self.options, self.folder, self.about, self.listener = case, case.nnm, folder, about, listener
+    def __init__(
+        self,
+        case: NnmCase,
+        folder: Path,
+        about: dict[str, Any],
+        listener: Listener | None = None,
+        stop: StopRequest | None = None,
+        resume: bool = False,
+    ) -> None:
         sys.audit("vipetsc.set-up", case.name)
+        self.case, self.options, self.folder, self.about, self.listener = case, case.nnm, folder, about, listener
+        self.stop, self.resume = stop or StopRequest(), resume
         options, self.system = case.nnm, System.from_case(case)
         flow: Flow = FLOWS[options.flow](self.system)
         automatic = "quarter" if self.system.odd else "half"
@@ -71,49 +93,53 @@ class Follower:
         shooting_map = MAPS[automatic if options.map == "auto" else options.map]
         self.problem = Shooting(flow, shooting_map, options.tolerance, options.max_newton)
 
-    def follow(self, mode: int, resume: bool = False) -> list[Branch]:
+    def follow(self, mode: int) -> list[Branch]:
         """The branch of ``mode`` (0-based), then the branches that cross it if the case asks for them."""
         sys.audit("vipetsc.member", mode + 1)
-        name, options = self.system.branch_name(mode), self.options
-        branch, path = self._empty(name), self.folder / f"branch-{name}.h5"
-        if resume and path.exists():
-            branch = Branch.read(path)
-            branch.case = self.case.to_toml()
-            if branch.complete:
-                return [branch]
-        try:
-            start = branch.regular()[-1] if branch.points else self._start(mode)
-            if options.direction == "both" and not branch.points:
-                down = self._empty(name)
-                self.grow(down, self.problem, start, options, -1)
-                # from the far end towards the start, with the tangents turned round
-                branch.points = [
-                    replace(p, tangent=-p.tangent, energy_tangent=-p.energy_tangent) for p in reversed(down.points)
-                ]
-                branch.findings += down.findings
-            direction = -1 if options.direction == "down" else 1
-            self.grow(branch, self.problem, start, options, direction, save=True)
-            branch.extra = sampled(self.problem, self._typical(branch))
-            for flow in options.compare:
-                branch.extra |= compare(self.problem, branch.regular(), FLOWS[flow](self.system))
-        except FAILURES as error:
-            branch.ending = f"failed: {error}"
-        branch.write(self.folder, self.about)
+        branch = self._begun(self.system.branch_name(mode))
+        if not branch.complete:
+            try:
+                self._follow(branch, mode)
+            except StoppedError as stopped:
+                branch.ending = str(stopped)
+            except FAILURES as error:
+                branch.ending = f"failed: {error}"
+            if branch.points or not branch.ending.startswith("stopped"):
+                branch.write(self.folder, self.about)
         return [branch, *self._crossing(branch)]
 
-    def grow(
-        self, branch: Branch, problem: Shooting, start: Point, control: NnmTable, direction: int = 1, save: bool = False
-    ) -> None:
+    def _follow(self, branch: Branch, mode: int) -> None:
+        """The branch itself, its orbits and what other flows make of it."""
+        options = self.options
+        start = branch.regular()[-1] if branch.points else self._start(mode)
+        if options.direction == "both" and not branch.points:
+            down = self._begun(f"{branch.name}-down")
+            if not down.complete:
+                self.grow(down, self.problem, down.regular()[-1] if down.points else start, options, -1)
+            # from the far end towards the start, with the tangents turned round
+            branch.points = [
+                replace(p, tangent=-p.tangent, energy_tangent=-p.energy_tangent) for p in reversed(down.points)
+            ]
+            branch.findings += down.findings
+        self.grow(branch, self.problem, start, options, -1 if options.direction == "down" else 1)
+        for half in self.folder.glob(f"branch-{branch.name}-down.*"):
+            half.unlink()  # it is the beginning of the whole
+        branch.extra = sampled(self.problem, self._typical(branch))
+        for flow in options.compare:
+            branch.extra |= compare(self.problem, branch.regular(), FLOWS[flow](self.system))
+
+    def grow(self, branch: Branch, problem: Shooting, start: Point, control: NnmTable, direction: int = 1) -> None:
         """Continue ``branch`` from ``start`` until it ends; its special points are located on the way.
 
-        Raises ContinuationError or FlowError if it cannot go on; the branch holds the points so far.
+        It is saved every ``SAVE_EVERY`` seconds. Raises ContinuationError or FlowError if it cannot go on, StoppedError
+        on request; the branch holds the points so far.
         """
         control = control.model_copy(update={"points": max(control.points - max(len(branch.regular()) - 1, 0), 0)})
         points = Continuation(problem, start, control, direction, branch.next_step or None)
-        monitor = BranchMonitor(self.system)
+        monitor = BranchMonitor(problem, control.guards)
         for point in branch.regular():
             monitor.check(point)
-        last, finding = points.point, None
+        last, finding, saved = points.point, None, time.monotonic()
         branch.points = branch.points or [last]
         try:
             for point in points:
@@ -128,8 +154,11 @@ class Follower:
                 if finding is not None:
                     branch.findings.append(finding)
                     break
-                if save and point.index % SAVE_EVERY == 0:
+                if self.stop.requested and not points.finished:
+                    raise StoppedError(f"stopped on request after point {point.index}; resume goes on")
+                if time.monotonic() - saved > SAVE_EVERY:
                     branch.write(self.folder, self.about)
+                    saved = time.monotonic()
                 last = point
         finally:
             branch.findings += [
@@ -137,8 +166,14 @@ class Follower:
             ]
         branch.ending, branch.complete = finding or points.ending, finding is not None or points.finished
 
-    def _empty(self, name: str) -> Branch:
-        return Branch(name, self.case.to_toml(), self.system.dofs)
+    def _begun(self, name: str) -> Branch:
+        """The branch as it is in its file when results are resumed, else one without points."""
+        path = self.folder / f"branch-{name}.h5"
+        if not (self.resume and path.exists()):
+            return Branch(name, self.case.to_toml(), self.system.dofs)
+        branch = Branch.read(path)
+        branch.case = self.case.to_toml()
+        return branch
 
     def _start(self, mode: int) -> Point:
         if self.options.start_energy != "auto":
@@ -162,13 +197,17 @@ class Follower:
         branches = []
         for kind in self.options.switch:
             for number, point in enumerate((p for p in branch.points if p.kind == kind), 1):
-                crossing = self._empty(f"{branch.name}-{kind}-{number}")
+                crossing = self._begun(f"{branch.name}-{kind}-{number}")
+                branches.append(crossing)
+                if crossing.complete:
+                    continue
                 sys.audit("vipetsc.switch", crossing.name)
                 try:
                     problem, first = switch(self.problem, point, self.options.switch_amplitude)
-                    self.grow(crossing, problem, first, control)
+                    self.grow(crossing, problem, crossing.regular()[-1] if crossing.points else first, control)
+                except StoppedError as stopped:
+                    crossing.ending = str(stopped)
                 except FAILURES as error:
                     crossing.ending = f"failed: {error}"
                 crossing.write(self.folder, self.about)
-                branches.append(crossing)
         return branches

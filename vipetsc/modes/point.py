@@ -8,6 +8,10 @@ import numpy as np
 from vipetsc.modes.flow import Arc
 from vipetsc.modes.shooting import Attempt, Chart, Relative, Shooting
 
+# An orbit that passes a part of its period again to this share of its size repeats it.
+SAME = 1e-6
+PRIMES = 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47
+
 # Quantities of a point: name in the files, type, unit, description.
 QUANTITIES: dict[str, tuple[str, type, str, str]] = {
     "energy": ("energy", float, "J", "energy"),
@@ -163,3 +167,19 @@ def resonance(problem: Shooting, point: Point, samples: int = 1024) -> int:
     u, rows = sample_orbit(problem, point, samples)[0], problem.system.contact_rows
     size = np.abs(np.fft.rfft(u @ rows.T if len(rows) else u, axis=0)).sum(axis=1)
     return int(np.argmax(size[2 : samples // 4])) + 2
+
+
+def repetitions(problem: Shooting, point: Point) -> int:
+    """The smallest prime number of times that an orbit passes the same motion in its period; 1 for its least period.
+
+    Along a branch from a linear mode it is 1 but where a tongue of an internal resonance crosses the other mode's
+    branch: there the orbit is the other mode's, passed k times.
+    """
+    start, rate = problem.arc(point.x, point.period).start, problem.flow.omega_ref(point.period)
+    size = np.abs(start).max() / (1.0 if problem.map.start == "rest" else rate)
+    scale = size * np.repeat([1.0, rate], problem.system.dofs)
+    for count in PRIMES:
+        again = problem.flow.arc(start, point.period / count, point.period).end
+        if np.all(np.abs(again - start) <= SAME * scale):
+            return count
+    return 1
