@@ -1,4 +1,4 @@
-"""Every phase meets a fault once, of kinds and in verbs in turn: all ranks end, the same command goes on, no bit differs.
+"""Every phase meets a fault once, of kinds and in verbs in turn: all end, the same command goes on to the same bits.
 
 ``scripts/campaign faults`` does all of them.
 """
