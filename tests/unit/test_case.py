@@ -216,3 +216,25 @@ def test_any_override_is_taken_or_refused(key, value):
         Case.load(overrides=[f"{key}={value}"])
     except CaseError as error:
         assert error.problems
+
+
+def test_exact_damping_is_chosen_by_the_case():
+    exact = Case.load(overrides=["contacts.damping=exact"]).model().contact
+    assert exact.effective_restitution == pytest.approx(0.7)
+    assert Case.load().model().contact.effective_restitution == pytest.approx(0.768, abs=1e-4)
+    assert case_id(Case.load(overrides=["contacts.damping=paper"])) == case_id(Case.load())
+    found = problems({}, "contacts.damping=exact", "contacts.restitution=0")
+    assert "the exact damping is unbounded there" in found["contacts.restitution"]
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("output.stride=10", "resolves 1571 of 3645 rad/s"),
+        ("output.every=4", "wavenumbers up to pi/4"),
+        ("output.window=[1, 40]", "holds none of the contact sites"),
+    ],
+)
+def test_what_is_kept_too_coarsely_is_a_warning(override, said):
+    (warning,) = Case.load(overrides=[override]).warnings()
+    assert said in warning

@@ -223,3 +223,30 @@ def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
     assert tracker.switch(0.0, np.zeros(1)) == 1
     assert tracker.contacts.sites["mode"].tolist() == [CLOSED]
     assert tracker.counts["grazes"] == 0
+
+
+@LAWS
+@pytest.mark.parametrize(
+    ("asked", "effective"), [(0.0, 0.4877413), (0.3, 0.5812880), (0.5, 0.6629622), (0.7, 0.7679998), (0.9, 0.9090157)]
+)
+def test_the_effective_restitution_is_that_of_a_simulated_impact(law, asked, effective):
+    """The paper's damping returns more than is asked, the exact one what is asked."""
+    for contact in (Contact(law, KC, asked), Contact(law, KC, asked or 0.1, exact=True)):
+        contacts, mass, speed = create_contacts(contact, [D]), 0.003, 0.3
+        contacts.sites[0] = (CLOSED, D, speed)
+
+        def rate(t, z, contacts=contacts, mass=mass):
+            return [z[1], -contact_force(contacts, 0, D + z[0], z[1])[0] / mass]
+
+        def apart(t, z):
+            return z[0] if t > 1e-6 else 1.0
+
+        apart.terminal, apart.direction = True, -1
+        ended = solve_ivp(rate, (0, 1), [0.0, speed], rtol=1e-11, atol=1e-14, events=apart, first_step=2e-6)
+        assert -ended.y[1, -1] / speed == pytest.approx(contact.effective_restitution, rel=1e-6)
+        assert contact.effective_restitution == pytest.approx(asked or 0.1 if contact.exact else effective, rel=1e-6)
+
+
+def test_the_exact_damping_meets_every_restitution():
+    asked = np.linspace(0.01, 1, 200)
+    assert [Contact("hertz", KC, r, exact=True).effective_restitution for r in asked] == pytest.approx(asked, abs=1e-7)

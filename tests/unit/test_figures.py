@@ -1,5 +1,7 @@
 """Every picture and the analysis, from small run files of every shape a run can have."""
 
+import json
+
 import h5py
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy.integrate import trapezoid
 
 from vipetsc.case import Case
 from vipetsc.figures.lattice import draw_lattice, draw_unit_cell
-from vipetsc.figures.registry import draw, draw_bands, figure_names
+from vipetsc.figures.registry import BRANCHES, draw, draw_bands, figure_names, warnings_of
 from vipetsc.figures.style import new_figure, rc_style
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.spectra import kinetic_energy
@@ -171,3 +173,20 @@ def test_any_cell_can_be_drawn(tmp_path, cell, ends):
     assert all(any(f"m_{{{i + 1}}}" in text for text in labels) for i in range(cell.dofs))
     assert imread(tmp_path / "cell.png").std() > 0.005
     assert_not_blank(draw_bands(cell, tmp_path / "bands.png"))
+
+
+def test_warnings_about_a_run_stand_below_its_pictures_each_once(tmp_path):
+    write_run(tmp_path / "run.h5")
+    (plain,) = draw("run", [tmp_path], ["ledger"])
+    height = imread(plain).shape[0]
+    assert warnings_of([tmp_path]) == []
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        file.attrs["warnings"] = json.dumps(["one", "a sentence that is wider than the picture " * 4, "one"])
+    assert len(warnings_of([tmp_path, tmp_path])) == 2
+    (warned,) = draw("run", [tmp_path], ["ledger"])
+    assert imread(warned).shape[0] >= height + 3 * 0.15 * 300
+
+
+def test_a_figure_that_branches_do_not_have_is_refused():
+    with pytest.raises(KeyError, match="no figure 'foo' of branches; did you mean 'branch'"):
+        figure_names(BRANCHES, ["foo"])

@@ -26,6 +26,7 @@ from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, wav
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
+LEAST_RESTITUTION = 0.01  # with exact damping
 MOST_SAMPLES = 1e9
 
 
@@ -96,6 +97,9 @@ class Case(CaseFile):
         length = lattice.cells if valid("lattice.cells") else None
         of_drive = list(_check_drive(sections["drive"], length, cell, valid))
         yield from of_drive
+        if contacts.damping == "exact" and contacts.restitution < LEAST_RESTITUTION and valid("contacts.restitution"):
+            remedy = f"the exact damping is unbounded there; at least {LEAST_RESTITUTION}"
+            yield Problem("contacts.restitution", contacts.restitution, remedy)
         if cell and not of_drive and valid("lattice", "drive", "time.end"):
             yield from check_traverse(cell, sections["drive"], sections["time"])
         yield from _check_sampling(sections["time"], cell, valid)
@@ -115,10 +119,11 @@ class Case(CaseFile):
             atol = small, small * drive.frequency
         else:
             atol = (1e-9 * abs(drive.amplitude) if time.atol == "paper" else time.atol,) * 2
-        stiffness = contacts.stiffness or 0.0
+        exact = contacts.damping == "exact"
+        of_contact = contacts.restitution, contacts.adhesion, contacts.approach_floor, exact
         return Model(
             chain=chain,
-            contact=Contact(contacts.law, stiffness, contacts.restitution, contacts.adhesion, contacts.approach_floor),
+            contact=Contact(contacts.law, contacts.stiffness or 0.0, *of_contact),
             drive=burst,
             drive_cell=drive.cell - 1,
             drive_mass=drive.mass - 1,
@@ -139,6 +144,23 @@ class Case(CaseFile):
             sentences.append(f"{outside}, so the wave is evanescent; see the verb `bands`")
         if model.end <= model.drive.duration:
             sentences.append(f"time.end = {model.end:.6g} s comes before the burst is over")
+        return sentences + self._unmeasured(model)
+
+    def _unmeasured(self, model: Model) -> list[str]:
+        """What the choice of cells and samples that are kept does to the measures."""
+        output, sentences = self.output, []
+        if not output.fields:
+            return []
+        interval, top = output.stride * model.sample_interval, pass_bands(model.chain.cell)[-1].high
+        if output.stride > 1 and interval >= np.pi / top:
+            resolved = f"keeps a field every {interval:g} s, which resolves {np.pi / interval:.0f} of {top:.0f} rad/s"
+            sentences.append(f"output.stride = {output.stride} {resolved}; bands, ibtet, dispersion are not measured")
+        if output.every > 1:
+            resolved = f"resolves wavenumbers up to pi/{output.every}: wavenumber content, dispersion, partition and"
+            sentences.append(f"output.every = {output.every} {resolved} entropy are not measured")
+        first, last = output.window or (1, model.chain.cells)
+        if model.chain.sites and not any(first <= site + 1 <= last for site in model.chain.sites):
+            sentences.append(f"output.window = [{first}, {last}] holds none of the contact sites")
         return sentences
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from vipetsc.case.reading import Problem, Table, Valid
 from vipetsc.case.schema import PRESETS, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
 from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
-from vipetsc.lattice.cell import cell_problems
+from vipetsc.lattice.cell import cell_problems, loose_masses
 
 LARGEST_INDEX = 2**31 - 1
 STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
@@ -95,9 +95,12 @@ def check_lattice(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]
     if problems:
         return None, problems
     cell = lattice.unit_cell()
+    if loose := ", ".join(str(mass + 1) for mass in loose_masses(cell)):
+        remedy = f"nothing ties mass {loose} to the next cell: add springs, or a spring with next_cell"
+        problems.append(Problem("lattice.cell.springs", None, remedy))
     if 2 * lattice.cells * cell.dofs > LARGEST_INDEX:
         remedy = f"has more than the {LARGEST_INDEX} displacements and velocities that PETSc's 32-bit indices count"
-        problems = [Problem("lattice.cells", lattice.cells, remedy)]
+        problems.append(Problem("lattice.cells", lattice.cells, remedy))
     return cell, problems
 
 
@@ -139,6 +142,8 @@ def resolved(sections: dict[str, Any]) -> dict[str, Table]:
     tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()}
     lattice, contacts, drive, time = (sections[name] for name in ("lattice", "contacts", "drive", "time"))
     cell, sites, law = lattice.unit_cell(), site_cells(lattice, contacts), tables["contacts"]
+    if contacts.damping == "paper":
+        del law["damping"]  # as if left out: the same case
     law |= {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
     if contacts.stiffness is None and law.keys() >= REPLACES["stiffness"]:
         law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law.pop("radius"), law.pop("poisson")))

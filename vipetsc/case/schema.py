@@ -148,7 +148,10 @@ class ClearanceSpan(Section):
 
 
 class ContactsTable(Section):
-    """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances."""
+    """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances.
+
+    ``damping``: ``paper`` (if left out) is 3 (1 - restitution)/2, ``exact`` the one that gives the restitution asked.
+    """
 
     law: Literal["hertz", "bilinear"] = "hertz"
     modulus: Positive | None = None
@@ -156,6 +159,7 @@ class ContactsTable(Section):
     poisson: Annotated[float, Field(gt=-1, le=0.5)] | None = None
     stiffness: Positive | None = None
     restitution: Annotated[float, Field(ge=0, le=1)] = 1.0
+    damping: Literal["paper", "exact"] | None = None
     sites: Annotated[int, Field(ge=0, le=MOST_SITES)] | list[Whole] | Span = 0
     clearance: Positive | list[Positive] | ClearanceSpan | None = None
     adhesion: Literal["allow", "clip"] = "allow"

@@ -123,7 +123,7 @@ def run_case_table(case: Case, ranks: int) -> str:
         ("pass bands", ", ".join(f"{b.low:.2f}-{b.high:.2f}" for b in bands) + " rad/s"),
         ("gaps", ", ".join(f"{a:.2f}-{b:.2f}" for a, b in gaps(bands)) + " rad/s" if gaps(bands) else "none"),
         ("contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.exponent:g}, "
-                    f"restitution {contact.restitution:g}"),
+                    f"restitution {contact.restitution:g}, effective {contact.effective_restitution:.3f}"),
         ("sites", _first_few([c + 1 for c in chain.sites])),
         ("clearance", _first_few([f"{1e3 * c:.4g}" for c in chain.clearances]) + " mm" if chain.sites else "none"),
         ("drive", f"{model.drive.amplitude:g} N, {model.drive.cycles} cycles, Om = {model.drive.frequency:.4f} rad/s"),
@@ -159,6 +159,7 @@ def run_table(result: "Result") -> str:
     rows = [
         ("energy", energy),
         ("impacts", f"{s['episodes']} episodes, {s['landings']} landings"),
+        ("restitution", f"{s['effective_restitution']:.3f} (effective)" if "effective_restitution" in s else ""),
         ("limits", ", ".join(f"{name} {s[name]}" for name in ("grazes", "floored", "clipped", "pulled") if s[name])),
         ("steps", steps),
         ("time", f"{s['wall_seconds']:.2f} s wall, {s['cpu_seconds']:.2f} s CPU of all ranks"),

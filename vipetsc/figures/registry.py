@@ -2,6 +2,7 @@
 
 import difflib
 import itertools
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -64,7 +65,8 @@ def figure_names(source: str, names: Sequence[str] | None = None) -> list[str]:
     for name in names or ():
         if name not in valid:
             (nearest,) = difflib.get_close_matches(name, valid, 1, 0) or valid[:1]
-            raise KeyError(f"no figure {name!r} of a {source}; did you mean {nearest!r}? There are {', '.join(valid)}")
+            of = source if source == BRANCHES else f"a {source}"
+            raise KeyError(f"no figure {name!r} of {of}; did you mean {nearest!r}? There are {', '.join(valid)}")
     return valid if names is None else list(names)
 
 
@@ -95,7 +97,18 @@ def draw(
         If a file cannot be read, or a picture not written.
     """
     with rc_style():
-        return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, itertools.count(*share))
+        target, turns = folders[0] / "figures", itertools.count(*share)
+        return draw_each(drawings(source, folders, names), target, formats, turns, "\n".join(warnings_of(folders)))
+
+
+def warnings_of(folders: Sequence[Path]) -> list[str]:
+    """The warnings about what ``folders`` hold, each once, from the attribute ``warnings`` (JSON) of their files."""
+    sentences: dict[str, None] = {}
+    for path in (folder / name for folder in folders for name in ("run.h5", "analysis.h5", "ensemble.h5", "design.h5")):
+        if path.exists():
+            with open_netcdf(path, "file of results") as data:
+                sentences |= dict.fromkeys(json.loads(data.attrs.get("warnings", "[]")))
+    return list(sentences)
 
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from textwrap import wrap
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -13,7 +14,8 @@ from matplotlib.transforms import Bbox
 from vipetsc.io.atomic import atomic_write
 
 COLUMN, PAGE = 3.4, 7.0  # widths of one and of two journal columns in inches
-NOTE = 0.16  # height in inches of the strip that a note takes below a picture
+NOTE = 0.16  # height in inches of the strip that a line of a note takes below a picture
+LETTERS = 19  # of a note on an inch
 
 # Okabe and Ito (2008): told apart with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -44,10 +46,14 @@ def new_figure(width: float, height: float, heading: str = "") -> Figure:
 
 
 def save(figure: Figure, path: Path, note: str = "") -> Path:
-    """Write ``figure`` to ``path`` in the format of its suffix, atomically, with a ``note`` in a strip below it."""
+    """Write ``figure`` to ``path`` in the format of its suffix, atomically, with a ``note`` in a strip below it.
+
+    Long lines of the note are wrapped to the width of the figure.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     width, height = figure.get_size_inches()
-    strip = Bbox([[0, -NOTE], [width, height]]) if note else None
+    lines = [line for sentence in note.splitlines() for line in wrap(sentence, int(LETTERS * width))]
+    strip, note = Bbox([[0, -NOTE * len(lines)], [width, height]]) if note else None, "\n".join(lines)
     text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=GREY)
     with atomic_write(path) as partial_path:
         figure.savefig(partial_path, format=path.suffix[1:], bbox_inches=strip)
@@ -71,7 +77,7 @@ def draw_each(
         Rising numbers, the next one asked for when a picture is done: every ``size``-th from a rank on shares
         the work evenly, a counter that all ranks draw from shares it by what it costs.
     note
-        A line of text below every picture.
+        Text below every picture.
     keep
         Whether the file at a path is to stay as it is.
     """

@@ -101,13 +101,14 @@ def cell_problems(
         problems.append(("contact", "host and resonator must be two different masses"))
     if not any(s.next_cell for s in springs):
         problems.append(("springs", "no spring has next_cell = true, so cells are not connected"))
-    elif not problems:
-        group = groups_of(n, ((s.start, s.end) for s in springs))
-        held = {group[s.start] for s in springs if s.next_cell}
-        if loose := [str(mass) for mass, g in enumerate(group, 1) if g not in held]:
-            text = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
-            problems.append(("springs", text))
     return problems
+
+
+def loose_masses(cell: UnitCell) -> list[int]:
+    """The masses (0-based) that no chain of springs joins to one with a spring to the next cell."""
+    group = groups_of(cell.dofs, ((s.start, s.end) for s in cell.springs))
+    held = {group[s.start] for s in cell.springs if s.next_cell}
+    return [mass for mass, g in enumerate(group) if g not in held]
 
 
 def groups_of(n: int, pairs: Iterable[tuple[int, int]]) -> list[int]:

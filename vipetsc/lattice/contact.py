@@ -5,10 +5,12 @@ F = kc [(w - D)_+^n - (-w - D)_+^n] g, restoring: -F on the resonator, +F on the
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import brentq
 
 Law = Literal["hertz", "bilinear"]
 Adhesion = Literal["allow", "clip"]
@@ -22,12 +24,31 @@ def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
     return 2 * modulus * np.sqrt(radius) / (3 * (1 - poisson**2))
 
 
+def rebound(damping: float, restitution: float) -> float:
+    """c (1 + e) + log(1 - c e) - log(1 + c) for the damping c and the restitution e: zero for an impact of two masses.
+
+    m w' dw'/(1 + c w'/w'_minus) = -kc x^n dx, integrated over a contact: neither m, kc, n nor the speed are left in it.
+    """
+    return float(damping * (1 + restitution) + np.log1p(-damping * restitution) - np.log1p(damping))
+
+
+@lru_cache
+def exact_damping(restitution: float) -> float:
+    """The damping c whose impact has the ``restitution`` e in (0, 1]; close to 1/e where e is small."""
+    e = restitution
+    if e >= 1 - 1e-6:
+        return 1.5 * (1 - e)
+    largest = (1 - 1e-12) / e
+    return largest if rebound(largest, e) >= 0 else brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), largest, (e,))
+
+
 @dataclass(frozen=True)
 class Contact:
     """A ``law`` F = kc x^n, its ``stiffness`` kc in N/m^n and its ``restitution`` r in [0, 1]; 1 conserves energy.
 
     ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
-    smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded.
+    smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded. ``exact``: the damping is the one
+    whose impact has the restitution, and not its limit for r near 1, which is the paper's.
     """
 
     law: Law
@@ -35,6 +56,7 @@ class Contact:
     restitution: float = 1.0
     adhesion: Adhesion = "allow"
     approach_floor: float = 0.0
+    exact: bool = False
 
     @property
     def exponent(self) -> float:
@@ -43,8 +65,17 @@ class Contact:
 
     @property
     def damping(self) -> float:
-        """3 (1 - r) / 2, the factor of w'/w'_minus in g (Hunt and Crossley 1975)."""
-        return 1.5 * (1 - self.restitution)
+        """3 (1 - r) / 2, the factor of w'/w'_minus in g (Hunt and Crossley 1975), or the exact one."""
+        return exact_damping(self.restitution) if self.exact else 1.5 * (1 - self.restitution)
+
+    @property
+    def effective_restitution(self) -> float:
+        """-w'_plus/w'_minus of two masses that nothing but the contact acts on, above the ``approach_floor``."""
+        c = self.damping
+        if c < 1e-6:
+            return 1 - 2 * c / 3
+        largest = min(1.0, (1 - 1e-12) / c)
+        return largest if rebound(c, largest) >= 0 else float(brentq(lambda e: rebound(c, e), 0.0, largest))
 
     def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
         """g = 1 + 3 (1 - r)/2 w'/w'_minus for relative velocity and approach velocity in m/s.
