@@ -99,9 +99,11 @@ def clean_environment() -> dict[str, str]:
 def vipetsc():
     """Call the program as a user types it: ``vipetsc(ranks, "run", ...)`` returns the ended process."""
 
-    def call(ranks: int, *arguments: object, timeout: float = 300, **options) -> subprocess.CompletedProcess:
+    def call(
+        ranks: int, *arguments: object, timeout: float = 300, module: str = "vipetsc", **options
+    ) -> subprocess.CompletedProcess:
         launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
-        command = [*launcher, sys.executable, "-m", "vipetsc", *map(str, arguments)]
+        command = [*launcher, sys.executable, "-m", module, *map(str, arguments)]
         options = {"capture_output": True, "text": True, "env": clean_environment()} | options
         return subprocess.run(command, timeout=timeout, check=False, **options)
 

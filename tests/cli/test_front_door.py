@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
-import tomllib
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets
-from vipetsc.case import Case
-from vipetsc.dynamics import simulate
+from tests.conftest import alone_and_on_two_ranks, clean_environment, datasets
 
 SMALL = """
 [lattice]
@@ -198,81 +192,6 @@ def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_
     run = datasets(out / "run.h5")
     assert 1 < len(run["time"]) < 2500
     assert all(abs(run["velocity"][k]).max() < 1e3 for k in range(len(run["time"])))
-
-
-def begin(case: Path, out: Path, ranks: int, *more: str) -> subprocess.Popen:
-    launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
-    command = [*launcher, sys.executable, "-m", "vipetsc", "run", str(case), "--out", str(out), *QUICK, *more]
-    return subprocess.Popen(
-        command, env=clean_environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-    )
-
-
-def await_checkpoints(process: subprocess.Popen, out: Path, ranks: int, number: int) -> None:
-    while process.poll() is None:
-        states = [p for p in (out / "parts").glob("state-*.npy") if int(p.stem.split("-")[1]) >= number]
-        if len(states) >= max(ranks, 1):
-            return
-        time.sleep(0.005)
-    raise AssertionError(process.communicate()[1].decode())
-
-
-LONG = ("--set", "time.end=1.0")
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
-    """The long run that nothing stops."""
-    folder = tmp_path_factory.mktemp("whole")
-    simulate(Case.from_table(tomllib.loads(SMALL), ["time.end=1.0"]), folder / "run")
-    return folder / "run"
-
-
-@alone_and_on_two_ranks
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_killed_run_goes_on_to_the_same_bits(vipetsc, in_process, case, whole, tmp_path, ranks, number):
-    out = tmp_path / "out"
-    process = begin(case, out, ranks, *LONG)
-    await_checkpoints(process, out, ranks, 2)
-    if number == signal.SIGKILL:
-        os.killpg(process.pid, number)
-    else:  # after SIGTERM mpirun gives its ranks one second, and has an exit code of its own
-        process.send_signal(signal.SIGUSR1 if ranks else number)
-    process.communicate(timeout=60)
-    assert process.returncode == 75 if number == signal.SIGTERM else process.returncode != 0
-    assert not (out / "run.h5").exists()
-    refused = in_process("run", case, "--out", out, *QUICK, *LONG)
-    assert refused.returncode == 2
-    assert "--resume" in refused.stderr
-    other = in_process("run", case, "--out", out, *QUICK, *LONG, "--set", "drive.amplitude=20.0", "--resume")
-    assert other.returncode == 2
-    assert "amplitude = 20.0" in other.stderr
-    resumed = vipetsc(ranks, "run", case, "--out", out, *QUICK, *LONG, "--resume")
-    assert resumed.returncode == 0, resumed.stderr
-    assert_same_bits(datasets(whole / "run.h5"), datasets(out / "run.h5"))
-    assert not (out / "parts").exists()
-
-
-@pytest.mark.mpirun
-def test_one_killed_rank_ends_all_and_loses_nothing(vipetsc, in_process, case, tmp_path):
-    out = tmp_path / "out"
-    process = begin(case, out, 2, *LONG)
-    await_checkpoints(process, out, 2, 1)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    os.kill(int(children[-1]), signal.SIGKILL)
-    process.communicate(timeout=60)
-    assert process.returncode != 0
-    wrong = in_process("run", case, "--out", out, *QUICK, *LONG, "--resume")
-    assert wrong.returncode == 2
-    assert "mpirun -n 2" in wrong.stderr
-    refused = vipetsc(2, "run", case, "--out", out, *QUICK, *LONG)
-    assert refused.returncode == 2
-    assert "--resume" in refused.stderr
-    other = vipetsc(2, "run", case, "--out", out, *QUICK, *LONG, "--set", "drive.amplitude=20.0", "--resume")
-    assert other.returncode == 2
-    assert "amplitude = 20.0" in other.stderr
-    resumed = vipetsc(2, "run", case, "--out", out, *QUICK, *LONG, "--resume")
-    assert resumed.returncode == 0, resumed.stderr
 
 
 FULL_DISK = """

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import random
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, clean_environment, datasets
-from vipetsc.case import Sweep
-from vipetsc.studies.sweep import run_sweep
+from tests.conftest import assert_same_bits, datasets
 
 SWEEP = """
 [lattice]
@@ -100,58 +92,6 @@ def test_a_scaled_member_is_what_its_simulation_would_be(in_process, case, tmp_p
         assert scaled[name] == pytest.approx(run[name], rel=1e-6, abs=1e-9 * run["energy/work"].max())
     assert not scaled["impacts/onset"].size
     assert np.array_equal(scaled["time"], run["time"])
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
-    """A folder with a sweep that nothing killed and its case: many members, on the slower engine, to be killed in."""
-    folder = tmp_path_factory.mktemp("whole")
-    text = SWEEP.replace("[time]", '[time]\nengine = "ts"').replace("count = 6", "count = 20")
-    (folder / "long.toml").write_text(text)
-    run_sweep(Sweep.load(folder / "long.toml", []), folder / "out")
-    return folder
-
-
-@pytest.mark.mpirun
-@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGTERM)])
-def test_a_killed_sweep_goes_on_to_the_same_bits(vipetsc, in_process, whole, tmp_path, ranks, number):
-    case, out = whole / "long.toml", tmp_path / "killed"
-    command = [
-        "mpirun",
-        "--oversubscribe",
-        "-n",
-        str(ranks),
-        sys.executable,
-        "-m",
-        "vipetsc",
-        "sweep",
-        str(case),
-        "--out",
-        str(out),
-    ]
-    process = subprocess.Popen(
-        command, env=clean_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
-    done = random.Random(ranks).randint(1, 6)
-    deadline = time.monotonic() + 100
-    while process.poll() is None and time.monotonic() < deadline:
-        if len(list(out.glob("*/summary.json"))) >= done:
-            break
-        time.sleep(0.01)
-    if number == signal.SIGKILL:
-        os.killpg(process.pid, number)
-    else:
-        process.terminate()
-    assert process.wait(60) != 0
-    assert not (out / "ensemble.h5").exists()
-    made = {p: p.stat().st_mtime_ns for p in out.glob("*/summary.json")}
-    assert made
-    again = ("sweep", case, "--out", out)
-    ended = in_process(*again) if ranks == 1 else vipetsc(ranks, *again)
-    assert ended.returncode == 0, ended.stderr
-    assert {p: p.stat().st_mtime_ns for p in made} == made
-    assert_same_bits(datasets(whole / "out" / "ensemble.h5"), datasets(out / "ensemble.h5"))
-    assert (whole / "out" / "ensemble.h5").read_bytes() == (out / "ensemble.h5").read_bytes()
 
 
 @pytest.mark.mpirun

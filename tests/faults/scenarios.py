@@ -50,8 +50,9 @@ BRANCHES = """
 [nnm]
 system = "own"
 modes = [1, 2]
-start_energy = 20.0
-energy = [10.0, 60.0]
+start_energy = 1.0
+energy = [0.5, 50.0]
+first_step = 0.05
 switch = ["symmetry-breaking"]
 switch_points = 3
 [nnm.own]

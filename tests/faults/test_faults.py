@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import pytest
 
+from tests.conftest import assert_same_bits, datasets
 from tests.faults.campaign import fault_table
 from tests.faults.inject import KINDS
 from tests.faults.phases import phases
-from tests.faults.trials import Crew, judge, last_words, matrix, processes_of, references
+from tests.faults.scenarios import SCENARIOS, prepare
+from tests.faults.trials import ROOT, Crew, judge, last_words, matrix, processes_of, references
+from vipetsc.case import Case
+from vipetsc.dynamics import simulate
 
 # The verbs on each number of ranks, all phases among them.
 VERBS = {2: ("run", "nnm", "design", "bands", "paper"), 3: ("run-ts", "run-resumed", "run-force", "sweep-team", "plot")}
@@ -46,3 +50,18 @@ def one_of_each(tasks, left, turn):
         kills -= chosen[-1]["kind"] == "sigkill"
         left.remove(phase)
     return chosen
+
+
+@pytest.mark.mpirun
+@pytest.mark.parametrize(("kind", "code"), [("sigterm", 75), ("sigkill", 137)])
+def test_a_fault_by_the_front_door(vipetsc, tmp_path, kind, code):
+    """Real processes from their beginning to their end, as a user has them: exit codes, and the plain command again."""
+    case, whole, out = prepare(SCENARIOS["run-ts"], tmp_path), tmp_path / "whole", tmp_path / "out"
+    simulate(Case.load(case), whole)
+    fault = vipetsc(2, "step", "60", "1", kind, "--", "run", case, "--out", out, module="tests.faults.inject", cwd=ROOT)
+    assert fault.returncode == code, fault.stderr
+    assert "Traceback" not in fault.stderr
+    assert not (out / "run.h5").exists()
+    again = vipetsc(2, "run", case, "--out", out)
+    assert again.returncode == 0, again.stderr
+    assert_same_bits(datasets(whole / "run.h5"), datasets(out / "run.h5"))

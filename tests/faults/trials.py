@@ -100,7 +100,7 @@ class Crew:
                 if kill and not self._changes(results, size, record["time"] + kill["delay"]):
                     (self.folder / "fired").write_text(str(time.time()))
                     self._kill(process.pid, record["processes"], kill)
-            elif time.monotonic() - last > 3 * self.patience:
+            elif time.monotonic() - last > 15 * self.patience:
                 os.killpg(process.pid, signal.SIGKILL)
             time.sleep(0.01)
         return process.returncode

@@ -91,12 +91,12 @@ class Worker:
         if scenario.before:
             if scenario.stop and self.comm.rank == 0:
                 self.injector.arm("step", scenario.stop, "sigterm")
-            self._call(words_of(scenario.before, case, before))
+            self._call(words_of(scenario.before, case, before), 10.0)
         if self.comm.rank == 0:
             copy(before, wanted)
         self.comm.Barrier()
         self.injector.disarm()
-        ended = self._call(words_of(scenario.words, case, wanted))
+        ended = self._call(words_of(scenario.words, case, wanted), 10.0)  # kernels may have to be compiled
         counts = self.comm.gather(self.injector.disarm())
         self._tell(task, "finished", **ended, counts=counts)
 
@@ -105,20 +105,23 @@ class Worker:
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
         return {"fired": fired.exists(), "since": since, "broken": unreadable(out) if self.comm.rank == 0 else []}
 
-    def _call(self, words: list[str]) -> dict[str, Any]:
-        """Call the program as its front door does: code, lines on stderr and time of all ranks, on all ranks."""
+    def _call(self, words: list[str], leave: float = 1.0) -> dict[str, Any]:
+        """Call the program as its front door does: code, lines on stderr and time of all ranks, on all ranks.
+
+        It has so many times the usual time to end.
+        """
         for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
         begin, code, error = time.monotonic(), 1, None
         with self._redirected():
-            faulthandler.dump_traceback_later(self.patience, exit=True)
+            faulthandler.dump_traceback_later(leave * self.patience, exit=True)
             try:
                 code = vipetsc(list(words))
             except SystemExit as end:
                 code = end.code
             except BaseException as raised:
                 error = raised
-            if not self._all_are_here(1.0 if error else 2 * self.patience):
+            if not self._all_are_here(1.0 if error else 2 * leave * self.patience):
                 sys.excepthook(type(error), error, error.__traceback__)  # as at the end of a process: it ends all
             self._report(error)
             faulthandler.cancel_dump_traceback_later()
