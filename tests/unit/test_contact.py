@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import vipetsc
 from vipetsc.contact import changes, search
 from vipetsc.contact.law import (
     CLIPPED,
@@ -250,3 +253,10 @@ def test_the_effective_restitution_is_that_of_a_simulated_impact(law, asked, eff
 def test_the_exact_damping_meets_every_restitution():
     asked = np.linspace(0.01, 1, 200)
     assert [Contact("hertz", KC, r, exact=True).effective_restitution for r in asked] == pytest.approx(asked, abs=1e-7)
+
+
+def test_the_manual_tells_what_impacts_return():
+    lines = (Path(vipetsc.__file__).parent / "manual/case-file.md").read_text(encoding="utf-8").splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("| restitution"))
+    asked, told = ([float(cell) for cell in line.split("|")[2:-1]] for line in (lines[first], lines[first + 2]))
+    assert [round(Contact("hertz", KC, r).effective_restitution, 3) for r in asked] == told
