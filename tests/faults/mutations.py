@@ -157,7 +157,7 @@ def _scale(rng: random.Random, table: Any, keys: Any) -> str:
     path = _choose(rng, table, lambda value: type(value) in (int, float))
     if path is None:
         return "nothing to scale"
-    factor = rng.choice((-1, 0.5, 2, 10, 100, 1e3, 1e6, 1e12, 0.1, 1e-3, 1e-6, 1e-12))
+    factor = rng.choice((-1, 0.5, 2, 10, 100, 1e3, 1e6, 1e12, 0.1, 1e-3, 1e-6, 1e-12, 1e40, 1e-40))
     old = _at(table, path)
     new = type(old)(old * factor) if abs(old) < 1e300 else old
     _at(table, path[:-1])[path[-1]] = new
