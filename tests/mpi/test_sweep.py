@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 
 from mpi4py import MPI
 
 import pytest
 
-from tests.conftest import assert_same_bits, datasets
+from tests.conftest import StopAt, assert_same_bits, datasets
+from tests.faults.inject import Injector
 from vipetsc.case import Sweep
-from vipetsc.parallel import SharedCounter
+from vipetsc.parallel import SharedCounter, StopRequest
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = """
@@ -34,19 +36,68 @@ amplitude = [0.1, 20.0, 40.0]
 """
 
 
+@pytest.fixture(scope="module")
+def injector():
+    return Injector()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The ensemble of the sweep as one rank makes it."""
+    plan = Sweep.from_table(tomllib.loads(TABLE))
+    folder = tmp_path_factory.mktemp("whole")
+    run_sweep(plan, folder, MPI.COMM_SELF)
+    return datasets(folder / "ensemble.h5")
+
+
 @pytest.mark.parallel([1, 2, 3])
 @pytest.mark.parametrize("team", [1, 2])
-def test_the_ensemble_does_not_depend_on_the_ranks(folder, team):
+def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
     comm = MPI.COMM_WORLD
     plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
-    result = run_sweep(plan, folder / "all", comm)
-    assert result.complete
-    assert len(result.outcomes) == 6
-    assert len(result.busy) == comm.size
-    if comm.rank == 0:
-        alone = run_sweep(Sweep.from_table(tomllib.loads(TABLE)), folder / "alone", MPI.COMM_SELF)
-        assert alone.complete
-        assert_same_bits(datasets(folder / "all" / "ensemble.h5"), datasets(folder / "alone" / "ensemble.h5"))
+    result = run_sweep(plan, folder, comm)
+    assert result.complete and len(result.outcomes) == 6 and len(result.busy) == comm.size
+    assert_same_bits(datasets(folder / "ensemble.h5"), whole)
+    comm.Barrier()
+
+
+@pytest.mark.parallel([2])
+@pytest.mark.parametrize(
+    ("team", "phase", "kind"), [(2, "analyse", "exception"), (2, "write", "full-disk"), (1, "step", "memory")]
+)
+def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, injector, whole, team, phase, kind):
+    comm = MPI.COMM_WORLD
+    plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
+    # The first files are those of the claim and of the linear run; a team's rank 0 measures and writes for it.
+    if comm.rank == (0 if team == 2 else 1):
+        injector.arm(phase, {"write": 7 - 4 * comm.rank, "step": 3, "analyse": 2}[phase], kind)
+    if kind == "full-disk":
+        with pytest.raises(OSError, match=r"No space left.*; make room, the same command goes on"):
+            run_sweep(plan, folder / "out", comm)
+    else:
+        result = run_sweep(plan, folder / "out", comm)
+        rows = json.loads((folder / "out" / "index.json").read_text())["members"]
+        ((reason),) = {row["reason"] for row in rows if row["status"] == "failed"}
+        assert ("a fault at analyse" if kind == "exception" else "MemoryError: Unable to allocate") in reason
+        assert not result.complete and not result.resumable and result.count(2) < 6
+    injector.disarm()
+    comm.Barrier()
+    assert run_sweep(plan, folder / "out", comm).complete
+    assert_same_bits(datasets(folder / "out" / "ensemble.h5"), whole)
+    comm.Barrier()
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize(("team", "looks"), [(1, 30), (2, 1)])
+def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
+    comm = MPI.COMM_WORLD
+    plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
+    stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
+    stopped = run_sweep(plan, folder / "out", comm, stop=stop)
+    assert stopped.resumable and not (folder / "out" / "ensemble.h5").exists()
+    comm.Barrier()
+    assert run_sweep(plan, folder / "out", comm).complete
+    assert_same_bits(datasets(folder / "out" / "ensemble.h5"), whole)
     comm.Barrier()
 
 

@@ -57,9 +57,10 @@ def folder(tmp_path):
         statistics = {"episodes": number, "work": 2.0, "dissipated": 0.5, "ledger_error": 0.0}
         summary = {"complete": True, "status": "complete", "statistics": statistics}
         (path / "summary.json").write_text(json.dumps(summary | {"measures": ["transfer"], "fields": False}))
+        h5py.File(path / "run.h5", "w").close()
         with h5py.File(path / "analysis.h5", "w") as file:
             file["ibtet"] = measure(member.case)
-    outcomes = conclude(plan, members, store, {members[5].id: "ArithmeticError: overflow"})
+    outcomes, _ = conclude(plan, members, store, {members[5].id: "ArithmeticError: overflow"})
     assert all(outcome.status != MISSING for outcome in outcomes)
     return tmp_path
 

@@ -1,10 +1,14 @@
 """Members of a sweep are scaled where nothing touches, and simulated where something may."""
 
+import os
+import shutil
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 
+from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, Sweep
 from vipetsc.case.sweep import SweepTable
 from vipetsc.io.netcdf import open_netcdf
@@ -77,3 +81,31 @@ def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
     thin = open_ensemble(tmp_path / "thin")
     for name in ("status", "contact_episodes", "ibtet", "entropy/energy_weighted", "entropy/masked", "bands/share"):
         np.testing.assert_array_equal(thin[name].values, ensemble[name].values[2:5], name)
+
+
+def test_files_that_were_cut_are_named_and_made_again(sweep, tmp_path):
+    _, ensemble, folder = sweep
+    out = shutil.copytree(folder, tmp_path / "out")
+    before = {path.relative_to(out): datasets(path) for path in out.rglob("*.h5")}
+    scaled, *touching = (out / str(name) for name in ensemble["member"].values[[0, 3, 4, 5]])
+    (shared,) = out.glob("linear/*/analysis-*.h5")
+    damaged = [scaled / "run.h5", shared, touching[0] / "summary.json", touching[1] / "analysis.h5",
+               touching[2] / "run.h5", shared.with_name("wave.h5"), shared.with_name("run.h5")]  # fmt: skip
+    for number, path in enumerate([*damaged, out / "ensemble.h5", out / "index.json"]):
+        os.truncate(path, path.stat().st_size // 2 if number % 2 else 0)
+    again = run_sweep(Sweep.load(out / "case.toml"), out)
+    assert again.complete and again.made == 4
+    # The wave is looked at first, and what was measured from its run goes with it.
+    named = [path for path in damaged if path not in (shared, shared.with_name("run.h5"))]
+    assert len(again.warnings) == len(named)
+    for path in named:
+        (warning,) = (text for text in again.warnings if str(path) in text)
+        assert "cannot be" in warning and warning.endswith("made again")
+    assert {path.relative_to(out) for path in out.rglob("*.h5")} == set(before)
+    for path, found in before.items():
+        assert_same_bits(found, datasets(out / path))
+    # A linear run alone, with what was measured of it.
+    for path in (shared, shared.with_name("run.h5")):
+        os.truncate(path, 100)
+    once_more = run_sweep(Sweep.load(out / "case.toml"), out)
+    assert once_more.made == 0 and [str(shared.with_name("run.h5")) in text for text in once_more.warnings] == [True]

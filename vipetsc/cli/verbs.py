@@ -75,6 +75,8 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     plan = _load(Sweep, options, comm)
     folder = _output(options, plan.name)
     result = run_sweep(plan, folder, comm, force=options.force, stop=stop, progress=True)
+    for warning in result.warnings:
+        echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
     echo(comm, tables.sweep_table(result))
     if result.resumable:
         return STOPPED

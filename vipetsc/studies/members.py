@@ -12,6 +12,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+import h5py
 import numpy as np
 import xarray as xr
 
@@ -51,6 +52,7 @@ class MemberStore:
     def __init__(self, folder: Path, options: SweepTable, team: MPI.Comm, stop: StopRequest) -> None:
         self.folder, self.options, self.team, self.stop = folder, options, team, stop
         self.measures = FULL if self.options.fields else [MEASURES[name] for name in self.options.measures]
+        self.warnings: list[str] = []  # of what this rank found
         self._linear: dict[Path, tuple[xr.Dataset, xr.Dataset]] = {}  # ledgers and measures that scaled members share
         self._requested = {"measures": sorted(self.options.measures), "fields": self.options.fields}
 
@@ -59,7 +61,7 @@ class MemberStore:
 
         Raises StoppedError, or RuntimeError if it does not come out.
         """
-        if on_root(self.team, lambda: read_wave(self.folder, case, current=True) is not None):
+        if on_root(self.team, lambda: self.has_linear(case)):
             return
         linear, memory = linear_case(case), RunMemory(self.team)
         self._simulate(linear, memory)
@@ -74,15 +76,47 @@ class MemberStore:
 
         on_root(self.team, measure)
 
+    def has_linear(self, case: Case) -> bool:
+        """Whether the linear run of ``case`` was made by this version, and its files can be read."""
+        return self.wave(case) is not None and self._is_whole(linear_folder(self.folder, case) / "run.h5")
+
+    def wave(self, case: Case) -> xr.Dataset | None:
+        """The linear wave of ``case`` as this version made it; None if it has not, or the file cannot be read."""
+        try:
+            return read_wave(self.folder, case, current=True)
+        except (OSError, ValueError) as error:
+            self.warnings.append(f"{error}; made again")
+            return None
+
     def summary(self, case: Case, current: bool = False) -> dict[str, Any]:
         """``summary.json`` of the member of ``case``; empty if it lacks anything that the sweep asks for.
 
-        If ``current``, empty too if another version made it.
+        If ``current``, empty too if another version made it. Files that cannot be read count as not there.
         """
-        path = self.folder / case_id(case) / "summary.json"
-        summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        folder = self.folder / case_id(case)
+        try:
+            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError) as error:
+            self.warnings.append(f"{folder / 'summary.json'} cannot be read: {error}; made again")
+            return {}
         asked = self._requested | {"complete": True} | ({"vipetsc_version": vipetsc.__version__} if current else {})
-        return summary if asked.items() <= summary.items() else {}
+        whole = asked.items() <= summary.items() and all(
+            map(self._is_whole, (folder / "run.h5", folder / "analysis.h5"))
+        )
+        return summary if whole else {}
+
+    def _is_whole(self, path: Path) -> bool:
+        """Whether the HDF5 file ``path`` is there and was not cut off, which HDF5 sees when it opens it."""
+        try:
+            with h5py.File(path) as file:
+                return bool(file)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            self.warnings.append(f"{path} cannot be read: {error}; made again")
+            return False
 
     def make(self, case: Case, wave: xr.Dataset) -> None:
         """Simulate the member of ``case``, or scale it; raises as ``make_linear``."""
@@ -111,8 +145,10 @@ class MemberStore:
                 ended = {"status": result.sentence, "complete": True, "statistics": result.statistics}
                 summary = provenance(self.team) | ended
             with open_run(folder / "run.h5") if memory.dataset is None else memory.dataset as run:
-                write_netcdf(folder / "analysis.h5", analyse(run, self.measures, arrival_at(wave, case)))
-            self._finish(folder, case, summary)
+                measured = analyse(run, self.measures, arrival_at(wave, case))
+            write_netcdf(folder / "analysis.h5", measured)
+            warnings = json.loads(measured.attrs.get("warnings", "[]"))
+            self._finish(folder, case, summary | {"warnings": [*summary.get("warnings", ()), *warnings]})
 
         on_root(self.team, measure)
 
@@ -131,7 +167,7 @@ class MemberStore:
         shared = source / f"analysis-{leading_cell(case)}-{'-'.join(sorted(self.options.measures))}.h5"
         if shared not in self._linear:
             with open_run(source / "run.h5") as run:
-                if not shared.exists():
+                if not self._is_whole(shared):
                     write_netcdf(shared, analyse(with_sites(run, case), self.measures, arrival_at(wave, case)))
                 with open_netcdf(shared, "analysis") as file:
                     self._linear[shared] = run.drop_vars("velocity").load(), file.load()

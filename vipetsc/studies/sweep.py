@@ -3,9 +3,11 @@
 The measures of runs already made, of one or of all members of a sweep whose fields were kept, are taken anew here too.
 """
 
+import errno
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import TypeVar
 from mpi4py import MPI
 
 import numpy as np
+import xarray as xr
 
 import vipetsc
 from vipetsc.case import Case, Sweep, SweepMember
@@ -27,8 +30,9 @@ from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, 
 from vipetsc.studies.members import MemberStore, arrival_at, linear_folder, reached, read_wave
 
 FORMAT_VERSION = 1
-# What a member may raise and leave the others to go on: the machine's limits, a solver's or a file's refusal.
-FAILURES = (ArithmeticError, MemoryError, OSError, RuntimeError, ValueError)
+FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # no other member could be written either
+PATIENCE = 5.0  # s that a rank whose member failed waits for the rest of its team to have failed as well
+MADE, UNMADE, LEFT, ENDED = range(4)  # how a job ended; the later counts if ranks differ
 
 Job = TypeVar("Job", bound=Hashable)
 
@@ -38,7 +42,7 @@ class SweepResult:
     """How a sweep ended: outcomes in the members' order.
 
     ``made`` counts the members simulated or scaled now; ``busy`` (rank) is the share of the time in which each
-    rank worked on members.
+    rank worked on members. ``warnings`` are sentences about files made again and about the members' results.
     """
 
     outcomes: list[Outcome]
@@ -46,6 +50,7 @@ class SweepResult:
     seconds: float
     busy: tuple[float, ...]
     folder: Path
+    warnings: list[str]
 
     @property
     def complete(self) -> bool:
@@ -89,11 +94,30 @@ def run_sweep(
     store = MemberStore(folder, plan.options, team, stop)
 
     cases = {m.id: m.case for m in members if m.case}
-    missing = on_root(comm, lambda: [key for key, case in cases.items() if not store.summary(case, current=True)])
-    source = {key: linear_folder(folder, cases[key]) for key in missing}
-    linear = {source[key]: cases[key] for key in missing}
+    # What there is and what comes first is decided on one rank: another may not see the files of the others yet.
+    source = {key: linear_folder(folder, case) for key, case in cases.items()}
+    linear = on_root(comm, lambda: {source[key]: c for key, c in cases.items() if not store.has_linear(c)})
     failures = pool.share(list(linear), lambda path: store.make_linear(linear[path]))
-    stored = on_root(comm, lambda: {path: read_wave(folder, case, current=True) for path, case in linear.items()})
+    order, waves = on_root(comm, lambda: _plan(cases, source, store))
+    bar = Progress(comm, len(order), "runs", show=progress)
+    made = pool.share(order, lambda key: store.make(cases[key], waves[source[key]]), bar)
+    reasons = {key: reason for key, path in source.items() if (reason := failures.get(path))} | made
+
+    seconds = time.perf_counter() - begin
+    busy = tuple(comm.allgather(pool.busy / seconds))
+    found = [warning for warnings in comm.allgather(store.warnings) for warning in warnings]
+    outcomes, warnings = on_root(comm, lambda: conclude(plan, members, store, reasons))
+    team.Free()
+    count = sum(reason == "" for reason in made.values())
+    return SweepResult(outcomes, count, seconds, busy, folder, [*dict.fromkeys(found), *warnings])
+
+
+def _plan(
+    cases: Mapping[str, Case], source: Mapping[str, Path], store: MemberStore
+) -> tuple[list[str], dict[Path, xr.Dataset]]:
+    """The members to be made whose linear run (``source``) came out, the longest first; the waves of linear runs."""
+    missing = [key for key, case in cases.items() if not store.summary(case, current=True)]
+    stored = {source[key]: store.wave(cases[key]) for key in missing}
     waves = {path: wave for path, wave in stored.items() if wave is not None}
 
     def cost(key: str) -> float:
@@ -101,27 +125,18 @@ def run_sweep(
         touching = np.minimum(reached(waves[source[key]], cases[key]), 10.0)
         return float(touching.sum()) + 1e-3 * float(cases[key].time.end)
 
-    order = sorted((key for key in missing if source[key] in waves), key=cost, reverse=True)
-    bar = Progress(comm, len(order), "runs", show=progress)
-    made = pool.share(order, lambda key: store.make(cases[key], waves[source[key]]), bar)
-    reasons = {key: failures.get(source[key], "") for key in missing} | made
-
-    seconds = time.perf_counter() - begin
-    busy = tuple(comm.allgather(pool.busy / seconds))
-    outcomes = on_root(comm, lambda: conclude(plan, members, store, reasons))
-    team.Free()
-    return SweepResult(outcomes, sum(reason == "" for reason in made.values()), seconds, busy, folder)
+    return sorted((key for key in missing if source[key] in waves), key=cost, reverse=True), waves
 
 
 def conclude(
     plan: Sweep, members: Sequence[SweepMember], store: MemberStore, reasons: Mapping[str, str]
-) -> list[Outcome]:
-    """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns how the members ended.
+) -> tuple[list[Outcome], list[str]]:
+    """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; how the members ended, and warnings.
 
     ``reasons`` names the members (by id) that failed just now, and why.
     """
     sys.audit("vipetsc.conclude", str(store.folder))
-    outcomes, rows = [], []
+    outcomes, rows, warned = [], [], Counter[str]()
     for member in members:
         outcome = Outcome(MISSING)
         if reason := reasons.get(member.id) or member.problem:
@@ -129,6 +144,7 @@ def conclude(
         elif member.case and (summary := store.summary(member.case)):
             status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
             outcome = Outcome(status, summary["status"], summary["statistics"])
+            warned.update(summary.get("warnings", ()))
         outcomes.append(outcome)
         ending = {"status": STATUS[outcome.status], "reason": outcome.reason}
         rows.append({"place": member.index, "id": member.id} | ending)
@@ -138,49 +154,82 @@ def conclude(
     write_text(store.folder / "index.json", json.dumps(index, indent=1) + "\n")
     if all(outcome.status != MISSING for outcome in outcomes):
         assemble(plan, members, outcomes, store.folder)
-    return outcomes
+    return outcomes, [f"{count} members: {sentence}" for sentence, count in warned.items()]
 
 
 class TaskPool:
-    """Teams of ranks that draw jobs until none are left; ``busy`` is the time in s that this rank worked on them."""
+    """Teams of ranks that draw jobs until none are left, or until some rank got a request to stop (``stopped``).
+
+    ``busy`` is the time in s that this rank worked on them.
+    """
 
     def __init__(self, comm: MPI.Comm, team: MPI.Comm, stop: StopRequest) -> None:
         self.comm, self.team, self.stop = comm, team, stop
-        self.busy = 0.0
+        self.stopped, self.busy = False, 0.0
 
     def share(
         self, jobs: Sequence[Job], work: Callable[[Job], None], progress: Progress | None = None
     ) -> dict[Job, str]:
-        """Do all ``jobs``; returns for each one done the reason why it failed, "" if it did not. Collective."""
+        """Do all ``jobs``; returns for each one done the reason why it failed, "" if it did not. Collective.
+
+        Raises OSError on all ranks when the disk is full.
+        """
         drawn, ended = SharedCounter(self.comm), SharedCounter(self.comm)
         reasons: dict[Job, str] = {}
-        leader = self.team.rank == 0
-        while not self.stop.requested:
+        leader, ending, reason = self.team.rank == 0, MADE, ""
+        while not (self.stopped or self.stop.agreed(self.team)):
             number = self.team.bcast(drawn.draw() if leader else None)
             if number >= len(jobs):
                 break
             job, begin = jobs[number], time.perf_counter()
-            try:
-                sys.audit("vipetsc.member", str(job))
-                work(job)
-                reasons[job] = ""
-            except StoppedError:
+            ending, reason = self._end(job, work)
+            self.busy += time.perf_counter() - begin
+            if ending in (LEFT, ENDED):
                 break
-            except FAILURES as error:
-                if self.team.size > 1:  # ranks that meet in a member cannot go on without one of theirs: all end
-                    raise
-                reasons[job] = str(error) if isinstance(error, RuntimeError) else f"{type(error).__name__}: {error}"
-            finally:
-                self.busy += time.perf_counter() - begin
+            reasons[job] = reason
             done = ended.draw(1 if leader else 0)
             if progress:
                 progress.update(done + 1)
-        everything = self.comm.allgather(reasons)
+        else:
+            ending = LEFT
+        if ending in (LEFT, ENDED):
+            drawn.draw(len(jobs))  # so that no team begins another
+        shares = self.comm.allgather((ending, reason, reasons))
+        self.stopped = any(ending == LEFT for ending, *_ in shares)
         if progress:
             progress.close()
         drawn.free()
         ended.free()
-        return {job: reason for share in everything for job, reason in share.items()}
+
+        def check() -> None:
+            for ending, reason, _ in shares:
+                if ending == ENDED:
+                    raise OSError(f"{reason}; make room, the same command goes on")
+
+        on_root(self.comm, check)
+        return {job: reason for *_, share in shares for job, reason in share.items()}
+
+    def _end(self, job: Job, work: Callable[[Job], None]) -> tuple[int, str]:
+        """Do a ``job`` with the whole team: how it ended, and why.
+
+        A rank that fails alone leaves the others in the midst of it, where they wait for ever: its exception is raised.
+        """
+        ending, failure = (MADE, ""), None
+        try:
+            sys.audit("vipetsc.member", str(job))
+            work(job)
+        except StoppedError:
+            ending = LEFT, ""
+        except Exception as error:
+            failure, text = error, str(error)
+            named = text if isinstance(error, RuntimeError) else f"{type(error).__name__}: {text}"
+            ending = (ENDED, text) if getattr(error, "errno", None) in FULL else (UNMADE, named)
+        met, since = self.team.Ibarrier(), time.monotonic()
+        while not met.Test():
+            if failure and time.monotonic() - since > PATIENCE:
+                raise failure
+            time.sleep(1e-3)
+        return max(self.team.allgather(ending))
 
 
 def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
@@ -196,7 +245,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     def reassemble(folder: Path) -> Path:
         plan = Sweep.load(folder / "case.toml")
         store = MemberStore(folder, plan.options, MPI.COMM_SELF, StopRequest())
-        outcomes = conclude(plan, plan.members(), store, {})
+        outcomes, _ = conclude(plan, plan.members(), store, {})
         if any(outcome.status == MISSING for outcome in outcomes):
             raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
         return folder / "ensemble.h5"
