@@ -29,16 +29,10 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="faults-") as work:
         for ranks in options.ranks:
             crew = Crew(Path(work) / str(ranks), ranks, options.patience)
-            counts = references(crew, options.only or list(SCENARIOS))
-            reached |= {phase for by_rank in counts.values() for count in by_rank for phase in count}
-            tasks = [t for t in matrix(counts, options.kinds) if not options.phases or t["phase"] in options.phases]
-            crew.do(tasks)
-            for task in tasks:
-                stages = crew.results[task["id"]]
-                wrong = judge(task, stages, options.allowed)
-                rows.append(task | {"ranks": ranks, "wrong": wrong, "last": last_words(stages) if wrong else ""})
-                if wrong:
-                    print(f"{task['id']}: {'; '.join(wrong)}\n    {rows[-1]['last']}", flush=True)
+            unbroken = references(crew, options.only or list(SCENARIOS))
+            tasks = [t for t in matrix(unbroken, options.kinds) if not options.phases or t["phase"] in options.phases]
+            reached |= {task["phase"] for task in tasks}
+            rows += [judged(task | {"ranks": ranks}, stages, options) for task, stages in crew.do(tasks)]
     missed = sorted(phases() - reached) if not options.only else []
     print(fault_table(rows, options.kinds, options.ranks))
     if missed:
@@ -53,20 +47,13 @@ def kills(options: argparse.Namespace) -> dict[str, Any]:
     rows = []
     with tempfile.TemporaryDirectory(prefix="kills-") as work:
         crews = {ranks: Crew(Path(work) / str(ranks), ranks, options.patience) for ranks in options.ranks}
-        seconds = {}
-        for ranks, crew in crews.items():
-            references(crew, options.only)
-            for name in options.only:
-                seconds[name, ranks] = crew.results[f"{name} unbroken"]["finished"]["seconds"]
+        for _ in range(2):  # kernels are compiled in the first
+            unbroken = {ranks: references(crew, options.only) for ranks, crew in crews.items()}
+        seconds = {(name, ranks): unbroken[ranks][name]["seconds"] for ranks in crews for name in options.only}
         tasks = list(trials.kills(seconds, options.seed, options.count))
         for ranks, crew in crews.items():
-            crew.do([task for task in tasks if task["ranks"] == ranks])
-        for task in tasks:
-            stages = crews[task["ranks"]].results[task["id"]]
-            wrong, came = judge(task, stages, options.allowed), stages["ended"]["fired"]
-            rows.append(task | {"came": came, "code": stages["ended"]["code"], "wrong": wrong})
-            if wrong:
-                print(f"{task['id']}: {'; '.join(wrong)}\n    {last_words(stages)}", flush=True)
+            share = [task for task in tasks if task["ranks"] == ranks]
+            rows += [judged(task, stages, options) for task, stages in crew.do(share)]
     bad = sum(bool(row["wrong"]) for row in rows)
     for name in options.only:
         of_name = [row for row in rows if row["scenario"] == name]
@@ -74,6 +61,14 @@ def kills(options: argparse.Namespace) -> dict[str, Any]:
         print(f"{name:<13}{len(of_name):>5} kills, {in_time:>4} before the end, {lost} not as they should be")
     print(f"seed {options.seed}: {len(rows)} kills, {bad} of them not as they should be")
     return {"seed": options.seed, "rows": rows, "bad": bad}
+
+
+def judged(task: dict[str, Any], stages: dict[str, dict[str, Any]], options: argparse.Namespace) -> dict[str, Any]:
+    """A row of the report; what is wrong is printed at once."""
+    wrong, ended = judge(task, stages, options.allowed), stages.get("ended", {})
+    if wrong:
+        print(f"{task['id']}: {'; '.join(wrong)}\n    {last_words(stages)}", flush=True)
+    return task | {"came": ended.get("fired"), "code": ended.get("code"), "since": ended.get("since"), "wrong": wrong}
 
 
 def cases(options: argparse.Namespace) -> dict[str, Any]:

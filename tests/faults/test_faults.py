@@ -27,9 +27,7 @@ def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
     for ranks, verbs in VERBS.items():
         crew = Crew(tmp_path / str(ranks), ranks)
         tasks = one_of_each(matrix(references(crew, verbs)), left, ranks)
-        crew.do(tasks)
-        for task in tasks:
-            stages = crew.results[task["id"]]
+        for task, stages in crew.do(tasks):
             wrong = judge(task, stages, allowed=crew.patience)
             rows.append(task | {"ranks": ranks, "wrong": wrong})
             if wrong:

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -33,41 +33,42 @@ Record = dict[str, Any]
 
 @dataclass
 class Crew:
-    """Workers on a number of ``ranks`` that do tasks in ``folder``; results by the id of a task and its stage."""
+    """Workers on a number of ``ranks`` that do tasks in ``folder``; a call has ``patience`` s to end."""
 
     folder: Path
     ranks: int
     patience: float = 40.0
-    results: dict[str, dict[str, Record]] = field(default_factory=dict)
 
-    def do(self, tasks: Sequence[Task]) -> None:
-        """Do all ``tasks``; after one that ended its worker, a new worker goes on."""
+    def do(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, dict[str, Record]]]:
+        """Do all ``tasks``: each with its records by stages, when it is done.
+
+        After a task that ended its worker a new worker goes on.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
-        left = list(tasks)
+        left, told = list(tasks), dict[str, dict[str, Record]]()
         while left:
             (self.folder / "results.jsonl").write_text("")
             code, messages = self._launch(left[:AT_ONCE])
             for line in (self.folder / "results.jsonl").read_text().splitlines():
                 record = json.loads(line)
-                self.results.setdefault(record["id"], {})[record["stage"]] = record
-            while left and "finished" in self.results.get(left[0]["id"], {}):
-                left.pop(0)
-            if left and (code != 0 or "ended" in self.results.get(left[0]["id"], {})):
-                self._note_end(left, code, messages)
+                told.setdefault(record["id"], {})[record["stage"]] = record
+            while left and "finished" in told.get(left[0]["id"], {}):
+                yield left[0], told.pop(left.pop(0)["id"])
+            stages = told.setdefault(left[0]["id"], {}) if left else {}
+            if left and (code != 0 or "ended" in stages):
+                end = self._end(code, messages)
+                if "begun" in stages and left[0]["do"] == "trial":
+                    stages.setdefault("ended", end | {"broken": unreadable(self.folder / left[0]["scenario"])})
+                    left[0] = left[0] | {"do": "finish"}
+                else:
+                    yield left.pop(0), stages | {"finished": end | {"differs": "it did not end by itself"}}
 
-    def _note_end(self, left: list[Task], code: int, messages: str) -> None:
-        """What is known of the task whose worker ended; it is to be finished, or given up."""
-        stages = self.results.setdefault(left[0]["id"], {})
+    def _end(self, code: int, messages: str) -> Record:
+        """What is known of a call that ended its worker."""
         errors = "".join(path.read_text(errors="replace") for path in sorted(self.folder.glob("errors-*")))
         fired = self.folder / "fired"
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
-        end = {"code": code, "errors": errors, "since": since, "fired": fired.exists(), "mpirun": messages}
-        if "begun" in stages and left[0]["do"] == "trial":
-            stages.setdefault("ended", end | {"broken": unreadable(self.folder / left[0]["scenario"])})
-            left[0] = left[0] | {"do": "finish"}
-        else:
-            stages["finished"] = end | {"differs": "it did not end by itself"}
-            left.pop(0)
+        return {"code": code, "errors": errors, "since": since, "fired": fired.exists(), "mpirun": messages}
 
     def _launch(self, tasks: Sequence[Task]) -> tuple[int, str]:
         """One mpirun with a worker; code and messages of mpirun. No process of it is left."""
@@ -133,24 +134,24 @@ def processes_of(folder: Path) -> list[int]:
     return found
 
 
-def references(crew: Crew, names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
-    """Unbroken calls of the scenarios: how often every phase came, by rank. Raises RuntimeError if one fails."""
-    crew.do([{"id": f"{name} unbroken", "do": "reference", "scenario": name} for name in names])
-    counts = {}
-    for name in names:
-        result = crew.results[f"{name} unbroken"]["finished"]
+def references(crew: Crew, names: Sequence[str]) -> dict[str, Record]:
+    """Unbroken calls of the scenarios: ``counts``, how often every phase came (by rank), and their time in ``seconds``.
+
+    Raises RuntimeError if one fails.
+    """
+    found = {}
+    for task, stages in crew.do([{"id": name, "do": "reference", "scenario": name} for name in names]):
+        found[task["scenario"]] = result = stages["finished"]
         if result["code"] != 0:
-            raise RuntimeError(
-                f"{name} on {crew.ranks} ranks ends with {result['code']} undisturbed: {result['errors']}"
-            )
-        counts[name] = result["counts"]
-    return counts
+            raise RuntimeError(f"{task['id']} on {crew.ranks} ranks: {result['code']}, {result['errors']}")
+    return found
 
 
-def matrix(counts: dict[str, list[dict[str, int]]], kinds: Sequence[str] = KINDS) -> Iterator[Task]:
+def matrix(unbroken: dict[str, Record], kinds: Sequence[str] = KINDS) -> Iterator[Task]:
     """A trial with every kind of fault at every phase of the scenarios, rank and occurrence in turn."""
     turn = 0
-    for name, ranks in counts.items():
+    for name, reference in unbroken.items():
+        ranks = reference["counts"]
         for phase in sorted(set().union(*ranks)):
             taking_part = [rank for rank, count in enumerate(ranks) if count.get(phase)]
             for kind in kinds:
