@@ -146,6 +146,7 @@ def test_ledger_closes(folder, preset, amplitude, law, restitution):
     assert (np.abs(residual[1:]) <= 1e-8 * energy["work"][1:]).mean() > 0.99
     assert (result.statistics["episodes"] == 0) == (amplitude < 1)
     assert (energy["dissipated"][-1] == 0) == (restitution == 1 or amplitude < 1)
+    assert restitution < 1 or result.statistics["pulled"] == 0
     np.testing.assert_allclose(energy["dissipated_by_site"].sum(axis=1), energy["dissipated"], rtol=1e-12, atol=1e-300)
 
 

@@ -6,8 +6,8 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 from scipy.special import gamma
 
-from vipetsc.contact.changes import Extremes, extremes, switching
-from vipetsc.contact.law import CLIPPED, FREE, Contacts
+from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
+from vipetsc.contact.law import CLIPPED, FREE, Contacts, elastic_force
 
 # Limits of the contact law, of which it is counted how often they acted.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
@@ -64,10 +64,16 @@ class ImpactTracker:
         """Update the open episode of site ``i`` with the extremes ``reached`` in a stretch of time."""
         episode.indentation = max(episode.indentation, reached.indentation)
         episode.force = max(episode.force, reached.force)
-        # A pull within the landing's rounding is none.
-        if reached.smallest_force < -1e-9 * episode.force and i not in self.pulling:
+        pull = -reached.smallest_force
+        if pull > 0.0 and i not in self.pulling and pull > self.landing_force(i, episode):
             self.pulling.add(i)
             self.counts["pulled"] += 1
+
+    def landing_force(self, i: int, episode: Episode) -> float:
+        """Largest pull in N that is none: of the law continued to a landing short of D, or beyond g = 0."""
+        law, clearance = self.contacts.law, float(self.contacts.sites["clearance"][i])
+        short_of_clearance = (1 + law.damping) * elastic_force(law, LANDED_W * clearance)
+        return short_of_clearance + LANDED_G * elastic_force(law, episode.indentation)
 
     def switch(self, t: float, energies: np.ndarray) -> int:
         """Switch every site that has landed at time ``t`` (motion in ``start``); returns how many.
