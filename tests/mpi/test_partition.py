@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import pytest
 
-from tests.conftest import assert_same_bits, datasets, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
@@ -69,6 +69,31 @@ def test_parallel_writing_gives_the_gathered_file(folder):
     gathered, parallel = (datasets(folder / w / "run.h5") for w in ("gather", "parallel"))
     assert_same_bits(gathered, parallel)
     assert gathered["cell"].tolist() == list(range(3, 21, 2))
+
+
+@pytest.mark.parallel([2, 3, 4])
+@pytest.mark.parametrize(("engine", "looks"), [("ts", (500, 150)), ("propagator", (170, 50))])
+@pytest.mark.parametrize("writer", ["gather", "parallel"])
+def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(folder, engine, looks, writer):
+    """On one rank, then on all, then on all but one; contacts last over both checkpoints."""
+    comm = MPI.COMM_WORLD
+    sections = {"contacts": {"sites": [12, 8, 1, 13, 24], "restitution": 0.7}, "output": {"writer": writer}}
+    case = small_case(time={"end": 0.05, "engine": engine}, **sections)
+    fewer = comm.Split(int(comm.rank == 0))
+    if comm.rank == 0:
+        simulate(case, folder / "straight", MPI.COMM_SELF)
+        assert simulate(case, folder / "stopped", MPI.COMM_SELF, stop=StopAt(looks[0])).resumable
+    comm.Barrier()
+    assert simulate(case, folder / "stopped", resume=True, stop=StopAt(looks[1])).resumable
+    comm.Barrier()
+    if comm.rank:
+        assert simulate(case, folder / "stopped", fewer, resume=True).complete
+    comm.Barrier()
+    fewer.Free()
+    if comm.rank == 0:
+        first, second = (datasets(folder / name / "run.h5") for name in ("straight", "stopped"))
+        assert_same_bits(first, second)
+        assert len(first["impacts/site"]) > 10
 
 
 @pytest.mark.parallel([1, 2])

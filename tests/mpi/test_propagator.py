@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, small_case
+from tests.conftest import small_case
 from tests.mpi.test_partition import runs_alike
 from vipetsc.case import Case
-from vipetsc.dynamics import simulate
 
 
 @pytest.mark.parallel([1, 2, 3, 4])
@@ -44,12 +43,3 @@ def test_same_bits_diatomic_and_driven_in_the_middle(folder):
         "time": {"end": 0.05, "engine": "propagator"},
     }
     runs_alike(folder, Case.from_table(table))
-
-
-@pytest.mark.parallel([2, 3])
-def test_a_stopped_run_goes_on_to_the_same_bits(folder):
-    case = small_case(contacts={"sites": [1, 8, 12, 13]}, time={"end": 0.04, "engine": "propagator"})
-    simulate(case, folder / "straight")
-    assert simulate(case, folder / "stopped", stop=StopAt(120)).resumable
-    assert simulate(case, folder / "stopped", resume=True).complete
-    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "stopped")))

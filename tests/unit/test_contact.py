@@ -20,7 +20,7 @@ from vipetsc.contact.law import (
     elastic_force,
     elastic_force_and_slope,
 )
-from vipetsc.contact.tracker import ImpactTracker
+from vipetsc.contact.tracker import TRACKED, ImpactTracker
 from vipetsc.lattice import Contact
 
 KC, D, R = 3e5, 2e-4, 0.7
@@ -168,11 +168,11 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     site = tracker.contacts.sites[1]
     tracker.start[1] = -D, 0.01, 0.0  # touches on the side -1, moving away: a graze
     assert tracker.switch(0.1, np.array([0.0, 0.25])) == 0
-    assert tracker.counts["grazes"] == 1
+    assert tracker.counts["grazes"].tolist() == [0, 1]
     tracker.start[1] = -D, -0.01, 0.0
     assert tracker.switch(0.2, np.array([0.0, 0.25])) == 1
     assert (site["mode"], site["approach"]) == (-CLOSED, -0.05)
-    assert (tracker.counts["floored"], tracker.counts["grazes"]) == (1, 1)
+    assert tracker.counts[1].tolist() == (1, 1, 0, 0)
     assert tracker.contact_time() == tracker.duration(0.05)
 
     tracker.end[1] = -1.5 * D, 0.0, 0.0
@@ -186,10 +186,12 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     assert np.isnan(episode.separation)
     assert episode.indentation == pytest.approx(0.5 * D, rel=0.05)
     assert episode.force > KC * (0.5 * D) ** 1.5
-    assert tracker.counts["pulled"] == 1
+    assert tracker.counts["pulled"].tolist() == [0, 1]
 
     resumed = ImpactTracker(create_contacts(contact, [D, D]), (4, 9), 0.003)
-    resumed.restore(tracker.checkpoint())
+    table = np.zeros(10, TRACKED)
+    table[[4, 9]] = tracker.checkpoint()
+    resumed.restore(table)
     for each in (tracker, resumed):
         each.start[1] = -D, 0.2, 0.0
         assert each.switch(0.3, np.array([0.0, 0.75])) == 1
@@ -200,7 +202,7 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
             {},
             [FREE, FREE],
         )
-        assert each.counts == tracker.counts
+        assert each.counts.tolist() == tracker.counts.tolist()
     assert tracker.contact_time() == np.inf
 
 
@@ -225,7 +227,7 @@ def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
     tracker.start[0] = 1.01 * D, -0.1, 0.0
     assert tracker.switch(0.0, np.zeros(1)) == 1
     assert tracker.contacts.sites["mode"].tolist() == [CLOSED]
-    assert tracker.counts["grazes"] == 0
+    assert tracker.counts["grazes"].sum() == 0
 
 
 @LAWS

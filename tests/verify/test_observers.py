@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
-from vipetsc.dynamics import observers, simulate
+from vipetsc.dynamics import recorder, simulate
 from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample
 
@@ -117,7 +117,7 @@ def test_a_run_stopped_at_its_end_still_knows_its_work(folder, monkeypatch):
     """Killed while its files are put together: nothing is left to simulate, and nothing is forgotten."""
     case = small_case(time={"end": 0.0254})
     assert case.model().samples % 128 == 0
-    monkeypatch.setattr(observers, "CHUNK_SAMPLES", 128)
+    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 128)
     straight = simulate(case, folder / "straight")
     monkeypatch.setattr("vipetsc.io.store.RunFolder.finish", lambda *_: None)
     simulate(case, folder / "killed")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets, small_case
-from vipetsc.dynamics import observers, simulate
+from vipetsc.dynamics import recorder, simulate
 from vipetsc.io import store
 from vipetsc.io.atomic import load_arrays, save_arrays
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
@@ -21,7 +21,7 @@ PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
     case = small_case(**sections, time={"end": 0.04})
     simulate(case, folder / "long")
-    monkeypatch.setattr(observers, "CHUNK_SAMPLES", 7)
+    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 7)
     simulate(case, folder / "short")
     assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("long", "short")))
 
@@ -60,7 +60,7 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(store, "put_chunks", fails)
-    monkeypatch.setattr(observers, "CHUNK_SAMPLES", 16)
+    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 16)
     with pytest.raises(OSError, match=r"run\.h5 could not be written: No space"):
         simulate(case, path, force=True)
     assert (path / "run.h5").read_bytes() == before
@@ -76,7 +76,7 @@ def test_episodes_stand_in_the_order_of_their_onsets():
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4)}
     memory = RunMemory()
     memory.begin("", force=False, resume=False)
-    memory.recording = Recording(given | {"sites/cell": np.arange(1, 4)}, (), None)
+    memory.recording = Recording(given | {"sites/cell": np.arange(1, 4)}, (), False)
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
         chunk = {n: np.zeros(1) if dims == "time" else np.arange(len(sites)) * 1.0 for n, (dims, *_) in SAMPLED.items()}
         chunk |= {"impacts/site": np.array(sites), "impacts/onset": np.array(onsets)}

@@ -1,16 +1,17 @@
 """Modes of sites over time: switching at located changes, and the log of impacts."""
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 
 import numpy as np
 from scipy.special import gamma
 
 from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
-from vipetsc.contact.law import CLIPPED, FREE, Contacts, elastic_force
+from vipetsc.contact.law import CLIPPED, FREE, SITE, Contacts, elastic_force
 
 # Limits of the contact law, of which it is counted how often they acted.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
+COUNTS = np.dtype([(name, np.int64) for name in LIMITS])
 
 
 @dataclass
@@ -30,6 +31,12 @@ class Episode:
     loss: float = 0.0
 
 
+EPISODE = np.dtype([(field.name, field.type) for field in fields(Episode)])
+_OF_SITES = {"number": np.int64, "site": SITE, "counts": COUNTS, "lasts": bool, "pulls": bool, "episode": EPISODE}
+TRACKED = np.dtype(list(_OF_SITES.items()))
+"""A site in a checkpoint: its number, its mode and law, counts of limits, its episode if one ``lasts``."""
+
+
 class ImpactTracker:
     """Switches the modes of ``contacts`` at located changes and logs every episode.
 
@@ -47,7 +54,7 @@ class ImpactTracker:
         self.open: dict[int, Episode] = {}
         self.pulling: set[int] = set()
         self.closed: list[Episode] = []
-        self.counts = dict.fromkeys(LIMITS, 0)
+        self.counts = np.zeros(len(numbers), COUNTS)
 
     def contact_time(self) -> float:
         """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
@@ -67,7 +74,7 @@ class ImpactTracker:
         pull = -reached.smallest_force
         if pull > 0.0 and i not in self.pulling and pull > self.landing_force(i, episode):
             self.pulling.add(i)
-            self.counts["pulled"] += 1
+            self.counts["pulled"][i] += 1
 
     def landing_force(self, i: int, episode: Episode) -> float:
         """Largest pull in N that is none: of the law continued to a landing short of D, or beyond g = 0."""
@@ -88,7 +95,7 @@ class ImpactTracker:
                     continue
                 # At a landing |w - D| is rounding: the rate tells on which side the site goes on.
                 if rate <= 0 and value <= tolerance:
-                    self.counts["grazes"] += int(site["mode"] == FREE)
+                    self.counts["grazes"][i] += int(site["mode"] == FREE)
                     continue
                 self._set_mode(i, mode, t, float(energies[i]))
                 switched += 1
@@ -101,7 +108,7 @@ class ImpactTracker:
         site["mode"] = mode
         if before == FREE:
             rate, floor = float(self.start[i, 1]), self.contacts.law.approach_floor
-            self.counts["floored"] += int(abs(rate) < floor)
+            self.counts["floored"][i] += int(abs(rate) < floor)
             site["approach"] = side * max(abs(rate), floor)
             self.open[i] = Episode(self.numbers[i], side, t, rate, loss=-energy)
         elif mode == FREE:
@@ -111,7 +118,7 @@ class ImpactTracker:
             episode.loss += energy
             self.closed.append(episode)
         elif abs(mode) == CLIPPED:
-            self.counts["clipped"] += 1
+            self.counts["clipped"][i] += 1
 
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> list[Episode]:
         """Episodes closed since the last call, and ``unfinished`` ones as they are; ``energies`` as in ``switch``."""
@@ -128,19 +135,17 @@ class ImpactTracker:
         integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
         return float(2 * integral * depth / speed)
 
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """Sites with their modes, open episodes and counts."""
-        episodes = [[i, i in self.pulling, *astuple(e)] for i, e in self.open.items()]
-        return {
-            "sites": self.contacts.sites.copy(),
-            "open": np.array(episodes, float),
-            "impact_counts": np.array(list(self.counts.values())),
-        }
+    def checkpoint(self) -> np.ndarray:
+        """Sites with their modes, counts and open episodes (sites,) of dtype ``TRACKED``."""
+        table = np.zeros(len(self.numbers), TRACKED)
+        table["number"], table["site"], table["counts"] = self.numbers, self.contacts.sites, self.counts
+        for i, episode in self.open.items():
+            table["lasts"][i], table["pulls"][i], table["episode"][i] = True, i in self.pulling, astuple(episode)
+        return table
 
-    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
-        """Go back to a checkpoint."""
-        self.contacts.sites[:] = checkpoint["sites"]
-        rows = checkpoint["open"].tolist()
-        self.open = {int(row[0]): Episode(int(row[2]), int(row[3]), *row[4:]) for row in rows}
-        self.pulling = {int(row[0]) for row in rows if row[1]}
-        self.counts = dict(zip(LIMITS, checkpoint["impact_counts"].tolist(), strict=True))
+    def restore(self, table: np.ndarray) -> None:
+        """Go back to a checkpoint, the ``table`` of all sites by their numbers."""
+        mine = table[list(self.numbers)]
+        self.contacts.sites[:], self.counts[:] = mine["site"], mine["counts"]
+        self.open = {i: Episode(*mine["episode"][i].tolist()) for i in np.flatnonzero(mine["lasts"]).tolist()}
+        self.pulling = set(np.flatnonzero(mine["pulls"]).tolist())

@@ -1,6 +1,7 @@
 """What every engine offers to a simulation."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from petsc4py import PETSc
@@ -53,11 +54,11 @@ class Engine(ABC):
 
     @abstractmethod
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """All that a resumed run needs to go on with the same bits, this rank's share."""
+        """All that a resumed run needs to go on with the same bits: this rank's cells and sites, and what all share."""
 
     @abstractmethod
-    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
-        """Go back to a checkpoint."""
+    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go back to a checkpoint, given the shares of all ranks that wrote it, in their order, however many."""
 
     @abstractmethod
     def destroy(self) -> None:

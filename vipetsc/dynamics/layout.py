@@ -8,6 +8,7 @@ the left, then on the right. Mass by mass keeps every inner loop contiguous.
 Compiled kernels see a rank's part as a ``LatticeRecord``: tables of masses, springs and sites, and the drive.
 """
 
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -67,7 +68,28 @@ class Layout:
         array = np.zeros(self.size + indices.size) if array is None else array
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
+    def checkpoint(self, y: np.ndarray) -> dict[str, np.ndarray]:
+        """The part ``y`` of the state in natural order: ``cells`` (cell, 2 dofs), and the ledger."""
+        motion, ledger = y[: 2 * self.dofs * self.owned], y[2 * self.dofs * self.owned : self.size]
+        cells = motion.reshape(2 * self.dofs, self.owned).T
+        losses = np.array([*zip(self.sites, ledger[self.owns_drive :], strict=True)], LOSS)
+        return {"cells": cells.copy(), "work": ledger[: self.owns_drive].copy(), "losses": losses}
 
+    def restore(self, shares: Sequence[Mapping[str, np.ndarray]], y: np.ndarray) -> None:
+        """Fill this rank's part ``y`` of the state, given the checkpoints of all ranks that there were."""
+        tables = join(shares, ("cells", "work", "losses"))
+        losses = np.sort(tables["losses"], order="site")["loss"][list(self.sites)]
+        motion = tables["cells"][self.start : self.stop].T.ravel()
+        y[: self.size] = np.concatenate([motion, tables["work"][: self.owns_drive], losses])
+
+
+def join(shares: Sequence[Mapping[str, np.ndarray]], names: Iterable[str]) -> dict[str, np.ndarray]:
+    """The tables ``names`` of a checkpoint's ``shares``, one after the other."""
+    return {name: np.concatenate([share[name] for share in shares]) for name in names}
+
+
+LOSS = np.dtype([("site", np.int64), ("loss", np.float64)])
+"""A site's number, from 0, and its dissipated energy in J."""
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
 COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64)])

@@ -15,8 +15,10 @@ from vipetsc.case import Case, Model
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.observers import Guard, Ledger, Observer, Recorder, RunawayError, Sample, Setup
+from vipetsc.dynamics.memory import check_memory
+from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample, Setup
 from vipetsc.dynamics.propagator.engine import Propagator
+from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import provenance
 from vipetsc.io.store import RunFolder, RunOutput
@@ -79,6 +81,8 @@ def simulate(
 
     Raises
     ------
+    CaseError
+        If the run needs more memory than there is.
     FolderError
         If the folder cannot be used as asked.
     OSError
@@ -87,15 +91,16 @@ def simulate(
     begin = time.perf_counter(), time.process_time()
     output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
     model = case.model()
+    kind, refusal = select_engine(case.time.engine, model)
+    check_memory(model, case.output, kind.name, output.comm)
     output.begin(case.to_toml(), force, resume)
     sys.audit("vipetsc.set-up", case.name)
     layout = Layout(model, output.comm)
-    kind, refusal = select_engine(case.time.engine, model)
     setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
     run = Run(setup, [*OBSERVERS, *(["progress"] if progress else []), *observers])
-    state = output.last_state() if resume else None
-    if state is not None:
-        run.restore(state)
+    shares = output.last_state() if resume else None
+    if shares is not None:
+        run.restore(shares)
     ending, sentence = run.advance()
     return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
 
@@ -118,9 +123,10 @@ class Run:
         for observer in self.observers:
             observer.begin(setup)
 
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on after a checkpoint."""
-        self.setup.engine.restore(dict(state))
+    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go on after a checkpoint, given the shares of all ranks that wrote it, however many."""
+        self.setup.engine.restore(shares)
+        state = shares[0]
         self.samples, self.last = int(state["samples"]), self.setup.engine.time
         for observer in self.observers:
             prefix = f"{observer.name}/"

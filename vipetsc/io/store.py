@@ -2,8 +2,10 @@
 
 While a run goes on, its samples are kept as chunks: chunk k holds those between the checkpoints k - 1 and k. A chunk
 and a checkpoint are named arrays; a rank writes its share of each into a file of its own, so nothing is sent while a
-run goes on. When it has ended, the chunks become one dataset in the layout of ``io.netcdf``. Its fields (t, cell, dof)
-are too large to be held whole: they are copied chunk by chunk, to a file of one rank or to one that all ranks share.
+run goes on. Every share says what it is of, so that another number of ranks can go on with it: fields come with
+``columns``, the half-open range of the recorded cells that they are of. When the run has ended, the chunks become one
+dataset in the layout of ``io.netcdf``. Its fields (t, cell, dof) are too large to be held whole: they are copied chunk
+by chunk, to a file of one rank or to one that all ranks share.
 """
 
 import json
@@ -11,7 +13,7 @@ import os
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.io.atomic import Arrays, load_arrays, save_arrays, unwritten, write_text
-from vipetsc.io.folder import RUN, FolderError, claim_folder
+from vipetsc.io.folder import RUN, claim_folder
 from vipetsc.io.netcdf import add_variable, put_dataset, tabulated
 from vipetsc.parallel import on_every_rank, on_root
 
@@ -66,12 +68,12 @@ class Recording:
     """What the chunks of a run hold.
 
     ``given``: the arrays of ``GIVEN``, but for the episodes; ``fields``: those of ``FIELDS`` that are recorded;
-    ``columns``: the recorded cells whose fields this rank's chunks hold, None where rank 0's hold those of all.
+    ``together``: whether all ranks write the fields into one file that they share, instead of rank 0 alone.
     """
 
     given: Arrays
     fields: tuple[str, ...]
-    columns: slice | None
+    together: bool
 
 
 class RunFolder:
@@ -115,38 +117,45 @@ class RunFolder:
 
     def save_state(self, state: Arrays) -> None:
         """Keep this rank's checkpoint after the last chunk, and the one before; as ``append``."""
-        number = self.count - 1
+        number, path = self.count - 1, self._state(self.count - 1, self.comm.rank, self.comm.size)
 
         def replace_oldest() -> None:
-            save_arrays(self._state(number), state)
-            self._state(number - 2).unlink(missing_ok=True)
+            save_arrays(path, state)
+            if self.comm.rank == 0:
+                for old in self._parts.glob(f"state-{number - 2:06d}-*"):
+                    old.unlink()
 
         on_every_rank(self.comm, replace_oldest)
 
-    def last_state(self) -> Arrays | None:
-        """Go back to the last checkpoint that all ranks wrote, if there is one: ``count``, and this rank's share.
+    def last_state(self) -> Sequence[Arrays] | None:
+        """Go back to the last checkpoint that is complete, if there is one: ``count``, and the shares of all its ranks.
 
-        All ranks must call it; raises FolderError if it was written by another number of ranks.
+        However many there were; all ranks must call it.
         """
 
-        def last_complete() -> int:
+        def last_complete() -> tuple[int, int]:
             names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
-            sizes = {int(size) for *_, size in names}
-            if sizes - {self.comm.size}:
-                message = f"was begun on {max(sizes)} ranks; resume with mpirun -n {max(sizes)}"
-                raise FolderError(f"{self.folder}: {message}")
-            counts = Counter(int(number) for _, number, *_ in names)
-            return max((number for number, count in counts.items() if count == self.comm.size), default=-1)
+            counts = Counter((int(number), int(size)) for _, number, _, size in names)
+            last = max((key for key, count in counts.items() if count == key[1]), default=(-1, 0))
+            for path in self._parts.glob("*-*-*.npy"):
+                if int(path.stem.split("-")[1]) > last[0]:
+                    path.unlink()  # another number of ranks would not replace it
+            return last
 
-        number = on_root(self.comm, last_complete)
+        number, size = on_root(self.comm, last_complete)
         self.count = number + 1
-        return on_every_rank(self.comm, lambda: load_arrays(self._state(number))) if number >= 0 else None
+        paths = [self._state(number, rank, size) for rank in range(size)]
+        return on_every_rank(self.comm, lambda: [load_arrays(path) for path in paths]) if paths else None
 
     def _chunk(self, number: int, rank: int) -> Path:
         return self._parts / f"part-{number:06d}-{rank}.npy"
 
-    def _state(self, number: int) -> Path:
-        return self._parts / f"state-{number:06d}-{self.comm.rank}-{self.comm.size}.npy"
+    def _state(self, number: int, rank: int, size: int) -> Path:
+        return self._parts / f"state-{number:06d}-{rank}-{size}.npy"
+
+    def ranks(self, number: int) -> list[int]:
+        """Those that kept a share of chunk ``number``."""
+        return [int(path.stem.split("-")[2]) for path in self._parts.glob(f"part-{number:06d}-*.npy")]
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Put the chunks together; all ranks must call it. Raises OSError on all ranks if one cannot write.
@@ -154,22 +163,22 @@ class RunFolder:
         ``attributes`` besides the case are the root's, the same on all ranks; ``summary.json`` tells them and
         ``summary``. ``run.h5`` takes its name when it is complete, then the chunks go.
         """
-        target, aside, columns = self.folder / "run.h5", self.folder / ".run.h5.part", self.recording.columns
+        target, aside, together = self.folder / "run.h5", self.folder / ".run.h5.part", self.recording.together
 
         def write() -> None:
             sys.audit("vipetsc.assemble", str(target))
-            if columns is None and self.comm.rank:
+            if not together and self.comm.rank:
                 return
             data = dataset_without_fields(self, attributes)
             try:
-                with h5py.File(aside, "w", **({"driver": "mpio", "comm": self.comm} if columns else {})) as file:
+                with h5py.File(aside, "w", **({"driver": "mpio", "comm": self.comm} if together else {})) as file:
                     put_dataset(file, data, write=self.comm.rank == 0)
                     dims = field_dimensions(data)
                     shape = [data.sizes[dim] for dim in dims]
                     # All of them first: ranks create together, but each copies and may fail alone.
                     fields = {n: add_variable(file, n, dims, shape, float, FIELDS[n]) for n in self.recording.fields}
                     for name, field in fields.items():
-                        put_chunks(field, self, name, columns or slice(None))
+                        put_chunks(field, self, name)
             except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
                 raise unwritten(target, error) from error
 
@@ -258,12 +267,16 @@ def field_dimensions(data: xr.Dataset) -> list[str]:
     return ["field_time" if "field_time" in data else "time", "cell", "dof"]
 
 
-def put_chunks(field: h5py.Dataset, output: RunOutput, name: str, columns: slice) -> None:
-    """Copy the field ``name`` of all chunks of this rank to the cells ``columns`` of ``field``."""
-    first = 0
+def put_chunks(field: h5py.Dataset, output: RunFolder, name: str) -> None:
+    """Copy the field ``name`` of all chunks to ``field``; ranks that write together share the files."""
+    first, comm = 0, output.comm
     for number in range(output.count):
-        values = output.read(number, output.comm.rank, [name])[name]
-        # h5py leaves out empty selections, on which writing together would hang.
-        if values.size:
-            field[first : first + len(values), columns] = values
-        first += len(values)
+        rows = output.read(number, 0, ["field_time"])["field_time"].size
+        for rank in output.ranks(number):
+            if output.recording.together and rank % comm.size != comm.rank:
+                continue
+            share = output.read(number, rank, [name, "columns"])
+            # h5py leaves out empty selections, on which writing together would hang.
+            if share[name].size:
+                field[first : first + rows, slice(*share["columns"])] = share[name]
+        first += rows

@@ -1,7 +1,7 @@
 """The engine of exact linear steps; the package's docstring has the method."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -202,15 +202,15 @@ class Propagator(Engine):
         }  # fmt: skip
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """All that a resumed run needs to go on with the same bits, this rank's share."""
-        state = self._components[self.steps % 2, : self._layout.size].copy()
-        return {"state": state, "steps": np.array(self.steps)} | self._forces.checkpoint()
+        """See ``Engine``."""
+        state = self._layout.checkpoint(self._components[self.steps % 2])
+        return state | {"steps": np.array(self.steps)} | self._forces.checkpoint()
 
-    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
-        """Go back to a checkpoint."""
-        steps = int(checkpoint["steps"])
-        self._components[steps % 2, : self._layout.size] = checkpoint["state"]
-        self._forces.restore(checkpoint)
+    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """See ``Engine``."""
+        steps = int(shares[0]["steps"])
+        self._layout.restore(shares, self._components[steps % 2])
+        self._forces.restore(shares)
         self._start(steps)
 
     def destroy(self) -> None:

@@ -3,6 +3,7 @@
 Sec. 5 and 6 of the derivation in the package's docstring.
 """
 
+from collections.abc import Mapping, Sequence
 from itertools import chain, compress
 from math import factorial
 from typing import Any
@@ -15,8 +16,8 @@ from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Extremes
 from vipetsc.contact.law import Contacts, create_contacts
-from vipetsc.contact.tracker import LIMITS, Episode, ImpactTracker
-from vipetsc.dynamics.layout import Layout, create_burst
+from vipetsc.contact.tracker import LIMITS, TRACKED, Episode, ImpactTracker
+from vipetsc.dynamics.layout import Layout, create_burst, join
 from vipetsc.dynamics.propagator.advance import ORDER
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries
@@ -24,6 +25,8 @@ from vipetsc.dynamics.propagator.stencil import HaloRegions
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1
+FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY), ("cluster", SUBSTEP_STATE)])
+"""A DoF of ``contact_dofs`` in a checkpoint: its number, -1 for the driven mass, and what its cluster's record has."""
 
 
 def contact_dofs(model: Model) -> np.ndarray:
@@ -111,7 +114,8 @@ class Forces:
         )
         self.clusters.state["length"] = 1.0
         self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
-        self._logs = [layout.start <= dofs["cell"][group[0]] < layout.stop for group in groups]
+        self._numbers = list(chain(*groups))
+        self._logs = np.array([layout.start <= dofs["cell"][group[0]] < layout.stop for group in groups], bool)
         self._clusters = [select_cluster(self.clusters, self.dofs, c) for c in range(len(groups))]
         self.trackers = []
         for group, cluster in zip(groups, self._clusters, strict=True):
@@ -150,27 +154,29 @@ class Forces:
 
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
-        limits = [list(tracker.counts.values()) for tracker in compress(self.trackers, self._logs)]
+        sites = self.checkpoint()["sites"]["counts"]
         total = np.array([*(self.clusters.state[name][self._logs].sum() for name in COUNTS),
-                          *np.array(limits, np.int64).reshape(-1, len(LIMITS)).sum(axis=0)])  # fmt: skip
+                          *(sites[name].sum() for name in LIMITS)])  # fmt: skip
         self._comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         return dict(zip((*COUNTS, *LIMITS), total.tolist(), strict=True))
 
-    def _saved(self) -> dict[str, np.ndarray]:
-        return {"energy": self.clusters.energy, "history": self.clusters.history, "clusters": self.clusters.state}
-
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """All that a resumed run needs."""
-        logs = {f"cluster-{c}-{name}": array for c, tracker in enumerate(self.trackers)
-                for name, array in tracker.checkpoint().items()}  # fmt: skip
-        return logs | {name: array.copy() for name, array in self._saved().items()}
+        """``forces`` and ``sites`` of the clusters that this rank logs."""
+        sizes, clusters = np.diff(self.dofs.first), self.clusters
+        forces = np.zeros(len(self._numbers), FORCE)
+        forces["number"], forces["energy"], forces["history"] = self._numbers, clusters.energy, clusters.history
+        forces["cluster"] = np.repeat(clusters.state, sizes)
+        sites = [np.zeros(0, TRACKED), *(tracker.checkpoint() for tracker in compress(self.trackers, self._logs))]
+        return {"forces": forces[np.repeat(self._logs, sizes)], "sites": np.concatenate(sites)}
 
-    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
-        """Go back to a checkpoint."""
-        for name, array in self._saved().items():
-            array[:] = checkpoint[name]
-        for c, tracker in enumerate(self.trackers):
-            tracker.restore({name: checkpoint[f"cluster-{c}-{name}"] for name in tracker.checkpoint()})
+    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go back to a checkpoint; all ranks that a cluster reaches go on from the same numbers."""
+        tables = {name: np.sort(table, order="number") for name, table in join(shares, ("forces", "sites")).items()}
+        mine = tables["forces"][np.array(self._numbers, int) + 1]  # from -1, the driven mass
+        self.clusters.energy[:], self.clusters.history[:] = mine["energy"], mine["history"]
+        self.clusters.state[:] = mine["cluster"][self.dofs.first[:-1]]
+        for tracker in self.trackers:
+            tracker.restore(tables["sites"])
 
 
 def _owned_cells(cells: np.ndarray, reach: int, layout: Layout) -> np.ndarray:

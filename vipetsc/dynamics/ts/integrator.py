@@ -4,6 +4,7 @@ The method stands in the package's docstring.
 """
 
 import sys
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mpi4py import MPI
@@ -14,9 +15,9 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.contact.changes import Change, first_change, switching
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
-from vipetsc.contact.tracker import Episode, ImpactTracker
+from vipetsc.contact.tracker import LIMITS, Episode, ImpactTracker
 from vipetsc.dynamics.engine import Engine, StalledError
-from vipetsc.dynamics.layout import Layout, create_record
+from vipetsc.dynamics.layout import Layout, create_record, join
 from vipetsc.dynamics.ts.right_hand_side import observe, register, right_hand_side
 from vipetsc.parallel import StopRequest
 
@@ -48,7 +49,7 @@ class Integrator(Engine):
     name = "ts"
 
     def __init__(self, model: Model, layout: Layout, native: bool = True, stop: StopRequest | None = None) -> None:
-        self.comm = layout.comm
+        self.comm, self.layout = layout.comm, layout
         self.lattice = create_record(model, layout)
         self.tracker = ImpactTracker(self.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
@@ -235,27 +236,31 @@ class Integrator(Engine):
 
     def statistics(self) -> dict[str, Any]:
         """Steps, what landings and limits of the contact law there were, and how the right-hand side is called."""
-        of_sites = {"switches": self.counts["switches"]} | self.tracker.counts
-        sums = {name: self.comm.allreduce(count) for name, count in of_sites.items()}
+        of_sites = np.array([self.counts["switches"], *(self.tracker.counts[name].sum() for name in LIMITS)])
+        self.comm.Allreduce(MPI.IN_PLACE, of_sites, MPI.SUM)
+        sums = dict(zip(("switches", *LIMITS), of_sites.tolist(), strict=True))
         return self.counts | sums | {"method": self.ts.getRKType(), "right_hand_side": self.right_hand_side}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """See ``Engine``."""
-        return self.tracker.checkpoint() | {
-            "state": self.state.array_r.copy(),
+        return self.layout.checkpoint(self.state.array_r) | {
+            "sites": self.tracker.checkpoint(),
             "time": np.array(self.time),
             "steps": np.array([self.step, self.free_step, float(self._any_open)]),
-            "counts": np.array(list(self.counts.values())),
+            "counts": np.array([list(self.counts.values())]),
         }
 
-    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
+    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
         """See ``Engine``."""
-        self.tracker.restore(checkpoint)
-        self.state.array[:] = checkpoint["state"]
-        self.time = float(checkpoint["time"])
-        self.step, self.free_step, any_open = checkpoint["steps"].tolist()
+        tables, common = join(shares, ("sites", "counts")), shares[0]
+        self.layout.restore(shares, self.state.array)
+        self.tracker.restore(np.sort(tables["sites"], order="number"))
+        self.time = float(common["time"])
+        self.step, self.free_step, any_open = common["steps"].tolist()
         self._any_open = bool(any_open)
-        self.counts = dict(zip(self.counts, checkpoint["counts"].tolist(), strict=True))
+        self.counts = dict(zip(self.counts, common["counts"][0].tolist(), strict=True))
+        # A rank counts the switches of its own sites: those so far are rank 0's from now on.
+        self.counts["switches"] = int(tables["counts"][:, -1].sum()) if self.comm.rank == 0 else 0
         self.ts.restartStep()
         self.observe(self.tracker.start)
 
