@@ -19,7 +19,7 @@ from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, U
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvidence
 from vipetsc.paper.claims.measure import READINGS, measure_claim, rounded
 from vipetsc.paper.claims.scattering import BRANCHES
-from vipetsc.spectra import Parts, dispersion, part_energies, power_law
+from vipetsc.spectra import FEWEST, Parts, dispersion, part_energies, power_law
 from vipetsc.studies.ensemble import COMPLETE, Outcome, assemble
 
 IDS = [f"C{i}" for i in range(1, 18)]
@@ -198,7 +198,7 @@ def test_thresholds_are_those_specified():
 
 
 def test_constants_inside_of_quantities_are_those_specified():
-    assert (constants.STRAIGHT, constants.STRAIGHT_EVERYWHERE, constants.FEWEST) == (0.95, 0.9, 4)
+    assert (constants.STRAIGHT, constants.STRAIGHT_EVERYWHERE, FEWEST) == (0.95, 0.9, 4)
     assert (constants.QUIET, constants.PEAK, constants.HIGH, constants.SEVERAL) == (0.1, (0.9, 1.8), 10.0, 3)
     assert (constants.ABRUPT, constants.LOW) == (10**0.5, 10)
     assert (constants.BESIDE, constants.NATIVE) == (0.02, (7, 8))
@@ -338,7 +338,7 @@ def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
 
     put_entropies(tmp_path, ["5pi/9"], ragged, lambda case: 0.1)
     found = measure("C7", tmp_path)
-    assert found.verdict == IN_PART and "5 (" in found.reason and "not met" in found.reason
+    assert found.verdict == IN_PART and "with 5 sites, spread" in found.reason and "not met" in found.reason
     assert found.value[SPREAD_FIT] == pytest.approx(0.5)
     assert measure("C9", tmp_path).verdict == FAILS
 
@@ -390,6 +390,14 @@ def test_fits_of_three_points_do_not_count(tmp_path):
         with h5py.File(tmp_path / "scattering" / "ensemble.h5", "r+") as file:
             file["fits/entropy/energy_weighted/points"][...] = points
         assert measure("C8", tmp_path).verdict == expected
+    # Nor are they printed as power laws, whatever their R^2.
+    found = measure("C7", tmp_path)
+    assert "no power law with 5 sites, spread: too few points (3)" in found.reason
+    assert found.value["exponent, 5 sites, spread"] is None
+    with h5py.File(tmp_path / "scattering" / "ensemble.h5", "r+") as file:
+        file["fits/entropy/energy_weighted/points"][...] = 9
+        file["fits/entropy/energy_weighted/r2_log_log"][...] = -0.25
+    assert "no power law with 5 sites, spread: adjusted R² -0.25" in measure("C7", tmp_path).reason
 
 
 # Low, medium and high amplitude of the diatomic lattice

@@ -95,6 +95,7 @@ def test_a_law_is_fitted_from_the_largest_value_on():
     assert (fit["peak_amplitude"], fit["peak"], fit["points"]) == (amplitude[4], law[4], 8)
     assert fit["exponent"] == pytest.approx(-0.8, abs=1e-12) and fit["factor"] == pytest.approx(3.0)
     assert fit["r2_log_log"] == pytest.approx(1.0) and fit["exponent_nonlinear"] == pytest.approx(-0.8)
+    assert fit["law"] == 1 and fit_curve(amplitude[:7], curve[:7], normalise=False)["law"] == 0  # three points
     assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])  # two points behind the peak
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from vipetsc.spectra import normalised, power_law
+from vipetsc.spectra import doubt, normalised, power_law
 from vipetsc.spectra.fits import r2_adjusted
 
 METHODS = ("log-log", "nonlinear")
@@ -110,3 +110,9 @@ def test_bad_points_are_named():
     with pytest.raises(ValueError, match="same length"):
         power_law([1.0, 2.0, 3.0], [1.0, 2.0])
     assert np.isnan(r2_adjusted([1.0, 1.0, 1.0], [1.0, 1.0, 1.0]))
+
+
+def test_three_points_or_a_fit_worse_than_the_mean_are_no_power_law():
+    assert [doubt(*fit) for fit in ((4, 0.0), (9, 0.99))] == ["", ""]
+    assert doubt(3, 0.999) == "too few points (3)" and doubt(5, -0.04) == "adjusted R² -0.04"
+    assert doubt(5, np.nan) == doubt(np.nan, np.nan) == "no fit"

@@ -260,7 +260,7 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
         assert (upper.get_yscale(), lower.get_xscale(), lower.get_yscale()) == ("linear", "log", "log")
         assert upper.get_title(loc="left") == f"{sites} sites"
         thick = [line for line in lower.lines if line.get_linewidth() == 2]
-        if np.isfinite(fit["factor"]):
+        if fit["points"] >= 4 and fit["r2_log_log"] >= 0:
             x, y = thick[0].get_data()
             assert x[0] == pytest.approx(fit["peak_amplitude"])
             assert len(x) == fit["points"]
@@ -268,7 +268,9 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
             assert f"{fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})" in lower.texts[0].get_text()
         else:
             assert not thick
-            assert lower.texts[0].get_text() == "no power law"
+            assert (
+                lower.texts[0].get_text().startswith(("no power law: too few points (", "no power law: adjusted R² -"))
+            )
         printed = select(curves, sites=sites, **fixed | {"reading": "printed"})[f"entropy/{average}"].values
         grey = [line for line in lower.lines if line.get_color() == GREY]
         np.testing.assert_allclose(grey[0].get_ydata(), normalised(printed))

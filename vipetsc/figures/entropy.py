@@ -17,7 +17,7 @@ from vipetsc.figures.study import AMPLITUDE, Sweeps, counted, grouped, in_pi, re
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import member_folder, select
-from vipetsc.spectra import normalised
+from vipetsc.spectra import doubt, normalised
 
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
@@ -42,7 +42,7 @@ class EntropyCurve(NamedTuple):
         valid = np.isfinite(value)
         if valid.sum() < 2 or np.ptp(value[valid]) == 0:
             return None
-        names = ("factor", "exponent", "peak_amplitude", "r2_log_log", "r2_nonlinear")
+        names = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
         fit = {name: float(row[f"fits/entropy/{average}/{name}"]) for name in names}
         deviation = 0.99 * error[valid] / np.ptp(value[valid])
         return cls(row[AMPLITUDE].values[valid], normalised(value[valid]), deviation, fit)
@@ -191,14 +191,15 @@ def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) -> No
     """The curve in logarithms, the power law from the peak on as a thick black line with both adjusted R^2."""
     _points(axes, curve, average, size)
     amplitude, fit = curve.amplitude, curve.fit
-    if np.isfinite(fit["factor"]):
+    doubts = doubt(fit["points"], fit["r2_log_log"])
+    if not doubts:
         x = amplitude[amplitude >= fit["peak_amplitude"] * (1 - 1e-9)]
         label = "power law, adjusted R² (of nonlinear fit)"
         axes.plot(x, fit["factor"] * x ** fit["exponent"], color=style.BLACK, lw=2.0, zorder=4, label=label)
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", fontsize=6)
     else:
-        axes.text(0.04, 0.04, "no power law", transform=axes.transAxes, color=style.GREY)
+        axes.text(0.04, 0.04, f"no power law: {doubts}", transform=axes.transAxes, color=style.GREY)
     axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * amplitude[0], 1.25 * amplitude[-1]))
 
 

@@ -17,6 +17,7 @@ from vipetsc.figures.runs import centre_axes, refined
 from vipetsc.figures.study import AMPLITUDE, Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, field_interval, field_time
+from vipetsc.spectra import doubt
 
 MARKERS = "os^Dv"  # of configurations
 FEWEST = 6  # amplitudes that make a curve
@@ -125,6 +126,8 @@ def _superposition(axes: Axes, aligned: Curve) -> str:
     axes.plot(energy[fitted], transfer[fitted], "o", color=style.RED, ms=2.8, label="in region III")
     label = f"$E^{{{curve['exponent']:.2f}}}$, adj. $R^2$ {curve['r2_adjusted']:.3f}"
     law = curve["factor"] * energy[fitted] ** curve["exponent"]
+    if doubts := doubt(fitted.sum(), curve["r2_adjusted"]):
+        law, label = np.full_like(law, np.nan), f"no power law: {doubts}"
     axes.plot(energy[fitted], law, color=style.GREEN, lw=1.4, zorder=4, label=label)
     shade_regions(axes, np.minimum(np.where(region == 1, grazing, branch), right), region, left, at_top=False)
     axes.set(xscale="log", yscale="log", xlabel="Normalised energy (J)", xlim=(left, right), ylim=(0.25 * floor, 4.0))

@@ -2,6 +2,6 @@
 
 from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, split
 from vipetsc.spectra.entropies import Entropy, entropy, local_entropy
-from vipetsc.spectra.fits import PowerLaw, normalised, power_law
+from vipetsc.spectra.fits import FEWEST, PowerLaw, doubt, normalised, power_law
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
 from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform

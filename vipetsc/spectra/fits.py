@@ -13,6 +13,7 @@ from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
 LEVEL = 0.95
+FEWEST = 4  # points of a power law: three lie near some of them by chance
 
 Method = Literal["log-log", "nonlinear"]
 
@@ -28,6 +29,13 @@ class PowerLaw:
     exponent: float
     r2_adjusted: float
     exponent_interval: tuple[float, float]
+
+
+def doubt(points: float, r2: float) -> str:
+    """Why a fit over ``points`` with the adjusted R^2 ``r2`` is not to be called a power law; empty if it is one."""
+    if points < FEWEST:
+        return f"too few points ({points:g})"
+    return "no fit" if np.isnan(r2) else "" if r2 >= 0 else f"adjusted R² {r2:.2g}"
 
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:

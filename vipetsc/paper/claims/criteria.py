@@ -17,7 +17,6 @@ LAWS = "hertz", "bilinear"
 
 # Constants of quantities: what is counted or measured, rather than what decides.
 STRAIGHT, STRAIGHT_EVERYWHERE = 0.95, 0.9  # adjusted R^2 of a power law (SPEC 11, C7 and C8)
-FEWEST = 4  # points of a fit: three lie near some power law by chance
 QUIET = 0.1  # normalised entropy that is still "nearly zero" (sec. II.C)
 ABRUPT = 10**0.5  # ratio of amplitudes, half a decade, in which an abrupt rise leads from QUIET to half the peak
 PEAK = 0.9, 1.8  # N (sec. II.C; SPEC 4: 1.1-1.4 N)

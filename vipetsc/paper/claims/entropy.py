@@ -3,9 +3,9 @@
 import numpy as np
 import xarray as xr
 
-from vipetsc.paper.claims.criteria import ABRUPT, FEWEST, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
+from vipetsc.paper.claims.criteria import ABRUPT, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
 from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence, Measurement, MissingEvidence
-from vipetsc.spectra import normalised
+from vipetsc.spectra import FEWEST, doubt, normalised
 
 SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
 AVERAGES = "energy_weighted", "masked", "joint"
@@ -78,7 +78,7 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
             f"{len(late)} of {len(spread)} configurations peak only from {first:.3g} N on, so that as few as {fewest}"
             f" of {len(late[0].amplitude)} amplitudes are left for a power law"
         )
-    weak = [f"{c.sites} ({c.r2:.3f})" for c in spread if c.r2 < STRAIGHT]
+    weak = [f"{c.sites} ({c.r2:.3f})" for c in spread if c.r2 < STRAIGHT and not doubt(c.points, c.r2)]
     if weak:
         result.reasons.append(f"spread sites short of {STRAIGHT:g}: {', '.join(weak)}")
 
@@ -90,11 +90,13 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: s
     result.value[f"share of configurations of {sites} sites with {fit}"] = straight
     for c in configurations:
         name = f"{c.sites} {'site' if c.sites == 1 else 'sites'}, {kind}"
-        result.value[f"adjusted R^2 (log-log), {name}"] = c.r2
-        result.value[f"exponent, {name}"] = c.exponent
+        doubts = doubt(c.points, c.r2)
+        result.value[f"adjusted R^2 (log-log), {name}"] = c.r2 if c.points >= FEWEST else None
+        result.value[f"exponent, {name}"] = None if doubts else c.exponent
         result.value[f"peak (N), {name}"] = c.peak_amplitude
-        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = c.half_width
+        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = None if doubts else c.half_width
         result.uncertainty[f"points of the fit, {name}"] = c.points
+        result.reasons += [f"no power law with {name}: {doubts}"] if doubts else []
 
 
 def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -110,7 +112,7 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
     primary = by_average["energy_weighted"]
     shares = {a: np.mean([c.reaches(c.best, STRAIGHT_EVERYWHERE) for c in cs]) for a, cs in by_average.items()}
     fit = f"share of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g} over {FEWEST} points or more"
-    finite = [c.r2 for c in primary if np.isfinite(c.r2)]
+    finite = [c.r2 for c in primary if np.isfinite(c.r2) and c.points >= FEWEST]
     result.value |= {
         "share of curves that rise, peak and fall by half": np.mean([c.falls for c in primary]),
         fit: shares["energy_weighted"],
