@@ -154,6 +154,19 @@ def test_validate_prints_what_follows_from_the_case(in_process):
         assert text in ended.stdout
 
 
+def test_validate_reads_every_section_as_its_verb_does(in_process, tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text("[nnm]\nmodes = [2]\n[design]\nwavenumbers = 11\n[sweep.drive]\namplitude = [1.0, 2.0]\n")
+    ended = in_process("validate", path)
+    assert ended.returncode == 0
+    for text in ("restitution 0.7, effective 0.768", "2 members (2), 0 of them impossible", "reduced system of 2 masses",
+                 "37 lambda x 36 eta, 11 wavenumbers"):  # fmt: skip
+        assert text in ended.stdout
+    spoilt = in_process("validate", path, "--set", "nnm.modes=foo", "--set", "design.wavenumbers=1")
+    assert spoilt.returncode == 2
+    assert spoilt.stderr.count("nnm.modes = 'foo'") == spoilt.stderr.count("design.wavenumbers = 1") == 1
+
+
 def test_bands_as_json_and_picture(in_process, tmp_path):
     ended = in_process("bands", "--json", "--set", "lattice.reading=printed", "--out", tmp_path / "bands")
     assert ended.returncode == 0, ended.stderr

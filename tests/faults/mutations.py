@@ -22,6 +22,10 @@ from pydantic import BaseModel
 from vipetsc.case import Case, CaseError, CaseFile, DesignCase, NnmCase
 from vipetsc.case.every import load_every
 from vipetsc.case.sweep import SweepTable
+from vipetsc.cli.tables import case_table
+from vipetsc.dynamics import simulate
+from vipetsc.io.store import RunMemory
+from vipetsc.parallel import StopRequest
 
 RUNS = Path(__file__).parents[2] / "runs"
 HOSTILE: list[Any] = [
@@ -257,8 +261,6 @@ def limit(seconds: int) -> Iterator[None]:
 
 def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
     """Read ``mutation`` from ``path``, as ``validate`` does; anything but cases or a CaseError is a defect."""
-    from vipetsc.cli.tables import case_table
-
     path.write_bytes(mutation.text)
     begin = time.perf_counter()
     try:
@@ -276,23 +278,30 @@ def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
     return Verdict(tuple(cases), seconds=time.perf_counter() - begin)
 
 
-def run_shortly(case: Case, seconds: int = 20, samples: int = 100) -> str:
-    """Simulate the first ``samples`` samples of ``case`` in memory; "" if it ended in a result, else the defect.
+class Deadline(StopRequest):
+    """A request to stop that comes after ``seconds``: an exception from a signal would leave PETSc in a step."""
 
-    Cases of more than 2000 cells are left out, and ones that take longer than ``seconds`` count as good.
+    def __init__(self, seconds: float) -> None:
+        self.end = time.monotonic() + seconds
+
+    @property
+    def requested(self) -> bool:  # type: ignore[override]
+        """Whether the time is over."""
+        return time.monotonic() > self.end
+
+
+def run_shortly(case: Case, seconds: float = 20, samples: int = 100) -> str:
+    """Simulate the first ``samples`` samples of ``case`` in memory; "" if it ended with a sentence, else the defect.
+
+    Cases of more than 2000 cells are left out, and those that take longer than ``seconds`` are stopped.
     """
-    from vipetsc.dynamics import simulate
-    from vipetsc.io.store import RunMemory
-
-    interval = case.model().sample_interval
     if case.lattice.cells > 2000:
         return ""
     table = tomllib.loads(case.to_toml())
-    table["time"]["end"] = min(table["time"]["end"], samples * interval)
+    table["time"]["end"] = min(table["time"]["end"], samples * case.model().sample_interval)
     try:
-        with limit(seconds):
-            result = simulate(Case.from_table(table), RunMemory())
-    except (CaseError, TimeoutError):
+        result = simulate(Case.from_table(table), RunMemory(), stop=Deadline(seconds))
+    except CaseError:
         return ""
     except Exception as error:
         return f"{type(error).__name__}: {error}"
