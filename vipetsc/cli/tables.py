@@ -15,7 +15,6 @@ import numpy as np
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
 from vipetsc.io.folder import provenance
-from vipetsc.io.store import GATHER_LIMIT
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
 if TYPE_CHECKING:
@@ -103,19 +102,21 @@ def case_table(case: CaseFile, ranks: int) -> str:
 
 def run_case_table(case: Case, ranks: int) -> str:
     """What follows from a case of a run: bands, drive, times, samples, file size, cost."""
+    from vipetsc.dynamics.memory import memory_available, memory_needed
+    from vipetsc.dynamics.recorder import recorded_cells, written_together
+
     model = case.model()
     cell, chain, contact = model.chain.cell, model.chain, model.contact
     bands, waves = pass_bands(cell), waves_at(cell, model.drive.frequency)
-    first, last = case.output.window or (1, case.lattice.cells)
-    columns = len(range(first - 1, last, case.output.every)) * cell.dofs * len(case.output.fields)
+    columns = len(recorded_cells(case.output, chain.cells)) * cell.dofs * len(case.output.fields)
     size = 8 * columns * -(-model.samples // case.output.stride)
     # At least one step a sample, and the top band resolved.
     steps = model.samples * max(np.ceil(model.sample_interval * bands[-1].high / 0.37), 1) * 1.3
     seconds = steps * (_STEP_SECONDS + _STEP_SECONDS_PER_MASS * chain.cells * cell.dofs / ranks)
     duration = f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
-    writer = case.output.writer
-    if writer == "auto":
-        writer = "parallel" if size > GATHER_LIMIT and ranks > 1 else "gather"
+    writer = "parallel" if written_together(model, case.output, ranks) else "gather"
+    engine = "ts" if case.time.engine == "ts" else "propagator"
+    needed, left = memory_needed(model, case.output, engine, ranks), memory_available() / ranks
     rows = [
         ("case", case.name),
         ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {chain.ends} ends, "
@@ -133,6 +134,7 @@ def run_case_table(case: Case, ranks: int) -> str:
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("file size", f"{size / 2**20:.4g} MiB ({writer})"),
+        ("memory", f"{needed / 1e9:.3g} GB on a rank" + f", and here are {left / 1e9:.3g} GB" * (needed > left)),
         ("cost", f"about {steps:.3g} steps of engine ts, {duration} on {ranks} rank{'s' * (ranks > 1)}"
                  " before contacts"),
     ]  # fmt: skip
