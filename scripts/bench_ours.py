@@ -30,7 +30,7 @@ class Flight:
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
         self.model = case.model()
         self.layout = Layout(self.model, comm)
-        kind, refused = select_engine(case.time.engine, self.model)
+        kind, refused = select_engine(case, self.model)
         if refused:
             raise RuntimeError(refused)
         self.engine = kind(self.model, self.layout)

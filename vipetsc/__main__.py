@@ -24,7 +24,20 @@ def main(arguments: list[str] | None = None) -> int:
     install_abort_hook()
     from vipetsc.cli.main import main as run_verb
 
-    return run_verb(arguments[:end])
+    return run_verb(arguments[:end], _options_of_a_case())
+
+
+def _options_of_a_case() -> dict[str, str]:
+    """Take those PETSc options out of its database that a result may depend on: they become part of the case."""
+    from petsc4py import PETSc
+
+    from vipetsc.case.schema import only_looks
+
+    database = PETSc.Options()
+    given = {name: value or "true" for name, value in database.getAll().items() if not only_looks(name)}
+    for name in given:
+        database.delValue(name)
+    return given
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from vipetsc.case.resolve import (
     wave_speed,
     with_preset,
 )
-from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, TimeTable
+from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
@@ -65,6 +65,7 @@ class Case(CaseFile):
     drive: DriveTable
     time: TimeTable
     output: OutputTable
+    petsc: PetscTable | None = None
 
     builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}}
 

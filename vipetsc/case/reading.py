@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 if TYPE_CHECKING:
     import xarray as xr
 
-SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "design")
+SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "design", "petsc")
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
@@ -110,8 +110,8 @@ class CaseFile(Section):
         """The fields besides ``name``, and everything wrong with the sections they come from."""
         fields, problems = {}, []
         for key, field in cls.model_fields.items():
-            if key != "name":
-                kind: Any = field.annotation
+            if key != "name" and (key in table or field.is_required()):
+                kind = next(_sections_in(field.annotation))
                 fields[key], wrong = read_section(kind, table.get(key, {}), key)
                 problems += wrong
         invalid = {problem.key for problem in problems}

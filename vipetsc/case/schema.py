@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from vipetsc.case.reading import Section
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
@@ -44,6 +44,12 @@ def once(values: list[Any]) -> list[Any]:
 
 LARGEST = 1e50  # products of such numbers are numbers still
 MOST_SITES = 1_000_000
+
+
+def _text(value: Any) -> Any:
+    return str(value) if isinstance(value, bool | int | float) else value
+
+
 Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_in_range)]
 Positive = Annotated[Finite, Field(gt=0)]
 NotNegative = Annotated[Finite, Field(ge=0)]
@@ -215,3 +221,25 @@ class OutputTable(Section):
     stride: Count = 1
     writer: Literal["auto", "gather", "parallel"] = "auto"
     figures: bool = True
+
+
+class PetscTable(Section):
+    """PETSc options by name, without the leading dash, as they stand behind ``--`` on the command line.
+
+    Those of time stepping (``ts_...``) are for ``ts``; a case that has some is not made by the propagator.
+    """
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Annotated[str, BeforeValidator(_text)]]
+
+
+# Options that say what PETSc prints, checks and does about an error, and change no result.
+_LOOKS = re.compile(
+    r"(log|info|malloc|memory|options|objects|debug|start_in|stop_for|on_error|error_output|fp_trap|check_pointer"
+    r"|no_signal|skip_petscrc|version|help|history|citations)(_|$)|.*_(view|monitor)(_|$)"
+)
+
+
+def only_looks(name: str) -> bool:
+    """Whether the PETSc option ``name`` changes no result, so that it is no part of a case."""
+    return bool(_LOOKS.match(name))

@@ -2,14 +2,14 @@
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
 import vipetsc
-from vipetsc.case import CaseError
+from vipetsc.case import CaseError, Problem
 from vipetsc.cli import verbs
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StoppedError, StopRequest
@@ -17,6 +17,7 @@ from vipetsc.parallel import StoppedError, StopRequest
 Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 # Verbs that look at a request to stop, to save first; others end where they are.
 STOPPABLE = ("run", "sweep", "paper")
+WITH_PETSC_OPTIONS = ("run", "sweep", "validate")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
 ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -65,12 +66,16 @@ class Parser(argparse.ArgumentParser):
             super()._print_message(message, file)
 
 
-def main(arguments: list[str]) -> int:
-    """Run the verb named in ``arguments`` on all ranks; returns the exit code."""
+def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
+    """Run the verb named in ``arguments`` on all ranks, with ``petsc`` options in its case; returns the exit code."""
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help", "--version")):
         arguments = ["run", *arguments]  # of the built-in case
     options = _parser().parse_args(arguments)
     try:
+        if petsc and options.verb not in WITH_PETSC_OPTIONS:
+            raise CaseError([Problem(f"-{name}", None, f"{options.verb} takes no PETSc options") for name in petsc])
+        if petsc:
+            options.set = [*options.set, *(f"petsc.{name}={value}" for name, value in petsc.items())]
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
         with StopRequest().listening(at_once=options.verb not in STOPPABLE) as stop:

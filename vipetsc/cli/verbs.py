@@ -70,9 +70,12 @@ def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 
 def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Every combination in the section [sweep] of a case; goes on where it was stopped."""
+    from vipetsc.dynamics.options import check_options
     from vipetsc.studies.sweep import run_sweep
 
     plan = _load(Sweep, options, comm)
+    for member in plan.members():
+        check_options(member.case)
     folder = _output(options, plan.name)
     result = run_sweep(plan, folder, comm, force=options.force, stop=stop, progress=True)
     for warning in result.warnings:
@@ -103,9 +106,12 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 
 def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Check a case as every verb whose section it has, and print what follows from it."""
+    from vipetsc.dynamics.options import check_options
 
     def report() -> str:
         cases = load_every(options.case, options.set)
+        for case in cases:
+            check_options(case)
         lines = [tables.case_table(case, comm.size) for case in cases]
         return "\n".join(lines + [f"warning: {warning}" for case in cases for warning in case.warnings()])
 

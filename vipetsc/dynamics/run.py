@@ -17,6 +17,7 @@ from vipetsc.dynamics.engine import Engine, StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample, Setup
+from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
@@ -82,7 +83,7 @@ def simulate(
     Raises
     ------
     CaseError
-        If the run needs more memory than there is.
+        If the run needs more memory than there is, or PETSc does not know its options.
     FolderError
         If the folder cannot be used as asked.
     OSError
@@ -90,13 +91,17 @@ def simulate(
     """
     begin = time.perf_counter(), time.process_time()
     output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
+    case = with_database(case)
+    check_options(case)
     model = case.model()
-    kind, refusal = select_engine(case.time.engine, model)
+    kind, refusal = select_engine(case, model)
     check_memory(model, case.output, kind.name, output.comm)
     output.begin(case.to_toml(), force, resume)
     sys.audit("vipetsc.set-up", case.name)
     layout = Layout(model, output.comm)
-    setup = Setup(case, model, layout, EnergyMeter(model, layout), kind(model, layout, native, stop), output)
+    with petsc_options(options_of(case)):
+        engine = kind(model, layout, native, stop)
+    setup = Setup(case, model, layout, EnergyMeter(model, layout), engine, output)
     run = Run(setup, [*OBSERVERS, *(["progress"] if progress else []), *observers])
     shares = output.last_state() if resume else None
     if shares is not None:
@@ -105,10 +110,12 @@ def simulate(
     return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
 
 
-def select_engine(name: str, model: Model) -> tuple[type[Engine], str | None]:
-    """The engine called ``name``, for ``auto`` the first, and None; or the last, which suits every model, and why."""
-    engine = next((engine for engine in ENGINES if engine.name == name), ENGINES[0])
+def select_engine(case: Case, model: Model) -> tuple[type[Engine], str | None]:
+    """The engine that ``case`` names, for ``auto`` the first, and None; or the last, which suits all, and why."""
+    engine = next((engine for engine in ENGINES if engine.name == case.time.engine), ENGINES[0])
     refusal = engine.refusal(model)
+    if options_of(case) and engine is not ENGINES[-1]:
+        refusal = "PETSc options are for ts"
     return (engine, None) if refusal is None else (ENGINES[-1], f"{engine.name} refused: {refusal}")
 
 

@@ -72,9 +72,6 @@ class Integrator(Engine):
 
     def _create_ts(self, model: Model, layout: Layout, native: bool) -> PETSc.TS:
         options = PETSc.Options()
-        # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.
-        if not options.hasName("ts_adapt_wnormtype"):
-            options["ts_adapt_wnormtype"] = "infinity"
         tolerances = self.state.duplicate()
         half = layout.dofs * layout.owned
         tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol
@@ -95,7 +92,14 @@ class Integrator(Engine):
             register(ts, self.lattice)
         else:
             ts.setRHSFunction(self._evaluate)
-        ts.setFromOptions()
+        # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.
+        default = "ts_adapt_wnormtype"
+        if options.hasName(default):
+            ts.setFromOptions()
+        else:
+            options[default] = "infinity"
+            ts.setFromOptions()
+            options.delValue(default)
         return ts
 
     def _exchange(self, u: PETSc.Vec) -> None:
