@@ -51,7 +51,7 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
         ("[drive]\nband = 2\nwavenumber = 'pi'", "stands (group velocity 0) and never crosses the lattice; give"),
         ("[output]\nfields = ['velocity', 'velocity']", "names 'velocity' more than once"),
         ("name = '../../evil'", "name = '../../evil': names the output folder"),
-        ("name = '.hidden'", "no dot or dash at the beginning"),
+        ("name = '.hidden'", "no dot or dash first"),
         ("name = 'a\\b'", "without / or \\"),
         (CELL.format(CHAIN), "lattice.cell.springs: nothing ties mass 3 to the next cell"),
         (TIED + "[contacts]\nclearance = 1.0\n[nnm]", "contacts.stiffness: missing"),

@@ -11,22 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid
-from vipetsc.case.resolve import (
-    build_chain,
-    check_lattice,
-    check_sites,
-    check_stiffness,
-    check_traverse,
-    resolved,
-    wave_speed,
-    with_preset,
-)
+from vipetsc.case.resolve import build_chain, check_cell, check_contacts, check_wave, resolved, wave_speed, with_preset
 from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
-LEAST_RESTITUTION = 0.01  # with exact damping
 MOST_SAMPLES = 1e9
 
 
@@ -89,20 +79,15 @@ class Case(CaseFile):
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """What is wrong between keys."""
         lattice, contacts = sections["lattice"], sections["contacts"]
-        cell, problems = check_lattice(lattice) if valid("lattice") else (None, [])
+        cell, problems = check_cell(lattice) if valid("lattice") else (None, [])
         yield from problems
         if valid("lattice.cells", "contacts.sites"):
-            yield from check_sites(lattice, contacts)
-            counted = isinstance(contacts.sites, int) and lattice.preset is None  # which needs a preset to place them
-            yield from check_stiffness(contacts, bool(contacts.sites) and not counted, valid)
+            yield from check_contacts(lattice, contacts, valid)
         length = lattice.cells if valid("lattice.cells") else None
         of_drive = list(_check_drive(sections["drive"], length, cell, valid))
         yield from of_drive
-        if contacts.damping == "exact" and contacts.restitution < LEAST_RESTITUTION and valid("contacts.restitution"):
-            remedy = f"the exact damping is unbounded there; at least {LEAST_RESTITUTION}"
-            yield Problem("contacts.restitution", contacts.restitution, remedy)
         if cell and not of_drive and valid("lattice", "drive", "time.end"):
-            yield from check_traverse(cell, sections["drive"], sections["time"])
+            yield from check_wave(cell, sections["drive"], sections["time"])
         yield from _check_sampling(sections["time"], cell, valid)
         window = sections["output"].window
         if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
@@ -139,30 +124,23 @@ class Case(CaseFile):
 
     def warnings(self) -> list[str]:
         """What is allowed but likely not meant, one sentence each."""
-        model, sentences = self.model(), []
-        if not waves_at(model.chain.cell, model.drive.frequency):
-            outside = f"drive.frequency = {model.drive.frequency:.6g} rad/s lies in no pass band"
-            sentences.append(f"{outside}, so the wave is evanescent; see the verb `bands`")
-        if model.end <= model.drive.duration:
-            sentences.append(f"time.end = {model.end:.6g} s comes before the burst is over")
-        return sentences + self._unmeasured(model)
-
-    def _unmeasured(self, model: Model) -> list[str]:
-        """What the choice of cells and samples that are kept does to the measures."""
-        output, sentences = self.output, []
-        if not output.fields:
-            return []
-        interval, top = output.stride * model.sample_interval, pass_bands(model.chain.cell)[-1].high
-        if output.stride > 1 and interval >= np.pi / top:
-            resolved = f"keeps a field every {interval:g} s, which resolves {np.pi / interval:.0f} of {top:.0f} rad/s"
-            sentences.append(f"output.stride = {output.stride} {resolved}; bands, ibtet, dispersion are not measured")
-        if output.every > 1:
-            resolved = f"resolves wavenumbers up to pi/{output.every}: wavenumber content, dispersion, partition and"
-            sentences.append(f"output.every = {output.every} {resolved} entropy are not measured")
-        first, last = output.window or (1, model.chain.cells)
-        if model.chain.sites and not any(first <= site + 1 <= last for site in model.chain.sites):
-            sentences.append(f"output.window = [{first}, {last}] holds none of the contact sites")
-        return sentences
+        model, output = self.model(), self.output
+        drive, sites, top = model.drive, model.chain.sites, pass_bands(model.chain.cell)[-1].high
+        interval, (first, last) = output.stride * model.sample_interval, output.window or (1, model.chain.cells)
+        outside = f"drive.frequency = {drive.frequency:.6g} rad/s lies in no pass band"
+        coarse = f"output.stride = {output.stride} keeps a field every {interval:g} s, which resolves"
+        checks = [
+            (not waves_at(model.chain.cell, drive.frequency),
+             f"{outside}, so the wave is evanescent; see the verb `bands`"),
+            (model.end <= drive.duration, f"time.end = {model.end:.6g} s comes before the burst is over"),
+            (output.fields and output.stride > 1 and interval >= np.pi / top,
+             f"{coarse} {np.pi / interval:.0f} of {top:.0f} rad/s; bands, ibtet, dispersion are not measured"),
+            (output.fields and output.every > 1, f"output.every = {output.every} resolves wavenumbers up to"
+             f" pi/{output.every}; wavenumber content, dispersion, partition and entropy are not measured"),
+            (output.fields and sites and not any(first <= site + 1 <= last for site in sites),
+             f"output.window = [{first}, {last}] holds none of the contact sites"),
+        ]  # fmt: skip
+        return [sentence for applies, sentence in checks if applies]
 
 
 def _check_drive(drive: DriveTable, length: int | None, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

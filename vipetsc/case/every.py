@@ -2,16 +2,14 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from vipetsc.case.case import Case
 from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
-from vipetsc.case.reading import CaseError, CaseFile, Problem, Table, read_toml, with_overrides
+from vipetsc.case.reading import CaseError, CaseFile, Problem, read_toml, with_overrides
 from vipetsc.case.sweep import Sweep
 
 OF_SECTION: dict[str, type[CaseFile]] = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase}
-OF_A_RUN = {"drive", "time", "output"}
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:
@@ -20,24 +18,22 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     A file with ``[nnm]`` or ``[design]`` and no section of a run is not read as one. A sweep may give what a run
     lacks: then its first possible member stands for the run. Raises CaseError with the problems of all verbs.
     """
-    table: Table = read_toml(path) if path else Case.builtin_table
-    overrides, source = list(overrides), str(path) if path else "built-in case"
-    changed, _ = with_overrides(table, overrides)
-    kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in changed]
-    if not kinds or "sweep" in changed or OF_A_RUN & changed.keys():
+    table, source = (read_toml(path), str(path)) if path else (Case.builtin_table, "built-in case")
+    sections = with_overrides(table, overrides := list(overrides))[0].keys()
+    kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in sections]
+    if not kinds or {"sweep", "drive", "time", "output"} & sections:
         kinds.insert(0, Case)
-    cases: dict[type[CaseFile], Any] = {}
+    cases: list[CaseFile] = []
     problems: dict[str, Problem] = {}
     for kind in kinds:
         try:
-            cases[kind] = kind.from_table(table, overrides, source)
-            if isinstance(cases[kind], Sweep):
-                members = cases[kind].members()
-                if Case not in cases:
-                    cases = {Case: next(member.case for member in members if member.case)} | cases
-                    problems = {}
+            case = kind.from_table(table, overrides, source)
+            if isinstance(case, Sweep):
+                possible = [member.case for member in case.members() if member.case]
+                cases, problems = cases or [*possible[:1]], {}
+            cases.append(case)
         except CaseError as error:
             problems |= {str(problem): problem for problem in error.problems}
     if problems:
         raise CaseError(problems.values(), source)
-    return list(cases.values())
+    return cases

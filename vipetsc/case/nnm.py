@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.resolve import check_lattice, check_sites, check_stiffness, site_cells, with_default_preset
+from vipetsc.case.resolve import check_cell, check_sites, check_stiffness, site_cells, with_default_preset
 from vipetsc.case.schema import PRESETS, ContactsTable, Count, Finite, LatticeTable, Positive, once
 from vipetsc.lattice import Contact, contact_stiffness
 from vipetsc.lattice.cell import groups_of
@@ -133,7 +133,7 @@ class NnmCase(CaseFile):
                 group = groups_of(dofs + 1, ((s.start, s.end) for s in nnm.custom.springs))
                 rigid = len(set(group)) - 1
         else:
-            cell, wrong = check_lattice(lattice)
+            cell, wrong = check_cell(lattice)
             problems += wrong
         if nnm.system == "chain":
             dofs = cell.dofs * lattice.cells if cell else 2
@@ -157,13 +157,6 @@ class NnmCase(CaseFile):
         if beyond and not problems:
             problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))
         return problems
-
-    @property
-    def masses(self) -> int:
-        """How many masses the system has."""
-        if self.nnm.custom is not None:
-            return len(self.nnm.custom.masses)
-        return 2 if self.nnm.system == "reduced" else self.lattice.cells * self.lattice.unit_cell().dofs
 
     def physics(self) -> tuple[Any, ...]:
         """What a branch that is resumed must keep: the system, the shooting map and the flow."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "design", "petsc")
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
+FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
@@ -99,7 +100,11 @@ class CaseFile(Section):
         valid = ("name", *SECTIONS)
         problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
-        problems += name_problems(name)
+        if not isinstance(name, str) or not name:
+            problems.append(Problem("name", name, "must be a non-empty string"))
+        elif not (name.isprintable() and FOLDER.fullmatch(name) and len(name.encode()) <= LONGEST_NAME):
+            remedy = f"names the output folder: {LONGEST_NAME} bytes at most, without / or \\, no dot or dash first"
+            problems.append(Problem("name", name, remedy))
         fields, wrong = cls.read(table)
         if problems + wrong:
             raise CaseError(problems + wrong, source)
@@ -148,17 +153,6 @@ def read_toml(path: str | Path) -> Table:
     raise CaseError([Problem(str(path), None, remedy)])
 
 
-def name_problems(name: Any) -> list[Problem]:
-    """What is wrong with a case's name: a folder in runs/ bears it, so it is one component of a path."""
-    if not isinstance(name, str) or not name:
-        return [Problem("name", name, "must be a non-empty string")]
-    printable = name.isprintable() and len(name.encode()) <= LONGEST_NAME
-    if printable and name == name.strip() and name[0] not in ".-" and not {*"/\\"} & {*name}:
-        return []
-    remedy = f"names the output folder: at most {LONGEST_NAME} bytes, without / or \\, no dot or dash at the beginning"
-    return [Problem("name", name, remedy)]
-
-
 def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
     """The problem of a key that is not one of ``valid``, with the nearest one that is."""
     parents, dot, key = path.rpartition(".")
@@ -178,10 +172,7 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
         if not equals or not all(path.split(".")):
             problems.append(Problem("--set", override, "write section.key=value"))
             continue
-        if not text:
-            problems += [replace(p, key=f"--set {p.key}") for p in _take_out(table, path)]
-            continue
-        value: Any = text  # a bare word
+        value: Any = text or None  # a bare word; nothing takes the key out
         for read in (lambda text: tomllib.loads(f"value = {text}")["value"], float):
             try:
                 value = read(text)
@@ -193,26 +184,18 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
 
 
 def put(table: Table, path: str, value: Any) -> list[Problem]:
-    """Set the key ``path`` ("a.b.c") of ``table`` in place; the problem if a parent is no section."""
+    """Set the key ``path`` ("a.b.c") of ``table`` in place, or take it out (None); the problem if that cannot be."""
     *parents, key = path.split(".")
     section: Any = table
     for parent in parents:
         section = section.setdefault(parent, {}) if isinstance(section, dict) else section
     if not isinstance(section, dict):
         return [Problem(path, value, f"{'.'.join(parents)} is a value, not a section")]
-    section[key] = value
-    return []
-
-
-def _take_out(table: Table, path: str) -> list[Problem]:
-    """Remove the key ``path`` ("a.b.c") of ``table`` in place; the problem if it is not there."""
-    *parents, key = path.split(".")
-    section: Any = table
-    for parent in parents:
-        section = section.get(parent) if isinstance(section, dict) else None
-    if not isinstance(section, dict) or key not in section:
+    if value is None and key not in section:
         return [Problem(path, None, "is not in the case, so there is nothing to take out")]
-    del section[key]
+    section[key] = value
+    if value is None:
+        del section[key]
     return []
 
 

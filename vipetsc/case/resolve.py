@@ -11,6 +11,7 @@ from vipetsc.case.schema import PRESETS, ContactsTable, DriveTable, LatticeTable
 from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import cell_problems, loose_masses
 
+LEAST_RESTITUTION = 0.05
 LARGEST_INDEX = 2**31 - 1
 STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 # A key of a case file takes the place of these keys of the preset.
@@ -82,7 +83,7 @@ def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
     return Chain(lattice.unit_cell(), lattice.cells, lattice.ends, tuple(c - 1 for c in sites), tuple(gaps))
 
 
-def check_lattice(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
+def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     """The unit cell, or what is wrong with it."""
     problems = []
     if lattice.preset is not None and lattice.cell is not None:
@@ -124,6 +125,16 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
         yield Problem("contacts.clearance", clearance, f"one clearance for each of the {len(cells)} sites is needed")
     if clearance is None and lattice.preset is None and cells:
         yield Problem("contacts.clearance", None, "missing; give the clearance in m")
+
+
+def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid) -> Iterator[Problem]:
+    """What is wrong with the sites of a run and with the law."""
+    yield from check_sites(lattice, contacts)
+    counted = isinstance(contacts.sites, int) and lattice.preset is None  # which needs a preset to place them
+    yield from check_stiffness(contacts, bool(contacts.sites) and not counted, valid)
+    if contacts.damping == "exact" and contacts.restitution < LEAST_RESTITUTION and valid("contacts.restitution"):
+        remedy = f"the exact damping grows without bound towards 0; at least {LEAST_RESTITUTION}"
+        yield Problem("contacts.restitution", contacts.restitution, remedy)
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
@@ -171,7 +182,7 @@ def drive_frequency(cell: UnitCell, drive: DriveTable) -> float:
     return max_group_velocity(cell, drive.band)[1]
 
 
-def check_traverse(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
+def check_wave(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
     """What is wrong with a valid drive that is to make a wave, and with a wave that is to cross the lattice."""
     frequency = drive_frequency(cell, drive)
     key = "frequency" if drive.frequency else "wavenumber" if drive.wavenumber else "band"
@@ -179,8 +190,7 @@ def check_traverse(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterat
     if not frequency > 0:
         yield Problem(f"drive.{key}", value, "the frequency there is 0; drive another wavenumber or band")
         return
-    fastest = max(max_group_velocity(cell, band + 1)[2] for band in range(cell.dofs))
-    speed = wave_speed(cell, frequency)
+    fastest, speed = wave_speed(cell, np.inf), wave_speed(cell, frequency)
     if drive.wavenumber and drive.band:
         speed = abs(float(bloch(cell, drive.wavenumber).group_velocity[drive.band - 1]))
     if time.end == "traverse" and not speed > STANDING * fastest:

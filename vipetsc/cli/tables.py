@@ -93,7 +93,7 @@ def case_table(case: CaseFile, ranks: int) -> str:
         assert isinstance(case, NnmCase)
         contact, (low, high) = case.contact(), case.nnm.energy
         rows = [
-            ("nnm", f"{case.nnm.system} system of {case.masses} masses, modes {_first_few(case.nnm.modes)}"),
+            ("nnm", f"{case.nnm.system} system, modes {_first_few(case.nnm.modes)}"),
             ("nnm contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.exponent:g}"),
             ("nnm energies", f"{low:g} to {high:g} J, at most {case.nnm.points} points a branch"),
         ]

@@ -6,6 +6,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 Reading = Literal["printed", "calibrated"]
 
@@ -113,11 +115,9 @@ def loose_masses(cell: UnitCell) -> list[int]:
 
 def groups_of(n: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
     """Of every one of ``n`` masses (0-based) the number of the group that ``pairs`` tie it to."""
-    group = list(range(n))
-    for start, end in pairs:
-        old, new = group[end], group[start]
-        group = [new if g == old else g for g in group]
-    return group
+    pairs = list(pairs)
+    graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
+    return connected_components(graph, directed=False)[1].tolist()
 
 
 def diatomic(reading: Reading = "printed") -> UnitCell:

@@ -5,7 +5,6 @@ F = kc [(w - D)_+^n - (-w - D)_+^n] g, restoring: -F on the resonator, +F on the
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -32,16 +31,6 @@ def rebound(damping: float, restitution: float) -> float:
     return float(damping * (1 + restitution) + np.log1p(-damping * restitution) - np.log1p(damping))
 
 
-@lru_cache
-def exact_damping(restitution: float) -> float:
-    """The damping c whose impact has the ``restitution`` e in (0, 1]; close to 1/e where e is small."""
-    e = restitution
-    if e >= 1 - 1e-6:
-        return 1.5 * (1 - e)
-    largest = (1 - 1e-12) / e
-    return largest if rebound(largest, e) >= 0 else brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), largest, (e,))
-
-
 @dataclass(frozen=True)
 class Contact:
     """A ``law`` F = kc x^n, its ``stiffness`` kc in N/m^n and its ``restitution`` r in [0, 1]; 1 conserves energy.
@@ -66,16 +55,16 @@ class Contact:
     @property
     def damping(self) -> float:
         """3 (1 - r) / 2, the factor of w'/w'_minus in g (Hunt and Crossley 1975), or the exact one."""
-        return exact_damping(self.restitution) if self.exact else 1.5 * (1 - self.restitution)
+        e = self.restitution
+        if not self.exact or e > 1 - 1e-6:
+            return 1.5 * (1 - e)
+        return float(brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), (1 - 1e-12) / e, (e,)))
 
     @property
     def effective_restitution(self) -> float:
         """-w'_plus/w'_minus of two masses that nothing but the contact acts on, above the ``approach_floor``."""
         c = self.damping
-        if c < 1e-6:
-            return 1 - 2 * c / 3
-        largest = min(1.0, (1 - 1e-12) / c)
-        return largest if rebound(c, largest) >= 0 else float(brentq(lambda e: rebound(c, e), 0.0, largest))
+        return 1 - 2 * c / 3 if c < 1e-6 else float(brentq(lambda e: rebound(c, e), 0.0, min(1.0, (1 - 1e-12) / c)))
 
     def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
         """g = 1 + 3 (1 - r)/2 w'/w'_minus for relative velocity and approach velocity in m/s.
