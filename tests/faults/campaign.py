@@ -92,13 +92,17 @@ def cases(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def fault_table(rows: Sequence[dict[str, Any]], kinds: Sequence[str], ranks: Sequence[int]) -> str:
-    """Phases of every verb against kinds of faults and numbers of ranks: a dot for as it should be, else a cross."""
-    cells = {(row["scenario"], row["phase"], row["kind"], row["ranks"]): "x" if row["wrong"] else "." for row in rows}
+    """Phases of every verb against kinds of faults and ranks: "." as it should be, "x" not, "-" it did not come."""
+    marks = {False: "-", True: "."}
+    cells = {
+        (row["scenario"], row["phase"], row["kind"], row["ranks"]): "x" if row["wrong"] else marks[bool(row["came"])]
+        for row in rows
+    }
     columns = [(kind, n) for kind in kinds for n in ranks]
     lines = [f"{'verb':<13}{'phase':<12}" + "".join(f"{kind + ' ' + str(n):>13}" for kind, n in columns)]
     for name, phase in dict.fromkeys((row["scenario"], row["phase"]) for row in rows):
-        marks = (cells.get((name, phase, kind, n), "") for kind, n in columns)
-        lines.append(f"{name:<13}{phase:<12}" + "".join(f"{mark:>13}" for mark in marks))
+        row = (cells.get((name, phase, kind, n), "") for kind, n in columns)
+        lines.append(f"{name:<13}{phase:<12}" + "".join(f"{mark:>13}" for mark in row))
     return "\n".join(lines)
 
 

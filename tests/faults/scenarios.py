@@ -126,12 +126,12 @@ def shrink() -> None:
     """Make the program's own pieces as small as the cases: pictures, chunks, the paper."""
     import vipetsc.paper.plan as plan
     from tests.cli.tiny_paper import tiny_plan
-    from vipetsc.dynamics import observers
+    from vipetsc.dynamics import recorder
     from vipetsc.figures import registry
 
     for name in registry.FIGURES.keys() - {*DRAWN}:
         del registry.FIGURES[name]
-    observers.CHUNK_SAMPLES = SAMPLES_A_CHUNK
+    recorder.CHUNK_SAMPLES = SAMPLES_A_CHUNK
     small = tiny_plan()
     steps = [s for s in small.steps if s.name in PAPER]
     steps = [replace(step, changes=(*step.changes, *PAPER[step.name])) for step in steps]
