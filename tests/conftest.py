@@ -73,6 +73,11 @@ def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]
         assert values.tolist() == second[name].tolist() if texts else values.tobytes() == second[name].tobytes(), name
 
 
+def modified(folder: Path) -> dict[Path, int]:
+    """When each file in a folder was written."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
 # One rank shares the cores with other tests; mpirun has them to itself.
 alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, marks=pytest.mark.mpirun)])
 

@@ -28,8 +28,9 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         if comm.rank and getattr(error, "from_root", False):
             time.sleep(2)  # rank 0 raised the same: its message is enough, and it ends this rank
         where = f"rank {comm.rank}: " if comm.size > 1 else ""
-        # A full disk or a missing right is the machine's matter: the trace would hide the message.
-        lines = [str(error)] if isinstance(error, OSError) else traceback.format_exception(kind, error, trace)
+        # A full disk or too little memory is the machine's matter: the trace would hide the message.
+        machine = isinstance(error, OSError | MemoryError)
+        lines = [str(error) or "out of memory"] if machine else traceback.format_exception(kind, error, trace)
         logger.critical("vipetsc: %s%s", where, "".join(lines).rstrip())
         sys.stdout.flush()
         if comm.size > 1:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import alone_and_on_two_ranks, clean_environment, datasets
+from tests.conftest import alone_and_on_two_ranks, clean_environment, datasets, modified
 
 SMALL = """
 [lattice]
@@ -35,7 +35,7 @@ def case(tmp_path) -> Path:
 
 
 @alone_and_on_two_ranks
-def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, case, tmp_path, ranks):
+def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, in_process, case, tmp_path, ranks):
     ended = vipetsc(ranks, "run", case, "--out", tmp_path / "out")
     assert ended.returncode == 0, ended.stderr
     assert "complete: 301 samples" in ended.stdout
@@ -51,17 +51,46 @@ def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, case, tmp_path, ra
     wanted = {"spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
     assert {f"{name}.png" for name in wanted} <= pictures.keys()
     assert min(pictures.values()) > 5000
+    if not ranks:
+        assert_the_same_command_finishes_what_is_missing(in_process, case, tmp_path / "out")
+
+
+def assert_the_same_command_finishes_what_is_missing(in_process, case, out):
+    """What is there stays as it is."""
+    before = modified(out)
+    for missing in ((), ("analysis.h5",), ("figures/ledger.png", "summary.json")):
+        for name in missing:
+            (out / name).unlink()
+        ended = in_process("run", case, "--out", out)
+        assert ended.returncode == 0, ended.stderr
+        assert "complete: 301 samples" in ended.stdout
+        assert modified(out).keys() == before.keys()
+        assert missing or modified(out) == before
+        assert modified(out)[out / "run.h5"] == before[out / "run.h5"]
+    assert {"status", "complete", "statistics", "case"} <= json.loads((out / "summary.json").read_text()).keys()
+    (out / "run.h5").write_bytes((out / "run.h5").read_bytes()[:1000])
+    cut = in_process("run", case, "--out", out)
+    assert cut.returncode == 2
+    assert f"{out / 'run.h5'} cannot be opened" in cut.stderr
+    assert "--force makes the run again" in cut.stderr
 
 
 def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
     ended = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "runs" / "four-band" / "run.h5").exists()
-    again = in_process("--set", "time.end=0.01", *QUICK, cwd=tmp_path)
-    assert again.returncode == 2
-    assert "--force" in again.stderr
-    forced = in_process("--set", "time.end=0.01", *QUICK, "--force", cwd=tmp_path)
+    other = in_process("--set", "time.end=0.02", *QUICK, cwd=tmp_path)
+    assert other.returncode == 2
+    assert "end = 0.01; end = 0.02; --force replaces it" in other.stderr
+    forced = in_process("--set", "time.end=0.02", *QUICK, "--force", cwd=tmp_path)
     assert forced.returncode == 0, forced.stderr
+    assert "end = 0.02" in (tmp_path / "runs" / "four-band" / "case.toml").read_text()
+    assert {p.name for p in (tmp_path / "runs" / "four-band").iterdir()} == {
+        "run.h5",
+        "summary.json",
+        "case.toml",
+        "analysis.h5",
+    }
 
 
 @alone_and_on_two_ranks
@@ -104,7 +133,7 @@ def test_everything_wrong_with_a_case_is_said_at_once(vipetsc, tmp_path, ranks):
         (("run", "--force", "--resume"), "exclude each other"),
         (("fly",), "invalid choice: 'fly'"),
         (("plot", "nowhere"), "holds no run.h5"),
-        (("run", "--resume", "--out", "new"), "no unfinished run"),
+        (("run", "--resume", "--out", "new"), "holds no run to resume"),
     ],
 )
 def test_bad_input_is_exit_code_2_and_writes_nothing(in_process, tmp_path, arguments, text):

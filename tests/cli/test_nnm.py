@@ -5,7 +5,7 @@ from __future__ import annotations
 import h5py
 import pytest
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, datasets
+from tests.conftest import alone_and_on_two_ranks, assert_same_bits, datasets, modified
 
 CASE = """
 [lattice]
@@ -41,10 +41,16 @@ def test_branch_files_picture_and_refusal(vipetsc, in_process, case, tmp_path):
         "branch-out-of-phase.csv",
         "figures/branch-out-of-phase.png",
     }
+    written = modified(out)
     again = in_process("nnm", case, "--out", out)
-    assert again.returncode == 2
-    assert "--force" in again.stderr
-    assert in_process("nnm", case, "--out", out, "--force").returncode == 0
+    assert again.returncode == 0
+    assert again.stdout == done.stdout.rpartition("  /")[0].rpartition("\n")[0] + "\n"
+    assert modified(out) == written  # complete: nothing is made again
+    other = in_process("nnm", case, "--out", out, "--set", "nnm.energy=[0.0, 0.5]")
+    assert other.returncode == 2
+    assert "--force" in other.stderr
+    assert in_process("nnm", case, "--out", out, "--set", "nnm.energy=[0.0, 0.5]", "--force").returncode == 0
+    assert modified(out).keys() == written.keys()
 
 
 def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):

@@ -62,8 +62,9 @@ def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypa
         simulate(case, path, force=True)
     COMM.Barrier()
     assert (path / "run.h5").read_bytes() == before
-    assert not (path / ".run.h5.part").exists()
-    assert (path / "parts").is_dir()
+    assert {p.name for p in path.iterdir()} == {"case.toml", "run.h5", "summary.json", ".new"}
+    assert not (path / ".new" / ".run.h5.part").exists()
+    assert (path / ".new" / "parts").is_dir()
 
 
 @pytest.mark.parallel([2, 3])
@@ -115,7 +116,7 @@ def test_only_checkpoints_that_all_ranks_wrote_count(folder):
 def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
     case = small_case().to_toml()
     output = RunFolder(folder / "run", COMM)
-    output.begin(case, force=False, resume=False)
+    output.begin(case)
     output.append({"x": np.zeros(1)})
     output.save_state({"number": np.array(1)})
     if COMM.rank == 1:

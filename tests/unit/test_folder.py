@@ -1,84 +1,241 @@
-"""Claiming output folders: what may be begun, replaced, gone on with."""
+"""Claiming output folders: what may be begun, replaced, gone on with; whatever had happened in them before."""
+
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+from mpi4py import MPI
 
 import pytest
 
-from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, FolderError, claim_folder
+from vipetsc.io.atomic import atomic_write
+from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, FolderError, claimed
+from vipetsc.io.lock import locked
+
+ROOT = Path(__file__).parents[2]
+SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
+OLD, ANEW = "a = 1\n", "a = 2\n"
+
+
+def claim(*arguments, **options):
+    return claimed(MPI.COMM_SELF, *arguments, **options)
+
+
+def visible(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A folder with a run of OLD and its analysis, and a file of the user's."""
+    folder = tmp_path / "run"
+    with claim(folder, RUN, OLD):
+        for name in ("run.h5", "summary.json", "analysis.h5", "notes.txt"):
+            (folder / name).write_text("old")
+        (folder / "figures").mkdir()
+        (folder / "figures" / "ledger.png").touch()
+    return folder
 
 
 def test_a_new_folder_gets_its_marker(tmp_path):
     for kind in KINDS:
         folder = tmp_path / "deep" / kind.noun
-        assert not claim_folder(folder, kind, "case")
-        assert [p.name for p in folder.iterdir()] == [kind.marker]
-        assert (folder / kind.marker).read_text() == "case"
+        with claim(folder, kind, OLD) as right:
+            assert not right.going_on
+            assert right.folder == folder
+        assert visible(folder) == {kind.marker}
+        assert (folder / kind.marker).read_text() == OLD
 
 
 def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(FolderError, match="is a file"):
-        claim_folder(tmp_path / "file", RUN, "case", force=True)
-    with pytest.raises(FolderError, match="of this kind"):
-        claim_folder(tmp_path, RUN, "case", force=True)
-    shown = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
-    for kind, file in shown.items():
+    with pytest.raises(FolderError, match="is a file"), claim(tmp_path / "file", RUN, OLD, force=True):
+        pass
+    with pytest.raises(FolderError, match="of this kind"), claim(tmp_path, RUN, OLD, force=True):
+        pass
+    for kind, file in SHOWN.items():
         folder = tmp_path / kind.noun
-        claim_folder(folder, kind, "case")
-        (folder / file).touch()
+        with claim(folder, kind, OLD):
+            (folder / file).touch()
         for other in KINDS:
             if other is not kind:
-                with pytest.raises(FolderError, match="of this kind"):
-                    claim_folder(folder, other, "case", force=True)
-        assert (folder / file).exists()
+                with pytest.raises(FolderError, match="of this kind"), claim(folder, other, OLD, force=True):
+                    pass
+        assert visible(folder) == {kind.marker, file}
 
 
-def test_force_replaces_and_no_force_refuses(tmp_path):
-    folder = tmp_path / "run"
-    claim_folder(folder, RUN, "old")
-    (folder / "run.h5").touch()
-    with pytest.raises(FolderError, match="exists; --force replaces what is in it, --out chooses another"):
-        claim_folder(folder, RUN, "new")
-    (folder / "parts").mkdir()
-    with pytest.raises(FolderError, match="exists; --resume goes on with the unfinished run in it, --force"):
-        claim_folder(folder, RUN, "new")
-    assert (folder / "case.toml").read_text() == "old"
-    assert not claim_folder(folder, RUN, "new", force=True)
-    assert (folder / "case.toml").read_text() == "new"
-    assert {p.name for p in folder.iterdir()} == {"case.toml", "run.h5"}  # until a new one replaces it
-
-
-def test_resume_needs_the_same_results_unfinished(tmp_path):
-    folder = tmp_path / "run"
-    with pytest.raises(FolderError, match="holds no unfinished run to resume; leave out --resume"):
-        claim_folder(folder, RUN, "a = 1", resume=True)
-    claim_folder(folder, RUN, "a = 1\nb = 2")
-    with pytest.raises(FolderError, match="no unfinished run"):
-        claim_folder(folder, RUN, "a = 1\nb = 2", resume=True)
-    (folder / "parts").mkdir()
-    assert claim_folder(folder, RUN, "a = 1\nb = 2", resume=True)
-    assert (folder / "parts").is_dir()
-    with pytest.raises(FolderError, match=r"differing: b = 2; b = 3$"):
-        claim_folder(folder, RUN, "a = 1\nb = 3", resume=True)
+def test_the_same_case_goes_on_and_another_is_refused(run):
+    before = (run / "case.toml").stat()
+    for resume in (False, True):
+        with claim(run, RUN, OLD, resume=resume) as right:
+            assert right.going_on
+            assert right.folder == run
+    assert (run / "case.toml").stat() == before  # going on touches nothing
+    for resume in (False, True):
+        message = "holds another run, differing: a = 1; a = 2; --force replaces it, --out chooses another folder"
+        with pytest.raises(FolderError, match=message), claim(run, RUN, ANEW, resume=resume):
+            pass
+    with pytest.raises(FolderError, match="holds no run to resume; leave out --resume"):
+        claim(run.parent / "deep" / "none", RUN, OLD, resume=True).__enter__()
+    assert visible(run.parent) == {"run"}
 
 
 def test_what_may_differ_is_the_caller_s_to_say(tmp_path):
-    claim_folder(tmp_path / "nnm", BRANCHES, "points = 3")
-    with pytest.raises(FolderError, match="another system"):
-        claim_folder(
-            tmp_path / "nnm", BRANCHES, "x", resume=True, difference=lambda earlier: f"another system: {earlier}"
-        )
-    assert claim_folder(tmp_path / "nnm", BRANCHES, "points = 9", resume=True, difference=lambda earlier: None)
-    assert (tmp_path / "nnm" / "case.toml").read_text() == "points = 9"
+    with claim(tmp_path / "nnm", BRANCHES, OLD):
+        pass
+    with pytest.raises(FolderError, match="another system: a = 1"):
+        claim(tmp_path / "nnm", BRANCHES, ANEW, difference=lambda earlier: f"another system: {earlier}").__enter__()
+    with claim(tmp_path / "nnm", BRANCHES, ANEW, resume=True, difference=lambda earlier: None) as right:
+        assert right.going_on
+    assert (tmp_path / "nnm" / "case.toml").read_text() == ANEW
 
 
-def test_a_sweep_goes_on_by_itself_and_force_begins_it_anew(tmp_path):
-    assert not claim_folder(tmp_path / "s", SWEEP, "same", resume=None)
-    (tmp_path / "s/member").mkdir()
-    (tmp_path / "s/index.json").touch()
-    written = (tmp_path / "s/case.toml").stat()
-    assert claim_folder(tmp_path / "s", SWEEP, "same", resume=None)
-    assert (tmp_path / "s/case.toml").stat() == written  # going on touches nothing
-    with pytest.raises(FolderError, match="holds another sweep; --force replaces it, --out chooses another folder"):
-        claim_folder(tmp_path / "s", SWEEP, "other", resume=None)
-    assert (tmp_path / "s/member").is_dir()
-    assert not claim_folder(tmp_path / "s", SWEEP, "other", resume=None, force=True)
-    assert [p.name for p in (tmp_path / "s").iterdir()] == ["case.toml"]
+def begin_anew(folder):
+    """Make new results beside the old ones, to the last but one step."""
+    with claim(folder, RUN, ANEW, force=True) as right:
+        assert not right.going_on
+        assert right.folder == folder / ".new"
+        (right.folder / "run.h5").write_text("new")
+        (right.folder / "figures").mkdir()
+        yield right
+
+
+def test_new_results_replace_the_old_ones_whole(run):
+    for right in begin_anew(run):
+        assert (run / "case.toml").read_text() == OLD
+        assert (run / "run.h5").read_text() == "old"
+        right.publish()
+        assert right.folder == run
+    assert visible(run) == {"case.toml", "run.h5", "figures", "notes.txt"}
+    assert (run / "case.toml").read_text() == ANEW
+    assert (run / "run.h5").read_text() == "new"
+    assert not visible(run / "figures")
+
+
+class KilledError(Exception):
+    """Stands for a kill: what comes after is not done."""
+
+
+def test_a_swap_killed_anywhere_is_finished_by_the_next_command(run, monkeypatch, tmp_path):
+    """The names change one by one: killed before each of them, before the removal, and not at all."""
+    for count in range(12):
+        folder = tmp_path / f"killed-{count}"
+        subprocess.run(["cp", "-r", run, folder], check=True)
+        left = count
+
+        def rename(source, target, replace=os.replace):
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise KilledError
+            replace(source, target)
+
+        killed = False
+        with monkeypatch.context() as context:
+            try:
+                for right in begin_anew(folder):
+                    context.setattr(os, "replace", rename)
+                    right.publish()
+            except KilledError:
+                killed = True
+        text = OLD if count == 0 else ANEW  # the first renaming decides
+        with claim(folder, RUN, text) as right:
+            assert right.going_on
+        assert (folder / "run.h5").read_text() == ("old" if count == 0 else "new")
+        if count:
+            assert visible(folder) == {"case.toml", "run.h5", "figures", "notes.txt"}, count
+    assert not killed  # there are fewer steps than that
+
+
+def test_what_was_begun_anew_is_gone_on_with_or_dropped(run):
+    for _ in begin_anew(run):
+        pass
+    with claim(run, RUN, OLD) as right:  # the case of the old results: they are there
+        assert right.folder == run
+    for resume in (False, True):
+        with claim(run, RUN, ANEW, resume=resume) as right:
+            assert right.going_on
+            assert right.folder == run / ".new"
+            assert (right.folder / "run.h5").read_text() == "new"
+    with claim(run, RUN, ANEW, force=True) as right:
+        assert visible(right.folder) == {"case.toml"}
+
+
+def test_what_a_killed_command_leaves_is_no_dead_end(tmp_path):
+    for name in ("parts", "figures"):
+        (tmp_path / name).mkdir()
+    for name in (".lock", ".run.h5.part", ".run.h5.host-7-ab.part", "figures/.ledger.png.host-7-cd.part"):
+        (tmp_path / name).touch()
+    (tmp_path / ".parts.old").mkdir()
+    (tmp_path / ".parts.old" / "part-000000-0.npy").touch()
+    with claim(tmp_path, RUN, OLD) as right:
+        assert not right.going_on
+    assert visible(tmp_path) == {"case.toml", "parts", "figures"}
+    assert not visible(tmp_path / "figures")
+
+
+def test_a_file_that_another_command_writes_stays(tmp_path):
+    """A sweep below a paper's folder has a lock of its own."""
+    with claim(tmp_path, PAPER, OLD):
+        pass
+    with locked(MPI.COMM_SELF, tmp_path / "step"), atomic_write(tmp_path / "step" / "a") as aside:
+        aside.touch()
+        with claim(tmp_path, PAPER, OLD):
+            assert aside.exists()
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from mpi4py import MPI
+from vipetsc.io.lock import locked
+with locked(MPI.COMM_SELF, Path(sys.argv[1])):
+    print("here", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def held(folder):
+    """Another process works in the folder; gives it."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdin=pipe, stdout=pipe) as process:
+        try:
+            process.stdout.readline()
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("run",),
+        ("run", "--force", "--set", "time.end=0.1"),
+        ("run", "--resume"),
+        ("sweep", ROOT / "runs" / "scattering-amplitudes.toml"),
+        ("nnm", ROOT / "runs" / "nnm-cubic.toml"),
+        ("design",),
+        ("paper", "--quick"),
+    ],
+)
+def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command):
+    """The other is named with its host; a lock that a killed process has left is nobody's."""
+
+    def state():
+        return sorted((path, path.stat().st_mtime_ns) for path in run.rglob("*"))
+
+    with held(run) as process:
+        before = state()
+        ended = in_process(*command, "--out", run)
+        assert ended.returncode == 2
+        assert f"process {process.pid} on {os.uname().nodename} is working in it" in ended.stderr
+        assert state() == before
+        process.kill()
+        process.wait()
+        assert (run / ".lock").exists()
+        with claim(run, RUN, OLD):
+            pass
+        assert not (run / ".lock").exists()

@@ -64,7 +64,7 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
     with pytest.raises(OSError, match=r"run\.h5 could not be written: No space"):
         simulate(case, path, force=True)
     assert (path / "run.h5").read_bytes() == before
-    assert {p.name for p in path.iterdir()} == {"run.h5", "case.toml", "parts", "summary.json"}
+    assert {p.name for p in path.iterdir()} == {"run.h5", "case.toml", "summary.json", ".new"}
     monkeypatch.undo()
     assert simulate(case, path, resume=True).complete
     simulate(case, folder / "straight")
@@ -75,7 +75,7 @@ def test_episodes_stand_in_the_order_of_their_onsets():
     """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4)}
     memory = RunMemory()
-    memory.begin("", force=False, resume=False)
+    memory.begin("")
     memory.recording = Recording(given | {"sites/cell": np.arange(1, 4)}, (), False)
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
         chunk = {n: np.zeros(1) if dims == "time" else np.arange(len(sites)) * 1.0 for n, (dims, *_) in SAMPLED.items()}

@@ -16,7 +16,7 @@ from vipetsc.parallel import StoppedError, StopRequest
 
 Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 # Verbs that look at a request to stop, to save first; others end where they are.
-STOPPABLE = ("run", "sweep", "paper")
+STOPPABLE = ("run", "sweep", "nnm", "paper")
 WITH_PETSC_OPTIONS = ("run", "sweep", "validate")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
@@ -27,8 +27,8 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "set": ("--set", {"action": "append", "default": [], "metavar": "SECTION.KEY=VALUE",
                       "help": "change one value; may be repeated"}),
     "out": ("--out", {"type": Path, "metavar": "DIR", "help": "output folder; one in runs/ if left out"}),
-    "force": ("--force", {"action": "store_true", "help": "replace the results in the output folder"}),
-    "resume": ("--resume", {"action": "store_true", "help": "go on with the unfinished run in the output folder"}),
+    "force": ("--force", {"action": "store_true", "help": "begin anew, and replace the results in the output folder"}),
+    "resume": ("--resume", {"action": "store_true", "help": "go on with what is in the output folder, nothing else"}),
     "json": ("--json", {"action": "store_true", "help": "print JSON instead of a table"}),
     "runs": ("path", {"type": Path, "nargs": "+", "metavar": "PATH",
                       "help": "folder of a run or of a sweep, or a run.h5"}),
@@ -48,9 +48,9 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
     "run": (verbs.run, "one simulation, its analysis and pictures", "case set out force resume"),
     "validate": (verbs.validate, "check a case; print band edges, frequency, end time, size and cost", "case set"),
     "bands": (verbs.bands, "pass bands, gaps and group velocities of a cell", "case set out json"),
-    "sweep": (verbs.sweep, "every combination in [sweep]; goes on where it was", "swept set out force"),
+    "sweep": (verbs.sweep, "every combination in [sweep]; goes on where it was", "swept set out force resume"),
     "nnm": (verbs.nnm, "nonlinear normal modes: frequency-energy branches", "modal set out force resume"),
-    "design": (verbs.design, "the (lambda, eta) search of the four-band cell", "case set out force"),
+    "design": (verbs.design, "the (lambda, eta) search of the four-band cell", "case set out force resume"),
     "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs"),
     "plot": (verbs.plot, "pictures of a finished run again, from its files", "path fig format"),
     "paper": (verbs.paper, "every figure and claim of the paper, and a report", "only quick list out"),

@@ -33,23 +33,26 @@ def draw_source(
     comm: MPI.Comm,
     names: list[str] | None = None,
     formats: tuple[str, ...] = ("png",),
+    afresh: bool = True,
 ) -> list[Path]:
     """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older.
 
-    ``names`` are figures of the kind ``source``. Returns the files written, on rank 0. Raises FolderError for folders
+    ``names`` are figures of the kind ``source``; unless ``afresh``, those that are newer than the files they show stay.
+    Returns the files written, on rank 0. Raises FolderError for folders
     that hold nothing to draw, and for a figure that does not exist.
     """
     from vipetsc.figures.registry import draw
 
     def draw_share() -> list[Path]:
         try:
-            return draw(source, folders, names, formats, (comm.rank, comm.size))
+            return draw(source, folders, names, formats, (comm.rank, comm.size), newest)
         except (OSError, KeyError, ValueError) as error:
             if source not in _NOT_OURS:
                 raise
             raise FolderError(f"{folders[0] / _NOT_OURS[source]} of vipetsc ({error})") from None
 
     on_root(comm, lambda: _prepare(source, folders, names))
+    newest = None if afresh else on_root(comm, lambda: max(p.stat().st_mtime for f in folders for p in f.glob("*.h5")))
     drawn = on_every_rank(comm, draw_share)
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
 

@@ -18,6 +18,7 @@ from vipetsc.case.every import load_every
 from vipetsc.cli import tables
 from vipetsc.cli.plot import draw_source, source_of
 from vipetsc.io.atomic import write_text
+from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_root
 
 DONE, FAILED, BAD_INPUT, STOPPED = 0, 1, 2, os.EX_TEMPFAIL
@@ -49,22 +50,23 @@ def _output(options: argparse.Namespace, name: str) -> Path:
 def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """One simulation, its analysis and pictures."""
     from vipetsc.dynamics import simulate
-    from vipetsc.studies.sweep import measure_run
+    from vipetsc.studies.sweep import is_measured, measure_run
 
     case = _load(Case, options, comm)
     for warning in on_root(comm, case.warnings):
         echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
     folder = _output(options, case.name)
-    result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
-    echo(comm, tables.run_table(result))
-    if result.resumable:
-        return STOPPED
-    stop.check(comm)
-    if case.output.fields and result.statistics["samples"] > 1:
-        on_root(comm, lambda: measure_run(folder))
+    with locked(comm, folder):
+        result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
+        echo(comm, tables.run_table(result))
+        if result.resumable:
+            return STOPPED
         stop.check(comm)
-        if case.output.figures:
-            echo_paths(comm, draw_source("run", [folder], comm))
+        if case.output.fields and result.statistics["samples"] > 1:
+            on_root(comm, lambda: is_measured(folder) or measure_run(folder))
+            stop.check(comm)
+            if case.output.figures:
+                echo_paths(comm, draw_source("run", [folder], comm, afresh=False))
     return DONE if result.complete else FAILED
 
 
@@ -77,29 +79,32 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     for member in plan.members():
         check_options(member.case)
     folder = _output(options, plan.name)
-    result = run_sweep(plan, folder, comm, force=options.force, stop=stop, progress=True)
-    for warning in result.warnings:
-        echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
-    echo(comm, tables.sweep_table(result))
-    if result.resumable:
-        return STOPPED
-    stop.check(comm)
-    if plan.table.get("output", {}).get("figures", True) and (folder / "ensemble.h5").exists():
-        echo_paths(comm, draw_source("sweep", [folder], comm))
+    with locked(comm, folder):
+        result = run_sweep(plan, folder, comm, force=options.force, stop=stop, resume=options.resume, progress=True)
+        for warning in result.warnings:
+            echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
+        echo(comm, tables.sweep_table(result))
+        if result.resumable:
+            return STOPPED
+        stop.check(comm)
+        if plan.table.get("output", {}).get("figures", True):
+            echo_paths(comm, draw_source("sweep", [folder], comm, afresh=False))
     return DONE if result.complete else FAILED
 
 
 def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
-    from vipetsc.modes.follow import follow_all, prepare_folder
+    from vipetsc.modes.follow import claim_branches, follow_all
 
     case = _load(NnmCase, options, comm)
     folder = _output(options, case.name)
-    on_root(comm, lambda: prepare_folder(case, folder, options.force, options.resume))
-    branches = follow_all(case, folder, comm, options.resume, tables.branch_log(sys.stderr))
-    for branch in branches:
-        echo(comm, tables.branch_table(branch))
-    echo_paths(comm, draw_source("branches", [folder], comm))
+    with claim_branches(case, folder, comm, options.force, options.resume) as claim:
+        branches = follow_all(case, claim.folder, comm, claim.going_on, tables.branch_log(sys.stderr), stop)
+        for branch in branches:
+            echo(comm, tables.branch_table(branch))
+        stop.check(comm)
+        claim.publish()
+        echo_paths(comm, draw_source("branches", [folder], comm, afresh=False))
     failed = comm.bcast(any(branch.ending.startswith("failed") for branch in branches))
     return FAILED if failed else DONE
 
@@ -145,8 +150,9 @@ def design(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
     case = _load(DesignCase, options, comm)
     folder = _output(options, case.name)
-    echo(comm, on_root(comm, lambda: search_design(case, folder, options.force)))
-    echo_paths(comm, draw_source("design", [folder], comm))
+    with locked(comm, folder):
+        echo(comm, on_root(comm, lambda: search_design(case, folder, options.force, options.resume)))
+        echo_paths(comm, draw_source("design", [folder], comm, afresh=False))
     return DONE
 
 
@@ -154,7 +160,9 @@ def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> i
     """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
     from vipetsc.studies.sweep import reanalyse_folders
 
-    echo_paths(comm, reanalyse_folders(options.path, comm))
+    folders = on_root(comm, lambda: [p.parent if p.name == "run.h5" else p for p in options.path if p.exists()])
+    with locked(comm, *folders):
+        echo_paths(comm, reanalyse_folders(options.path, comm))
     return DONE
 
 

@@ -2,8 +2,9 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ from vipetsc.dynamics.options import check_options, options_of, petsc_options, w
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
-from vipetsc.io.folder import provenance
-from vipetsc.io.store import RunFolder, RunOutput
+from vipetsc.io.folder import RUN, claimed, provenance
+from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest
 
 # In the order in which engine = "auto" tries them.
@@ -67,8 +68,9 @@ def simulate(
     case
         A resolved case.
     folder
-        Output folder; must not exist unless ``force`` (replaces the run in it) or ``resume`` (goes on with an
-        unfinished one, to the same bits). A ``RunMemory`` keeps the run in memory.
+        Output folder. An unfinished run of the same case in it is gone on with, to the same bits; one that has ended
+        is not made again. ``force`` begins anew and replaces the run in the folder when the new one has ended,
+        ``resume`` needs one to go on with. A ``RunMemory`` keeps the run in memory.
     comm
         The ranks that share the lattice; those of a ``RunMemory`` are its own.
     native
@@ -85,25 +87,51 @@ def simulate(
     CaseError
         If the run needs more memory than there is, or PETSc does not know its options.
     FolderError
-        If the folder cannot be used as asked.
+        If the folder cannot be used as asked: it holds anything else, or another process works in it.
     OSError
         If a file cannot be written, on all ranks.
     """
-    begin = time.perf_counter(), time.process_time()
-    output = folder if isinstance(folder, RunOutput) else RunFolder(Path(folder), comm)
+    if isinstance(folder, RunMemory) and resume:
+        raise ValueError("a run in memory cannot be resumed")
     case = with_database(case)
     check_options(case)
     model = case.model()
     kind, refusal = select_engine(case, model)
-    check_memory(model, case.output, kind.name, output.comm)
-    output.begin(case.to_toml(), force, resume)
+    check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
+    watching = [*OBSERVERS, *(["progress"] if progress else []), *observers]
+    make = partial(_simulate, case, model, partial(kind, native=native, stop=stop), refusal, watching)
+    if isinstance(folder, RunOutput):
+        return make(folder)
+    with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
+        output = RunFolder(claim.folder, comm)
+        told = output.ending()
+        if told is None:
+            result = make(output)
+        else:
+            result = Result(told["complete"], False, told["status"], told["statistics"], claim.folder)
+        if not result.resumable:
+            claim.publish()
+    return replace(result, folder=claim.path)
+
+
+def _simulate(
+    case: Case,
+    model: Model,
+    create: Callable[[Model, Layout], Engine],
+    refusal: str | None,
+    watching: Sequence[str],
+    output: RunOutput,
+) -> Result:
+    """Simulate ``case`` into ``output``, from its last checkpoint on if it has one."""
+    begin = time.perf_counter(), time.process_time()
+    output.begin(case.to_toml())
     sys.audit("vipetsc.set-up", case.name)
     layout = Layout(model, output.comm)
     with petsc_options(options_of(case)):
-        engine = kind(model, layout, native, stop)
+        engine = create(model, layout)
     setup = Setup(case, model, layout, EnergyMeter(model, layout), engine, output)
-    run = Run(setup, [*OBSERVERS, *(["progress"] if progress else []), *observers])
-    shares = output.last_state() if resume else None
+    run = Run(setup, watching)
+    shares = output.last_state()
     if shares is not None:
         run.restore(shares)
     ending, sentence = run.advance()
@@ -176,7 +204,7 @@ class Run:
         engine, output, comm = self.setup.engine, self.setup.output, self.setup.output.comm
         if ending == STOPPED:
             self.checkpoint()
-            sentence += "; --resume goes on from there"
+            sentence += "; the same command goes on from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
         for observer in self.observers:
             observer.finish(ending == STOPPED)

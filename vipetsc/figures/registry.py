@@ -76,6 +76,7 @@ def draw(
     names: Sequence[str] | None = None,
     formats: Sequence[str] = ("png",),
     share: tuple[int, int] = (0, 1),
+    newest: float | None = None,
 ) -> list[Path]:
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; returns the files, each complete.
 
@@ -88,6 +89,8 @@ def draw(
         Which figures; by default all that the data allow.
     share
         (rank, size): draw every ``size``-th picture from ``rank`` on, so that ranks can share the work.
+    newest
+        Keep pictures that are not older than this time.
 
     Raises
     ------
@@ -96,9 +99,14 @@ def draw(
     OSError, ValueError
         If a file cannot be read, or a picture not written.
     """
+
+    def keep(path: Path) -> bool:
+        return newest is not None and path.exists() and path.stat().st_mtime >= newest
+
+    turns = itertools.count(*share)
     with rc_style():
-        target, turns = folders[0] / "figures", itertools.count(*share)
-        return draw_each(drawings(source, folders, names), target, formats, turns, "\n".join(warnings_of(folders)))
+        note = "\n".join(warnings_of(folders))
+        return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, turns, note, keep)
 
 
 def warnings_of(folders: Sequence[Path]) -> list[str]:

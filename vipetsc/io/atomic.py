@@ -4,6 +4,7 @@ import os
 import platform
 import re
 import secrets
+import shutil
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -40,6 +41,15 @@ def unwritten(path: Path, error: Exception) -> OSError:
     number = getattr(error, "errno", None) or (int(told[1]) if told else 0)
     reason = os.strerror(number) if number else str(error)
     return OSError(number, f"{path} could not be written: {reason}; the same command goes on when that is mended")
+
+
+def discard(folder: Path) -> None:
+    """Remove ``folder``, if it is there; a kill leaves it whole, or under a name that begins with a dot."""
+    aside = folder.with_name(f".{folder.name}.old")
+    shutil.rmtree(aside, ignore_errors=True)
+    if folder.is_dir():
+        os.replace(folder, aside)
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:

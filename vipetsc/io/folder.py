@@ -1,9 +1,17 @@
-"""Output folders: the one way to claim one, and the provenance that every output carries."""
+"""Output folders: the one way to claim one, and the provenance that every output carries.
 
+Names that begin with a dot are no results: ``.lock`` while a command works in the folder, ``.new`` for results that
+are to replace those that are there, ``.ready``, ``.moving`` and ``.*.old`` while they do, ``.*.part`` for a file being
+written.
+"""
+
+import os
 import platform
 import shutil
 import sys
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,107 +23,175 @@ import h5py
 import numpy as np
 
 import vipetsc
-from vipetsc.io.atomic import write_text
+from vipetsc.io.atomic import discard, write_text
+from vipetsc.io.lock import LOCK, FolderError, locked
+from vipetsc.parallel import on_root
 
 FORMAT_VERSION = 1
+NEW, READY, MOVING, OLD = ".new", ".ready", ".moving", ".replaced.old"
 
-
-class FolderError(ValueError):
-    """An output folder that cannot be used as asked."""
+Difference = Callable[[str], str | None]
 
 
 @dataclass(frozen=True)
 class FolderKind:
     """What a folder of results holds; patterns as of ``Path.glob``.
 
-    ``noun``: one of them; ``results``: what shows that a folder holds some; ``unfinished``: what is there while they
-    can be gone on with, and their name; ``replaced``: what goes when ``force`` begins anew (other results stay until
-    new ones replace them); ``marker``: the file that names what the results are of.
+    ``noun``: one of them; ``results``: what shows that a folder holds some; ``beside``: what else is theirs;
+    ``marker``: the file that names what the results are of.
     """
 
     noun: str
     results: tuple[str, ...]
-    unfinished: tuple[str, str] | None = None
-    replaced: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ("figures",)
     marker: str = "case.toml"
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Everything that belongs to the results."""
+        return (self.marker, *self.results, *self.beside)
 
-RUN = FolderKind("run", ("run.h5", "parts"), ("parts", "unfinished run"), ("parts",))
-BRANCHES = FolderKind("branch", ("branch-*.h5",), ("case.toml", "branches"), ("branch-*.*",))
+
+RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "figures"))
+BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
 SEARCH = FolderKind("search", ("design.h5",))
-SWEEP = FolderKind("sweep", ("index.json", "linear"), None, ("*/", "index.json", "ensemble.h5", "backbone.h5"))
-PAPER = FolderKind("paper", ("plan.json",), marker="plan.json")
+SWEEP = FolderKind("sweep", ("index.json", "linear"), ("*/", "ensemble.h5", "backbone.h5"))
+PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, SWEEP, PAPER)
 
 
-def claim_folder(
-    path: Path,
+class Claim:
+    """The right to work in an output folder; ``path`` is the folder itself.
+
+    ``folder`` is where results are to be made, ``path/.new`` while they are to replace others; ``going_on`` tells
+    whether it holds results of the same case.
+    """
+
+    def __init__(self, comm: MPI.Comm, path: Path, kind: FolderKind, folder: Path, going_on: bool) -> None:
+        self.comm, self.path, self.kind, self.folder, self.going_on = comm, path, kind, folder, going_on
+
+    def publish(self) -> None:
+        """Let the results, which are whole, take the place of earlier ones; all ranks must call it."""
+
+        def swap() -> None:
+            shutil.rmtree(self.path / OLD, ignore_errors=True)
+            sys.audit("vipetsc.swap", str(self.path))
+            os.replace(self.folder, self.path / READY)
+            _finish_swap(self.path, self.kind)
+
+        if self.folder != self.path:
+            on_root(self.comm, swap)
+            self.folder = self.path
+
+
+@contextmanager
+def claimed(
+    comm: MPI.Comm,
+    path: str | Path,
     kind: FolderKind,
     text: str,
     *,
     force: bool = False,
-    resume: bool | None = False,
-    difference: Callable[[str], str | None] | None = None,
-) -> bool:
-    """Make ``path`` a folder for results of ``kind``, with ``text`` in its marker; returns whether they go on.
+    resume: bool = False,
+    difference: Difference | None = None,
+) -> Iterator[Claim]:
+    """Work in the folder ``path``, alone, on results of ``kind``: begin them, or go on with those of the same case.
+
+    All ranks must call it; what a command that was killed has left in the folder is put in order first.
 
     Parameters
     ----------
-    path, kind
-        The folder, made if it is missing, and what it is to hold.
+    path
+        The folder, made if it is missing.
     text
-        What the results are of, a resolved case.
+        What the results are of, a resolved case; it is kept in the folder.
     force
-        Begin anew where results of the same kind are.
+        Begin anew: the results made in ``Claim.folder`` replace earlier ones when they are published. Those that were
+        not are gone on with by the next call without ``force``.
     resume
-        Go on with results that are there and nothing else; None: go on if there are results of the same ``text``.
+        Go on with results that are there, and nothing else.
     difference
-        Of the marker's text: why results begun with it are not those asked for, None if they are; by default any
-        change of ``text``.
+        Of an earlier text: why results of it are not those asked for, None if they are; by default any change.
 
     Raises
     ------
     FolderError
-        If it is a file, holds anything but results of ``kind``, or those where neither ``force`` nor ``resume``
-        tells what to do with them.
+        If the path is a file, another process works in it, or it holds anything but results of ``kind`` and of the
+        same case where ``force`` is off; if there is nothing to ``resume``.
     """
+    path = Path(path)
+    with locked(comm, path):
+        folder, going_on = on_root(comm, lambda: _claim(path, kind, text, force, resume, difference))
+        yield Claim(comm, path, kind, folder, going_on)
+
+
+def _claim(
+    path: Path, kind: FolderKind, text: str, force: bool, resume: bool, difference: Difference | None
+) -> tuple[Path, bool]:
+    """Where to work, and whether results of the same case are there."""
     sys.audit("vipetsc.claim", str(path))
-    if path.exists() and not path.is_dir():
-        raise FolderError(f"{path}: is a file, not a folder; choose another --out")
-    marker = path / kind.marker
-    unfinished, name = kind.unfinished or (kind.marker, kind.noun)
-    begun = marker.exists() and any(path.glob(unfinished))
-    if resume and not begun:
-        raise FolderError(f"{path}: holds no {name} to resume; leave out --resume")
+    marker, aside = path / kind.marker, path / NEW
     foreign = [pattern for other in KINDS if other is not kind for pattern in other.results]
-    filled = path.is_dir() and any(path.iterdir())
-    if filled and (not marker.exists() or any(any(path.glob(pattern)) for pattern in foreign)):
+    if any(any(folder.glob(name)) for folder in (path, path / READY, path / MOVING) for name in foreign):
         raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
-    going_on = filled and not force and resume is not False
-    if going_on:
-        earlier = marker.read_text(encoding="utf-8")
-        problem = difference(earlier) if difference else _difference(earlier, text, kind, resume)
+    _finish_swap(path, kind)
+    filled = any(not entry.is_dir() or _results(entry) for entry in _results(path))
+    if filled and not marker.exists():
+        raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
+    if resume and not filled:
+        raise FolderError(f"{path}: holds no {kind.noun} to resume; leave out --resume")
+    folder, going_on = path, filled
+    if force or not filled:
+        discard(aside)
+    if force and filled:
+        folder, going_on = aside, False
+    elif filled:
+        if (aside / kind.marker).exists() and _problem(aside, kind, text, difference) is None:
+            folder = aside
+        problem = _problem(folder, kind, text, difference)
         if problem:
             raise FolderError(f"{path}: {problem}")
-    elif filled and not force:
-        go_on = f"--resume goes on with the {name} in it, " if begun and kind.unfinished else ""
-        raise FolderError(f"{path}: exists; {go_on}--force replaces what is in it, --out chooses another")
-    elif filled:
-        for old in [old for pattern in kind.replaced for old in path.glob(pattern)]:
-            shutil.rmtree(old) if old.is_dir() else old.unlink()
-    path.mkdir(parents=True, exist_ok=True)
-    if not marker.exists() or marker.read_text(encoding="utf-8") != text:
-        write_text(marker, text)
-    return going_on
+    folder.mkdir(exist_ok=True)
+    if not going_on or (folder / kind.marker).read_text(encoding="utf-8") != text:
+        write_text(folder / kind.marker, text)
+    for temporary in [p for where in ("", "*/", "linear/*/") for p in folder.glob(f"{where}.*.part")]:
+        if temporary.parent == folder or not (temporary.parent / LOCK).exists():  # where nobody else is writing
+            temporary.unlink(missing_ok=True)
+    return folder, going_on
 
 
-def _difference(earlier: str, text: str, kind: FolderKind, resume: bool | None) -> str | None:
-    if earlier == text:
-        return None
-    if resume is None:
-        return f"holds another {kind.noun}; --force replaces it, --out chooses another folder"
+def _results(folder: Path) -> list[Path]:
+    return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+
+
+def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference | None) -> str | None:
+    """Why results in ``folder`` are not those of ``text``; None if they are."""
+    earlier = (folder / kind.marker).read_text(encoding="utf-8")
+    if difference or earlier == text:
+        return difference(earlier) if difference else None
+    with suppress(ValueError):
+        if tomllib.loads(earlier) == tomllib.loads(text):
+            return None
     lines = {line.strip() for line in set(earlier.splitlines()) ^ set(text.splitlines())}
-    return f"--resume needs the case it was begun with; differing: {'; '.join(sorted(lines - {''}))}"
+    differing = "; ".join(sorted(lines - {""}))
+    return f"holds another {kind.noun}, differing: {differing}; --force replaces it, --out chooses another folder"
+
+
+def _finish_swap(path: Path, kind: FolderKind) -> None:
+    """Put results that are ready in the place of earlier ones, from wherever a kill has ended it; remove leftovers."""
+    ready, moving, old = path / READY, path / MOVING, path / OLD
+    if ready.is_dir():
+        old.mkdir(exist_ok=True)
+        for entry in [entry for pattern in kind.files for entry in path.glob(pattern)]:
+            if not entry.name.startswith("."):
+                os.replace(entry, old / entry.name)
+        os.replace(ready, moving)
+    if moving.is_dir():
+        for entry in moving.iterdir():
+            os.replace(entry, path / entry.name)
+        moving.rmdir()
+    for leftover in path.glob(".*.old"):
+        shutil.rmtree(leftover, ignore_errors=True)
 
 
 def provenance(comm: MPI.Comm) -> dict[str, Any]:

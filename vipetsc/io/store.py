@@ -10,8 +10,8 @@ by chunk, to a file of one rank or to one that all ranks share.
 
 import json
 import os
-import shutil
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,9 +24,10 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from vipetsc.io.atomic import Arrays, load_arrays, save_arrays, unwritten, write_text
-from vipetsc.io.folder import RUN, claim_folder
+from vipetsc.io.atomic import Arrays, discard, load_arrays, save_arrays, unwritten, write_text
+from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset, tabulated
+from vipetsc.io.read import open_run
 from vipetsc.parallel import on_every_rank, on_root
 
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
@@ -89,18 +90,36 @@ class RunFolder:
         self.folder, self.comm, self.count = Path(folder), comm, 0
         self._parts = self.folder / "parts"
 
-    def begin(self, case: str, force: bool, resume: bool) -> None:
-        """Make ready for a run of ``case`` (TOML), or for one that goes on; all ranks must call it.
-
-        Raises FolderError.
-        """
+    def begin(self, case: str) -> None:
+        """Make ready for a run of ``case`` (TOML), or for one that goes on; all ranks must call it."""
         self.case = case
+        on_root(self.comm, lambda: self._parts.mkdir(parents=True, exist_ok=True))
 
-        def claim() -> None:
-            claim_folder(self.folder, RUN, case, force=force, resume=resume)
-            self._parts.mkdir(exist_ok=True)
+    def ending(self) -> Mapping[str, Any] | None:
+        """The root attributes of ``run.h5``; None if the run has not ended. All ranks must call it.
 
-        on_root(self.comm, claim)
+        ``summary.json`` is written again where it is lost. Raises FolderError if ``run.h5`` cannot be read.
+        """
+
+        def read() -> dict[str, Any] | None:
+            if not (self.folder / "run.h5").exists() or any(self._parts.glob("*")):
+                return None
+            try:
+                with open_run(self.folder / "run.h5") as run:
+                    told = {key: np.asarray(value).item() for key, value in run.attrs.items()}
+            except (OSError, ValueError) as error:
+                raise FolderError(f"{error}; --force makes the run again") from error
+            told |= {key: json.loads(told[key]) for key in ("statistics", "warnings") if key in told}
+            try:
+                json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
+            except (OSError, ValueError):
+                self._summarise(told | {"case": tomllib.loads(told["case"])})
+            return told
+
+        return on_root(self.comm, read)
+
+    def _summarise(self, told: Mapping[str, Any]) -> None:
+        write_text(self.folder / "summary.json", json.dumps(told, indent=2, allow_nan=False) + "\n")
 
     def append(self, chunk: Arrays | None) -> None:
         """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
@@ -185,10 +204,9 @@ class RunFolder:
         def conclude() -> None:
             sys.audit("vipetsc.conclude", str(self.folder))
             os.replace(aside, target)
-            text = json.dumps({**attributes, **summary}, indent=2, allow_nan=False)
-            write_text(self.folder / "summary.json", text + "\n")
+            self._summarise({**attributes, **summary})
             sys.audit("vipetsc.clean", str(self._parts))
-            shutil.rmtree(self._parts)
+            discard(self._parts)
 
         try:
             on_every_rank(self.comm, write)
@@ -211,10 +229,8 @@ class RunMemory:
         self.comm, self.count = comm, 0
         self.dataset: xr.Dataset | None = None
 
-    def begin(self, case: str, force: bool, resume: bool) -> None:
-        """Make ready; raises ValueError for ``resume``."""
-        if resume:
-            raise ValueError("a run in memory cannot be resumed")
+    def begin(self, case: str) -> None:
+        """Make ready."""
         self.case, self.count = case, 0
         self._chunks: list[Arrays] = []
 

@@ -4,6 +4,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from mpi4py import MPI
 
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
-from vipetsc.io.folder import BRANCHES, claim_folder, provenance
+from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
 from vipetsc.modes.audit import BranchMonitor, compare, jumps, sampled
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.continuation import Continuation, ContinuationError
@@ -23,7 +24,7 @@ from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate, switch
 from vipetsc.modes.system import System
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StoppedError, StopRequest
 
 # The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
@@ -34,18 +35,17 @@ FAILURES = (ContinuationError, FlowError, ValueError)
 Listener = Callable[[Branch, Point], None]
 
 
-class StoppedError(RuntimeError):
-    """A branch was stopped on request; it holds the points so far and can be resumed."""
-
-
-def prepare_folder(case: NnmCase, folder: Path, force: bool, resume: bool) -> None:
-    """Make ``folder`` ready for the branches of ``case`` (rank 0 only); raises FolderError if it is not ours."""
+def claim_branches(
+    case: NnmCase, folder: Path, comm: MPI.Comm, force: bool = False, resume: bool = False
+) -> AbstractContextManager[Claim]:
+    """Claim ``folder`` for the branches of ``case``, as ``claimed``; to ``resume`` them, their ends may be others."""
 
     def difference(earlier: str) -> str | None:
         same = NnmCase.from_toml(earlier).physics() == case.physics()
         return None if same else "--resume needs the system, map and flow that its branches were begun with"
 
-    claim_folder(folder, BRANCHES, case.to_toml(), force=force, resume=resume, difference=difference)
+    further = difference if resume else None
+    return claimed(comm, folder, BRANCHES, case.to_toml(), force=force, resume=resume, difference=further)
 
 
 def follow_all(

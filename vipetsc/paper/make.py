@@ -7,7 +7,7 @@ their results, the version of the package. ``made.json`` keeps the hashes.
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from mpi4py import MPI
 from vipetsc.figures import style
 from vipetsc.figures.style import Drawing, draw_each
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import PAPER, claim_folder, provenance
+from vipetsc.io.folder import PAPER, Claim, claimed, provenance
 from vipetsc.paper.claims import write_claims
 from vipetsc.paper.figures import RELATED, TRANSFER
 from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, Step, fingerprint
@@ -66,8 +66,15 @@ def make_paper(
     if a case file cannot be used.
     """
     sys.audit("vipetsc.plan", str(root))
-    root, stop, part = Path(root), stop or StopRequest(), plan.only(only)
-    on_root(comm, lambda: _claim(plan, root))
+    root, part = Path(root), plan.only(only)
+    with _claimed(plan, root, comm):
+        return _make_paper(plan, part, root, comm, stop or StopRequest(), tell)
+
+
+def _make_paper(
+    plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell
+) -> PaperResult | None:
+    """Make the steps and figures of ``part``, and from all of ``plan`` that is there the claims and the report."""
     made = _make_steps(part, root, comm, stop, tell)
     if stop.agreed(comm):
         return None
@@ -83,8 +90,8 @@ def make_paper(
     return PaperResult(made, drawn, claims, on_root(comm, lambda: all(map(is_complete, part.steps))))
 
 
-def _claim(plan: Plan, root: Path) -> None:
-    """Make ``root`` the folder of this plan; a case that cannot be used raises before anything is written."""
+def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:
+    """Claim ``root`` for this plan; a case that cannot be used raises before anything is written."""
     for step in plan.steps:
         _ = step.text
 
@@ -95,7 +102,7 @@ def _claim(plan: Plan, root: Path) -> None:
         other = f"holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
         return other if grid != plan.grid else None
 
-    claim_folder(root, PAPER, json.dumps({"grid": plan.grid}) + "\n", resume=None, difference=difference)
+    return claimed(comm, root, PAPER, json.dumps({"grid": plan.grid}) + "\n", difference=difference)
 
 
 def _make_steps(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> tuple[str, ...]:

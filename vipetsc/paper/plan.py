@@ -23,7 +23,7 @@ from vipetsc.case import DesignCase, NnmCase, Sweep
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
-from vipetsc.modes.follow import follow_all, prepare_folder
+from vipetsc.modes.follow import claim_branches, follow_all
 from vipetsc.modes.system import System
 from vipetsc.paper.claims import measure_claims
 from vipetsc.paper.claims.criteria import CLAIMS
@@ -83,15 +83,15 @@ class Step:
     def make(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
         """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``."""
         case, folder = self.case, self.folder(root)
-        begun = on_root(comm, (folder / "case.toml").exists)
         if isinstance(case, Sweep):
             run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True)
         elif isinstance(case, NnmCase):
-            resume = begun and not afresh
-            on_root(comm, lambda: prepare_folder(case, folder, afresh, resume))
-            follow_all(case, folder, comm, resume)
+            with claim_branches(case, folder, comm, afresh) as claim:
+                follow_all(case, claim.folder, comm, claim.going_on, stop=stop)
+                if not stop.agreed(comm):
+                    claim.publish()
         else:
-            on_root(comm, lambda: search_design(case, folder, afresh or begun))
+            on_root(comm, lambda: search_design(case, folder, afresh))
 
     def state(self, root: Path) -> str:
         """DONE, BEGUN, MISSING, or STALE if the folder holds another case."""

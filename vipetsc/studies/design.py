@@ -12,8 +12,8 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case.design import DesignCase
-from vipetsc.io.folder import SEARCH, claim_folder, provenance
-from vipetsc.io.netcdf import tabulated, write_netcdf
+from vipetsc.io.folder import SEARCH, claimed, provenance
+from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band
 from vipetsc.lattice.search import COSTS, Search, search, signed_deflection, unit_vectors
@@ -48,14 +48,24 @@ LAYOUT = {
 }
 
 
-def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> str:
+def search_design(case: DesignCase, folder: str | Path, force: bool = False, resume: bool = False) -> str:
     """Search the grid of ``case`` in each of its readings; writes ``design.h5``, returns a table of the optima.
 
-    Call it on one rank. ``force`` replaces an earlier search in ``folder``; raises FolderError if it holds anything
-    else, or a search and ``force`` is off.
+    Call it on one rank. A search of the same case that is in ``folder`` is not made again unless ``force`` replaces
+    it; ``resume`` needs one. Raises FolderError if the folder holds anything else.
     """
-    folder, options = Path(folder), case.design
-    claim_folder(folder, SEARCH, case.to_toml(), force=force)
+    with claimed(MPI.COMM_SELF, folder, SEARCH, case.to_toml(), force=force, resume=resume) as claim:
+        path = claim.folder / "design.h5"
+        if not path.exists():
+            write_netcdf(path, _search(case))
+        claim.publish()
+        with open_netcdf(claim.path / "design.h5", "search", BEST) as data:
+            return _table(data)
+
+
+def _search(case: DesignCase) -> xr.Dataset:
+    """All of ``design.h5``."""
+    options = case.design
     sys.audit("vipetsc.set-up", case.name)
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
     lam, eta = options.lam.values(), options.eta.values()
@@ -74,9 +84,7 @@ def search_design(case: DesignCase, folder: str | Path, force: bool = False) -> 
     about = provenance(MPI.COMM_SELF) | {"case": case.to_toml()}
     if options.eta.last == 1:
         about["left_out"] = "eta = 1: the host mass m (1 - eta) vanishes"
-    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
-    write_netcdf(folder / "design.h5", data)
-    return _table(data)
+    return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
 
 
 def _optima(searches: Mapping[Reading, Search], grids: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -21,11 +21,11 @@ from vipetsc.case import Case, case_id
 from vipetsc.case.sweep import SweepTable
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.run import Result
-from vipetsc.io.atomic import write_text
+from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import field_time, open_run
-from vipetsc.io.store import RunMemory
+from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.analysis import FULL, analyse
@@ -125,16 +125,19 @@ class MemberStore:
             on_root(self.team, lambda: self._scale(case, folder, wave))
             return
 
-        def is_begun() -> bool:
-            """Whether a run with its fields was cut off; one killed before it had begun is dropped."""
-            marker = folder / "case.toml"
-            if whole and folder.is_dir() and not marker.exists():
-                shutil.rmtree(folder)
-            return whole and (folder / "parts").is_dir() and marker.read_text(encoding="utf-8") == case.to_toml()
+        def begin() -> None:
+            """A run with its fields that was cut off goes on, if it is of this version."""
+            marker, text = folder / "case.toml", case.to_toml()
+            if not marker.exists() or marker.read_text(encoding="utf-8") != text:
+                discard(folder)
+                folder.mkdir()
+                write_text(marker, text)
 
-        begun, memory = on_root(self.team, is_begun), RunMemory(self.team)
-        simulated, output = (case, folder) if whole else (_gathered(case, "velocity"), memory)
-        result = self._simulate(simulated, output, force=not begun, resume=begun)
+        memory = RunMemory(self.team)
+        if whole:
+            on_root(self.team, begin)
+        simulated, output = (case, RunFolder(folder, self.team)) if whole else (_gathered(case, "velocity"), memory)
+        result = self._simulate(simulated, output)
 
         def measure() -> None:
             if memory.dataset is None:
@@ -152,8 +155,8 @@ class MemberStore:
 
         on_root(self.team, measure)
 
-    def _simulate(self, case: Case, output: Path | RunMemory, **options: Any) -> Result:
-        result = simulate(case, output, self.team, stop=self.stop, **options)
+    def _simulate(self, case: Case, output: RunOutput) -> Result:
+        result = simulate(case, output, self.team, stop=self.stop)
         if result.resumable:
             raise StoppedError(result.sentence)
         if not result.complete:

@@ -9,7 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,7 +21,7 @@ import xarray as xr
 import vipetsc
 from vipetsc.case import Case, Sweep, SweepMember
 from vipetsc.io.atomic import write_text
-from vipetsc.io.folder import SWEEP, FolderError, claim_folder
+from vipetsc.io.folder import SWEEP, FolderError, claimed
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, on_every_rank, on_root
@@ -74,21 +74,32 @@ def run_sweep(
     *,
     force: bool = False,
     stop: StopRequest | None = None,
+    resume: bool = False,
     progress: bool = False,
 ) -> SweepResult:
     """Make every member of ``plan`` in ``folder``, then ``index.json`` and ``ensemble.h5``.
 
     Members that are complete and made by this version are not made again, so a sweep that was killed goes on where
-    it was; ``force`` begins anew. A member that fails is recorded with its reason and the others go on. All ranks of
+    it was; ``force`` begins anew and replaces the sweep in the folder when the new one has ended, ``resume`` needs one
+    to go on with. A member that fails is recorded with its reason and the others go on. All ranks of
     ``comm`` make members; ``[sweep] ranks`` of them share each.
 
     Raises CaseError if no member is a valid case, FolderError if the folder holds anything but this sweep.
     """
-    folder, stop = Path(folder), stop or StopRequest()
+    members = plan.members()
+    with claimed(comm, folder, SWEEP, plan.to_toml(), force=force, resume=resume) as claim:
+        result = _make_all(plan, members, claim.folder, comm, stop or StopRequest(), progress)
+        if not result.resumable:
+            claim.publish()
+    return replace(result, folder=claim.path)
+
+
+def _make_all(
+    plan: Sweep, members: Sequence[SweepMember], folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool
+) -> SweepResult:
+    """Make what is missing of the ``members`` in ``folder``, on all ranks, and put together what is there."""
     begin = time.perf_counter()
     sys.audit("vipetsc.plan", plan.name)
-    members = plan.members()
-    on_root(comm, lambda: claim_folder(folder, SWEEP, plan.to_toml(), force=force, resume=None))
     team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
     pool = TaskPool(comm, team, stop)
     store = MemberStore(folder, plan.options, team, stop)
