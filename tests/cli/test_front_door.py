@@ -191,6 +191,9 @@ def test_validate_reads_every_section_as_its_verb_does(in_process, tmp_path):
     for text in ("restitution 0.7, effective 0.768", "2 members (2), 0 of them impossible", "reduced system, modes 2",
                  "37 lambda x 36 eta, 11 wavenumbers"):  # fmt: skip
         assert text in ended.stdout
+    unknown = in_process("validate", path, "--set", "petsc.ts_rk_type=magic")
+    assert unknown.returncode == 2
+    assert "petsc.ts_rk_type = 'magic'" in unknown.stderr
     spoilt = in_process("validate", path, "--set", "nnm.modes=foo", "--set", "design.wavenumbers=1")
     assert spoilt.returncode == 2
     assert spoilt.stderr.count("nnm.modes = 'foo'") == spoilt.stderr.count("design.wavenumbers = 1") == 1

@@ -24,6 +24,7 @@ from vipetsc.case.every import load_every
 from vipetsc.case.sweep import SweepTable
 from vipetsc.cli.tables import case_table
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.options import check_options
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
 
@@ -36,6 +37,12 @@ HOSTILE: list[Any] = [
     {"first": 1, "last": 10**9, "count": 5}, {"first": 5, "count": 3, "spacing": 10**9}, [{"start": 1, "end": 9}],
     {"log": [1.0, 100.0], "count": 3}, {"linear": [0, 1], "count": 10**9}, {"log": [0, 0], "count": 2},
 ]  # fmt: skip
+PETSC: dict[str, tuple[Any, ...]] = {
+    "ts_rk_type": ("5dp", "8vr", "3bs", "1fe", "magic"), "ts_adapt_type": ("basic", "none", "dsp", "glee"),
+    "ts_adapt_clip": ("0.1,2", "2", "0,0"), "ts_dt": ("1e-6", "0", "-1"), "ts_max_steps": ("0", "5"), "ts_rtol": ("1",),
+    "ts_type": ("rk", "euler"), "ts_max_time": ("1e-3",), "ts_adapt_wnormtype": ("2", "infinity"), "ksp_type": ("cg",),
+    "ts_adapt_safety": ("0.9", "7"), "ts_adapt_dt_max": ("1e-5",), "log_view": ("",), "snes_rtol": (1e-3,),
+}  # fmt: skip
 MISSPELT = ("s", ".x", "\u0445")
 OWN: dict[str, Any] = {
     "lattice": {
@@ -89,7 +96,7 @@ def known_keys() -> dict[Path_, list[Any]]:
             if name != "name":
                 _collect(field.annotation, (name,), found)
     _collect(SweepTable, ("sweep",), found)
-    return found
+    return found | {("petsc", name): list(values) for name, values in PETSC.items()}
 
 
 def _collect(annotation: Any, path: Path_, found: dict[Path_, list[Any]]) -> None:
@@ -266,6 +273,7 @@ def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
     try:
         with limit(seconds):
             cases = load_every(path)
+            check_options(cases[0])
             for case in cases:
                 case_table(case, 1)
                 if isinstance(case, Case):
