@@ -8,6 +8,8 @@ import itertools
 import tomllib
 from dataclasses import fields, replace
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -18,15 +20,18 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import Guards, NnmCase, NnmTable
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
 from vipetsc.modes import dop853
-from vipetsc.modes.audit import sampled
+from vipetsc.modes.audit import BranchMonitor, is_jump, sampled, suspects
 from vipetsc.modes.branch import Branch, slope_laws, tell_regions
 from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
-from vipetsc.modes.continuation import Continuation, half_trace_change, unit
+from vipetsc.modes.continuation import Continuation, half_trace_change, relative_turn, unit
 from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.point import half_traces, linear_start, multipliers, sample_orbit
+from vipetsc.modes.follow import follow_all
+from vipetsc.modes.point import Point, half_traces, linear_start, multipliers, repetitions, sample_orbit
+from vipetsc.modes.reference import Newmark
 from vipetsc.modes.shooting import MAPS, Chart, Grazing, Logarithmic, Relative, Shooting
-from vipetsc.modes.special import locate
+from vipetsc.modes.special import _Segment, locate, switch
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
+from vipetsc.parallel import StopRequest
 
 D = 10**-2.75
 LAW = Contact("bilinear", contact_stiffness(1e8, 0.005, 0.3))
@@ -455,3 +460,167 @@ def test_picture_from_the_file(short_branch, tmp_path):
     (path,) = draw("branches", [tmp_path])
     assert path == tmp_path / "figures" / "branch-out-of-phase.png"
     assert path.stat().st_size > 20000
+
+
+def in_phase_hertz(**control) -> tuple[Shooting, list[Point]]:
+    """The in-phase Hertz branch in the chart auto, up to just behind the tip of its 3:1 tongue."""
+    system = System.reduced(four_band(), D, Contact("hertz", contact_stiffness(1e8, 0.005, 0.3)))
+    problem = Shooting(Dop853Flow(system), MAPS["quarter"])
+    start = linear_start(problem, 0, system.grazing_energy(0) / 100)
+    growing = Continuation(problem, start, NnmTable(**{"points": 150, "chart": "auto", "energy": [0, 6e9]} | control))
+    return problem, [growing.point, *growing]
+
+
+@pytest.mark.parametrize("guarded", [True, False])
+def test_the_in_phase_hertz_branch_crosses_the_out_of_phase_one_and_goes_on(guarded):
+    """The tip of its 3:1 tongue lies on the out-of-phase branch: a turn that the grazing chart hides leads onto it.
+
+    The true branch comes back from the tip, with c = 1 passed there, and no orbit repeats itself.
+    """
+    problem, points = in_phase_hertz(guards=Guards() if guarded else Guards(turn_relative=0))
+    assert max(relative_turn(problem, a, b) for a, b in itertools.pairwise(points)) > 0.2
+    monitor = BranchMonitor(problem, Guards())
+    said = [s for s in map(monitor.check, points) if s]
+    assert [i for i, why in suspects(problem, points) if "turns by" in why] == ([] if guarded else [123])
+    if guarded:
+        assert not said
+        assert points[-1].energy < points[124].energy < 0.031
+    else:
+        assert said[0] == "left its branch: the orbit of point 125 is another one passed 3 times"
+        assert is_jump(problem, points[123], points[124], NnmTable(chart="auto"))
+
+
+def test_a_branch_that_stands_still_says_so():
+    monitor = BranchMonitor(Shooting(Dop853Flow(reduced()), MAPS["quarter"]), Guards(standstill=20))
+    problem = Shooting(Newmark(reduced()), MAPS["quarter"])
+    start = linear_start(problem, 1, 0.0293434)
+    growing = Continuation(problem, start, NnmTable(points=100, chart="auto"))
+    said = next(s for s in map(monitor.check, growing) if s)
+    assert said.startswith("does not advance: 20 points up to ")
+    assert "E = 0.0293434562 J" in said
+
+
+def on_branch(problem: Shooting, x: list[float], period: float, step: float) -> Point:
+    """A point of a branch from rounded values, with falling period along its tangent."""
+    chart = Relative(problem.system, np.array(x), period)
+    xi = chart.encode(np.array(x), period)
+    row = np.linalg.svd(problem.jacobian(problem.arc(np.array(x), period)) @ chart.derivative(xi))[2][-1]
+    attempt = problem.solve(chart, xi, row, row @ xi)
+    assert attempt.converged
+    return replace(Point.of(problem, attempt, chart, -row * np.sign(row[-1])), step=step)
+
+
+# Three points of the in-phase Hertz branch, x in m, period in s and step each; 1.0e6 J and 1.7e7 J.
+PAIRS = {
+    "symmetry-breaking": [
+        ([-9.151145747905344, -9.226299568925315], 0.003148020146748403, 0.0986),
+        ([-9.869904521950374, -9.949778169710124], 0.0031478468939554415, 0.1),
+        ([-10.564752182727462, -10.650004848960046], 0.0031476911959756027, 0.0969),
+    ],
+    "fold-energy": [
+        ([-41.58157519928831, -41.827813151364275], 0.003145313850191308, 0.0109),
+        ([-41.592476734313195, -41.841905100306086], 0.003145304127065715, 0.013),
+        ([-41.58941483494171, -41.843776559314165], 0.0031452884555063713, 0.0198),
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", PAIRS)
+def test_two_special_points_within_a_step_are_found(kind):
+    """A test that turns just behind zero has one sign at both ends of the step."""
+    system = System.reduced(four_band(), D, Contact("hertz", contact_stiffness(1e8, 0.005, 0.3)))
+    problem = Shooting(Dop853Flow(system), MAPS["quarter"])
+    before, left, right = (on_branch(problem, *values) for values in PAIRS[kind])
+    pair = [p for p in locate(problem, left, right, before=before) if p.kind == kind]
+    assert len(pair) == 2
+    assert 0 < pair[0].step < pair[1].step < right.step
+    assert not [p for p in locate(problem, left, right) if p.kind == kind]
+    for point in pair:
+        off = point.half_traces[0] + 1 if kind == "symmetry-breaking" else point.energy_tangent / point.energy
+        assert abs(off) <= 1e-8
+
+
+def test_a_root_that_newton_misses_is_sought_in_half_of_the_step(short_branch, monkeypatch):
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
+    steps = itertools.pairwise(short_branch.points)
+    a, b = next((a, b) for a, b in steps if a.energy_tangent * b.energy_tangent < 0 and a.episodes > 0)
+    (fold,) = (p for p in locate(problem, a, b) if p.kind == "fold-energy")
+    at, missed = _Segment.at, []
+
+    def fails_once_off_the_middle(self, arclength):
+        if self.length > 0.9 * b.step and arclength != 0.5 * self.length:
+            raise ArithmeticError("no luck")
+        return at(self, arclength)
+
+    monkeypatch.setattr(_Segment, "at", fails_once_off_the_middle)
+    (again,) = (p for p in locate(problem, a, b, missed=missed) if p.kind == "fold-energy")
+    assert again.energy == pytest.approx(fold.energy, rel=1e-12)
+    assert again.step == pytest.approx(fold.step, rel=1e-3)
+    assert not missed
+    monkeypatch.setattr(_Segment, "at", lambda *_: (_ for _ in ()).throw(ArithmeticError("never")))
+    assert not locate(problem, a, b, missed=missed)
+    assert missed[0].startswith(f"a fold-energy after point {a.index} (E = {a.energy:.9g} J) is not located")
+
+
+def test_a_period_doubled_orbit_is_off_its_parent(short_branch):
+    """Near grazing the first attempt ends on the linear mode passed twice; the switch goes on with a smaller one."""
+    problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])
+    steps = itertools.pairwise(short_branch.points)
+    near = (p for a, b in steps if a.energy < 0.02935 and b.episodes for p in locate(problem, a, b))
+    point = next(p for p in near if p.kind == "period-doubling")
+    fresh, first = switch(problem, point)
+    assert repetitions(fresh, first) == 1
+    assert first.energy == pytest.approx(point.energy, rel=1e-3)
+    assert first.period == pytest.approx(2 * point.period, rel=1e-3)
+    doubled = replace(first, x=point.x, period=2 * point.period)
+    assert repetitions(fresh, doubled) == 2
+
+
+def follow(folder, name: str, listener=None, stop=None, resume=False, **nnm) -> Branch:
+    folder = folder / name
+    folder.mkdir(exist_ok=True)
+    lattice, contacts = {"preset": "four-band", "reading": "printed"}, {"law": "bilinear", "modulus": 1e8}
+    table = {"name": "x", "lattice": lattice, "contacts": contacts, "nnm": {"modes": [2], "chart": "auto"} | nnm}
+    case = NnmCase.from_table(table)
+    return follow_all(case, folder, MPI.COMM_SELF, resume=resume, listener=listener, stop=stop)[0]
+
+
+def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
+    """Between its two folds, .0264 and .02934 J, the branch passes an energy three times."""
+    branch = follow(tmp_path, "a", energy=[0.0, 0.05], orbits_at=[0.028, 0.0316, 9.0], locate=False)
+    asked = [(e, t) for e, t in zip(*(branch.extra[f"orbits/{n}"].values for n in ("energy", "period")), strict=True)]
+    asked = asked[-4:]
+    assert [e for e, _ in asked] == pytest.approx([0.028] * 3 + [0.0316], rel=1e-12)
+    assert len({t for _, t in asked}) == 4
+    assert branch.findings == ["the branch has no orbit of 9 J"]
+
+
+def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
+    monkeypatch.setattr("vipetsc.modes.follow.SAVE_EVERY", 0.0)
+    nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05], "switch": ["period-doubling"]}
+    nnm |= {"switch_points": 3}
+    stop, saved = StopRequest(), set()
+
+    def listener(branch, point):
+        saved.update(path.name for path in (tmp_path / "parts").iterdir())
+        stop.requested = (branch.name, point.index) in {("out-of-phase-down", 5), ("out-of-phase", 7)}
+
+    first = follow(tmp_path, "parts", listener, stop, **nnm)
+    assert first.ending.startswith("stopped on request")
+    assert not (tmp_path / "parts" / "branch-out-of-phase.h5").exists()
+    second = follow(tmp_path, "parts", listener, stop, True, **nnm)
+    assert second.ending == "stopped on request after point 7; resume goes on"
+    last = follow(tmp_path, "parts", resume=True, **nnm)
+    whole = follow(tmp_path, "whole", **nnm)
+    assert last.to_csv() == whole.to_csv()
+    assert last.complete
+    names = {path.name for path in (tmp_path / "whole").iterdir()}
+    assert names == {path.name for path in (tmp_path / "parts").iterdir()}
+    assert {"branch-out-of-phase-down.h5", "branch-out-of-phase.h5"} <= saved
+    for name in names:
+        if name.endswith("csv"):
+            assert (tmp_path / "parts" / name).read_text() == (tmp_path / "whole" / name).read_text()
+    crossing = next(name for name in names if "doubling" in name and name.endswith("h5"))
+    (tmp_path / "parts" / crossing).unlink()
+    follow(tmp_path, "parts", resume=True, **nnm)
+    assert (tmp_path / "parts" / crossing).exists()

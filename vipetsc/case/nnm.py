@@ -76,9 +76,10 @@ class NnmTable(Section):
 
     ``system``: ``reduced`` (the paper's model of the cell's contact pair), ``chain`` (the lattice with its sites)
     or ``own`` (``[nnm.own]``). ``modes`` are linear modes (1-based, lowest first). ``energy`` in J and
-    ``frequency`` in Hz bound the branch; ``direction`` is where energy goes first. ``orbits_at`` lists energies
-    in J whose orbits are stored beside those of the regions; ``compare`` corrects every fourth point with other
-    flows; ``switch`` follows the branches that cross at these kinds of special points, ``switch_points`` points each.
+    ``frequency`` in Hz bound the branch; ``direction`` is where energy goes first. ``orbits_at`` lists energies in J:
+    the orbits of these energies, wherever the branch passes one, are stored beside those of the regions; ``compare``
+    corrects every fourth point with other flows; ``switch`` follows the branches that cross at these kinds of special
+    points, ``switch_points`` points each.
     """
 
     system: Literal["reduced", "chain", "own"] = "reduced"

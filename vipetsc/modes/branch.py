@@ -58,6 +58,10 @@ class Branch:
         """Region of every point (points,), see ``tell_regions``."""
         return tell_regions(*(self.column(name) for name in ("energy", "slope", "episodes", "closed")))
 
+    def tongues(self) -> list[int]:
+        """k of the k:1 internal resonances whose tongues the branch passes, each with an energy fold at its tip."""
+        return sorted({p.resonance for p in self.points} - {0, 1})
+
     def fits(self) -> dict[str, dict[str, float]]:
         """Power laws of the slope over the energy in regions II (its falling part), III and IV."""
         regular = np.array([p.kind == "regular" for p in self.points], bool)
@@ -105,6 +109,7 @@ class Branch:
             data[stored] = variable("point", self.column(name), units, text)
         attributes = {"name": self.name, "case": self.case, "complete": int(self.complete), "ending": self.ending}
         attributes |= {"next_step": self.next_step, "findings": "\n".join(self.findings), "fits": self.fits()}
+        attributes["tongues"] = len(self.tongues())
         return xr.Dataset(data | self.extra, attrs=attributes)
 
     @classmethod

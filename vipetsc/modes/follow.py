@@ -1,9 +1,10 @@
 """Follow the branches of a case: one by one or shared over ranks, saved as they grow, resumed where they ended."""
 
+import itertools
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from vipetsc.modes.flow import Flow, FlowError
 from vipetsc.modes.point import Point, linear_start
 from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Shooting
-from vipetsc.modes.special import locate, switch
+from vipetsc.modes.special import at_energy, locate, switch
 from vipetsc.modes.system import System
 from vipetsc.parallel import StoppedError, StopRequest
 
@@ -124,7 +125,7 @@ class Follower:
         self.grow(branch, self.problem, start, options, -1 if options.direction == "down" else 1)
         for half in self.folder.glob(f"branch-{branch.name}-down.*"):
             half.unlink()  # it is the beginning of the whole
-        branch.extra = sampled(self.problem, self._typical(branch))
+        branch.extra = sampled(self.problem, [*self._typical(branch), *self._asked(branch)])
         for flow in options.compare:
             branch.extra |= compare(self.problem, branch.regular(), FLOWS[flow](self.system))
 
@@ -139,13 +140,13 @@ class Follower:
         monitor = BranchMonitor(problem, control.guards)
         for point in branch.regular():
             monitor.check(point)
-        last, finding, saved = points.point, None, time.monotonic()
-        branch.points = branch.points or [last]
+        before, last, finding, saved = next(iter(branch.regular()[-2:-1]), None), points.point, None, time.monotonic()
+        branch.points, grazing = branch.points or [last], self.options.locate_grazing
         try:
             for point in points:
                 sys.audit("vipetsc.step")
                 if self.options.locate:
-                    branch.points += locate(problem, last, point, control.chart, self.options.locate_grazing)
+                    branch.points += locate(problem, last, point, control.chart, grazing, before, branch.findings)
                 branch.points.append(point)
                 branch.next_step = points.step
                 if self.listener is not None:
@@ -154,12 +155,13 @@ class Follower:
                 if finding is not None:
                     branch.findings.append(finding)
                     break
-                if self.stop.requested and not points.finished:
-                    raise StoppedError(f"stopped on request after point {point.index}; resume goes on")
-                if time.monotonic() - saved > SAVE_EVERY:
+                stopped = self.stop.requested and not points.finished
+                if stopped or time.monotonic() - saved > SAVE_EVERY:
                     branch.write(self.folder, self.about)
                     saved = time.monotonic()
-                last = point
+                if stopped:
+                    raise StoppedError(f"stopped on request after point {point.index}; resume goes on")
+                before, last = last, point
         finally:
             branch.findings += [
                 jump for jump in jumps(branch.regular(), problem, control) if jump not in branch.findings
@@ -183,13 +185,23 @@ class Follower:
         return linear_start(self.problem, mode, max(energy, self.options.energy[0] * 1.001))
 
     def _typical(self, branch: Branch) -> list[Point]:
-        """The regular points in the middle of every region, and at the energies asked for."""
+        """The regular points in the middle of every region."""
         regular = [(p, at) for p, at in zip(branch.points, branch.regions(), strict=True) if p.kind == "regular"]
         groups = ([p for p, at in regular if at == region] for region in range(5))
-        chosen = [group[len(group) // 2] for group in groups if group]
+        return [group[len(group) // 2] for group in groups if group]
+
+    def _asked(self, branch: Branch) -> Iterator[Point]:
+        """The orbits at the energies asked for, wherever the branch passes one."""
         for energy in self.options.orbits_at:
-            chosen.append(min(branch.regular(), key=lambda p: abs(math.log(p.energy / energy))))
-        return chosen
+            pairs = itertools.pairwise(branch.regular())
+            steps = [(a, b) for a, b in pairs if (a.energy < energy) != (b.energy < energy)]
+            if not steps:
+                branch.findings.append(f"the branch has no orbit of {energy:g} J")
+            for left, right in steps:
+                try:
+                    yield at_energy(self.problem, left, right, energy, self.options.chart)
+                except ArithmeticError as error:
+                    branch.findings.append(f"the orbit of {energy:g} J after point {left.index} is not found: {error}")
 
     def _crossing(self, branch: Branch) -> list[Branch]:
         """The branches that cross ``branch`` at the kinds of special points asked for."""

@@ -26,7 +26,7 @@ QUANTITIES: dict[str, tuple[str, type, str, str]] = {
     "episodes": ("contacts", int, "1", "contact episodes in the arc that is shot"),
     "newton": ("newton", int, "1", "Newton steps"),
     "index": ("number", int, "1", "number of the regular point, or of the one after a special point"),
-    "resonance": ("resonance", int, "1", "k of the k:1 internal resonance at an energy fold; 0 elsewhere"),
+    "resonance": ("resonance", int, "1", "k of the k:1 tongue of an energy fold; else 1 or 0"),
 }
 
 
@@ -160,13 +160,14 @@ def sample_orbit(problem: Shooting, point: Point, samples: int = 400) -> tuple[n
 
 
 def resonance(problem: Shooting, point: Point, samples: int = 1024) -> int:
-    """The harmonic k >= 2 that is strongest in the contacts' relative motion (all displacements without contacts).
+    """How often the contacts' relative motion (all displacements without contacts) passes zero in half a period.
 
     On a tongue of a k:1 internal resonance, mode two moves k times while mode one moves once.
     """
     u, rows = sample_orbit(problem, point, samples)[0], problem.system.contact_rows
-    size = np.abs(np.fft.rfft(u @ rows.T if len(rows) else u, axis=0)).sum(axis=1)
-    return int(np.argmax(size[2 : samples // 4])) + 2
+    w = u @ rows.T if len(rows) else u
+    moving = w[:, np.abs(w).max(axis=0) > SAME * np.abs(w).max()] > 0
+    return int(np.sum(moving != np.roll(moving, 1, axis=0), axis=0).max()) // 2
 
 
 def repetitions(problem: Shooting, point: Point) -> int:
@@ -179,7 +180,7 @@ def repetitions(problem: Shooting, point: Point) -> int:
     size = np.abs(start).max() / (1.0 if problem.map.start == "rest" else rate)
     scale = size * np.repeat([1.0, rate], problem.system.dofs)
     for count in PRIMES:
-        again = problem.flow.arc(start, point.period / count, point.period).end
-        if np.all(np.abs(again - start) <= SAME * scale):
+        later = problem.flow.arc(start, point.period / count, point.period).end
+        if np.all(np.abs(later - start) <= SAME * scale):
             return count
     return 1

@@ -2,16 +2,30 @@
 
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.modes.continuation import ContinuationError, Frame, unit
-from vipetsc.modes.point import Point, resonance
+from vipetsc.modes.point import Point, repetitions, resonance
 from vipetsc.modes.shooting import MAPS, Relative, Shooting
 
 Test = Callable[[Point], float]
+# A point of a segment is nearer to where it was sought than this share of its length.
+FURTHEST = 0.5
+# Rounding keeps Newton's method from the tolerance near the tips of narrow tongues; so many times of it is enough here.
+ROUNDING = 10
+# Attempts at a point that Newton's method does not reach, each in half of the segment before, and where to halve it.
+HALVINGS = 5
+MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
+# Parts of the first step along a crossing branch that are tried; how many of them Newton's method may add, since the
+# branch leaves at an angle (up to 5 on the paper's branches, beyond 100 on others); the loosest tolerance there.
+AMPLITUDES, ASTRAY, LOOSEST = np.array([1.0, 0.1, 0.01, 0.001]), 20.0, 1e-9
+# A turn is looked at, so many times, if its value is estimated below this share of those beside it.
+TURNS, NEAR = 3, 0.5
 
 
 def special_kinds(problem: Shooting) -> Iterator[tuple[str, Test, float]]:
@@ -35,60 +49,136 @@ def special_kinds(problem: Shooting) -> Iterator[tuple[str, Test, float]]:
             yield kind, crossing(level, i), 1e-6
 
 
-def locate(problem: Shooting, left: Point, right: Point, chart: str = "relative", grazing: bool = False) -> list[Point]:
+def locate(
+    problem: Shooting,
+    left: Point,
+    right: Point,
+    chart: str = "relative",
+    grazing: bool = False,
+    before: Point | None = None,
+    missed: list[str] | None = None,
+) -> list[Point]:
     """Special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
 
     ``chart`` as for ``Continuation``; with ``grazing`` also every change of the number of contacts, by bisection (40
-    corrections or so). An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins
-    or ends the tongue of a ``resonance``.
+    corrections or so). With the point ``before`` the left one, two special points of a kind are found within a step as
+    well. An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins or ends the
+    tongue of a ``resonance``. What cannot be located is appended to ``missed`` in a sentence.
     """
     points, segment = list[Point](), _Segment(problem, chart, left, right)
     touching = sum(p.episodes > 0 for p in (left, right))
-    for kind, test, floor in special_kinds(problem):
+    kinds = list(special_kinds(problem))
+    if grazing and left.episodes != right.episodes:
+        kinds.append(("grazing", lambda p: 1.0 if p.episodes == right.episodes else -1.0, 0.0))
+    for kind, test, floor in kinds:
         if not problem.system.springs and touching < (2 if kind.startswith("fold") else 1):
             continue  # a linear branch has folds of rounding only
-        a, b = test(left), test(right)
-        folded = kind == "branch-point" and any(p.kind == "fold-energy" for p in points)
-        if a * b < 0 and min(abs(a), abs(b)) > floor and not folded:
-            sys.audit("vipetsc.landing", kind)
-            points += segment.root(kind, test)
-    if grazing and left.episodes != right.episodes:
-        points += segment.root("grazing", lambda p: 1.0 if p.episodes == right.episodes else -1.0, 1e-11)
+        if kind == "branch-point" and any(p.kind == "fold-energy" for p in points):
+            continue
+        try:
+            points += segment.roots(kind, test, floor, before)
+        except ArithmeticError as error:
+            if missed is not None:
+                missed.append(f"a {kind} after point {left.index} (E = {left.energy:.9g} J) is not located: {error}")
     folds = (replace(p, resonance=resonance(problem, p)) if p.kind == "fold-energy" else p for p in points)
     return sorted(folds, key=lambda p: p.step)
 
 
-class _Segment:
-    """The branch between two points, parametrised by arclength along the left point's tangent."""
+def at_energy(problem: Shooting, left: Point, right: Point, energy: float, chart: str = "relative") -> Point:
+    """The orbit of an ``energy`` in J between two consecutive points on both sides of it, of the kind regular.
 
-    def __init__(self, problem: Shooting, chart: str, left: Point, right: Point) -> None:
-        self.left, self.right, self.frame = left, right, Frame(problem, chart, left)
+    Raises ArithmeticError if Newton's method fails.
+    """
+    return _Segment(problem, chart, left, right).root("regular", lambda p: p.energy / energy - 1, HALVINGS)
+
+
+class _Segment:
+    """The branch between two points, parametrised by arclength along the left point's tangent.
+
+    ``begin`` is the arclength from the start of the step that the segment is a part of.
+    """
+
+    def __init__(self, problem: Shooting, chart: str, left: Point, right: Point, begin: float = 0.0) -> None:
+        self.left, self.right, self.begin, self.frame = left, right, begin, Frame(problem, chart, left)
         self.chord = self.frame.chart.encode(right.x, right.period) - self.frame.xi
         self.length = float(self.frame.tangent @ self.chord)
+        self.make = partial(_Segment, problem, chart)
 
     def at(self, arclength: float) -> Point:
-        """The point at an arclength; raises ArithmeticError if Newton's method fails there."""
+        """The point at an arclength; raises ArithmeticError if Newton's method fails there or leaves the step."""
         frame, share = self.frame, arclength / self.length
         # a parabola through both points, tangent at the left one
         guess = frame.xi + arclength * frame.tangent + share**2 * (self.chord - self.length * frame.tangent)
         attempt = frame.correct(guess, arclength)
-        if not attempt.converged:
-            raise ArithmeticError(attempt.reason)
+        allowed = ROUNDING * frame.problem.tolerance
+        if attempt.arc is None or not (attempt.converged or attempt.history[-1] <= allowed):
+            raise ArithmeticError(f"{attempt.reason}; residuals {attempt.residuals}")
+        if np.linalg.norm(attempt.xi - guess) > FURTHEST * self.length:
+            raise ArithmeticError("Newton's method leaves the step")
         return frame.point(attempt, self.right.index, arclength)[0]
 
-    def root(self, kind: str, test: Test, accuracy: float = 1e-14) -> list[Point]:
-        """The point where ``test`` vanishes, to ``accuracy`` of the step; none if Newton's method fails on the way."""
+    def roots(self, kind: str, test: Test, floor: float, before: Point | None) -> list[Point]:
+        """Points where ``test`` vanishes: one between values of two signs beyond ``floor``, or two around a turn."""
+        a, b = test(self.left), test(self.right)
+        if min(abs(a), abs(b)) <= floor:
+            return []
+        if a * b < 0:
+            return [self.root(kind, test, HALVINGS)]
+        if before is None or not self.left.step:
+            return []
+        beside, ends = (-self.left.step, test(before)), ((0.0, a), (self.length, b))
+        for _ in range(TURNS):
+            turn = _turn(beside, *ends)
+            if turn is None:
+                break
+            try:
+                beside = turn, test(self.at(turn))
+            except ArithmeticError:
+                break
+            if a * beside[1] < 0:
+                return [part.root(kind, test, HALVINGS) for part in self.split(turn)]
+        return []
+
+    def root(self, kind: str, test: Test, halvings: int) -> Point:
+        """The point where ``test`` vanishes; in the half with it if Newton's method fails on the way.
+
+        Raises ArithmeticError if that does not help ``halvings`` times.
+        """
+        sys.audit("vipetsc.landing", kind)
 
         def value(arclength: float) -> float:
             if arclength == 0:
                 return test(self.left)
             return test(self.right) if arclength == self.length else test(self.at(arclength))
 
+        accuracy = 1e-11 if kind == "grazing" else 1e-14
         try:
             arclength = brentq(value, 0.0, self.length, xtol=accuracy * self.length, rtol=1e-14)
-            return [replace(self.at(arclength), kind=kind)]
-        except (ArithmeticError, ValueError):
-            return []
+            point = self.at(arclength)
+            return replace(point, kind=kind, step=self.begin + point.step)
+        except (ArithmeticError, ValueError) as error:
+            if halvings == 0:
+                raise ArithmeticError(error) from error
+        first, second = self.split()
+        return (first if test(first.left) * test(first.right) < 0 else second).root(kind, test, halvings - 1)
+
+    def split(self, arclength: float | None = None) -> "tuple[_Segment, _Segment]":
+        """The parts before and behind an arclength, or about the middle; raises ArithmeticError if there is none."""
+        for place in (arclength,) if arclength else self.length * MIDDLES:
+            with suppress(ArithmeticError):
+                middle = self.at(place)
+                return self.make(self.left, middle, self.begin), self.make(middle, self.right, self.begin + place)
+        raise ArithmeticError("Newton's method fails within the step")
+
+
+def _turn(beside: tuple[float, float], *ends: tuple[float, float]) -> float | None:
+    """Where a value turns between two ``ends``, if it may cross zero there, by the parabola through a third place."""
+    (x0, z), (x1, a), (x2, b) = beside, *ends
+    bend = ((b - a) / (x2 - x1) - (z - a) / (x0 - x1)) / (x2 - x0)
+    slope = (b - a) / (x2 - x1) - bend * (x2 - x1)
+    at = -slope / (2 * bend) if bend else x1
+    top = a + slope * at / 2
+    return at if x1 < at < x2 and top * np.sign(a) < NEAR * min(abs(a), abs(b)) else None
 
 
 def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooting, Point]:
@@ -96,8 +186,9 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
     centre, whichever map has a second null direction at ``point``; over the doubled period at a period doubling.
-    ``amplitude`` is the first step along the new direction, relative to the orbit's size. Raises ContinuationError if
-    no map has a second null direction, or Newton's method fails.
+    ``amplitude`` is the first step along the new direction, relative to the orbit's size; where Newton's method goes
+    astray, parts of it are tried. The tolerance is what the map's rounding at the special point allows. Raises
+    ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
     """
     singular = []
     for name in ("quarter", "half", "half-centre") if old.map.quarter else (old.map.name,):
@@ -106,8 +197,10 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
         chart = Relative(problem.system, x, period, rest=problem.map.start == "rest")
         xi = chart.encode(x, period)
         arc = problem.arc(x, period)
-        if np.abs(problem.residual(arc)).max() > 1e-6 * chart.size:
+        rounding = float(np.abs(problem.residual(arc)).max() / chart.size)
+        if rounding > 1e-6:
             continue  # not an orbit of this map: the doubled period's quarter
+        problem.tolerance = max(old.tolerance, min(10 * rounding, LOOSEST))
         matrix = problem.jacobian(arc) @ chart.derivative(xi) / chart.size
         values, directions = np.linalg.svd(matrix)[1:]
         singular.append(f"{name} {values[-1] / values[0]:.1e}")
@@ -117,11 +210,16 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
         along = chart.encode(*_re_expressed(old, replace(point, x=x, period=period), problem)) - xi
         first, second = directions[-2:] @ (directions[-2:].T @ directions[-2:] @ along)
         row = unit(directions[-2:].T @ np.array([-second, first]))  # across the old branch in the null plane
-        attempt = problem.solve(chart, xi + amplitude * row, row, row @ xi + amplitude)
-        if not attempt.converged:
-            why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.switch_amplitude"
-            raise ContinuationError(f"no convergence on the crossing branch at E = {point.energy:.9g} J {why}")
-        return problem, Point.of(problem, attempt, chart, problem.tangent(attempt.xi, row))
+        for step in amplitude * AMPLITUDES:
+            attempt = problem.solve(chart, xi + step * row, row, row @ xi + step)
+            astray = float(np.linalg.norm(attempt.xi - xi - step * row)) > ASTRAY * step
+            if attempt.converged and not astray:
+                first = Point.of(problem, attempt, chart, problem.tangent(attempt.xi, row))
+                if repetitions(problem, first) == 1:
+                    return problem, first
+        why = f"the last attempt, at {step:g}: {attempt.reason}; residuals {attempt.residuals}"
+        knobs = f"raise nnm.tolerance (it was {problem.tolerance:.1g}), or change nnm.switch_amplitude"
+        raise ContinuationError(f"no orbit off the old branch is found at E = {point.energy:.9g} J ({why}): {knobs}")
     where = f"at E = {point.energy:.9g} J, f = {point.frequency:.9g} Hz"
     raise ContinuationError(f"no branch crosses {where}: smallest singular values {', '.join(singular)}")
 
