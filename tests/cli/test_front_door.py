@@ -285,11 +285,10 @@ on_root(MPI.COMM_WORLD, write)
 
 FAILS_ON_ONE_RANK = """
 from mpi4py import MPI
-from vipetsc.parallel import install_abort_hook
-install_abort_hook()
+from vipetsc import Case, simulate
 if MPI.COMM_WORLD.rank == 1:
     raise RuntimeError("rank 1 cannot go on")
-MPI.COMM_WORLD.Barrier()
+simulate(Case.from_table({"time": {"end": 0.01}}), "out")
 """
 
 
@@ -304,7 +303,7 @@ def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
 
 
 @pytest.mark.mpirun
-def test_a_rank_that_raises_ends_all(tmp_path):
+def test_a_rank_of_a_script_that_raises_ends_all(tmp_path):
     script = tmp_path / "fails.py"
     script.write_text(FAILS_ON_ONE_RANK)
     command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, str(script)]

@@ -24,13 +24,17 @@ from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import RUN, claimed, provenance
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StopRequest, install_abort_hook
 
 # In the order in which engine = "auto" tries them.
 ENGINES = (Propagator, Integrator)
 # The guard first: a sample that it refuses is not recorded.
 OBSERVERS = (Guard.name, Ledger.name, Recorder.name)
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
+
+# In a script under mpirun, a rank that raises would leave the others waiting; who has a hook already is not disturbed.
+if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
+    install_abort_hook()
 
 
 @dataclass(frozen=True)
@@ -104,14 +108,16 @@ def simulate(
         return make(folder)
     with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
         output = RunFolder(claim.folder, comm)
-        told = output.ending()
-        if told is None:
-            result = make(output)
-        else:
-            result = Result(told["complete"], False, told["status"], told["statistics"], claim.folder)
+        result = _ended(output) or make(output)
         if not result.resumable:
             claim.publish()
     return replace(result, folder=claim.path)
+
+
+def _ended(output: RunFolder) -> Result | None:
+    """How the run in ``output`` ended; None if it has not."""
+    told = output.ending()
+    return Result(told["complete"], False, told["status"], told["statistics"], output.folder) if told else None
 
 
 def _simulate(

@@ -95,7 +95,7 @@ class RunFolder:
         self.case = case
         on_root(self.comm, lambda: self._parts.mkdir(parents=True, exist_ok=True))
 
-    def ending(self) -> Mapping[str, Any] | None:
+    def ending(self) -> dict[str, Any] | None:
         """The root attributes of ``run.h5``; None if the run has not ended. All ranks must call it.
 
         ``summary.json`` is written again where it is lost. Raises FolderError if ``run.h5`` cannot be read.
