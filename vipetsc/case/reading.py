@@ -96,7 +96,7 @@ class CaseFile(Section):
     @classmethod
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
         """The resolved case of a parsed table; raises CaseError with everything that is wrong."""
-        table, problems = with_overrides(table, overrides)
+        table, problems = with_overrides(table, overrides) if overrides else (table, [])
         valid = ("name", *SECTIONS)
         problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")

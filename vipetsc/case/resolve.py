@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -178,8 +179,15 @@ def drive_frequency(cell: UnitCell, drive: DriveTable) -> float:
         return drive.frequency
     assert drive.band is not None
     if drive.wavenumber is not None:
-        return float(bloch(cell, drive.wavenumber).frequency[drive.band - 1])
+        return _wave(cell, drive.wavenumber, drive.band)[0]
     return max_group_velocity(cell, drive.band)[1]
+
+
+@lru_cache
+def _wave(cell: UnitCell, wavenumber: float, band: int) -> tuple[float, float]:
+    """Frequency in rad/s and |group velocity| in cells/s of the wave of ``band`` (1-based)."""
+    point = bloch(cell, wavenumber)
+    return float(point.frequency[band - 1]), float(abs(point.group_velocity[band - 1]))
 
 
 def check_wave(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
@@ -192,7 +200,7 @@ def check_wave(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[P
         return
     fastest, speed = wave_speed(cell, np.inf), wave_speed(cell, frequency)
     if drive.wavenumber and drive.band:
-        speed = abs(float(bloch(cell, drive.wavenumber).group_velocity[drive.band - 1]))
+        speed = _wave(cell, drive.wavenumber, drive.band)[1]
     if time.end == "traverse" and not speed > STANDING * fastest:
         remedy = f"the wave at {frequency:.6g} rad/s stands (group velocity 0) and never crosses the lattice"
         yield Problem(f"drive.{key}", value, f"{remedy}; give time.end in s, or another wavenumber")

@@ -16,7 +16,7 @@ from vipetsc.case.case import Case, case_id
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.schema import LARGEST, number
 
-MOST_MEMBERS = 20_000
+MOST_MEMBERS = 10_000
 Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -106,6 +107,7 @@ def cell_problems(
     return problems
 
 
+@lru_cache
 def loose_masses(cell: UnitCell) -> list[int]:
     """The masses (0-based) that no chain of springs joins to one with a spring to the next cell."""
     group = groups_of(cell.dofs, ((s.start, s.end) for s in cell.springs))
