@@ -12,7 +12,7 @@ import numpy as np
 
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid
 from vipetsc.case.resolve import build_chain, check_cell, check_contacts, check_wave, resolved, wave_speed, with_preset
-from vipetsc.case.schema import ContactsTable, DriveTable, LatticeTable, OutputTable, PetscTable, TimeTable
+from vipetsc.case.schema import CONTACTS, ContactsTable, DriveTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
@@ -121,6 +121,11 @@ class Case(CaseFile):
             scale=scale,
             speed=wave_speed(chain.cell, drive.frequency),
         )
+
+    @property
+    def contact_radius(self) -> float | None:
+        """Radius in m of the spheres in contact, the preset's where another one is not given; None if it is unknown."""
+        return self.contacts.radius or (CONTACTS["radius"] if self.lattice.preset else None)
 
     def warnings(self) -> list[str]:
         """What is allowed but likely not meant, one sentence each."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.reading import Problem, Table, Valid
-from vipetsc.case.schema import PRESETS, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
+from vipetsc.case.schema import CONTACTS, PRESETS, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
 from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import cell_problems, loose_masses
 
@@ -139,11 +139,11 @@ def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid)
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
-    """The contact stiffness is given once: as a number, or by the material."""
+    """The contact stiffness is given once: as a number, or by the material; a radius may stand beside the number."""
     material = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
     given = [key for key, value in material.items() if value is not None]
     missing = [key for key in material if key not in given]
-    if contacts.stiffness is not None and given:
+    if contacts.stiffness is not None and given not in ([], ["radius"]):
         yield Problem("contacts.stiffness", contacts.stiffness, f"give it or {', '.join(given)}, not both")
     if contacts.stiffness is None and missing and any_sites and valid(*(f"contacts.{key}" for key in material)):
         yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
@@ -158,7 +158,9 @@ def resolved(sections: dict[str, Any]) -> dict[str, Table]:
         del law["damping"]  # as if left out: the same case
     law |= {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
     if contacts.stiffness is None and law.keys() >= REPLACES["stiffness"]:
-        law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law.pop("radius"), law.pop("poisson")))
+        law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law["radius"], law.pop("poisson")))
+        if lattice.preset and law["radius"] == CONTACTS["radius"]:
+            del law["radius"]  # it goes without saying
     frequency, end, interval = drive_frequency(cell, drive), time.end, time.sample_interval
     if end == "traverse":
         end = 2 * np.pi * drive.cycles / frequency + lattice.cells / wave_speed(cell, frequency)

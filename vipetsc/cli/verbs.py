@@ -38,6 +38,12 @@ def echo_paths(comm: MPI.Comm, paths: Iterable[Path]) -> None:
         echo(comm, f"  {path}")
 
 
+def echo_warnings(comm: MPI.Comm, warnings: Iterable[str]) -> None:
+    """Print on rank 0 what is to be known about a result."""
+    for warning in warnings:
+        echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
+
+
 def _load(kind: type[AnyCase], options: argparse.Namespace, comm: MPI.Comm) -> AnyCase:
     """The case, read on rank 0 alone; raises CaseError on all ranks."""
     return on_root(comm, lambda: kind.load(options.case, options.set))
@@ -53,11 +59,12 @@ def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     from vipetsc.studies.sweep import is_measured, measure_run
 
     case = _load(Case, options, comm)
-    for warning in on_root(comm, case.warnings):
-        echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
+    known = on_root(comm, case.warnings)
+    echo_warnings(comm, known)
     folder = _output(options, case.name)
     with locked(comm, folder):
         result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
+        echo_warnings(comm, [warning for warning in result.warnings if warning not in known])
         echo(comm, tables.run_table(result))
         if result.resumable:
             return STOPPED
@@ -81,8 +88,7 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     folder = _output(options, plan.name)
     with locked(comm, folder):
         result = run_sweep(plan, folder, comm, force=options.force, stop=stop, resume=options.resume, progress=True)
-        for warning in result.warnings:
-            echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
+        echo_warnings(comm, result.warnings)
         echo(comm, tables.sweep_table(result))
         if result.resumable:
             return STOPPED

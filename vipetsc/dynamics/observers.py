@@ -22,6 +22,8 @@ from vipetsc.parallel import Progress
 
 # A ledger that misses by this share of the largest work is no longer a solution but an instability.
 RUNAWAY = 0.1
+# Errors of the ledger over the largest work that are as expected: in tolerances, and bounds of that.
+LEDGER_PER_RTOL, LEAST_LEDGER, MOST_LEDGER = 100.0, 1e-8, 1e-4
 
 
 class RunawayError(RuntimeError):
@@ -103,6 +105,10 @@ class Observer:
         """Numbers for ``summary.json`` and the attributes of ``run.h5``; those of rank 0 count."""
         return {}
 
+    def warnings(self) -> list[str]:
+        """Sentences about a result that is not what it seems, beside the statistics; those of rank 0 count."""
+        return []
+
 
 class Guard(Observer):
     """Raises RunawayError for a state that is not finite, or holds energy that nothing has put in."""
@@ -141,6 +147,15 @@ class Ledger(Observer):
         """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end."""
         error = {"ledger_error": self.worst / self.most_work if self.most_work else 0.0}
         return error if np.isnan(self.work) else error | {"work": self.work, "dissipated": self.dissipated}
+
+    def warnings(self) -> list[str]:
+        """An error of the balance that is larger than that of the trajectory should make it."""
+        error, rtol = self.statistics()["ledger_error"], self.setup.model.rtol
+        bound = min(max(LEDGER_PER_RTOL * rtol, LEAST_LEDGER), MOST_LEDGER)
+        if error <= bound:
+            return []
+        missing = f"the energy balance misses {error:.2g} of the work, more than {bound:.2g}"
+        return [f"{missing}: the trajectory is no better; lower time.rtol = {rtol:g}"]
 
 
 class ProgressReport(Observer):

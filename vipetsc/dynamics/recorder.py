@@ -42,8 +42,9 @@ class Recorder(Observer):
     """Keeps the case's share of the fields, the energies and the contact episodes, and writes them in chunks."""
 
     name = "recorder"
-    saved = ("episodes",)
+    saved = ("episodes", "deepest")
     episodes = 0
+    deepest = 0.0  # indentation in m
 
     def begin(self, setup: Setup) -> None:
         """See ``Observer``."""
@@ -116,6 +117,7 @@ class Recorder(Observer):
             chunk["columns"] = self._columns
         output.append(chunk or None)
         self.episodes += comm.allreduce(len(episodes))
+        self.deepest = comm.allreduce(max([self.deepest, *(episode.indentation for episode in episodes)]), MPI.MAX)
         self._samples.clear()
         self._field_times.clear()
 
@@ -126,7 +128,17 @@ class Recorder(Observer):
 
     def statistics(self) -> dict[str, Any]:
         """Contact episodes logged."""
-        return {"episodes": self.episodes}
+        return {"episodes": self.episodes, "deepest_indentation": self.deepest}
+
+    def warnings(self) -> list[str]:
+        """Sites that nothing reached; indentations for which there is no theory of contact."""
+        sites, radius = len(self.setup.model.chain.sites), self.setup.case.contact_radius
+        if sites and not self.episodes:
+            return [f"no contact: nothing reached {'the site' if sites == 1 else f'one of the {sites} sites'}"]
+        if radius is None or self.setup.model.contact.law != "hertz" or self.deepest <= radius:
+            return []
+        beyond = f"the deepest indentation, {self.deepest:.3g} m, is beyond the contacts' radius of {radius:g} m"
+        return [f"{beyond}: Hertz's law holds for indentations far below it"]
 
 
 def as_columns(group: str, record: type, rows: list[Any]) -> dict[str, np.ndarray]:

@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,13 +44,15 @@ class Result:
 
     ``complete``: the whole case was simulated; ``resumable``: it was stopped and can go on from its last
     checkpoint; neither: it failed, and ``run.h5`` holds the samples up to the last good one. ``sentence`` says
-    it in words, ``statistics`` in numbers, the same on all ranks.
+    it in words, ``statistics`` in numbers; ``warnings`` are sentences about results that are not what they seem. All
+    are the same on all ranks.
     """
 
     complete: bool
     resumable: bool
     sentence: str
     statistics: dict[str, Any]
+    warnings: list[str]
     folder: Path | None
 
 
@@ -117,7 +120,13 @@ def simulate(
 def _ended(output: RunFolder) -> Result | None:
     """How the run in ``output`` ended; None if it has not."""
     told = output.ending()
-    return Result(told["complete"], False, told["status"], told["statistics"], output.folder) if told else None
+    return result_of(told, False, output.folder) if told else None
+
+
+def result_of(told: Mapping[str, Any], resumable: bool, folder: Path | None) -> Result:
+    """The result that the attributes of a run tell."""
+    about = told["status"], told["statistics"], told.get("warnings", [])
+    return Result(told["complete"], resumable, *about, folder)
 
 
 def _simulate(
@@ -135,13 +144,25 @@ def _simulate(
     layout = Layout(model, output.comm)
     with petsc_options(options_of(case)):
         engine = create(model, layout)
-    setup = Setup(case, model, layout, EnergyMeter(model, layout), engine, output)
-    run = Run(setup, watching)
-    shares = output.last_state()
-    if shares is not None:
-        run.restore(shares)
-    ending, sentence = run.advance()
-    return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
+    with released(engine, output.comm):
+        run = Run(Setup(case, model, layout, EnergyMeter(model, layout), engine, output), watching)
+        shares = output.last_state()
+        if shares is not None:
+            run.restore(shares)
+        ending, sentence = run.advance()
+        return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
+
+
+@contextmanager
+def released(engine: Engine, comm: MPI.Comm) -> Iterator[None]:
+    """Free ``engine`` at the end, which all ranks do together; one that leaves alone by an error must not wait."""
+    try:
+        yield
+    except BaseException as error:
+        if comm.size == 1 or getattr(error, "from_root", False):
+            engine.destroy()
+        raise
+    engine.destroy()
 
 
 def select_engine(case: Case, model: Model) -> tuple[type[Engine], str | None]:
@@ -206,23 +227,27 @@ class Run:
         self.setup.output.save_state(state)
 
     def finish(self, ending: str, sentence: str, begin: tuple[float, float], note: dict[str, str]) -> Result:
-        """Write the last checkpoint of a run that was stopped, or the files of one that ended, and free the engine."""
+        """Write the last checkpoint of a run that was stopped, or the files of one that ended."""
         engine, output, comm = self.setup.engine, self.setup.output, self.setup.output.comm
         if ending == STOPPED:
             self.checkpoint()
             sentence += "; the same command goes on from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
+        statistics["effective_restitution"] = self.setup.model.contact.effective_restitution
+        warnings = self.setup.case.warnings()
         for observer in self.observers:
             observer.finish(ending == STOPPED)
             statistics |= observer.statistics()
+            warnings += observer.warnings() if ending != STOPPED else []
+        if ending == FAILED:
+            warnings.append(f"the record ends at sample {self.samples} of {self.setup.model.samples}: {sentence}")
         wall, cpu = time.perf_counter() - begin[0], comm.allreduce(time.process_time() - begin[1])
         statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
-        attributes = provenance(comm) | {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics}
-        attributes = comm.bcast(attributes)  # what rank 0 tells counts
+        about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
+        attributes = comm.bcast(provenance(comm) | about)  # what rank 0 tells counts
         if ending != STOPPED:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
-        engine.destroy()
-        return Result(ending == COMPLETE, ending == STOPPED, sentence, attributes["statistics"], output.folder)
+        return result_of(attributes, ending == STOPPED, output.folder)
 
 
 def fastest_cell(setup: Setup) -> str:

@@ -36,7 +36,7 @@ def tabulated(layout: Mapping[str, tuple[str, str, str]], values: Mapping[str, A
 
 
 def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
-    """Write ``data`` to ``path``, whole or not at all; an attribute that is a dict becomes JSON.
+    """Write ``data`` to ``path``, whole or not at all; an attribute that is a dict or a list becomes JSON.
 
     Raises OSError if the file cannot be written, ValueError if a dimension has no coordinate.
     """
@@ -62,7 +62,7 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
     for path, value in data.attrs.items():
         group, _, key = str(path).rpartition("/")
         node = file.require_group(group) if group else file
-        node.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
+        node.attrs[key] = json.dumps(value) if isinstance(value, dict | list) else value
 
 
 def add_variable(

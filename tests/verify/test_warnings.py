@@ -1,0 +1,81 @@
+"""What is wrong with a result is said in it: in what ``simulate`` returns, in the summary and in the file."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.case import Case
+from vipetsc.cli.main import main
+from vipetsc.dynamics import simulate
+
+HALF = {"time": {"end": 0.04}}
+
+
+def told(result) -> list[str]:
+    """The warnings of a result, which are those of its files."""
+    summary = json.loads((result.folder / "summary.json").read_text())
+    with h5py.File(result.folder / "run.h5") as file:
+        assert json.loads(file.attrs["warnings"]) == summary["warnings"] == result.warnings
+    return result.warnings
+
+
+def test_a_run_as_it_should_be_warns_of_nothing(folder):
+    assert told(simulate(small_case(**HALF), folder / "run")) == []
+    assert told(simulate(small_case(**HALF, contacts={"sites": []}), folder / "without-sites")) == []
+
+
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_sites_that_nothing_reaches(folder, engine):
+    case = small_case(drive={"amplitude": 0.1}, time={"end": 0.04, "engine": engine})
+    assert told(simulate(case, folder / "run")) == ["no contact: nothing reached one of the 3 sites"]
+
+
+def test_indentations_beyond_the_radius(folder):
+    def warnings(name, **contacts):
+        case = small_case(**HALF, drive={"amplitude": 400.0}, contacts={"modulus": 1e5} | contacts)
+        return told(simulate(case, folder / name))
+
+    (warning,) = warnings("soft")
+    assert "beyond the contacts' radius of 0.005 m: Hertz" in warning
+    assert warnings("larger", radius=1.0) == []
+    assert warnings("bilinear", law="bilinear") == []
+
+
+def test_the_radius_stays_with_the_case():
+    case = small_case(contacts={"modulus": 1e4, "radius": 1.0})
+    assert case.contact_radius == Case.from_toml(case.to_toml()).contact_radius == 1.0
+    assert small_case().contact_radius == 0.005
+    assert "radius" not in small_case().to_toml()
+
+
+def test_an_energy_balance_that_does_not_close(folder, petsc_options, capsys):
+    petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=1e-4)
+    result = simulate(small_case(**HALF), folder / "run")
+    assert result.complete
+    (warning,) = told(result)
+    assert warning.startswith("the energy balance misses ")
+    assert f"{result.statistics['ledger_error']:.2g} of the work, more than 1e-08" in warning
+    sets = ["lattice.cells=24", "contacts.sites=[6]", "time.end=0.02", "output.figures=false"]
+    assert main(["run", "--out", str(folder / "out"), *(word for text in sets for word in ("--set", text))]) == 0
+    assert "vipetsc: warning: the energy balance misses" in capsys.readouterr().err
+
+
+def test_a_record_that_ends_early(folder, petsc_options):
+    petsc_options(ts_rk_type="1fe", ts_adapt_type="none")
+    result = simulate(small_case(contacts={"sites": []}), folder / "run")
+    assert not result.complete
+    warning = told(result)[-1]
+    assert warning.startswith(f"the record ends at sample {result.statistics['samples']} of 401: the energy runs away")
+
+
+def test_what_an_exception_leaves_behind_is_freed(folder, monkeypatch):
+    freed = []
+    monkeypatch.setattr("vipetsc.dynamics.ts.integrator.Integrator.destroy", lambda self: freed.append(self))
+    monkeypatch.setattr("vipetsc.dynamics.run.Run.advance", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        simulate(small_case(), folder / "run")
+    assert len(freed) == 1
