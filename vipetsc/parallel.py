@@ -120,8 +120,11 @@ class StopRequest:
 
         def receive(number: int, frame: FrameType | None) -> None:
             self.requested = True
+            signal.pthread_sigmask(signal.SIG_BLOCK, earlier)
+            signal.sigtimedwait(earlier, 0.1)  # ``timeout`` sends its signal twice
             for number in earlier:
                 signal.signal(number, signal.SIG_DFL)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, earlier)
             if at_once and MPI.COMM_WORLD.size > 1:
                 MPI.COMM_WORLD.Abort(os.EX_TEMPFAIL)  # the others may wait for this rank
             if at_once:

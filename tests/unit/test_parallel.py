@@ -1,6 +1,8 @@
 """Requests to stop: which signals are one, what a second does, what is put back."""
 
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -16,6 +18,16 @@ def test_a_signal_is_a_request_and_a_second_one_the_end(number):
         assert stop.requested
         assert {signal.getsignal(other) for other in STOP_SIGNALS} == {signal.SIG_DFL}
     assert {other: signal.getsignal(other) for other in STOP_SIGNALS} == before
+
+
+def test_a_signal_that_is_sent_twice_is_one_request(tmp_path):
+    script = "import os, signal, vipetsc.parallel as p\nwith p.StopRequest().listening() as stop:\n"
+    script += "    print(os.getpid(), flush=True)\n    while not stop.requested: pass\nprint('saved')"
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
+        number = process.stdout.readline().strip()
+        subprocess.run(["sh", "-c", f"kill -TERM {number}; kill -TERM {number}"], check=True)
+        assert process.stdout.read() == "saved\n"
+    assert process.returncode == 0
 
 
 def test_what_has_nothing_to_save_ends_at_once():

@@ -71,6 +71,27 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
     assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "run")))
 
 
+def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch):
+    """The removal of a folder takes many steps; to the next command it has been done, or has not been begun."""
+
+    def killed(path, **options):
+        if path.name == ".parts.old" and path.exists():
+            (next(path.iterdir())).unlink()
+            raise InterruptedError
+
+    case = small_case(time={"end": 0.01})
+    with monkeypatch.context() as context:
+        context.setattr("shutil.rmtree", killed)
+        with pytest.raises(InterruptedError):
+            simulate(case, folder / "run")
+    assert (folder / "run" / ".parts.old").exists()
+    run = datasets(folder / "run" / "run.h5")
+    for resume in (True, False):
+        assert simulate(case, folder / "run", resume=resume).complete
+    assert_same_bits(run, datasets(folder / "run" / "run.h5"))
+    assert {p.name for p in (folder / "run").iterdir()} == {"run.h5", "case.toml", "summary.json"}
+
+
 def test_episodes_stand_in_the_order_of_their_onsets():
     """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4)}

@@ -46,11 +46,6 @@ class FolderKind:
     beside: tuple[str, ...] = ("figures",)
     marker: str = "case.toml"
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Everything that belongs to the results."""
-        return (self.marker, *self.results, *self.beside)
-
 
 RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "figures"))
 BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
@@ -97,27 +92,14 @@ def claimed(
 ) -> Iterator[Claim]:
     """Work in the folder ``path``, alone, on results of ``kind``: begin them, or go on with those of the same case.
 
-    All ranks must call it; what a command that was killed has left in the folder is put in order first.
+    All ranks must call it. The folder is made if it is missing, and what a killed command has left in it is put in
+    order. ``text``, a resolved case, is kept in it. ``force`` begins anew: earlier results stay until new ones are
+    published; what was begun so is gone on with by the next call without ``force``. ``resume`` goes on with what is
+    there, and nothing else. ``difference`` tells of an earlier text why its results are not those asked for, None if
+    they are; by default any change is a reason.
 
-    Parameters
-    ----------
-    path
-        The folder, made if it is missing.
-    text
-        What the results are of, a resolved case; it is kept in the folder.
-    force
-        Begin anew: the results made in ``Claim.folder`` replace earlier ones when they are published. Those that were
-        not are gone on with by the next call without ``force``.
-    resume
-        Go on with results that are there, and nothing else.
-    difference
-        Of an earlier text: why results of it are not those asked for, None if they are; by default any change.
-
-    Raises
-    ------
-    FolderError
-        If the path is a file, another process works in it, or it holds anything but results of ``kind`` and of the
-        same case where ``force`` is off; if there is nothing to ``resume``.
+    Raises FolderError if the path is a file, another process works in it, it holds anything but results of ``kind`` and
+    of this case, which ``force`` allows to differ, or there is nothing to ``resume``.
     """
     path = Path(path)
     with locked(comm, path):
@@ -140,18 +122,17 @@ def _claim(
         raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
     if resume and not filled:
         raise FolderError(f"{path}: holds no {kind.noun} to resume; leave out --resume")
-    folder, going_on = path, filled
-    if force or not filled:
+    folder, going_on = path, filled and not force
+    if not going_on:
         discard(aside)
-    if force and filled:
-        folder, going_on = aside, False
-    elif filled:
-        if (aside / kind.marker).exists() and _problem(aside, kind, text, difference) is None:
+        folder = aside if filled else path
+        folder.mkdir(exist_ok=True)
+    else:
+        if (aside / kind.marker).exists() and not _problem(aside, kind, text, difference):
             folder = aside
         problem = _problem(folder, kind, text, difference)
         if problem:
             raise FolderError(f"{path}: {problem}")
-    folder.mkdir(exist_ok=True)
     if not going_on or (folder / kind.marker).read_text(encoding="utf-8") != text:
         write_text(folder / kind.marker, text)
     for temporary in [p for where in ("", "*/", "linear/*/") for p in folder.glob(f"{where}.*.part")]:
@@ -182,7 +163,7 @@ def _finish_swap(path: Path, kind: FolderKind) -> None:
     ready, moving, old = path / READY, path / MOVING, path / OLD
     if ready.is_dir():
         old.mkdir(exist_ok=True)
-        for entry in [entry for pattern in kind.files for entry in path.glob(pattern)]:
+        for entry in [p for pattern in (kind.marker, *kind.results, *kind.beside) for p in path.glob(pattern)]:
             if not entry.name.startswith("."):
                 os.replace(entry, old / entry.name)
         os.replace(ready, moving)
