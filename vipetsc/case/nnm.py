@@ -152,8 +152,7 @@ class NnmCase(CaseFile):
                 problems.append(Problem("contacts.clearance", None, "missing; give the clearance in m"))
         problems += check_stiffness(contacts, nnm.system != "own" and lattice.cell is not None, valid)
         if still := [mode for mode in nnm.modes if mode <= rigid]:
-            remedy = f"the system is free to move as a whole: its first {rigid} have no period"
-            problems.append(Problem("nnm.modes", still, remedy.replace("first 1 have", "first mode has")))
+            problems.append(Problem("nnm.modes", still, "the system is free to move as a whole, which has no period"))
         beyond = [mode for mode in nnm.modes if mode > dofs]
         if beyond and not problems:
             problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))

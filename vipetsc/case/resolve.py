@@ -161,7 +161,7 @@ def resolved(sections: dict[str, Any]) -> dict[str, Table]:
         law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law["radius"], law.pop("poisson")))
         if lattice.preset and law["radius"] == CONTACTS["radius"]:
             del law["radius"]  # it goes without saying
-    frequency, end, interval = drive_frequency(cell, drive), time.end, time.sample_interval
+    frequency, end, interval = driven_wave(cell, drive)[0], time.end, time.sample_interval
     if end == "traverse":
         end = 2 * np.pi * drive.cycles / frequency + lattice.cells / wave_speed(cell, frequency)
     if time.samples is not None:
@@ -175,37 +175,25 @@ def resolved(sections: dict[str, Any]) -> dict[str, Table]:
     return tables
 
 
-def drive_frequency(cell: UnitCell, drive: DriveTable) -> float:
-    """The frequency in rad/s that a valid ``drive`` gives as a number, by wavenumber and band, or by a band."""
-    if drive.frequency is not None:
-        return drive.frequency
-    assert drive.band is not None
-    if drive.wavenumber is not None:
-        return _wave(cell, drive.wavenumber, drive.band)[0]
-    return max_group_velocity(cell, drive.band)[1]
-
-
 @lru_cache
-def _wave(cell: UnitCell, wavenumber: float, band: int) -> tuple[float, float]:
-    """Frequency in rad/s and |group velocity| in cells/s of the wave of ``band`` (1-based)."""
-    point = bloch(cell, wavenumber)
-    return float(point.frequency[band - 1]), float(abs(point.group_velocity[band - 1]))
+def driven_wave(cell: UnitCell, drive: DriveTable) -> tuple[float, float]:
+    """Frequency in rad/s and |group velocity| in cells/s of the wave that a valid ``drive`` makes."""
+    if drive.wavenumber is not None and drive.band is not None:
+        point = bloch(cell, drive.wavenumber)
+        return float(point.frequency[drive.band - 1]), float(abs(point.group_velocity[drive.band - 1]))
+    frequency = drive.frequency or max_group_velocity(cell, drive.band or 1)[1]
+    return frequency, wave_speed(cell, frequency)
 
 
 def check_wave(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
     """What is wrong with a valid drive that is to make a wave, and with a wave that is to cross the lattice."""
-    frequency = drive_frequency(cell, drive)
+    frequency, speed = driven_wave(cell, drive)
     key = "frequency" if drive.frequency else "wavenumber" if drive.wavenumber else "band"
-    value = getattr(drive, key)
     if not frequency > 0:
-        yield Problem(f"drive.{key}", value, "the frequency there is 0; drive another wavenumber or band")
-        return
-    fastest, speed = wave_speed(cell, np.inf), wave_speed(cell, frequency)
-    if drive.wavenumber and drive.band:
-        speed = _wave(cell, drive.wavenumber, drive.band)[1]
-    if time.end == "traverse" and not speed > STANDING * fastest:
+        yield Problem(f"drive.{key}", getattr(drive, key), "the frequency there is 0; drive another wavenumber or band")
+    elif time.end == "traverse" and not speed > STANDING * wave_speed(cell, np.inf):
         remedy = f"the wave at {frequency:.6g} rad/s stands (group velocity 0) and never crosses the lattice"
-        yield Problem(f"drive.{key}", value, f"{remedy}; give time.end in s, or another wavenumber")
+        yield Problem(f"drive.{key}", getattr(drive, key), f"{remedy}; give time.end in s, or another wavenumber")
 
 
 def wave_speed(cell: UnitCell, frequency: float) -> float:

@@ -16,7 +16,8 @@ larger on the way in than on the way out, and the contact dissipates the power
 
 For the reduced mass m, m w'' = -F gives w' dw'/(1 + c w'/w'_minus) = -kc x^n dx/m. The right side vanishes over a
 whole contact, hence the rebound e = -w'_plus/w'_minus solves e + log(1 - c e)/c = log(1 + c)/c - 1, whose
-expansion is e = r + O((1 - r)^2): r is the restitution of a nearly elastic impact. Fast separation makes g < 0, a
+expansion is e = r + O((1 - r)^2): r is the restitution of a nearly elastic impact. The exact damping is the c that
+solves it for e = r. Fast separation makes g < 0, a
 pull; ``adhesion = "clip"`` holds the force at zero then, and a grazing onset is kept from an unbounded g by a floor
 of |w'_minus|.
 

@@ -24,10 +24,7 @@ def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
 
 
 def rebound(damping: float, restitution: float) -> float:
-    """c (1 + e) + log(1 - c e) - log(1 + c) for the damping c and the restitution e: zero for an impact of two masses.
-
-    m w' dw'/(1 + c w'/w'_minus) = -kc x^n dx, integrated over a contact: neither m, kc, n nor the speed are left in it.
-    """
+    """c (1 + e) + log(1 - c e) - log(1 + c): zero where an impact with the damping c has the restitution e."""
     return float(damping * (1 + restitution) + np.log1p(-damping * restitution) - np.log1p(damping))
 
 
