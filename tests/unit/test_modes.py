@@ -302,6 +302,8 @@ def test_case_reports_everything_at_once():
 def test_case_round_trip_and_systems():
     case = NnmCase.from_table({"name": "a", "lattice": {"reading": "printed"}, "contacts": {"law": "bilinear"}})
     assert NnmCase.from_table(tomllib.loads(case.to_toml())) == case
+    written = tomllib.loads(case.to_toml())["contacts"]
+    assert (written["modulus"], written["radius"], written["poisson"], written["clearance"]) == (1e8, 0.005, 0.3, [D])
     system = System.from_case(case)
     assert system.contacts[0].clearance == pytest.approx(D)
     assert [system.branch_name(mode) for mode in (0, 1)] == ["in-phase", "out-of-phase"]
@@ -317,7 +319,12 @@ def test_systems_of_every_kind_of_case():
     masses, springs = [1.0, 2.0], [{"start": 0, "end": 1, "stiffness": 3.0}, {"start": 1, "end": 2, "stiffness": 5.0}]
     own = {"masses": masses, "springs": springs, "smooth": [{"start": 0, "end": 2, "cubic": 7.0}]}
     own["contacts"] = [{"host": 0, "resonator": 2, "clearance": 0.1}]
-    system = System.from_case(NnmCase.from_table({"nnm": {"system": "own", "own": own}}))
+    with pytest.raises(CaseError, match=r"contacts\.stiffness: missing"):
+        NnmCase.from_table({"nnm": {"system": "own", "own": own}})
+    system = System.from_case(
+        NnmCase.from_table({"contacts": {"stiffness": 2.0}, "nnm": {"system": "own", "own": own}})
+    )
+    assert system.contacts[0].law.stiffness == 2.0
     assert system.stiffness == pytest.approx(np.array([[8.0, -5.0], [-5.0, 5.0]]))
     assert (system.contacts[0].host, system.contacts[0].resonator) == (None, 1)
     assert system.springs == (SmoothSpring(None, 1, cubic=7.0),)
@@ -340,11 +347,13 @@ def test_pairs_that_are_not_in_the_system_are_named(key):
         NnmCase.from_table({"nnm": {"system": "own", "own": own}})
 
 
-def test_a_cell_of_ones_own_needs_clearances():
+def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
     springs = [{"start": 1, "end": 2, "stiffness": 1.0}, {"start": 2, "end": 1, "stiffness": 1.0, "next_cell": True}]
     cell = {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}
     with pytest.raises(CaseError, match=r"contacts\.clearance"):
         NnmCase.from_table({"lattice": {"cell": cell}, "contacts": {"stiffness": 1.0}})
+    with pytest.raises(CaseError, match=r"contacts\.stiffness: missing; give it or also modulus, radius, poisson"):
+        NnmCase.from_table({"lattice": {"cell": cell}, "contacts": {"clearance": 0.1}})
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,22 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.resolve import check_cell, check_sites, check_stiffness, site_cells, with_default_preset
-from vipetsc.case.schema import PRESETS, ContactsTable, Count, Finite, LatticeTable, Positive, once
+from vipetsc.case.resolve import (
+    check_cell,
+    check_sites,
+    check_stiffness,
+    clearances,
+    site_cells,
+    with_default_preset,
+    with_preset,
+)
+from vipetsc.case.schema import ContactsTable, Count, Finite, LatticeTable, Positive, once
 from vipetsc.lattice import Contact, contact_stiffness
 from vipetsc.lattice.cell import groups_of
 
 MOST_MASSES = 4000
+# Keys of [contacts] that a preset gives, as for a run; the others are those of a run alone.
+MATERIAL = "law", "modulus", "radius", "poisson"
 
 
 class LinearSpringTable(Section):
@@ -118,8 +128,18 @@ class NnmCase(CaseFile):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The sections, and everything that is wrong with them."""
-        return super().read(with_default_preset(table))
+        """The sections, with the preset's material and clearances, and everything that is wrong with them."""
+        given, nnm = with_preset(table).get("contacts", {}), table.get("nnm", {})
+        own = isinstance(nnm, dict) and nnm.get("system") == "own"
+        if isinstance(given, dict) and not own:
+            stated = table.get("contacts", {})
+            table = table | {"contacts": {key: v for key, v in given.items() if key in MATERIAL or key in stated}}
+        fields, problems = super().read(with_default_preset(table))
+        lattice, contacts = fields["lattice"], fields["contacts"]
+        if not (problems or own or contacts.clearance):
+            count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
+            fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
+        return fields, problems
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
@@ -150,7 +170,7 @@ class NnmCase(CaseFile):
                 problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
             if contacts.clearance is None and lattice.preset is None:
                 problems.append(Problem("contacts.clearance", None, "missing; give the clearance in m"))
-        problems += check_stiffness(contacts, nnm.system != "own" and lattice.cell is not None, valid)
+        problems += check_stiffness(contacts, nnm.custom is None or bool(nnm.custom.contacts), valid)
         if still := [mode for mode in nnm.modes if mode <= rigid]:
             problems.append(Problem("nnm.modes", still, "the system is free to move as a whole, which has no period"))
         beyond = [mode for mode in nnm.modes if mode > dofs]
@@ -164,10 +184,11 @@ class NnmCase(CaseFile):
         return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian
 
     def contact(self) -> Contact:
-        """The contact law without dissipation; stiffness from the paper's material where none is given."""
-        given = PRESETS[self.lattice.preset or "four-band"].contacts | self.contacts.model_dump(exclude_none=True)
-        material = given["modulus"], given["radius"], given["poisson"]
-        return Contact(given["law"], float(given.get("stiffness") or contact_stiffness(*material)))
+        """The contact law without dissipation; the stiffness is 0 in a system without contacts."""
+        given, stiffness = self.contacts, self.contacts.stiffness or 0.0
+        if given.modulus and given.radius and given.poisson is not None:
+            stiffness = contact_stiffness(given.modulus, given.radius, given.poisson)
+        return Contact(given.law, stiffness)
 
 
 def _check_options(nnm: NnmTable) -> Iterator[Problem]:

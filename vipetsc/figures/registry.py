@@ -112,10 +112,10 @@ def draw(
 def warnings_of(folders: Sequence[Path]) -> list[str]:
     """The warnings about what ``folders`` hold, each once, from the attribute ``warnings`` (JSON) of their files."""
     sentences: dict[str, None] = {}
-    for path in (folder / name for folder in folders for name in ("run.h5", "analysis.h5", "ensemble.h5", "design.h5")):
-        if path.exists():
-            with open_netcdf(path, "file of results") as data:
-                sentences |= dict.fromkeys(json.loads(data.attrs.get("warnings", "[]")))
+    names = "run.h5", "analysis.h5", "ensemble.h5", "design.h5", "branch-*.h5"
+    for path in (path for folder in folders for name in names for path in sorted(folder.glob(name))):
+        with open_netcdf(path, "file of results") as data:
+            sentences |= dict.fromkeys(json.loads(data.attrs.get("warnings", "[]")))
     return list(sentences)
 
 

@@ -1,5 +1,6 @@
 """A branch: its points in order, special ones among them, its regions and power laws, and the files that hold it."""
 
+import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ import xarray as xr
 from vipetsc.io.atomic import write_text
 from vipetsc.io.netcdf import Variables, open_netcdf, variable, write_netcdf
 from vipetsc.modes.point import QUANTITIES, Point
-from vipetsc.spectra import power_law
+from vipetsc.spectra import doubt, power_law
 
 KINDS = ("regular", "fold-energy", "fold-frequency", "branch-point", "symmetry-breaking", "period-doubling", "grazing")
 REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 not told"
@@ -108,7 +109,7 @@ class Branch:
         for name, (stored, _, units, text) in QUANTITIES.items():
             data[stored] = variable("point", self.column(name), units, text)
         attributes = {"name": self.name, "case": self.case, "complete": int(self.complete), "ending": self.ending}
-        attributes |= {"next_step": self.next_step, "findings": "\n".join(self.findings), "fits": self.fits()}
+        attributes |= {"next_step": self.next_step, "warnings": json.dumps(self.findings), "fits": self.fits()}
         attributes["tongues"] = len(self.tongues())
         return xr.Dataset(data | self.extra, attrs=attributes)
 
@@ -126,7 +127,7 @@ class Branch:
         points = [Point(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
         name, case, ending = (str(about[key]) for key in ("name", "case", "ending"))
         next_step, complete = float(about["next_step"]), bool(about["complete"])
-        findings = [line for line in str(about["findings"]).split("\n") if line]
+        findings = json.loads(about.get("warnings", "[]"))
         return cls(name, case, data.sizes["dof"], points, next_step, complete, ending, findings)
 
 
@@ -168,7 +169,7 @@ def tell_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, cl
 
 
 def slope_laws(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dict[str, dict[str, float]]:
-    """df/dE = factor E^exponent in regions II (its falling part), III and IV, where four points or more allow it.
+    """df/dE = factor E^exponent in regions II (its falling part), III and IV, where it is without ``doubt``.
 
     A vertical piece of a branch has none: its exponent leaves the range of numbers, or its adjusted R^2 is none.
     """
@@ -184,7 +185,7 @@ def slope_laws(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dic
         if usable.sum() < 4 or np.ptp(e[usable]) == 0:
             continue
         law = power_law(e[usable], s[usable])
-        if np.isfinite(law.r2_adjusted) and 1 / MOST <= law.factor <= MOST:
+        if not doubt(usable.sum(), law.r2_adjusted) and 1 / MOST <= law.factor <= MOST:
             laws[label] = {"exponent": law.exponent, "factor": law.factor, "adjusted_r2": law.r2_adjusted}
             laws[label]["points"] = int(usable.sum())
     return laws
