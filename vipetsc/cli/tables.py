@@ -192,7 +192,7 @@ def branch_log(stream: TextIO) -> Callable[["Branch", "Point"], None]:
 
 
 def branch_table(branch: "Branch") -> str:
-    """How a branch went: length, range, special points, power laws, findings."""
+    """How a branch went: length, range, special points, power laws."""
     regular = branch.regular()
     lines = [f"{branch.name}: {len(regular)} points; {branch.ending}"]
     if regular:
@@ -207,12 +207,14 @@ def branch_table(branch: "Branch") -> str:
         of_kind = [p for p in special if p.kind == kind]
         lines.append(f"  {kind}: {len(of_kind)}")
         lines += [f"    E = {p.energy:.12g} J, f = {p.frequency:.11g} Hz" for p in of_kind[:4]]
+    if tongues := branch.tongues():
+        lines.append(f"  {len(tongues)} tongues of internal resonances: {', '.join(f'{k}:1' for k in tongues)}")
     for region, law in branch.fits().items():
         lines.append(
             f"  region {region}: df/dE ~ E^{law['exponent']:.4f}, adjusted R^2 {law['adjusted_r2']:.5f}"
             f" ({law['points']} points)"
         )
-    return "\n".join(lines + [f"  ! {finding}" for finding in branch.findings])
+    return "\n".join(lines)
 
 
 def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:

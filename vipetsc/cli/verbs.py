@@ -108,6 +108,8 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         branches = follow_all(case, claim.folder, comm, claim.going_on, tables.branch_log(sys.stderr), stop)
         for branch in branches:
             echo(comm, tables.branch_table(branch))
+            for finding in branch.findings:
+                echo(comm, f"vipetsc: warning: {branch.name}: {finding}", sys.stderr)
         stop.check(comm)
         claim.publish()
         echo_paths(comm, draw_source("branches", [folder], comm, afresh=False))
