@@ -32,7 +32,8 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
             unbroken = references(crew, options.only or list(SCENARIOS))
             tasks = [t for t in matrix(unbroken, options.kinds) if not options.phases or t["phase"] in options.phases]
             reached |= {task["phase"] for task in tasks}
-            rows += [judged(task | {"ranks": ranks}, stages, options) for task, stages in crew.do(tasks)]
+            share = tasks[:: options.every]
+            rows += [judged(task | {"ranks": ranks}, stages, options) for task, stages in crew.do(share)]
     missed = sorted(phases() - reached) if not options.only else []
     print(fault_table(rows, options.kinds, options.ranks))
     if missed:
@@ -118,6 +119,7 @@ def main() -> int:
     part.add_argument("--only", nargs="+", choices=SCENARIOS, help="scenarios; all if left out")
     part.add_argument("--phases", nargs="+", help="phases; all if left out")
     part.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    part.add_argument("--every", type=int, default=1, metavar="N", help="every N-th fault only")
     part.add_argument("--ranks", nargs="+", type=int, default=[2, 3])
     part.set_defaults(function=faults)
     part = kinds.add_parser("kills", parents=[common], help=kills.__doc__, description=kills.__doc__)
