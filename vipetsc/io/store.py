@@ -184,11 +184,13 @@ class RunFolder:
         """
         target, aside, together = self.folder / "run.h5", self.folder / ".run.h5.part", self.recording.together
 
-        def write() -> None:
+        def read_chunks() -> xr.Dataset | None:
             sys.audit("vipetsc.assemble", str(target))
-            if not together and self.comm.rank:
+            return dataset_without_fields(self, attributes) if together or self.comm.rank == 0 else None
+
+        def write() -> None:
+            if data is None:
                 return
-            data = dataset_without_fields(self, attributes)
             try:
                 with h5py.File(aside, "w", **({"driver": "mpio", "comm": self.comm} if together else {})) as file:
                     put_dataset(file, data, write=self.comm.rank == 0)
@@ -209,6 +211,7 @@ class RunFolder:
             discard(self._parts)
 
         try:
+            data = on_every_rank(self.comm, read_chunks)  # a rank that cannot must not leave the others creating a file
             on_every_rank(self.comm, write)
             on_root(self.comm, conclude)
         finally:
