@@ -10,6 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import xarray as xr
+from matplotlib.figure import Figure
+
 from vipetsc.figures import backbone, design, entropy, lattice, runs, scattering, transfer, transfer_curves
 from vipetsc.figures.study import table
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
@@ -105,18 +108,19 @@ def draw(
 
     turns = itertools.count(*share)
     with rc_style():
-        note = "\n".join(warnings_of(folders))
-        return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, turns, note, keep)
+        return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, turns, keep=keep)
 
 
-def warnings_of(folders: Sequence[Path]) -> list[str]:
-    """The warnings about what ``folders`` hold, each once, from the attribute ``warnings`` (JSON) of their files."""
-    sentences: dict[str, None] = {}
-    names = "run.h5", "analysis.h5", "ensemble.h5", "design.h5", "branch-*.h5"
-    for path in (path for folder in folders for name in names for path in sorted(folder.glob(name))):
-        with open_netcdf(path, "file of results") as data:
-            sentences |= dict.fromkeys(json.loads(data.attrs.get("warnings", "[]")))
-    return list(sentences)
+def warned(make: Callable[[], Figure], *results: xr.Dataset) -> Callable[[], Figure]:
+    """``make``, whose figure is labelled with the warnings in the ``results``: their attribute ``warnings`` (JSON)."""
+    sentences = dict.fromkeys(line for data in results for line in json.loads(data.attrs.get("warnings", "[]")))
+
+    def labelled() -> Figure:
+        figure = make()
+        figure.set_label("\n".join(sentences))
+        return figure
+
+    return labelled
 
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
@@ -129,7 +133,7 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
 def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[Drawing]:
     """Stems and drawings of what the ``folders`` hold, as ``draw`` draws them; the first of them checks the names.
 
-    Files stay open until the last drawing was asked for.
+    Warnings in the files are the figures' labels. Files stay open until the last drawing was asked for.
     """
     specs = {name: FIGURES[name] for name in figure_names(source, names)}
     folder = folders[0]
@@ -139,17 +143,20 @@ def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None =
             for name, spec in specs.items():
                 measured = [e for e in ensembles if spec.measure in table(e)["sweep"]["measures"]]
                 for suffix, make in spec.function(measured):
-                    yield f"{name}-{suffix}" if suffix else name, make
+                    yield f"{name}-{suffix}" if suffix else name, warned(make, *measured)
         elif source == BRANCHES:
             for spec, path in itertools.product(specs.values(), sorted(folder.glob("branch-*.h5"))):
                 paths = [other / path.name for other in folders if (other / path.name).exists()]
                 stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
-                yield stem, partial(spec.function, paths)
+                with ExitStack() as opened:
+                    branches = [opened.enter_context(open_netcdf(path, "branch")) for path in paths]
+                    yield stem, warned(partial(spec.function, paths), *branches)
         elif source == RUN:
             run, analysis = stack.enter_context(open_run(folder / "run.h5")), None
             if (folder / "analysis.h5").exists():
                 analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
-            yield from ((name, partial(spec.function, run, analysis)) for name, spec in specs.items())
+            of_run = [data for data in (run, analysis) if data is not None]
+            yield from ((name, warned(partial(spec.function, run, analysis), *of_run)) for name, spec in specs.items())
         else:
             search = stack.enter_context(open_netcdf(folder / "design.h5", "search", ("cost", "frequency")))
             yield from ((name, partial(spec.function, search)) for name, spec in specs.items())

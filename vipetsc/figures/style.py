@@ -48,12 +48,13 @@ def new_figure(width: float, height: float, heading: str = "") -> Figure:
 def save(figure: Figure, path: Path, note: str = "") -> Path:
     """Write ``figure`` to ``path`` in the format of its suffix, atomically, with a ``note`` in a strip below it.
 
-    Long lines of the note are wrapped to the width of the figure.
+    The figure's label stands there as well, in lines of the figure's width.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     width, height = figure.get_size_inches()
-    lines = [line for sentence in note.splitlines() for line in wrap(sentence, int(LETTERS * width))]
-    strip, note = Bbox([[0, -NOTE * len(lines)], [width, height]]) if note else None, "\n".join(lines)
+    sentences = [*note.splitlines(), *figure.get_label().splitlines()]
+    lines = [line for sentence in sentences for line in wrap(sentence, int(LETTERS * width))]
+    strip, note = Bbox([[0, -NOTE * len(lines)], [width, height]]) if lines else None, "\n".join(lines)
     text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=GREY)
     with atomic_write(path) as partial_path:
         figure.savefig(partial_path, format=path.suffix[1:], bbox_inches=strip)
@@ -77,7 +78,7 @@ def draw_each(
         Rising numbers, the next one asked for when a picture is done: every ``size``-th from a rank on shares
         the work evenly, a counter that all ranks draw from shares it by what it costs.
     note
-        Text below every picture.
+        A line of text below every picture, above the figure's label.
     keep
         Whether the file at a path is to stay as it is.
     """
