@@ -217,12 +217,14 @@ def _sweep_statistics(folder: Path) -> dict[str, Any]:
 
 
 def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
-    """Points, largest residual and endings of the branches, and how many of them failed."""
+    """Points, largest residual, endings with tongues and warnings of the branches, and how many of them failed."""
     residuals, endings = [], []
     for path in paths:
         with open_netcdf(path, "branch", ("kind", "residual", "ending")) as branch:
             residuals.extend(branch["residual"].values[branch["kind"].values == 0].tolist())
-            endings.append(f"{branch.attrs['name']}: {branch.attrs['ending']}")
+            passed = [f"{branch.attrs['tongues']} tongues"] if branch.attrs.get("tongues") else []
+            told = [branch.attrs["ending"], *passed, *json.loads(branch.attrs.get("warnings", "[]"))]
+            endings.append(f"{branch.attrs['name']}: {', '.join(told)}")
     failed = sum("failed" in ending for ending in endings)
     return {"points": len(residuals), "residual": max(residuals, default=0.0), "endings": endings, "failed": failed}
 

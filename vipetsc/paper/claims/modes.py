@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import xarray as xr
 
 from vipetsc.case import NnmCase
 from vipetsc.io.read import field_interval, nearest_cell, open_run
@@ -15,6 +16,12 @@ from vipetsc.studies.backbone import BRANCH, log_slope
 
 INTERBAND, ONE_SITE = "interband", "interband-one-site"
 MAIN = "5-sites-30-cycles"
+BESIDE = "branch-in-phase.h5"
+# What the in-phase branch passes up to 6e9 J at 100 MPa, counted with steps of a third of the usual ones.
+TRUE = {
+    "hertz": {"tongues": 17, "grazing": 320, "symmetry-breaking": 62, "period-doubling": 41, "fold-energy": 90},
+    "bilinear": {"tongues": 15, "grazing": 187, "fold-energy": 132},
+}
 
 
 def branches(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -55,6 +62,20 @@ def branches(evidence: Evidence, reading: str, result: Measurement) -> None:
         if folds < FEWEST_FOLDS:
             modulus = f" at {case.contacts.modulus / 1e6:g} MPa" if case.contacts.modulus else ""
             result.reasons.append(f"the {law} branch{modulus} has {folds} energy folds at grazing")
+        if reading == "printed" and (evidence.root / step / BESIDE).exists():
+            _beside(evidence.open(step, BESIDE, needs=("kind", "frequency", "resonance")), law, result)
+
+
+def _beside(branch: xr.Dataset, law: str, result: Measurement) -> None:
+    """The in-phase branch: its tongues, special points and largest frequency, and where they are not the true ones."""
+    kind, tongue = branch["kind"].values, branch["resonance"].values
+    counts = {name: int(np.sum(kind == KINDS.index(name))) for name in TRUE[law] if name != "tongues"}
+    counts["tongues"] = len(set(tongue[tongue > 1].tolist()))
+    result.value |= {f"{name} of the in-phase branch, {law}": count for name, count in counts.items()}
+    result.value[f"largest frequency (Hz) of the in-phase branch, {law}"] = branch["frequency"].values.max()
+    for name, count in counts.items():
+        if count != TRUE[law][name]:
+            result.reasons.append(f"the {law} branch in phase has {count} {name}, not {TRUE[law][name]}")
 
 
 def _largest(values: np.ndarray) -> float | None:
