@@ -164,6 +164,16 @@ def test_a_hump_beside_a_dip_in_one_quarter_of_a_step_is_found():
     assert 0 < share < 0.02
 
 
+def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():
+    """Slope (x - .05)(x - .15), so that .05 is a largest value and the gap rises again within the same quarter."""
+    rise = np.polynomial.Polynomial.fromroots([0.05, 0.15]).integ().coef
+    c = np.append(rise, [0.0, 1e-3])
+    c[0] = 1e-6 - np.polynomial.Polynomial(c)(0.05)
+    share, outcome = first_rise(c)
+    assert outcome == EXTREMUM
+    assert share == pytest.approx(0.05, abs=1e-3)
+
+
 def test_the_second_hump_of_a_gap_is_found():
     """Slope -(x - .1)(x - .45)(x - .9): the first largest value is 2e-3 below zero, the second 2.3e-3 above."""
     slope = -np.polynomial.Polynomial.fromroots([0.1, 0.45, 0.9])

@@ -160,8 +160,9 @@ def first_rise(c: np.ndarray) -> tuple[float, int]:
         for part in range(1, 5):  # the first quarter of the step that ends above zero
             end = 0.25 * part
             if end > left:
-                if _value(c, end) > 0.0:
-                    return _bisect(c, left, end, 0.0), CROSSING
+                root = _bisect(c, left, end, 0.0) if _value(c, end) > 0.0 else 2.0
+                if root <= top:
+                    return root, CROSSING
                 if end >= top:
                     break
                 left = end
