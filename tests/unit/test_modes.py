@@ -505,7 +505,7 @@ def test_the_in_phase_hertz_branch_crosses_the_out_of_phase_one_and_goes_on(guar
         assert not said
         assert points[-1].energy < points[124].energy < 0.031
     else:
-        assert said[0] == "left its branch: the orbit of point 125 is another one passed 3 times"
+        assert said[0] == "left its branch: the orbit of point 150 is another one passed 3 times"
         assert is_jump(problem, points[123], points[124], NnmTable(chart="auto"))
 
 

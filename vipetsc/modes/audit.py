@@ -14,7 +14,7 @@ from vipetsc.modes.point import Point, repetitions, sample_orbit
 from vipetsc.modes.shooting import Relative, Shooting
 
 # Points between two looks whether a branch has passed on to another one.
-REPETITIONS_EVERY = 25
+REPETITIONS_EVERY = 50
 
 
 def suspects(problem: Shooting, points: list[Point]) -> Iterator[tuple[int, str]]:

@@ -165,8 +165,7 @@ class Shooting:
     x are displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre.
     Raises ValueError if the map needs an odd system and the system is not. Newton's method solves the n equations and
     one more linear row in the unknowns of a chart; it ends at a scaled residual of ``tolerance``, after a step below
-    ``STEP_TOLERANCE``, where rounding allows no more, or after ``max_newton`` steps. PETSc options:
-    ``-nnm_snes_monitor`` and the like.
+    ``STEP_TOLERANCE``, where rounding allows no more, or after ``max_newton`` steps.
     """
 
     def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
