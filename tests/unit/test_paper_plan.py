@@ -16,7 +16,7 @@ from vipetsc.paper import make
 from vipetsc.paper.figures import TRANSFER
 from vipetsc.paper.make import read_record
 from vipetsc.paper.plan import DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StoppedError, StopRequest
 from vipetsc.studies.design import search_design
 
 ROOT = Path(__file__).parents[2]
@@ -119,7 +119,8 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
 def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
     stop, told = StopRequest(), []
     stop.requested = True
-    assert make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop, tell=told.append) is None
+    with pytest.raises(StoppedError):
+        make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop, tell=told.append)
     assert told == [] and [path.name for path in tmp_path.iterdir()] == ["plan.json"]
 
 

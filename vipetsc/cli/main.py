@@ -79,16 +79,14 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
         with StopRequest().listening(at_once=options.verb not in STOPPABLE) as stop:
-            code = int(options.function(options, MPI.COMM_WORLD, stop))
+            return int(options.function(options, MPI.COMM_WORLD, stop))
     except (CaseError, FolderError) as error:
         verbs.echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return verbs.BAD_INPUT
     except StoppedError as error:
-        verbs.echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
-        code = verbs.STOPPED
-    if code == verbs.STOPPED and getattr(options, "force", False):
-        verbs.echo(MPI.COMM_WORLD, "vipetsc: to go on, leave out --force, which begins anew", sys.stderr)
-    return code
+        how = "; leave out --force, which begins anew" if getattr(options, "force", False) else ""
+        verbs.echo(MPI.COMM_WORLD, f"vipetsc: {error}{how}", sys.stderr)
+        return verbs.STOPPED
 
 
 def _parser() -> Parser:

@@ -66,8 +66,6 @@ def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
         echo_warnings(comm, [warning for warning in result.warnings if warning not in known])
         echo(comm, tables.run_table(result))
-        if result.resumable:
-            return STOPPED
         stop.check(comm)
         if case.output.fields and result.statistics["samples"] > 1:
             on_root(comm, lambda: is_measured(folder) or measure_run(folder))
@@ -90,8 +88,6 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
         result = run_sweep(plan, folder, comm, force=options.force, stop=stop, resume=options.resume, progress=True)
         echo_warnings(comm, result.warnings)
         echo(comm, tables.sweep_table(result))
-        if result.resumable:
-            return STOPPED
         stop.check(comm)
         if plan.table.get("output", {}).get("figures", True):
             echo_paths(comm, draw_source("sweep", [folder], comm, afresh=False))
@@ -193,9 +189,6 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
         echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
         return DONE
     result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
-    if result is None:
-        echo(comm, "stopped on request; the same command goes on")
-        return STOPPED
     echo(comm, claims_table(result.claims))
     echo(comm, f"  {len(result.made)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
     return DONE if result.complete else FAILED

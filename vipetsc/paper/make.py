@@ -53,8 +53,8 @@ def make_paper(
     only: Sequence[str] = (),
     stop: StopRequest | None = None,
     tell: Tell = lambda text: None,
-) -> PaperResult | None:
-    """Make what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``; None if asked to leave early.
+) -> PaperResult:
+    """Make what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``.
 
     Leaves ``<step>/`` for every step, ``figures/`` (PNG and PDF), ``claims.json`` and ``report.html``. A call that
     was stopped or killed is gone on with by the next one; one with nothing to do takes seconds.
@@ -63,7 +63,7 @@ def make_paper(
     the report is written from all that is there. ``tell`` is called on rank 0 with what is about to be done.
 
     Raises FolderError if ``root`` holds the paper on another grid, or something else, or for an unknown id, CaseError
-    if a case file cannot be used.
+    if a case file cannot be used, StoppedError after a request to stop.
     """
     sys.audit("vipetsc.plan", str(root))
     root, part = Path(root), plan.only(only)
@@ -71,17 +71,13 @@ def make_paper(
         return _make_paper(plan, part, root, comm, stop or StopRequest(), tell)
 
 
-def _make_paper(
-    plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell
-) -> PaperResult | None:
+def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> PaperResult:
     """Make the steps and figures of ``part``, and from all of ``plan`` that is there the claims and the report."""
     made = _make_steps(part, root, comm, stop, tell)
-    if stop.agreed(comm):
-        return None
+    stop.check(comm)
     on_root(comm, lambda: _relate(plan.folders(root)))
     drawn = draw_paper(part, root, comm, stop, tell)
-    if stop.agreed(comm):
-        return None
+    stop.check(comm)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
 
     def is_complete(step: Step) -> bool:
