@@ -6,11 +6,14 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.observers import Observer
+from vipetsc.io.store import RunMemory
 
 
 def runs_alike(folder: Path, case: Case, **options) -> None:
@@ -69,6 +72,44 @@ def test_parallel_writing_gives_the_gathered_file(folder):
     gathered, parallel = (datasets(folder / w / "run.h5") for w in ("gather", "parallel"))
     assert_same_bits(gathered, parallel)
     assert gathered["cell"].tolist() == list(range(3, 21, 2))
+
+
+class Spoiler(Observer):
+    """Makes a number of the last rank's state invalid."""
+
+    name = "test-spoiler"
+
+    def observe(self, sample):
+        if sample.number == 60 and self.setup.layout.comm.rank == self.setup.layout.comm.size - 1:
+            sample.state.array[self.setup.layout.owned // 2] = np.nan
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize(
+    ("engine", "stiffness", "observers", "reason"),
+    [
+        ("propagator", 1e45, [], "stalled: the contacts of sites 1 at"),
+        ("ts", 1e30, [], "stalled: the step fell to"),
+        ("propagator", 1e6, ["test-spoiler"], "the state is not finite"),
+        ("ts", 1e6, ["test-spoiler"], "the state is not finite"),
+    ],
+)
+def test_a_step_that_fails_on_one_rank_ends_the_run_on_all(engine, stiffness, observers, reason):
+    """One rank owns the site, and in the propagator another one does not feel it at all."""
+    table = {
+        "name": "failing",
+        "lattice": {"preset": "diatomic", "cells": 40},
+        "contacts": {"law": "bilinear", "stiffness": stiffness, "sites": [5], "clearance": 1e-5},
+        "drive": {"amplitude": 20.0},
+        "time": {"end": 0.02, "engine": engine, "rtol": 1e-8},
+    }
+    result = simulate(Case.from_table(table), RunMemory(MPI.COMM_WORLD), observers=observers)
+    assert not result.complete
+    assert not result.resumable
+    assert result.sentence.startswith(reason)
+    assert "nearest site 1 in cell 5" in result.sentence
+    told = MPI.COMM_WORLD.allgather((result.sentence, result.statistics, result.warnings))
+    assert all(each == told[0] for each in told)
 
 
 @pytest.mark.parallel([2, 3, 4])

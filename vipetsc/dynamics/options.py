@@ -6,6 +6,8 @@ from contextlib import contextmanager
 
 from petsc4py import PETSc
 
+import numpy as np
+
 from vipetsc.case import Case, CaseError, CaseFile, Problem
 from vipetsc.case.schema import PetscTable, only_looks
 from vipetsc.dynamics.ts.right_hand_side import petsc_library
@@ -49,10 +51,12 @@ def check_options(case: CaseFile | None) -> None:
     problems = [] if _taken(options) else [(n, "PETSc refuses it") for n in options if not _taken({n: options[n]})]
     if not problems:
         with petsc_options(options):
-            kind = _runge_kutta()
+            kind, step = _runge_kutta()
             problems = [(name, "PETSc's time stepping has no such option") for name in options if not _used(name)]
         if kind != PETSc.TS.Type.RK:
             problems.append(("ts_type", 'the lattice is stepped by "rk" alone; ts_rk_type names the method'))
+        if not 0 < step < np.inf:
+            problems.append(("ts_dt", "must be positive"))
     if problems:
         raise CaseError([Problem(f"petsc.{name}", options[name], remedy) for name, remedy in problems])
 
@@ -67,13 +71,13 @@ def _taken(options: Mapping[str, str]) -> bool:
     return True
 
 
-def _runge_kutta() -> str:
-    """The type that a time stepper has after it has read its options."""
+def _runge_kutta() -> tuple[str, float]:
+    """Type and first step in s of a time stepper that has read its options."""
     ts = PETSc.TS().create(PETSc.COMM_SELF)
     try:
         ts.setType(PETSc.TS.Type.RK)
         ts.setFromOptions()
-        return ts.getType()
+        return ts.getType(), ts.getTimeStep()
     finally:
         ts.destroy()
 

@@ -28,7 +28,7 @@ MOST_PARTS = 16
 # Sites of one cluster beyond which plain time stepping costs less.
 MOST_SITES = 32
 # Changes of one cluster in one step beyond which it counts as stalled.
-MOST_CHANGES = 20_000
+MOST_CHANGES = 5_000
 # Rough costs that decide the step's length, in us: a step, a cell in it, a sample's contacts per site of a cluster.
 STEP_COST, CELL_COST, SITE_COST = 20.0, 0.03, 10.0
 # What steps hand over; CHANGED and FAILED are those of ``advance_cluster``.

@@ -24,8 +24,8 @@ from vipetsc.parallel import StopRequest
 # PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
 # and often saves a step on the way to a sample.
 STRETCH = 1.08
-# Steps and rejected trials on the way to one time beyond which a run counts as stalled.
-MOST_TRIALS = 200_000
+# Steps and rejected trials for each site, on the way to one time, beyond which a run counts as stalled.
+MOST_TRIALS = 10_000
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
 
@@ -63,6 +63,7 @@ class Integrator(Engine):
         self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
         self._stop = stop or StopRequest()
         self._any_open = False
+        self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
         # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
         # as h^(5/2). The shares are those that the controller settles at.
         hertz = model.contact.law == "hertz"
@@ -126,8 +127,8 @@ class Integrator(Engine):
             return False
         trials = 0
         while self.time < target:
-            if trials > MOST_TRIALS:
-                raise StalledError(f"{MOST_TRIALS} steps did not reach t = {target:.6g} s")
+            if trials > self._most_trials:
+                raise StalledError(f"{trials} steps did not reach t = {target:.6g} s")
             if not self._step(target):
                 return False
             trials += 1
