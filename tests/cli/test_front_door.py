@@ -188,7 +188,7 @@ def test_validate_reads_every_section_as_its_verb_does(in_process, tmp_path):
     path.write_text("[nnm]\nmodes = [2]\n[design]\nwavenumbers = 11\n[sweep.drive]\namplitude = [1.0, 2.0]\n")
     ended = in_process("validate", path)
     assert ended.returncode == 0
-    for text in ("restitution 0.7, effective 0.768", "2 members (2), 0 of them impossible", "reduced system, modes 2",
+    for text in ("restitution 0.7, effective 0.768", "2 members (2), 0 of them impossible", "reduced system, modes 2,",
                  "37 lambda x 36 eta, 11 wavenumbers"):  # fmt: skip
         assert text in ended.stdout
     unknown = in_process("validate", path, "--set", "petsc.ts_rk_type=magic")

@@ -78,29 +78,26 @@ def sweep_table(result: "SweepResult") -> str:
     return table(rows)
 
 
-def case_table(case: CaseFile, ranks: int) -> str:
-    """What follows from the case of a verb."""
-    if isinstance(case, Case):
-        return run_case_table(case, ranks)
+def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
+    """What follows from the case of a verb, as rows of a table."""
     if isinstance(case, Sweep):
         impossible, counts = sum(member.case is None for member in case.members()), " x ".join(map(str, case.shape))
-        rows = [("sweep", f"{np.prod(case.shape)} members ({counts}), {impossible} of them impossible")]
-    elif isinstance(case, DesignCase):
+        return [("sweep", f"{np.prod(case.shape)} members ({counts}), {impossible} of them impossible")]
+    if isinstance(case, DesignCase):
         search = case.design
         cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
-        rows = [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]
-    else:
-        assert isinstance(case, NnmCase)
+        return [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]
+    if isinstance(case, NnmCase):
         contact, (low, high) = case.contact(), case.nnm.energy
-        rows = [
-            ("nnm", f"{case.nnm.system} system, modes {_first_few(case.nnm.modes)}"),
+        return [
+            ("nnm", f"{case.nnm.system} system, modes {_first_few(case.nnm.modes)}, {low:g} to {high:g} J"),
             ("nnm contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.exponent:g}"),
-            ("nnm energies", f"{low:g} to {high:g} J, at most {case.nnm.points} points a branch"),
         ]
-    return table(rows)
+    assert isinstance(case, Case)
+    return run_case_rows(case, ranks)
 
 
-def run_case_table(case: Case, ranks: int) -> str:
+def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
     """What follows from a case of a run: bands, drive, times, samples, file size, cost."""
     from vipetsc.dynamics.memory import memory_available, memory_needed
     from vipetsc.dynamics.recorder import recorded_cells, written_together
@@ -117,7 +114,7 @@ def run_case_table(case: Case, ranks: int) -> str:
     writer = "parallel" if written_together(model, case.output, ranks) else "gather"
     engine = "ts" if case.time.engine == "ts" else "propagator"
     needed, left = memory_needed(model, case.output, engine, ranks), memory_available() / ranks
-    rows = [
+    return [
         ("case", case.name),
         ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {chain.ends} ends, "
                     f"reading {case.lattice.reading}"),
@@ -138,7 +135,6 @@ def run_case_table(case: Case, ranks: int) -> str:
         ("cost", f"about {steps:.3g} steps of engine ts, {duration} on {ranks} rank{'s' * (ranks > 1)}"
                  " before contacts"),
     ]  # fmt: skip
-    return table(rows)
 
 
 def _first_few(items: Sequence[object]) -> str:

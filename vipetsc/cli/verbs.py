@@ -121,8 +121,10 @@ def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> 
         cases = load_every(options.case, options.set)
         for case in cases:
             check_options(case)
-        lines = [tables.case_table(case, comm.size) for case in cases]
-        return "\n".join(lines + [f"warning: {warning}" for case in cases for warning in case.warnings()])
+        rows = [row for case in cases for row in tables.case_rows(case, comm.size)]
+        return "\n".join(
+            [tables.table(rows)] + [f"warning: {warning}" for case in cases for warning in case.warnings()]
+        )
 
     echo(comm, on_root(comm, report))
     return DONE
