@@ -7,9 +7,13 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vipetsc
+from tests.conftest import assert_same_bits, datasets
+from tests.faults.inject import Injector
+from vipetsc.case import Case, Sweep, case_id
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import make
@@ -140,3 +144,51 @@ def test_a_search_is_done_when_its_file_has_its_case(searched):
     with open_netcdf(root / "design" / "design.h5", "search") as search:
         assert tomllib.loads(search.attrs["case"]) == tomllib.loads(plan.steps[0].text)
     assert plan.steps[0].results(root) == [root / "design" / "design.h5"]
+
+
+def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_path):
+    plan, root = searched[0], tmp_path / "paper"
+    plan = replace(plan, steps=(replace(plan.steps[0], name="other"), *plan.steps), measure=lambda root: [])
+    plan = replace(plan, figures=[figure for figure in plan.figures if figure.id == "fig10"])
+    injector = Injector()
+    injector.arm("member", 1, "exception")
+    result = make.make_paper(plan, root)
+    assert result.failed == ["other: a fault at member"] and result.made == ("design",) and not result.complete
+    whole = make.make_paper(plan, root)
+    assert whole.made == ("other",) and whole.complete and not whole.drawn
+    found, claims = datasets(root / "design" / "design.h5"), (root / "claims.json").read_bytes()
+    picture = next((root / "figures").glob("*.png"))
+    for path in (
+        root / "design" / "design.h5",
+        root / "claims.json",
+        root / "made.json",
+        root / "report.html",
+        picture,
+    ):
+        os.truncate(path, path.stat().st_size // 2 if path.suffix == ".h5" else 0)
+    again = make.make_paper(plan, root)
+    assert again.made == ("design",) and again.complete and picture in again.drawn
+    assert_same_bits(datasets(root / "design" / "design.h5"), found)
+    assert (root / "claims.json").read_bytes() == claims and picture.read_bytes()[-8:-4] == b"IEND"
+    (root / "plan.json").write_text("")
+    with pytest.raises(FolderError, match=r"plan\.json cannot be read; remove it if the folder holds"):
+        make.make_paper(plan, root)
+
+
+def test_a_sample_has_one_member_of_every_curve_and_is_the_same_again():
+    steps = {step.name: step for step in paper_plan(FULL).steps}
+    sweeps = {name for name, step in steps.items() if step.kind is Sweep and not step.checks}
+    assert sweeps == {step.checks for step in steps.values() if step.checks}
+
+    def curve(case: Case) -> str:
+        return str((case.lattice.reading, case.contacts.law, case.contacts.sites, case.drive.cycles))
+
+    for name in ("interband", "scattering-neighbours"):
+        sweep, step = steps[name].case, steps[f"{name}-ts"]
+        members, sample = ([member.case for member in case.members()] for case in (sweep, step.case))
+        assert set(map(curve, sample)) == set(map(curve, members))
+        assert len(sample) == max(len(set(map(curve, members))), int(np.ceil(0.02 * len(members))))
+        assert {case.time.engine for case in sample} == {"ts"}
+        tables = (case.model_dump(by_alias=True, exclude_none=True) | {"name": name} for case in sample)
+        assert {case_id(Case.from_table(t, ["time.engine=auto"])) for t in tables} <= set(map(case_id, members))
+        assert step.text == replace(step).text

@@ -7,7 +7,7 @@ their results, the version of the package. ``made.json`` keeps the hashes.
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,15 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import PAPER, Claim, claimed, provenance
 from vipetsc.paper.claims import write_claims
 from vipetsc.paper.figures import RELATED, TRANSFER
-from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, Step, fingerprint
+from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, Step, fingerprint, read_json
 from vipetsc.paper.report import write_report
-from vipetsc.parallel import SharedCounter, StopRequest, on_root
+from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
+from vipetsc.studies.sweep import FULL
 
 FORMATS = ("png", "pdf")
+LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".html": b"</html>"}  # what such files end with
+MANY = 2**40  # more than any count
 MADE = "made.json"
 Tell = Callable[[str], None]
 Record = dict[str, Any]
@@ -36,13 +39,16 @@ Record = dict[str, Any]
 class PaperResult:
     """What was done: steps ``made``, files ``drawn``; the rows of ``claims.json``.
 
-    ``complete``: every step asked for is there, without failures.
+    ``complete``: every step asked for is there, without failures; ``failed`` says which were not and why, ``warnings``
+    what else is to be known of the results.
     """
 
     made: tuple[str, ...]
     drawn: tuple[Path, ...]
     claims: list[dict[str, Any]]
     complete: bool
+    failed: list[str]
+    warnings: list[str]
 
 
 def make_paper(
@@ -73,17 +79,36 @@ def make_paper(
 
 def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> PaperResult:
     """Make the steps and figures of ``part``, and from all of ``plan`` that is there the claims and the report."""
-    made = _make_steps(part, root, comm, stop, tell)
+    failed, warnings = list[str](), list[str]()
+    made = _make_steps(part, root, comm, stop, tell, failed, warnings)
     stop.check(comm)
-    on_root(comm, lambda: _relate(plan.folders(root)))
-    drawn = draw_paper(part, root, comm, stop, tell)
+    with _noted(comm, "backbone", failed):
+        on_root(comm, lambda: _relate(plan.folders(root)))
+    drawn: tuple[Path, ...] = ()
+    with _noted(comm, "figures", failed):
+        drawn = draw_paper(part, root, comm, stop, tell)
     stop.check(comm)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
 
     def is_complete(step: Step) -> bool:
         return step.state(root) == DONE and not step.statistics(root).get("failed")
 
-    return PaperResult(made, drawn, claims, on_root(comm, lambda: all(map(is_complete, part.steps))))
+    complete = on_root(comm, lambda: all(map(is_complete, part.steps))) and not failed
+    return PaperResult(made, drawn, claims, complete, failed, warnings)
+
+
+@contextmanager
+def _noted(comm: MPI.Comm, name: str, failed: list[str]) -> Iterator[None]:
+    """Note in ``failed`` what is raised, and go on; not where one rank failed alone, nor for a full disk."""
+    try:
+        yield
+    except StoppedError:
+        raise
+    except Exception as error:
+        alone = comm.size > 1 and not getattr(error, "from_root", False)
+        if alone or getattr(error, "errno", None) in FULL:
+            raise
+        failed.append(f"{name}: {error or type(error).__name__}")
 
 
 def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:
@@ -92,17 +117,19 @@ def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[C
         _ = step.text
 
     def difference(text: str) -> str | None:
-        grid = "?"
         with suppress(ValueError, KeyError):
             grid = json.loads(text)["grid"]
-        other = f"holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
-        return other if grid != plan.grid else None
+            other = f"holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
+            return other if grid != plan.grid else None
+        return f"its plan.json cannot be read; remove it if the folder holds the paper on the {plan.grid} grid"
 
     return claimed(comm, root, PAPER, json.dumps({"grid": plan.grid}) + "\n", difference=difference)
 
 
-def _make_steps(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> tuple[str, ...]:
-    """Make the steps that are not done, until a request to stop; returns their names."""
+def _make_steps(
+    plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell, failed: list[str], warnings: list[str]
+) -> tuple[str, ...]:
+    """Make the steps that are not done, until a request to stop; returns their names, notes failures and warnings."""
     made = []
     for step in plan.steps:
         state, left = on_root(comm, lambda step=step: (step.state(root), step.left(root)))  # type: ignore[misc]
@@ -111,9 +138,10 @@ def _make_steps(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell:
         if state != DONE:
             if comm.rank == 0:
                 tell(f"{step.name}: about {duration(left / comm.size)}")
-            sys.audit("vipetsc.member", step.name)
-            step.make(root, comm, stop, state == STALE)
-            made.append(step.name)
+            with _noted(comm, step.name, failed):
+                sys.audit("vipetsc.member", step.name)
+                warnings += [f"{step.name}: {warning}" for warning in step.make(root, comm, stop, state == STALE)]
+                made.append(step.name)
     return tuple(made)
 
 
@@ -138,6 +166,7 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: 
     def turns() -> Iterator[int]:
         while not stop.requested:
             yield counter.draw()
+        counter.draw(MANY)  # so that no rank begins another
 
     def offered() -> Iterator[Drawing]:
         for figure in plan.figures:
@@ -147,12 +176,22 @@ def draw_paper(plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: 
                 entry["pictures"].append(stem)
                 yield stem, make
 
-    with style.rc_style():
-        mine = draw_each(offered(), root / "figures", FORMATS, turns(), plan.note, keep=Path.exists)
+    def draw_share() -> list[Path]:
+        with style.rc_style():
+            return draw_each(offered(), root / "figures", FORMATS, turns(), plan.note, keep=_is_whole)
+
+    try:
+        mine = on_every_rank(comm, draw_share)
+    finally:
+        counter.free()
     drawn = sorted(path for paths in comm.allgather(mine) for path in paths)
-    counter.free()
     on_root(comm, lambda: _write_record(root, record))
     return tuple(drawn)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a picture or page is there to its end."""
+    return path.exists() and LAST[path.suffix] in path.read_bytes()[-32:]
 
 
 def _drop_stale(plan: Plan, root: Path) -> Record:
@@ -168,9 +207,8 @@ def _drop_stale(plan: Plan, root: Path) -> Record:
 
 
 def read_record(root: Path) -> Record:
-    """``made.json``, or an empty record."""
-    path = root / MADE
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"figures": {}}
+    """``made.json``, or an empty record, after which everything is made again."""
+    return read_json(root / MADE) or {"figures": {}}
 
 
 def _write_record(root: Path, record: Record) -> None:
@@ -182,7 +220,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> list[dict[s
     """``claims.json`` and ``report.html`` as far as their inputs changed; returns the claims."""
     record, inputs = read_record(root), plan.inputs(root)["claims"]
     path, report = root / "claims.json", root / "report.html"
-    if not path.exists() or record.get("claims") != inputs:
+    if read_json(path) is None or record.get("claims") != inputs:
         tell("claims")
         sys.audit("vipetsc.claims")
         write_claims(plan.measure(root), path)
@@ -190,7 +228,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell) -> list[dict[s
     text = path.read_text(encoding="utf-8")
     versions = {key: value for key, value in provenance(comm).items() if key.endswith("_version")}
     inputs = fingerprint(text, json.dumps([inputs, record["figures"], versions]))
-    if not report.exists() or record.get("report") != inputs:
+    if not _is_whole(report) or record.get("report") != inputs:
         tell("report")
         sys.audit("vipetsc.report")
         stems = {key: entry["pictures"] for key, entry in record["figures"].items()}

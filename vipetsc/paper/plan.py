@@ -7,6 +7,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
@@ -30,11 +31,14 @@ from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.design import search_design
+from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.sweep import run_sweep
 
 FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
+SAMPLE, SEED = 0.02, 2024  # share of a sweep's members that are made by the other engine as well, and how it is drawn
+TS_COST = 3.0  # s of CPU time of one of them
 RELATION = "backbone.h5"  # beside a sweep that is laid over branches
 
 # Steps that a claim is measured from, and figures that bear on it are drawn from, besides those that these show.
@@ -49,7 +53,8 @@ class Step:
     """One case made in ``root/<name>``: a sweep, branches or a search.
 
     ``kind`` of case and its ``file``, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time
-    in s of all of it (of a member, for sweeps) on a core of the 2020s, used until rates are measured.
+    in s of all of it (of a member, for sweeps) on a core of the 2020s, used until rates are measured. With ``checks``,
+    the name of another step, it makes a sample of that sweep's members by the engine ``ts``.
     """
 
     name: str
@@ -57,6 +62,7 @@ class Step:
     file: Path
     changes: tuple[str, ...] = ()
     cost: float = 1.0
+    checks: str = ""
 
     def folder(self, root: Path) -> Path:
         """Where the step's files are."""
@@ -65,7 +71,8 @@ class Step:
     @cached_property
     def case(self) -> StepCase:
         """The resolved case; raises CaseError."""
-        return self.kind.load(self.file, self.changes)
+        case = self.kind.load(self.file, self.changes)
+        return sampled(case, SAMPLE, SEED) if self.checks and isinstance(case, Sweep) else case
 
     @cached_property
     def text(self) -> str:
@@ -80,18 +87,22 @@ class Step:
             names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
         return [self.folder(root) / name for name in names]
 
-    def make(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> None:
-        """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``."""
+    def make(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
+        """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``.
+
+        Returns warnings about what was made.
+        """
         case, folder = self.case, self.folder(root)
         if isinstance(case, Sweep):
-            run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True)
-        elif isinstance(case, NnmCase):
+            return run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True).warnings
+        if isinstance(case, NnmCase):
             with claim_branches(case, folder, comm, afresh) as claim:
                 follow_all(case, claim.folder, comm, claim.going_on, stop=stop)
                 if not stop.agreed(comm):
                     claim.publish()
         else:
             on_root(comm, lambda: search_design(case, folder, afresh))
+        return []
 
     def state(self, root: Path) -> str:
         """DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
@@ -104,12 +115,11 @@ class Step:
 
     def _is_complete(self, path: Path) -> bool:
         """Whether a result is of this case; a branch has ended, by itself or in a failure that it names."""
-        if not path.exists():
-            return False
-        with h5py.File(path) as file:
+        with suppress(OSError), h5py.File(path) as file:  # one that was cut off does not open
             if "ending" in file.attrs:
                 return bool(file.attrs["complete"]) or str(file.attrs["ending"]).startswith("failed")
             return self._is_same_case(file.attrs["case"])
+        return False
 
     def _is_same_case(self, text: str) -> bool:
         """Whether a case in TOML is this step's, in whatever order its keys stand."""
@@ -135,7 +145,8 @@ class Step:
         """Numbers about the results for a report, once they are there; empty where there are none to tell."""
         if isinstance(self.case, NnmCase):
             return _branch_statistics(self.results(root))
-        return _sweep_statistics(self.folder(root)) if isinstance(self.case, Sweep) else {}
+        told = _sweep_statistics(self.folder(root)) if isinstance(self.case, Sweep) else {}
+        return told | ({"agreement": agreement(root / self.checks, self.folder(root))} if self.checks else {})
 
 
 @dataclass(frozen=True)
@@ -200,6 +211,7 @@ def paper_plan(grid: str = FULL) -> Plan:
         if row["kind"] == "sweep":  # the figures of the paper are drawn from all sweeps together
             changes.insert(0, "output.figures=false")
         steps.append(Step(name, KINDS[row["kind"]], file, tuple(changes), row["cost"]))
+    steps += [replace(s, name=f"{s.name}-ts", cost=TS_COST, checks=s.name) for s in steps if s.kind is Sweep]
     return Plan(grid, tuple(steps), note=COARSE if grid == QUICK else "")
 
 
@@ -231,9 +243,17 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
 
 def _cpu_times(folder: Path) -> list[float]:
     """CPU times in s of the members in ``folder`` that are complete; 0 for scaled ones."""
-    summaries = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*/summary.json")]
+    summaries = [read_json(path) or {} for path in folder.glob("*/summary.json")]
     statistics = [summary.get("statistics", {}) for summary in summaries if summary.get("complete")]
     return [0.0 if "scaled_from" in s else float(s.get("cpu_seconds", 0.0)) for s in statistics]
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds; None if it is not there or was cut off."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
 
 
 def fingerprint(*parts: str | bytes) -> str:

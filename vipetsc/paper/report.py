@@ -15,6 +15,8 @@ from PIL import Image  # type: ignore[import-untyped]
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.paper.figures import READINGS, PaperFigure, describe
+from vipetsc.paper.plan import SAMPLE
+from vipetsc.studies.engines import COMPARED
 
 WIDEST = 1500  # pixels of a picture in the page
 COLOURS = 200
@@ -49,6 +51,9 @@ def write_report(
         figure_of={claim: figure for figure, _ in reversed(pictures) for claim in figure.claims},
         sweeps={name: row for name, row in statistics.items() if "members" in row},
         branches={name: row for name, row in statistics.items() if "points" in row},
+        checks={name.removesuffix("-ts"): row["agreement"] for name, row in statistics.items() if "agreement" in row},
+        bounds=COMPARED,
+        share=SAMPLE,
     )
     write_text(path, page)
 

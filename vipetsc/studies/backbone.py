@@ -5,6 +5,7 @@ import json
 import sys
 import tomllib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,9 +187,8 @@ def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
 
 def is_related(folder: Path, branches: Sequence[Path]) -> bool:
     """Whether ``folder/backbone.h5`` is what this version makes of the sweep and the ``branches`` as they are now."""
-    if not (folder / "backbone.h5").exists():
-        return False
-    with open_netcdf(folder / "backbone.h5", "relation") as file:
+    made, version = "{}", None
+    with suppress(OSError), open_netcdf(folder / "backbone.h5", "relation") as file:  # none, or one that was cut off
         made, version = file.attrs.get("sources", "{}"), file.attrs.get("vipetsc_version")
     return version == vipetsc.__version__ and json.loads(made) == _sources(folder, branches)
 

@@ -1,0 +1,55 @@
+"""Whether both engines give a sweep the same: a sample of its members by ``ts``, beside what the sweep measured."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vipetsc.case import Sweep
+from vipetsc.case.reading import put
+from vipetsc.io.read import axes, open_ensemble, select
+from vipetsc.studies.ensemble import AMPLITUDE, FITTED
+
+COMPARED = {name: 1e-3 for name in FITTED} | {"dissipated_fraction": 1e-3}
+"""Measures that are compared, and by how much they may differ (1, bit) where the motion is not chaotic."""
+
+
+def sampled(sweep: Sweep, share: float, seed: int) -> Sweep:
+    """Members of ``sweep`` for the engine ``ts``: one of every curve over the amplitude, a ``share`` of all if more.
+
+    They are drawn from ``seed``, and stand on one axis. Raises StopIteration if the amplitude does not vary.
+    """
+    random, number = np.random.default_rng(seed), np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
+    along = next(i for i, axis in enumerate(sweep.axes) if AMPLITUDE in axis)
+    curves = np.moveaxis(number, along, -1).reshape(-1, sweep.shape[along])
+    chosen = random.permuted(curves, axis=1)[:, 0]
+    further = max(int(np.ceil(share * number.size)) - len(chosen), 0)
+    chosen = np.sort(np.append(chosen, random.permutation(np.setdiff1d(number, chosen))[:further]))
+    section = sweep.options.model_dump() | {"fields": False, "zip": [[key for axis in sweep.axes for key in axis]]}
+    for axis, places in zip(sweep.axes, np.unravel_index(chosen, sweep.shape), strict=True):
+        for key, values in axis.items():
+            put(section, key, [values[i] for i in places])
+    return Sweep.from_table(sweep.table | {"name": f"{sweep.name}-ts", "sweep": section}, ["time.engine=ts"])
+
+
+def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
+    """What the members of the ``sample`` differ by from those of the ``sweep`` (folders), the loudest last.
+
+    A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample), ``differences`` by measure and the
+    ``largest``, and whether the member ``agrees``: as many episodes, no difference above that of ``COMPARED``.
+    Raises OSError, or ValueError.
+    """
+    all_members, members = open_ensemble(sweep), open_ensemble(sample)
+    (axis,) = axes(members)
+    keys = [str(name) for name, item in members.coords.items() if item.dims == (axis,) and name in all_members.coords]
+    rows: list[dict[str, Any]] = []
+    for i in range(members.sizes[axis]):
+        one = members.isel({axis: i})
+        pair = select(all_members, **{key: one[key].item() for key in keys}), one
+        episodes = [int(np.nan_to_num(member["contact_episodes"].item(), nan=-1)) for member in pair]
+        values = {name: [member[name].item() for member in pair] for name in COMPARED if name in one}
+        differences = {name: abs(b - a) for name, (a, b) in values.items() if np.isfinite([a, b]).all()}
+        same = episodes[0] == episodes[1] and all(d <= COMPARED[name] for name, d in differences.items())
+        row = {"amplitude": one["amplitude"].item(), "episodes": episodes, "differences": differences, "agrees": same}
+        rows.append(row | {"largest": max(differences.values(), default=0.0)})
+    return sorted(rows, key=lambda row: row["amplitude"])
