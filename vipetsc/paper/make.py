@@ -24,7 +24,7 @@ from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, Step, fingerprint, re
 from vipetsc.paper.report import write_report
 from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_every_rank, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
-from vipetsc.studies.sweep import FULL
+from vipetsc.studies.pool import FULL
 
 FORMATS = ("png", "pdf")
 LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".html": b"</html>"}  # what such files end with

@@ -138,12 +138,12 @@ class _Record:
         top, every = pass_bands(self.model.chain.cell)[-1].high, int(np.diff(self.cells).max(initial=1))
         names: set[str] = set()
         if self.interval * top >= np.pi:
-            kept = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
-            self.warnings.append(f"{kept}: dispersion, bands and ibtet are not measured")
+            text = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
+            self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
             names |= {"dispersion", "bands"}
         if every > 1:
-            kept = f"fields of one cell in {every} do not resolve waves shorter than {2 * every} cells"
-            self.warnings.append(f"{kept}: wavenumber_content, dispersion, partition and entropy are not measured")
+            text = f"fields of one cell in {every} do not resolve waves shorter than {2 * every} cells"
+            self.warnings.append(f"{text}: wavenumber_content, dispersion, partition and entropy are not measured")
             names |= {"wavenumber", "dispersion", "partition", "entropy"}
         return names
 

@@ -1,5 +1,6 @@
 """The (lambda, eta) search of the supplement: a case in, ``design.h5`` out."""
 
+import logging
 import sys
 from collections.abc import Mapping
 from itertools import product
@@ -18,6 +19,7 @@ from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band
 from vipetsc.lattice.search import COSTS, Search, search, signed_deflection, unit_vectors
 
+logger = logging.getLogger(__name__)
 PAPER = 0.1, 0.5  # the (lambda, eta) that the paper takes
 UNITS = {"deflection": "1", "group_velocity": "cells/s", "weighted": "cells/s"}
 GRID, OPTIMUM = "reading lambda eta", "reading cost"
@@ -56,11 +58,22 @@ def search_design(case: DesignCase, folder: str | Path, force: bool = False, res
     """
     with claimed(MPI.COMM_SELF, folder, SEARCH, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "design.h5"
-        if not path.exists():
+        if not _is_search(path):
             write_netcdf(path, _search(case))
         claim.publish()
         with open_netcdf(claim.path / "design.h5", "search", BEST) as data:
             return _table(data)
+
+
+def _is_search(path: Path) -> bool:
+    """Whether a search is there; one that cannot be read is named."""
+    try:
+        with open_netcdf(path, "search", BEST):
+            return True
+    except (OSError, ValueError) as error:
+        if path.exists():
+            logger.warning("vipetsc: warning: %s; made again", error)
+        return False
 
 
 def _search(case: DesignCase) -> xr.Dataset:

@@ -1,5 +1,6 @@
 """``ensemble.h5``: what was measured of every member of a sweep, over the swept keys, with power-law fits."""
 
+import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -70,8 +71,10 @@ class Outcome:
     statistics: dict[str, Any] = field(default_factory=dict)
 
 
-def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> None:
-    """Write ``folder/ensemble.h5`` from the members' files, whole or not at all.
+def assemble(
+    plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path, warnings: Sequence[str] = ()
+) -> None:
+    """Write ``folder/ensemble.h5`` from the members' files, with ``warnings`` about them, whole or not at all.
 
     A dimension for every axis, named after its first key, with a coordinate for every key; NaN where a member
     failed. The file depends on the members alone, not on when or on how many ranks they were made.
@@ -104,7 +107,7 @@ def assemble(plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Out
         data["part"] = variable("part", number, "1", "part of the frequency axis")
     failed = [f"{m.index}: {o.reason}" for m, o in zip(members, outcomes, strict=True) if o.status == FAILED]
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
-    about |= {"case": plan.to_toml(), "failed": failed}
+    about |= {"case": plan.to_toml(), "failed": failed, "warnings": json.dumps(warnings)}
     data |= _fits(data, names[AMPLITUDE]) if AMPLITUDE in names else {}
     write_netcdf(folder / "ensemble.h5", xr.Dataset(data, attrs=about))
 

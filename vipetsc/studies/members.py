@@ -78,7 +78,7 @@ class MemberStore:
 
     def has_linear(self, case: Case) -> bool:
         """Whether the linear run of ``case`` was made by this version, and its files can be read."""
-        return self.wave(case) is not None and self._is_whole(linear_folder(self.folder, case) / "run.h5")
+        return self.wave(case) is not None and self.is_whole(linear_folder(self.folder, case) / "run.h5")
 
     def wave(self, case: Case) -> xr.Dataset | None:
         """The linear wave of ``case`` as this version made it; None if it has not, or the file cannot be read."""
@@ -103,11 +103,11 @@ class MemberStore:
             return {}
         asked = self._requested | {"complete": True} | ({"vipetsc_version": vipetsc.__version__} if current else {})
         whole = asked.items() <= summary.items() and all(
-            map(self._is_whole, (folder / "run.h5", folder / "analysis.h5"))
+            map(self.is_whole, (folder / "run.h5", folder / "analysis.h5"))
         )
         return summary if whole else {}
 
-    def _is_whole(self, path: Path) -> bool:
+    def is_whole(self, path: Path) -> bool:
         """Whether the HDF5 file ``path`` is there and was not cut off, which HDF5 sees when it opens it."""
         try:
             with h5py.File(path) as file:
@@ -170,7 +170,7 @@ class MemberStore:
         shared = source / f"analysis-{leading_cell(case)}-{'-'.join(sorted(self.options.measures))}.h5"
         if shared not in self._linear:
             with open_run(source / "run.h5") as run:
-                if not self._is_whole(shared):
+                if not self.is_whole(shared):
                     write_netcdf(shared, analyse(with_sites(run, case), self.measures, arrival_at(wave, case)))
                 with open_netcdf(shared, "analysis") as file:
                     self._linear[shared] = run.drop_vars("velocity").load(), file.load()

@@ -3,15 +3,13 @@
 The measures of runs already made, of one or of all members of a sweep whose fields were kept, are taken anew here too.
 """
 
-import errno
 import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 from mpi4py import MPI
 
@@ -24,17 +22,13 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, FolderError, claimed
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run
-from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, on_every_rank, on_root
+from vipetsc.parallel import Progress, StopRequest, on_every_rank, on_root
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Outcome, assemble
 from vipetsc.studies.members import MemberStore, arrival_at, linear_folder, reached, read_wave
+from vipetsc.studies.pool import TaskPool
 
 FORMAT_VERSION = 1
-FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # no other member could be written either
-PATIENCE = 5.0  # s that a rank whose member failed waits for the rest of its team to have failed as well
-MADE, UNMADE, LEFT, ENDED = range(4)  # how a job ended; the later counts if ranks differ
-
-Job = TypeVar("Job", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -116,11 +110,11 @@ def _make_all(
 
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(pool.busy / seconds))
-    found = [warning for warnings in comm.allgather(store.warnings) for warning in warnings]
+    noticed = [warning for warnings in comm.allgather(store.warnings) for warning in warnings]
     outcomes, warnings = on_root(comm, lambda: conclude(plan, members, store, reasons))
     team.Free()
     count = sum(reason == "" for reason in made.values())
-    return SweepResult(outcomes, count, seconds, busy, folder, [*dict.fromkeys(found), *warnings])
+    return SweepResult(outcomes, count, seconds, busy, folder, [*dict.fromkeys(noticed), *warnings])
 
 
 def _plan(
@@ -140,11 +134,12 @@ def _plan(
 
 
 def conclude(
-    plan: Sweep, members: Sequence[SweepMember], store: MemberStore, reasons: Mapping[str, str]
+    plan: Sweep, members: Sequence[SweepMember], store: MemberStore, reasons: Mapping[str, str], afresh: bool = False
 ) -> tuple[list[Outcome], list[str]]:
-    """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; how the members ended, and warnings.
+    """Write ``ensemble.h5``, once no member is missing, and ``index.json``; how the members ended, and warnings.
 
-    ``reasons`` names the members (by id) that failed just now, and why.
+    ``reasons`` names the members (by id) that were made just now, and why they failed. What is there stays as it is
+    if there are none, unless ``afresh``.
     """
     sys.audit("vipetsc.conclude", str(store.folder))
     outcomes, rows, warned = [], [], Counter[str]()
@@ -162,85 +157,16 @@ def conclude(
     names = plan.names()
     axes = [{"keys": [*axis], "names": [names[k] for k in axis], "values": [*axis.values()]} for axis in plan.axes]
     index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}
-    write_text(store.folder / "index.json", json.dumps(index, indent=1) + "\n")
-    if all(outcome.status != MISSING for outcome in outcomes):
-        assemble(plan, members, outcomes, store.folder)
-    return outcomes, [f"{count} members: {sentence}" for sentence, count in warned.items()]
-
-
-class TaskPool:
-    """Teams of ranks that draw jobs until none are left, or until some rank got a request to stop (``stopped``).
-
-    ``busy`` is the time in s that this rank worked on them.
-    """
-
-    def __init__(self, comm: MPI.Comm, team: MPI.Comm, stop: StopRequest) -> None:
-        self.comm, self.team, self.stop = comm, team, stop
-        self.stopped, self.busy = False, 0.0
-
-    def share(
-        self, jobs: Sequence[Job], work: Callable[[Job], None], progress: Progress | None = None
-    ) -> dict[Job, str]:
-        """Do all ``jobs``; returns for each one done the reason why it failed, "" if it did not. Collective.
-
-        Raises OSError on all ranks when the disk is full.
-        """
-        drawn, ended = SharedCounter(self.comm), SharedCounter(self.comm)
-        reasons: dict[Job, str] = {}
-        leader, ending, reason = self.team.rank == 0, MADE, ""
-        while not (self.stopped or self.stop.agreed(self.team)):
-            number = self.team.bcast(drawn.draw() if leader else None)
-            if number >= len(jobs):
-                break
-            job, begin = jobs[number], time.perf_counter()
-            ending, reason = self._end(job, work)
-            self.busy += time.perf_counter() - begin
-            if ending in (LEFT, ENDED):
-                break
-            reasons[job] = reason
-            done = ended.draw(1 if leader else 0)
-            if progress:
-                progress.update(done + 1)
-        else:
-            ending = LEFT
-        if ending in (LEFT, ENDED):
-            drawn.draw(len(jobs))  # so that no team begins another
-        shares = self.comm.allgather((ending, reason, reasons))
-        self.stopped = any(ending == LEFT for ending, *_ in shares)
-        if progress:
-            progress.close()
-        drawn.free()
-        ended.free()
-
-        def check() -> None:
-            for ending, reason, _ in shares:
-                if ending == ENDED:
-                    raise OSError(f"{reason}; make room, the same command goes on")
-
-        on_root(self.comm, check)
-        return {job: reason for *_, share in shares for job, reason in share.items()}
-
-    def _end(self, job: Job, work: Callable[[Job], None]) -> tuple[int, str]:
-        """Do a ``job`` with the whole team: how it ended, and why.
-
-        A rank that fails alone leaves the others in the midst of it, where they wait for ever: its exception is raised.
-        """
-        ending, failure = (MADE, ""), None
-        try:
-            sys.audit("vipetsc.member", str(job))
-            work(job)
-        except StoppedError:
-            ending = LEFT, ""
-        except Exception as error:
-            failure, text = error, str(error)
-            named = text if isinstance(error, RuntimeError) else f"{type(error).__name__}: {text}"
-            ending = (ENDED, text) if getattr(error, "errno", None) in FULL else (UNMADE, named)
-        met, since = self.team.Ibarrier(), time.monotonic()
-        while not met.Test():
-            if failure and time.monotonic() - since > PATIENCE:
-                raise failure
-            time.sleep(1e-3)
-        return max(self.team.allgather(ending))
+    warnings = [f"{count} members: {sentence}" for sentence, count in warned.items()]
+    path, text = store.folder / "index.json", json.dumps(index, indent=1) + "\n"
+    told = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
+    finished = all(outcome.status != MISSING for outcome in outcomes)
+    # The index comes last: with it and nothing made since, the ensemble is that of these members.
+    if finished and (reasons or afresh or not told or not store.is_whole(store.folder / "ensemble.h5")):
+        assemble(plan, members, outcomes, store.folder, warnings)
+    if not told:
+        write_text(path, text)
+    return outcomes, warnings
 
 
 def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
@@ -256,7 +182,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     def reassemble(folder: Path) -> Path:
         plan = Sweep.load(folder / "case.toml")
         store = MemberStore(folder, plan.options, MPI.COMM_SELF, StopRequest())
-        outcomes, _ = conclude(plan, plan.members(), store, {})
+        outcomes, _ = conclude(plan, plan.members(), store, {}, afresh=True)
         if any(outcome.status == MISSING for outcome in outcomes):
             raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
         return folder / "ensemble.h5"
