@@ -151,7 +151,7 @@ class MemberStore:
                 measured = analyse(run, self.measures, arrival_at(wave, case))
             write_netcdf(folder / "analysis.h5", measured)
             warnings = json.loads(measured.attrs.get("warnings", "[]"))
-            self._finish(folder, case, summary | {"warnings": [*summary.get("warnings", ()), *warnings]})
+            self._finish(folder, case, summary | {"warnings": [*result.warnings, *warnings]})
 
         on_root(self.team, measure)
 
