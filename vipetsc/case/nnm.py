@@ -18,7 +18,7 @@ from vipetsc.case.resolve import (
     with_default_preset,
     with_preset,
 )
-from vipetsc.case.schema import ContactsTable, Count, Finite, LatticeTable, Positive, once
+from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive, once
 from vipetsc.lattice import Contact, contact_stiffness
 from vipetsc.lattice.cell import groups_of
 
@@ -94,7 +94,7 @@ class NnmTable(Section):
 
     system: Literal["reduced", "chain", "own"] = "reduced"
     custom: SystemTable | None = Field(None, alias="own")
-    modes: Annotated[list[Count], AfterValidator(once)] = Field([1, 2], min_length=1)
+    modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = Field([1, 2], min_length=1)
     map: Literal["auto", "quarter", "half", "whole"] = "auto"
     flow: Literal["compiled", "tsrk", "newmark"] = "compiled"
     jacobian: Literal["variational", "differences"] = "variational"

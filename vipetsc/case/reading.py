@@ -7,6 +7,7 @@ case is a subclass that declares the sections it reads.
 
 import copy
 import difflib
+import math
 import re
 import sys
 import tomllib
@@ -25,6 +26,7 @@ SECTIONS = ("lattice", "contacts", "drive", "time", "output", "sweep", "nnm", "d
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
+LARGEST = 1e50
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
@@ -203,16 +205,30 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
     """The section ``name`` and its problems; with problems, the section holds the valid keys and defaults."""
     if not isinstance(table, dict):
         return kind(), [Problem(name, table, f"must be a section [{name}]")]
+    problems = {problem.key: problem for problem in _out_of_range(table, name)}
+    invalid = {key for key, value in table.items() if any(_out_of_range(value, ""))}
     try:
-        return kind(**table), []
+        section = kind(**table)
     except ValidationError as error:
-        problems: dict[str, Problem] = {}
         for item in error.errors(include_url=False):
             problem = _problem_of(kind, name, dict(item))
             problems.setdefault(problem.key, problem)
-        invalid = {item["loc"][0] for item in error.errors()}
+            invalid.add(item["loc"][0])
+    if problems:
         section, _ = read_section(kind, {k: v for k, v in table.items() if k not in invalid}, name)
-        return section, list(problems.values())
+    return section, list(problems.values())
+
+
+def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
+    """Numbers anywhere in ``value`` that are so large or small that products of a few are no numbers any more."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _out_of_range(item, f"{path}.{key}")
+    elif isinstance(value, list):
+        for i, item in enumerate(value, 1):
+            yield from _out_of_range(item, f"{path}[{i}]")
+    elif type(value) in (int, float) and (0 < abs(value) < 1 / LARGEST or LARGEST < abs(value) < math.inf):
+        yield Problem(path, value, f"must be of a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
 
 
 def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem:

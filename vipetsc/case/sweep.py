@@ -13,8 +13,8 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case, case_id
-from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, put, read_section
-from vipetsc.case.schema import LARGEST, number
+from vipetsc.case.reading import LARGEST, CaseError, CaseFile, Problem, Section, Table, put, read_section
+from vipetsc.case.schema import number
 
 MOST_MEMBERS = 10_000
 Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
