@@ -151,7 +151,7 @@ class NnmCase(CaseFile):
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:
-                group = groups_of(dofs + 1, ((s.start, s.end) for s in nnm.custom.springs))
+                group = groups_of(dofs + 1, tuple((s.start, s.end) for s in nnm.custom.springs))
                 rigid = len(set(group)) - 1
         else:
             cell, wrong = check_cell(lattice)

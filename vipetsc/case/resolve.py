@@ -10,7 +10,7 @@ import numpy as np
 from vipetsc.case.reading import Problem, Table, Valid
 from vipetsc.case.schema import CONTACTS, PRESETS, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
 from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
-from vipetsc.lattice.cell import cell_problems, loose_masses
+from vipetsc.lattice.cell import cell_problems, groups_of
 
 LEAST_RESTITUTION = 0.05
 LARGEST_INDEX = 2**31 - 1
@@ -97,8 +97,10 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     if problems:
         return None, problems
     cell = lattice.unit_cell()
-    if loose := ", ".join(str(mass + 1) for mass in loose_masses(cell)):
-        remedy = f"nothing ties mass {loose} to the next cell: add springs, or a spring with next_cell"
+    next_cell = tuple((0, s.start + 1) for s in cell.springs if s.next_cell)
+    group = groups_of(cell.dofs + 1, (*next_cell, *((s.start + 1, s.end + 1) for s in cell.springs)))
+    if loose := [str(mass) for mass, number in enumerate(group) if number != group[0]]:
+        remedy = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
         problems.append(Problem("lattice.cell.springs", None, remedy))
     if 2 * lattice.cells * cell.dofs > LARGEST_INDEX:
         remedy = f"has more than the {LARGEST_INDEX} displacements and velocities that PETSc's 32-bit indices count"

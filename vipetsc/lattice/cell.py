@@ -1,6 +1,5 @@
 """The unit cell: masses, springs inside it and to the next cell, and the pair that may collide."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -108,16 +107,8 @@ def cell_problems(
 
 
 @lru_cache
-def loose_masses(cell: UnitCell) -> list[int]:
-    """The masses (0-based) that no chain of springs joins to one with a spring to the next cell."""
-    group = groups_of(cell.dofs, ((s.start, s.end) for s in cell.springs))
-    held = {group[s.start] for s in cell.springs if s.next_cell}
-    return [mass for mass, g in enumerate(group) if g not in held]
-
-
-def groups_of(n: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """Of every one of ``n`` masses (0-based) the number of the group that ``pairs`` tie it to."""
-    pairs = list(pairs)
+def groups_of(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
+    """Of each of ``n`` nodes (0-based) the number of the group that ``pairs`` tie it to."""
     graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
     return connected_components(graph, directed=False)[1].tolist()
 
