@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,15 +100,22 @@ class Follower:
         sys.audit("vipetsc.member", mode + 1)
         branch = self._begun(self.system.branch_name(mode))
         if not branch.complete:
-            try:
-                self._follow(branch, mode)
-            except StoppedError as stopped:
-                branch.ending = str(stopped)
-            except FAILURES as error:
-                branch.ending = f"failed: {error}"
-            if branch.points or not branch.ending.startswith("stopped"):
-                branch.write(self.folder, self.about)
+            self._save(branch, lambda: self._follow(branch, mode))
+        if branch.points:
+            for half in self.folder.glob(f"branch-{branch.name}-down.*"):
+                half.unlink()  # it is the beginning of the whole
         return [branch, *self._crossing(branch)]
+
+    def _save(self, branch: Branch, follow: Callable[[], None]) -> None:
+        """Follow a branch and write it, with the reason if it is stopped or fails."""
+        try:
+            follow()
+        except StoppedError as stopped:
+            branch.ending = str(stopped)
+        except FAILURES as error:
+            branch.ending = f"failed: {error}"
+        if branch.points or not branch.ending.startswith("stopped"):
+            branch.write(self.folder, self.about)
 
     def _follow(self, branch: Branch, mode: int) -> None:
         """The branch itself, its orbits and what other flows make of it."""
@@ -123,8 +131,6 @@ class Follower:
             ]
             branch.findings += down.findings
         self.grow(branch, self.problem, start, options, -1 if options.direction == "down" else 1)
-        for half in self.folder.glob(f"branch-{branch.name}-down.*"):
-            half.unlink()  # it is the beginning of the whole
         branch.extra = sampled(self.problem, [*self._typical(branch), *self._asked(branch)])
         for flow in options.compare:
             branch.extra |= compare(self.problem, branch.regular(), FLOWS[flow](self.system))
@@ -211,15 +217,12 @@ class Follower:
             for number, point in enumerate((p for p in branch.points if p.kind == kind), 1):
                 crossing = self._begun(f"{branch.name}-{kind}-{number}")
                 branches.append(crossing)
-                if crossing.complete:
-                    continue
-                sys.audit("vipetsc.switch", crossing.name)
-                try:
-                    problem, first = switch(self.problem, point, self.options.switch_amplitude)
-                    self.grow(crossing, problem, crossing.regular()[-1] if crossing.points else first, control)
-                except StoppedError as stopped:
-                    crossing.ending = str(stopped)
-                except FAILURES as error:
-                    crossing.ending = f"failed: {error}"
-                crossing.write(self.folder, self.about)
+                if not crossing.complete:
+                    self._save(crossing, partial(self._cross, crossing, point, control))
         return branches
+
+    def _cross(self, crossing: Branch, point: Point, control: NnmTable) -> None:
+        """The branch that crosses at a special ``point``."""
+        sys.audit("vipetsc.switch", crossing.name)
+        problem, first = switch(self.problem, point, self.options.switch_amplitude)
+        self.grow(crossing, problem, crossing.regular()[-1] if crossing.points else first, control)

@@ -24,8 +24,8 @@ MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
 # Parts of the first step along a crossing branch that are tried; how many of them Newton's method may add, since the
 # branch leaves at an angle (up to 5 on the paper's branches, beyond 100 on others); the loosest tolerance there.
 AMPLITUDES, ASTRAY, LOOSEST = np.array([1.0, 0.1, 0.01, 0.001]), 20.0, 1e-9
-# A turn is looked at, so many times, if its value is estimated below this share of those beside it.
-TURNS, NEAR = 3, 0.5
+# A turn is looked at if its value is estimated below this share of those beside it.
+NEAR = 0.5
 
 
 def special_kinds(problem: Shooting) -> Iterator[tuple[str, Test, float]]:
@@ -126,17 +126,11 @@ class _Segment:
             return [self.root(kind, test, HALVINGS)]
         if before is None or not self.left.step:
             return []
-        beside, ends = (-self.left.step, test(before)), ((0.0, a), (self.length, b))
-        for _ in range(TURNS):
-            turn = _turn(beside, *ends)
-            if turn is None:
-                break
-            try:
-                beside = turn, test(self.at(turn))
-            except ArithmeticError:
-                break
-            if a * beside[1] < 0:
-                return [part.root(kind, test, HALVINGS) for part in self.split(turn)]
+        turn = _turn((-self.left.step, test(before)), (0.0, a), (self.length, b))
+        with suppress(ArithmeticError):
+            parts = self.split(turn) if turn else ()
+            if parts and a * test(parts[1].left) < 0:
+                return [part.root(kind, test, HALVINGS) for part in parts]
         return []
 
     def root(self, kind: str, test: Test, halvings: int) -> Point:
@@ -171,9 +165,9 @@ class _Segment:
         raise ArithmeticError("Newton's method fails within the step")
 
 
-def _turn(beside: tuple[float, float], *ends: tuple[float, float]) -> float | None:
-    """Where a value turns between two ``ends``, if it may cross zero there, by the parabola through a third place."""
-    (x0, z), (x1, a), (x2, b) = beside, *ends
+def _turn(*values: tuple[float, float]) -> float | None:
+    """Where a value turns between the last two of three places, if it may cross zero there, by a parabola."""
+    (x0, z), (x1, a), (x2, b) = values
     bend = ((b - a) / (x2 - x1) - (z - a) / (x0 - x1)) / (x2 - x0)
     slope = (b - a) / (x2 - x1) - bend * (x2 - x1)
     at = -slope / (2 * bend) if bend else x1
