@@ -205,7 +205,7 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
     """The section ``name`` and its problems; with problems, the section holds the valid keys and defaults."""
     if not isinstance(table, dict):
         return kind(), [Problem(name, table, f"must be a section [{name}]")]
-    problems = {problem.key: problem for problem in _out_of_range(table, name)}
+    problems: dict[str, Problem] = {}
     invalid = {key for key, value in table.items() if any(_out_of_range(value, ""))}
     try:
         section = kind(**table)
@@ -214,6 +214,8 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
             problem = _problem_of(kind, name, dict(item))
             problems.setdefault(problem.key, problem)
             invalid.add(item["loc"][0])
+    mistyped = tuple(problems)
+    problems |= {p.key: p for p in _out_of_range(table, name) if not p.key.startswith(mistyped)}
     if problems:
         section, _ = read_section(kind, {k: v for k, v in table.items() if k not in invalid}, name)
     return section, list(problems.values())
