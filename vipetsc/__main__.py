@@ -19,25 +19,20 @@ def main(arguments: list[str] | None = None) -> int:
 
     # Signals are ours: SIGTERM ends a run at its next step, with a checkpoint.
     petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
-    from vipetsc.parallel import install_abort_hook
-
-    install_abort_hook()
-    from vipetsc.cli.main import main as run_verb
-
-    return run_verb(arguments[:end], _options_of_a_case())
-
-
-def _options_of_a_case() -> dict[str, str]:
-    """Take those PETSc options out of its database that a result may depend on: they become part of the case."""
     from petsc4py import PETSc
 
     from vipetsc.case.schema import only_looks
+    from vipetsc.parallel import install_abort_hook
 
+    install_abort_hook()
+    # Options that a result may depend on become part of the case.
     database = PETSc.Options()
-    given = {name: value or "true" for name, value in database.getAll().items() if not only_looks(name)}
-    for name in given:
+    options = {name: value or "true" for name, value in database.getAll().items() if not only_looks(name)}
+    for name in options:
         database.delValue(name)
-    return given
+    from vipetsc.cli.main import main as run_verb
+
+    return run_verb(arguments[:end], options)
 
 
 if __name__ == "__main__":
