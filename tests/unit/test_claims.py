@@ -525,7 +525,8 @@ def put_transfer(root, top, floor=1e-4, one=0.1, slow=0.0):
     def content(case):
         a, highest = case.drive.amplitude, top if len(case.contacts.sites) > 1 else one
         highest *= 0.02 if a < slow else 1.0
-        return {"ibtet": floor + (highest * (a / 17.0) ** -1.5 if a > 17.0 else 0.0)}
+        transfer = highest * (a / 17.0) ** -1.5 if a > 17.0 else 0.0
+        return {"ibtet": 0.02 * floor + transfer, "ibtet_whole": floor + transfer}
 
     return put_sweep(root / "interband", table, content, lambda case: int(case.drive.amplitude > 17.0))
 
@@ -545,6 +546,8 @@ def test_transfer_as_the_paper_has_it_holds(tmp_path):
     onset, single = measure("C11", tmp_path), measure("C14", tmp_path)
     assert (onset.verdict, single.verdict) == (HOLDS, HOLDS)
     assert onset.value["floor, hertz"] == pytest.approx(1e-4)
+    assert onset.value["floor without the record's ends, hertz"] == pytest.approx(2e-6)
+    assert "without the ends it is 2e-06" in onset.reason
     assert single.value["correlation of 15 and 30 cycles, hertz"] == pytest.approx(1.0)
     assert single.uncertainty["amplitudes, hertz"] == 17
 

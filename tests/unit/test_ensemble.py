@@ -15,6 +15,7 @@ from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import curves, open_ensemble, select
 from vipetsc.lattice import four_band
 from vipetsc.parallel import StopRequest
+from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import MISSING, fit_curve
 from vipetsc.studies.members import (
     MemberStore,
@@ -45,24 +46,46 @@ def measure(case):
     return case.drive.amplitude + 100 * sites + 1000 * case.drive.cycles + 1e5 * (case.contacts.law == "hertz")
 
 
-@pytest.fixture
-def folder(tmp_path):
+def put_sweep(folder, plan, failing, changed=lambda case: 0.0):
     """A finished sweep whose members were not simulated, but have what an ensemble is made of."""
-    plan = Sweep.from_table(SWEEP)
-    store, members = MemberStore(tmp_path, plan.options, MPI.COMM_SELF, StopRequest()), plan.members()
+    store, members = MemberStore(folder, plan.options, MPI.COMM_SELF, StopRequest()), plan.members()
     for number, member in enumerate(members):
-        path = tmp_path / member.id
-        path.mkdir()
+        path = folder / member.id
+        path.mkdir(parents=True)
         (path / "case.toml").write_text(member.case.to_toml())
         statistics = {"episodes": number, "work": 2.0, "dissipated": 0.5, "ledger_error": 0.0}
         summary = {"complete": True, "status": "complete", "statistics": statistics}
         (path / "summary.json").write_text(json.dumps(summary | {"measures": ["transfer"], "fields": False}))
         h5py.File(path / "run.h5", "w").close()
         with h5py.File(path / "analysis.h5", "w") as file:
-            file["ibtet"] = measure(member.case)
-    outcomes, _ = conclude(plan, members, store, {members[5].id: "ArithmeticError: overflow"})
+            file["ibtet"] = measure(member.case) + changed(member.case)
+    outcomes, _ = conclude(plan, members, store, failing)
     assert all(outcome.status != MISSING for outcome in outcomes)
-    return tmp_path
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A sweep of which one member failed."""
+    plan = Sweep.from_table(SWEEP)
+    return put_sweep(tmp_path / "all", plan, {plan.members()[5].id: "ArithmeticError: overflow"})
+
+
+def test_a_sample_is_compared_member_by_member(folder, tmp_path):
+    sample = sampled(Sweep.from_table(SWEEP), 0.5, 1)
+    assert len(sample.members()) == 12
+    louder = sample.members()[3].case
+
+    def changed(case):
+        return 2e-3 if case == louder else 5e-4
+
+    rows = agreement(folder, put_sweep(tmp_path / "sample", sample, {}, changed))
+    assert [row["amplitude"] for row in rows] == sorted(member.case.drive.amplitude for member in sample.members())
+    different = [row for row in rows if row["differences"].get("ibtet", 0) > 1e-3]
+    assert [row["amplitude"] for row in different] == [louder.drive.amplitude] and not different[0]["agrees"]
+    for row in rows:  # the stand-in numbers the episodes by the member
+        assert row["agrees"] == (row["episodes"][0] == row["episodes"][1] and row["largest"] < 1e-3)
+    assert any(row["agrees"] for row in rows) or all(row["episodes"][0] != row["episodes"][1] for row in rows)
 
 
 def test_every_member_stands_at_the_values_of_its_keys(folder):
@@ -80,7 +103,7 @@ def test_every_member_stands_at_the_values_of_its_keys(folder):
         else:
             assert one["status"].item() == 0 and one["ibtet"].item() == measure(case)
             assert one["dissipated_fraction"].item() == 0.25
-    assert np.atleast_1d(ensemble.attrs["failed"]).tolist() == ["(0, 1, 1): ArithmeticError: overflow"]
+    assert json.loads(ensemble.attrs["failed"]) == ["(0, 1, 1): ArithmeticError: overflow"]
     for curve, path in curves(ensemble):
         case = Case.load(path / "case.toml")
         assert (case.contacts.law, case.drive.cycles) == (curve["law"].item(), curve["cycles"].item())
@@ -95,7 +118,7 @@ def test_a_law_is_fitted_from_the_largest_value_on():
     assert (fit["peak_amplitude"], fit["peak"], fit["points"]) == (amplitude[4], law[4], 8)
     assert fit["exponent"] == pytest.approx(-0.8, abs=1e-12) and fit["factor"] == pytest.approx(3.0)
     assert fit["r2_log_log"] == pytest.approx(1.0) and fit["exponent_nonlinear"] == pytest.approx(-0.8)
-    assert fit["law"] == 1 and fit_curve(amplitude[:7], curve[:7], normalise=False)["law"] == 0  # three points
+    assert fit["is_power_law"] == 1 and fit_curve(amplitude[:7], curve[:7], normalise=False)["is_power_law"] == 0
     assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])  # two points behind the peak
 
 

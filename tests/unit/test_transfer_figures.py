@@ -131,7 +131,7 @@ def test_backbone_is_aligned_exactly(reduced):
     (axes,) = all_axes(figures["calibrated-1-site-4-cycles"])
     assert "branch of the printed reading" in axes.get_title(loc="left")
     with h5py.File(reduced / "backbone.h5") as file:
-        assert "bilinear" in file.attrs["left_out"][0]
+        assert "bilinear" in file.attrs["left_out"]
         (group,) = file.values()
         about = dict(group.attrs)
     _, folder = next(curves(open_ensemble(reduced)))

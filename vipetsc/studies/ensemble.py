@@ -31,7 +31,7 @@ STATISTICS = {
     "work": ("", "J", "work done by the drive"),
     "ledger_error": ("", "1", "largest error of the energy ledger over the work"),
 }
-MEASURES = {name: LAYOUT[name] for name in (*FITTED, "entropy/error")} | {
+MEASURES = {name: LAYOUT[name] for name in (*FITTED, "ibtet_whole", "entropy/error")} | {
     "entropy/history": ("snapshot", "bit", "entropy of a snapshot"),
     "entropy/snapshot": ("snapshot", "s", "time of a snapshot"),
     "bands/share": ("part", "1", "mean share of a pass band or gap after the wave's arrival"),
@@ -58,7 +58,10 @@ FIT = {
     "exponent_nonlinear": ("1", "exponent of the nonlinear fit"),
     "factor_nonlinear": ("1", "factor of the nonlinear fit at 1 N"),
     "r2_nonlinear": ("1", "adjusted R^2 of the nonlinear fit"),
-    "law": ("1", f"1 where the log-log line is a power law: {FEWEST} points or more, adjusted R^2 not below 0"),
+    "is_power_law": (
+        "1",
+        f"1 where the log-log line is a power law: {FEWEST} points or more, adjusted R^2 not below 0",
+    ),
 }
 
 
@@ -169,13 +172,13 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     if len(y) < 3 or np.ptp(y) == 0:
         return row
     peak = int(np.argmax(y))
-    row |= {"peak_amplitude": x[peak], "peak": y[peak], "points": len(y) - peak, "law": 0.0}
+    row |= {"peak_amplitude": x[peak], "peak": y[peak], "points": len(y) - peak, "is_power_law": 0.0}
     if row["points"] < 3:
         return row
     y = normalised(y) if normalise else y
     line, curved = power_law(x[peak:], y[peak:]), power_law(x[peak:], y[peak:], "nonlinear")
     low, high = line.exponent_interval
     row |= {"exponent": line.exponent, "exponent_low": low, "exponent_high": high, "factor": line.factor}
-    row["law"] = float(not doubt(row["points"], line.r2_adjusted))
+    row["is_power_law"] = float(not doubt(row["points"], line.r2_adjusted))
     row |= {"r2_log_log": line.r2_adjusted, "r2_nonlinear": curved.r2_adjusted}
     return row | {"exponent_nonlinear": curved.exponent, "factor_nonlinear": curved.factor}

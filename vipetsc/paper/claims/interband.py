@@ -43,21 +43,29 @@ def _on_grid(values: np.ndarray) -> np.ndarray:
     return multiples if multiples.size > 1 else np.arange(len(values))
 
 
-def _transfer(evidence: Evidence, reading: str, law: str, sites: int, cycles: int) -> AmplitudeCurve:
-    return AmplitudeCurve(evidence.select(STEP, reading, law=law, sites=sites, cycles=cycles), "ibtet")
+def _transfer(
+    evidence: Evidence, reading: str, law: str, sites: int, cycles: int, mean: str = "ibtet"
+) -> AmplitudeCurve:
+    return AmplitudeCurve(evidence.select(STEP, reading, law=law, sites=sites, cycles=cycles), mean)
 
 
 def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C11: floor, sudden onset and maximum of the transfer with five sites (Figs. 8, 9)."""
-    maxima = []
+    """C11: floor, sudden onset and maximum of the transfer with five sites (Figs. 8, 9).
+
+    The floor is that of the paper's mean, in which the record's last samples are.
+    """
+    maxima, inner = [], []
     for law in LAWS:
-        curve = _transfer(evidence, reading, law, 5, 30)
-        floor = curve.value[curve.untouched].mean() if curve.untouched.any() else np.nan
+        curve, whole = (_transfer(evidence, reading, law, 5, 30, mean) for mean in ("ibtet", "ibtet_whole"))
+        floors = [c.value[c.untouched].mean() if c.untouched.any() else np.nan for c in (whole, curve)]
+        floor = floors[0]
+        inner.append(floors[1])
         highest = curve.value.max()
         growth = curve.growth_ratio(LOW * floor, highest / 2)
         maxima.append(highest)
         result.value |= {
             f"floor, {law}": floor,
+            f"floor without the record's ends, {law}": inner[-1],
             f"ratio of amplitudes from the floor to half the maximum, {law}": growth,
             f"maximum, {law}": highest,
             f"amplitude of the maximum (N), {law}": curve.peak_amplitude,
@@ -68,6 +76,8 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
         result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - beside
         result.uncertainty[f"amplitudes, {law}"] = len(curve.amplitude)
     result.uncertainty["spread of the maxima between the laws"] = np.ptp(maxima)
+    text = "the floor is what the filters make of the record's end, not transfer: without the ends it is"
+    result.reasons += [f"{text} {np.nanmax(inner):.1g}"] if np.isfinite(inner).any() else []
     lowest = next(c.interval[0] for c in CLAIMS["C11"].criteria if c.quantity.startswith("maximum"))
     if max(maxima) < lowest and reading == "printed":
         result.reasons.append("the resonator's spring lambda k of the printed equations gives less transfer")
