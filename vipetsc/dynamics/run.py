@@ -111,16 +111,11 @@ def simulate(
         return make(folder)
     with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
         output = RunFolder(claim.folder, comm)
-        result = _ended(output) or make(output)
+        told = output.ending()
+        result = result_of(told, False, output.folder) if told else make(output)
         if not result.resumable:
             claim.publish()
     return replace(result, folder=claim.path)
-
-
-def _ended(output: RunFolder) -> Result | None:
-    """How the run in ``output`` ended; None if it has not."""
-    told = output.ending()
-    return result_of(told, False, output.folder) if told else None
 
 
 def result_of(told: Mapping[str, Any], resumable: bool, folder: Path | None) -> Result:

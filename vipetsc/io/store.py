@@ -102,17 +102,16 @@ class RunFolder:
         """
 
         def read() -> dict[str, Any] | None:
-            if not (self.folder / "run.h5").exists() or any(self._parts.glob("*")):
+            path = self.folder / "run.h5"
+            if not path.exists() or any(self._parts.glob("*")):
                 return None
             try:
-                with open_run(self.folder / "run.h5") as run:
+                with open_run(path) as run:
                     told = {key: np.asarray(value).item() for key, value in run.attrs.items()}
             except (OSError, ValueError) as error:
                 raise FolderError(f"{error}; --force makes the run again") from error
             told |= {key: json.loads(told[key]) for key in ("statistics", "warnings") if key in told}
-            try:
-                json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
-            except (OSError, ValueError):
+            if not (self.folder / "summary.json").exists():
                 self._summarise(told | {"case": tomllib.loads(told["case"])})
             return told
 
