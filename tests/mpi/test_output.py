@@ -21,9 +21,18 @@ COMM = MPI.COMM_WORLD
 
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("writer", ["gather", "parallel"])
-def test_all_ranks_agree_on_the_statistics_in_the_file(folder, writer):
+def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer):
+    """HDF5 fails to close a file whose attributes, such as the seconds a run took, differ between ranks."""
+    finish, told = RunFolder.finish, []
+
+    def watch(output, attributes, summary):
+        told.append(dict(attributes))
+        finish(output, attributes, summary)
+
+    monkeypatch.setattr(RunFolder, "finish", watch)
     result = simulate(small_case(output={"writer": writer}, time={"end": 0.01}), folder / "run")
-    assert len(set(COMM.allgather(json.dumps(result.statistics)))) == 1
+    told.append([result.sentence, result.statistics, result.warnings])
+    assert len(set(COMM.allgather(json.dumps(told)))) == 1
     with h5py.File(folder / "run" / "run.h5") as file:
         assert json.loads(file.attrs["statistics"]) == result.statistics
         assert file.attrs["ranks"] == COMM.size

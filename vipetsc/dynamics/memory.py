@@ -17,7 +17,7 @@ STATES_BESIDE_STAGES, PROPAGATOR_STATES = 4.6, 3.0
 # Copies of a chunk on rank 0 while it is gathered and written.
 COPIES = 3
 # Bytes of one sample's energies, of a contact site's tables and log.
-SAMPLE_BYTES, SITE_BYTES = 1000, 5000
+SAMPLE_BYTES, SITE_BYTES = 300, 5000
 
 
 def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) -> int:
