@@ -64,7 +64,7 @@ def test_impact_log_is_complete_and_ordered(folder):
 
 
 def test_a_stalled_run_says_when_and_where_and_keeps_its_samples(folder, monkeypatch):
-    monkeypatch.setattr(integrator, "MOST_TRIALS", 24)
+    monkeypatch.setattr(integrator, "MOST_TRIALS", 6)
     result = simulate(small_case(), folder / "run")
     assert not result.complete
     assert not result.resumable

@@ -83,7 +83,7 @@ def simulate(
     native
         Register the right-hand side natively (default) or through Python.
     stop
-        A request that ends the run after the step at hand.
+        A request that ends the run at the next sample.
     progress
         Report progress on stderr of rank 0.
     observers

@@ -21,7 +21,8 @@ control off around them, hence:
   to |w - D| <= 1e-10 D, where modes switch;
 - a rejected trial also returns to the saved copy: PETSc rolls back by subtraction, which loses digits where the trial
   was far too long for a contact;
-- TSRK restarts after every change, so that a first-same-as-last pair does not reuse a stage of the old modes;
+- TSRK restarts after every change, so that a first-same-as-last pair does not reuse a stage of the old modes, and at
+  every sample, where a run may have gone on from a checkpoint;
 - after an onset the step is a small share of the contact's duration (Johnson 1985, sec. 11.4), since Hertz's force
   begins like (t - onset)^(3/2), which no method of high order resolves.
 

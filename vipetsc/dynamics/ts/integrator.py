@@ -40,7 +40,7 @@ class Integrator(Engine):
     native
         Register the compiled right-hand side directly (default), or through Python with the same bits.
     stop
-        Looked at after every step; a request on any rank ends ``advance`` on all.
+        Looked at after every step; a request on any rank is told by ``advance`` on all, at the time it goes to.
 
     PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor, first step; with
     ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
@@ -125,14 +125,14 @@ class Integrator(Engine):
         burst_end = self.lattice.burst.duration
         if self.time < burst_end < target and not self.advance(burst_end):
             return False
-        trials = 0
+        trials, stopped = 0, False
         while self.time < target:
             if trials > self._most_trials:
                 raise StalledError(f"{trials} steps did not reach t = {target:.6g} s")
-            if not self._step(target):
-                return False
+            stopped |= not self._step(target)
             trials += 1
-        return True
+        self.ts.restartStep()  # as a run does that goes on from here
+        return not stopped
 
     def _step(self, target: float) -> bool:
         remaining = target - self.time
