@@ -22,10 +22,11 @@ def test_a_signal_is_a_request_and_a_second_one_the_end(number):
 
 def test_a_signal_that_is_sent_twice_is_one_request(tmp_path):
     script = "import os, signal, vipetsc.parallel as p\nwith p.StopRequest().listening() as stop:\n"
-    script += "    print(os.getpid(), flush=True)\n    while not stop.requested: pass\nprint('saved')"
+    script += "    print(os.getpid(), flush=True)\n    while not stop.requested: pass\n"
+    script += "    os.system('sleep 0.2')\n    print('saved')"
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
         number = process.stdout.readline().strip()
-        subprocess.run(["sh", "-c", f"kill -TERM {number}; kill -TERM {number}"], check=True)
+        subprocess.run(["sh", "-c", f"kill -TERM {number}; sleep 0.03; kill -TERM {number}"], check=True)
         assert process.stdout.read() == "saved\n"
     assert process.returncode == 0
 
