@@ -114,11 +114,11 @@ def _claim(
     sys.audit("vipetsc.claim", str(path))
     marker, aside = path / kind.marker, path / NEW
     foreign = [pattern for other in KINDS if other is not kind for pattern in other.results]
-    if any(any(folder.glob(name)) for folder in (path, path / READY, path / MOVING) for name in foreign):
-        raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
-    _finish_swap(path, kind)
+    ours = not any(any(folder.glob(name)) for folder in (path, path / READY, path / MOVING) for name in foreign)
+    if ours:
+        _finish_swap(path, kind)
     filled = any(not entry.is_dir() or _results(entry) for entry in _results(path))
-    if filled and not marker.exists():
+    if not ours or (filled and not marker.exists()):
         raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
     if resume and not filled:
         raise FolderError(f"{path}: holds no {kind.noun} to resume; leave out --resume")
