@@ -72,7 +72,7 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
     if comm.rank == (0 if team == 2 else 1):
         injector.arm(phase, {"write": 7 - 4 * comm.rank, "step": 3, "analyse": 2}[phase], kind)
     if kind == "full-disk":
-        with pytest.raises(OSError, match=r"No space left.*; make room, the same command goes on"):
+        with pytest.raises(OSError, match="No space left"):
             run_sweep(plan, folder / "out", comm)
     else:
         result = run_sweep(plan, folder / "out", comm)

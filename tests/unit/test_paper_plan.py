@@ -153,7 +153,7 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
     injector = Injector()
     injector.arm("member", 1, "exception")
     result = make.make_paper(plan, root)
-    assert result.failed == ["other: a fault at member"] and result.made == ("design",) and not result.complete
+    assert result.notes == ["failed: other: a fault at member"] and result.made == ("design",) and not result.complete
     whole = make.make_paper(plan, root)
     assert whole.made == ("other",) and whole.complete and not whole.drawn
     found, claims = datasets(root / "design" / "design.h5"), (root / "claims.json").read_bytes()

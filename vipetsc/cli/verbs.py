@@ -191,8 +191,8 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
         echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
         return DONE
     result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
-    for sentence in [f"warning: {warning}" for warning in result.warnings] + [f"failed: {f}" for f in result.failed]:
-        echo(comm, f"vipetsc: {sentence}", sys.stderr)
+    for note in result.notes:
+        echo(comm, f"vipetsc: {note}", sys.stderr)
     echo(comm, claims_table(result.claims))
     echo(comm, f"  {len(result.made)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
     return DONE if result.complete else FAILED

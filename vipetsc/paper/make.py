@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,16 +40,14 @@ Record = dict[str, Any]
 class PaperResult:
     """What was done: steps ``made``, files ``drawn``; the rows of ``claims.json``.
 
-    ``complete``: every step asked for is there, without failures; ``failed`` says which were not and why, ``warnings``
-    what else is to be known of the results.
+    ``complete``: every step asked for is there, without failures; ``notes`` are warnings, and say what failed and why.
     """
 
     made: tuple[str, ...]
     drawn: tuple[Path, ...]
     claims: list[dict[str, Any]]
     complete: bool
-    failed: list[str]
-    warnings: list[str]
+    notes: list[str]
 
 
 def make_paper(
@@ -79,27 +78,28 @@ def make_paper(
 
 def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> PaperResult:
     """Make the steps and figures of ``part``, and from all of ``plan`` that is there the claims and the report."""
-    failed, warnings = list[str](), list[str]()
-    made = _make_steps(part, root, comm, stop, tell, failed, warnings)
+    notes: list[str] = []
+    made = _make_steps(part, root, comm, stop, tell, notes)
     stop.check(comm)
-    with _noted(comm, "backbone", failed):
+    with _noted(comm, "backbone", notes):
         on_root(comm, lambda: _relate(plan.folders(root)))
     drawn: tuple[Path, ...] = ()
-    with _noted(comm, "figures", failed):
+    with _noted(comm, "figures", notes):
         drawn = draw_paper(part, root, comm, stop, tell)
     stop.check(comm)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell))
 
     def is_complete(step: Step) -> bool:
-        return step.state(root) == DONE and not step.statistics(root).get("failed")
+        state, _, failures = _progress(step, root)
+        return state == DONE and not failures
 
-    complete = on_root(comm, lambda: all(map(is_complete, part.steps))) and not failed
-    return PaperResult(made, drawn, claims, complete, failed, warnings)
+    complete = on_root(comm, lambda: all(map(is_complete, part.steps)))
+    return PaperResult(made, drawn, claims, complete and not any(note.startswith("failed") for note in notes), notes)
 
 
 @contextmanager
-def _noted(comm: MPI.Comm, name: str, failed: list[str]) -> Iterator[None]:
-    """Note in ``failed`` what is raised, and go on; not where one rank failed alone, nor for a full disk."""
+def _noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
+    """Note what is raised and go on; not where one rank failed alone, nor for a full disk."""
     try:
         yield
     except StoppedError:
@@ -108,7 +108,7 @@ def _noted(comm: MPI.Comm, name: str, failed: list[str]) -> Iterator[None]:
         alone = comm.size > 1 and not getattr(error, "from_root", False)
         if alone or getattr(error, "errno", None) in FULL:
             raise
-        failed.append(f"{name}: {error or type(error).__name__}")
+        notes.append(f"failed: {name}: {error or type(error).__name__}")
 
 
 def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:
@@ -126,21 +126,28 @@ def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[C
     return claimed(comm, root, PAPER, json.dumps({"grid": plan.grid}) + "\n", difference=difference)
 
 
+def _progress(step: Step, root: Path) -> tuple[str, float, int]:
+    """State of a step, CPU time in s that is left, and how many of its members or branches failed."""
+    state = step.state(root)
+    return state, step.left(root), step.statistics(root).get("failed", 0) if state == DONE else 0
+
+
 def _make_steps(
-    plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell, failed: list[str], warnings: list[str]
+    plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell, notes: list[str]
 ) -> tuple[str, ...]:
-    """Make the steps that are not done, until a request to stop; returns their names, notes failures and warnings."""
+    """Make the steps that are not done or had failures, until a request to stop; returns their names."""
     made = []
     for step in plan.steps:
-        state, left = on_root(comm, lambda step=step: (step.state(root), step.left(root)))  # type: ignore[misc]
+        state, left, failures = on_root(comm, partial(_progress, step, root))
         if stop.agreed(comm):
             break
-        if state != DONE:
+        if state != DONE or failures:
             if comm.rank == 0:
                 tell(f"{step.name}: about {duration(left / comm.size)}")
-            with _noted(comm, step.name, failed):
+            with _noted(comm, step.name, notes):
                 sys.audit("vipetsc.member", step.name)
-                warnings += [f"{step.name}: {warning}" for warning in step.make(root, comm, stop, state == STALE)]
+                warnings = step.make(root, comm, stop, state == STALE)
+                notes += [f"warning: {step.name}: {warning}" for warning in warnings]
                 made.append(step.name)
     return tuple(made)
 

@@ -62,9 +62,8 @@ class TaskPool:
         ended.free()
 
         def check() -> None:
-            for ending, reason, _ in shares:
-                if ending == ENDED:
-                    raise OSError(f"{reason}; make room, the same command goes on")
+            if full := next((reason for ending, reason, _ in shares if ending == ENDED), ""):
+                raise OSError(full)
 
         on_root(self.comm, check)
         return {job: reason for *_, share in shares for job, reason in share.items()}
