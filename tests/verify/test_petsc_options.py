@@ -10,6 +10,7 @@ import pytest
 
 from tests.conftest import StopAt, small_case
 from vipetsc.case import Case, CaseError
+from vipetsc.case.schema import only_looks
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
 from vipetsc.io.folder import FolderError
@@ -52,6 +53,7 @@ def test_options_in_the_database_become_part_of_the_case(folder, petsc_options):
     [
         ("ts_rk_tpye", "5dp", "no such option"),
         ("mat_type", "aij", "no such option"),
+        ("log_veiw", "", "no such option"),
         ("ts_rk_type", "foo", "PETSc refuses it"),
         ("ts_adapt_type", "foo", "PETSc refuses it"),
         ("ts_rtol", "much", "PETSc refuses it"),
@@ -62,16 +64,24 @@ def test_options_in_the_database_become_part_of_the_case(folder, petsc_options):
 )
 def test_what_petsc_does_not_know_is_refused_before_anything_is_written(folder, capsys, name, value, reason):
     out = folder / "out"
+    value = value or "true"  # as the front door reads it
     code = main(["run", "--out", str(out)], {"ts_adapt_clip": "0.1,5", name: value})
     assert code == 2
     message = capsys.readouterr().err
-    assert f"petsc.{name} = '{value}': " in message
+    assert f"petsc.{name} = '{value}': ".lower() in message.lower()
     assert reason in message
     assert message.count("petsc.") == 1
     assert not out.exists()
     assert main(["validate", "--set", f"petsc.{name}={value}"]) == 2
     with pytest.raises(CaseError):
         simulate(small_case(petsc={name: value}), out)
+
+
+def test_what_only_looks_is_no_part_of_a_case():
+    for name in ("log_view", "info", "malloc_debug", "ts_monitor", "ts_adapt_monitor", "options_left", "ts_view"):
+        assert only_looks(name)
+    for name in ("ts_rk_type", "ts_adapt_clip", "log_veiw", "ts_moniter", "ts_max_snes_failures"):
+        assert not only_looks(name)
 
 
 def test_verbs_without_time_stepping_take_no_options(capsys):

@@ -225,11 +225,13 @@ class PetscTable(Section):
 
 # Options that say what PETSc prints, checks and does about an error, and change no result.
 _LOOKS = re.compile(
-    r"(log|info|malloc|memory|options|objects|debug|start_in|stop_for|on_error|error_output|fp_trap|check_pointer"
-    r"|no_signal|skip_petscrc|version|help|history|citations)(_|$)|.*_(view|monitor)(_|$)"
+    r"log(_(view|trace|all|sync|exclude|summary)\w*)?|info(_exclude)?|malloc(_(debug|dump|view|test|hbw)\w*)?"
+    r"|memory_view|options_(left|view|monitor|file)\w*|objects_dump|start_in_debugger|stop_for_debugger|debugg?er?_\w+"
+    r"|on_error_\w+|error_output_\w+|fp_trap|check_pointer_intensity|no_signal_handler|skip_petscrc|version|help"
+    r"|history|citations|get_total_flops|\w+_(view|monitor)(_\w+)?"
 )
 
 
 def only_looks(name: str) -> bool:
     """Whether the PETSc option ``name`` changes no result, so that it is no part of a case."""
-    return bool(_LOOKS.match(name))
+    return bool(_LOOKS.fullmatch(name))
