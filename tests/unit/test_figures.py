@@ -183,6 +183,10 @@ def test_warnings_about_a_run_stand_below_its_pictures_each_once(tmp_path):
         file.attrs["warnings"] = json.dumps(["one", "a sentence that is wider than the picture " * 4, "one"])
     (warned,) = draw("run", [tmp_path], ["ledger"])
     assert imread(warned).shape[0] >= height + 3 * 0.15 * 300
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        file.attrs["warnings"] = json.dumps([f"warning {i}" for i in range(300)])
+    (crowded,) = draw("run", [tmp_path], ["ledger"])
+    assert imread(crowded).shape[0] <= height + 4 * 0.17 * 300
 
 
 def test_a_figure_that_branches_do_not_have_is_refused():

@@ -20,6 +20,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 
+MOST_WARNINGS = 4  # below a picture
 RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
 
 
@@ -113,7 +114,10 @@ def draw(
 
 def warned(make: Callable[[], Figure], *results: xr.Dataset) -> Callable[[], Figure]:
     """``make``, whose figure is labelled with the warnings in the ``results``: their attribute ``warnings`` (JSON)."""
-    sentences = dict.fromkeys(line for data in results for line in json.loads(data.attrs.get("warnings", "[]")))
+    warnings = (line for data in results for line in json.loads(data.attrs.get("warnings", "[]")))
+    sentences = [*dict.fromkeys(warnings)]
+    if len(sentences) > MOST_WARNINGS:
+        sentences[MOST_WARNINGS - 1 :] = [f"{len(sentences) - MOST_WARNINGS + 1} more warnings are in the file"]
 
     def labelled() -> Figure:
         figure = make()
