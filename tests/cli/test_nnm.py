@@ -46,6 +46,9 @@ def test_branch_files_picture_and_refusal(vipetsc, in_process, case, tmp_path):
     assert again.returncode == 0
     assert again.stdout == done.stdout.rpartition("  /")[0].rpartition("\n")[0] + "\n"
     assert modified(out) == written  # complete: nothing is made again
+    (out / "branch-out-of-phase.h5").write_text("cut")
+    assert in_process("nnm", case, "--out", out).returncode == 0
+    assert modified(out).keys() == written.keys()
     other = in_process("nnm", case, "--out", out, "--set", "nnm.energy=[0.0, 0.5]")
     assert other.returncode == 2
     assert "--force" in other.stderr

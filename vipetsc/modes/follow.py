@@ -1,6 +1,7 @@
 """Follow the branches of a case: one by one or shared over ranks, saved as they grow, resumed where they ended."""
 
 import itertools
+import logging
 import math
 import sys
 import time
@@ -34,6 +35,7 @@ FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, N
 SAVE_EVERY = 10.0
 FAILURES = (ContinuationError, FlowError, ValueError)
 
+logger = logging.getLogger(__name__)
 Listener = Callable[[Branch, Point], None]
 
 
@@ -177,11 +179,14 @@ class Follower:
     def _begun(self, name: str) -> Branch:
         """The branch as it is in its file when results are resumed, else one without points."""
         path = self.folder / f"branch-{name}.h5"
-        if not (self.resume and path.exists()):
-            return Branch(name, self.case.to_toml(), self.system.dofs)
-        branch = Branch.read(path)
-        branch.case = self.case.to_toml()
-        return branch
+        if self.resume and path.exists():
+            try:
+                branch = Branch.read(path)
+                branch.case = self.case.to_toml()
+                return branch
+            except OSError as error:
+                logger.warning("vipetsc: warning: %s; made again", error)
+        return Branch(name, self.case.to_toml(), self.system.dofs)
 
     def _start(self, mode: int) -> Point:
         if self.options.start_energy != "auto":
