@@ -81,7 +81,9 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
     if not few:
         axes.margins(y=0.08)
         for number in LABELLED_TONGUES:
-            tongue = branch.isel(point=branch["resonance"].values == number)
+            k = branch["resonance"].values
+            first = np.nonzero(k > number)[0][:1]  # folds behind it that have this k are on the way between tongues
+            tongue = branch.isel(point=(k == number) & (np.arange(len(k)) < np.append(first, len(k))[0]))
             if tongue.sizes["point"]:
                 tip = tongue.isel(point=int(np.argmax(tongue["frequency"].values)))
                 at = float(tip["energy"]), float(tip["frequency"])
