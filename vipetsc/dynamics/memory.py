@@ -54,12 +54,6 @@ def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm)
     share = comm.allreduce(memory_available() // node.size, MPI.MIN)
     node.Free()
     if needed > share:
-        raise CaseError([memory_problem(model, needed, share)])
-
-
-def memory_problem(model: Model, needed: int, available: int) -> Problem:
-    """The problem of a run that needs so many bytes on a rank where fewer are available."""
-    chain, gb = model.chain, 1e9
-    size = f"{chain.cells} cells, {len(chain.sites)} sites and {model.samples} samples"
-    need = f"{size} need {needed / gb:.3g} GB of memory on a rank, which has {available / gb:.3g} GB"
-    return Problem("lattice.cells", None, f"{need}; take fewer of them, or more machines")
+        size = f"{model.chain.cells} cells, {len(model.chain.sites)} sites and {model.samples} samples"
+        need = f"{size} need {needed / 1e9:.3g} GB of memory on a rank, which has {share / 1e9:.3g} GB"
+        raise CaseError([Problem("lattice.cells", None, f"{need}; take fewer of them, or more machines")])
