@@ -7,6 +7,8 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 
@@ -14,12 +16,12 @@ import vipetsc
 from tests.conftest import assert_same_bits, datasets
 from tests.faults.inject import Injector
 from vipetsc.case import Case, Sweep, case_id
-from vipetsc.io.folder import FolderError
+from vipetsc.io.folder import SEARCH, FolderError, claimed
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import make
 from vipetsc.paper.figures import TRANSFER
 from vipetsc.paper.make import read_record
-from vipetsc.paper.plan import DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
+from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
 from vipetsc.parallel import StoppedError, StopRequest
 from vipetsc.studies.design import search_design
 
@@ -97,6 +99,11 @@ def test_another_case_is_another_input_and_a_stale_step(searched):
     assert step.state(root) == STALE
     assert step.identity(root) != plan.steps[0].identity(root)
     assert plan.steps[0].state(root / "none") == MISSING
+    with claimed(MPI.COMM_SELF, step.folder(root), SEARCH, step.text, force=True):
+        pass  # killed before it was made anew: what was begun is gone on with
+    assert step.state(root) == BEGUN
+    step.make(root, MPI.COMM_SELF, StopRequest(), False)
+    assert step.state(root) == DONE
 
 
 def test_a_relation_that_changes_is_another_input(tmp_path):

@@ -21,7 +21,7 @@ import numpy as np
 
 import vipetsc
 from vipetsc.case import DesignCase, NnmCase, Sweep
-from vipetsc.io.folder import FolderError
+from vipetsc.io.folder import NEW, FolderError
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
 from vipetsc.modes.follow import claim_branches, follow_all
@@ -110,7 +110,8 @@ class Step:
         if not marker.exists():
             return MISSING
         if not self._is_same_case(marker.read_text(encoding="utf-8")):
-            return STALE
+            begun = self.folder(root) / NEW / "case.toml"  # what is to replace them
+            return BEGUN if begun.exists() and self._is_same_case(begun.read_text(encoding="utf-8")) else STALE
         return DONE if all(map(self._is_complete, self.results(root))) else BEGUN
 
     def _is_complete(self, path: Path) -> bool:
