@@ -199,7 +199,7 @@ def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) -> No
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", fontsize=6)
     else:
-        axes.text(0.04, 0.04, f"no power law: {doubts}", transform=axes.transAxes, color=style.GREY)
+        axes.text(0.04, 0.04, f"no power law: {doubts}", transform=axes.transAxes, color=style.GREY, fontsize=6)
     axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * amplitude[0], 1.25 * amplitude[-1]))
 
 

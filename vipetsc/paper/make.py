@@ -129,7 +129,7 @@ def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[C
 def _progress(step: Step, root: Path) -> tuple[str, float, int]:
     """State of a step, CPU time in s that is left, and how many of its members or branches failed."""
     state = step.state(root)
-    return state, step.left(root), step.statistics(root).get("failed", 0) if state == DONE else 0
+    return state, step.left(root), step.failures(root) if state == DONE else 0
 
 
 def _make_steps(

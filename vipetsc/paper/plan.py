@@ -32,6 +32,7 @@ from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.design import search_design
 from vipetsc.studies.engines import agreement, sampled
+from vipetsc.studies.ensemble import FAILED
 from vipetsc.studies.sweep import run_sweep
 
 FULL, QUICK = "full", "quick"
@@ -141,6 +142,12 @@ class Step:
         times = _cpu_times(self.folder(root)) if state == BEGUN else []
         rate = max(float(np.mean(times)), self.cost) if times else self.cost  # measuring a run takes time as well
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
+
+    def failures(self, root: Path) -> int:
+        """How many members or branches of a step that is done failed."""
+        if isinstance(self.case, NnmCase):
+            return int(_branch_statistics(self.results(root))["failed"])
+        return int((open_ensemble(self.folder(root))["status"] == FAILED).sum()) if isinstance(self.case, Sweep) else 0
 
     def statistics(self, root: Path) -> dict[str, Any]:
         """Numbers about the results for a report, once they are there; empty where there are none to tell."""
