@@ -6,7 +6,7 @@ from itertools import islice
 
 import pytest
 
-from tests.faults.mutations import judge, mutations
+from tests.faults.mutations import judge, mutations, run_shortly
 from vipetsc.case import CaseError
 from vipetsc.case.every import load_every
 
@@ -54,7 +54,9 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
         ("name = '.hidden'", "no dot or dash first"),
         ("name = 'a\\b'", "without / or \\"),
         (CELL.format(CHAIN), "lattice.cell.springs: nothing ties mass 3 to the next cell"),
+        (CELL.format(CHAIN.replace("end = 2", "end = 4")), "lattice.cell.springs[2]: mass 4 is not one of"),
         (TIED + "[contacts]\nclearance = 1.0\n[nnm]", "contacts.stiffness: missing"),
+        (TIED + "[nnm]", "contacts.clearance: missing"),
         (OWN.format("{ start = 1, end = 2, stiffness = 1.0 }"), "nnm.modes = [1]: the system is free to move"),
         (OWN.format("{ start = 0, end = 3, stiffness = 1.0 }"), "not a pair of the system's 2 masses"),
         ("[lattice]\ncells = 100000\n[contacts]\nsites = 1\n[nnm]\nsystem = 'chain'", "makes 400000 masses"),
@@ -84,6 +86,12 @@ def test_a_key_can_be_taken_out(tmp_path):
     assert case.drive.frequency == 1000
     with pytest.raises(CaseError, match=r"--set drive\.bnad: is not in the case"):
         read(tmp_path / "case.toml", text, "drive.bnad=")
+
+
+def test_a_cell_of_ones_own_needs_no_contacts(tmp_path):
+    (case,) = read(tmp_path / "case.toml", TIED + "[drive]\nfrequency = 1.0\n[time]\nend = 10.0\n")
+    assert case.model().chain.sites == ()
+    assert run_shortly(case, samples=3) == ""
 
 
 def test_a_sweep_may_give_what_a_run_lacks(tmp_path):
