@@ -7,8 +7,9 @@ them nothing touches; those are that run, scaled.
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from mpi4py import MPI
 
@@ -34,6 +35,7 @@ from vipetsc.studies.analysis import FULL, analyse
 # exceeds the sampled envelope by less than the rest for any burst of a few cycles.
 MARGIN = 0.9
 
+T = TypeVar("T")
 MEASURES = {"entropy": "entropy", "transfer": "bands"}  # what ``analyse`` calls those of ``[sweep] measures``
 LAYOUT = {
     "cell": ("cell", "1", "cell, counted from 1"),
@@ -82,11 +84,8 @@ class MemberStore:
 
     def wave(self, case: Case) -> xr.Dataset | None:
         """The linear wave of ``case`` as this version made it; None if it has not, or the file cannot be read."""
-        try:
-            return read_wave(self.folder, case, current=True)
-        except (OSError, ValueError) as error:
-            self.warnings.append(f"{error}; made again")
-            return None
+        path = linear_folder(self.folder, case) / "wave.h5"
+        return self._readable(path, lambda path: read_wave(self.folder, case, current=True))
 
     def summary(self, case: Case, current: bool = False) -> dict[str, Any]:
         """``summary.json`` of the member of ``case``; empty if it lacks anything that the sweep asks for.
@@ -94,29 +93,24 @@ class MemberStore:
         If ``current``, empty too if another version made it. Files that cannot be read count as not there.
         """
         folder = self.folder / case_id(case)
-        try:
-            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            return {}
-        except (OSError, ValueError) as error:
-            self.warnings.append(f"{folder / 'summary.json'} cannot be read: {error}; made again")
-            return {}
+        summary = self._readable(folder / "summary.json", lambda path: json.loads(path.read_bytes())) or {}
         asked = self._requested | {"complete": True} | ({"vipetsc_version": vipetsc.__version__} if current else {})
-        whole = asked.items() <= summary.items() and all(
-            map(self.is_whole, (folder / "run.h5", folder / "analysis.h5"))
-        )
-        return summary if whole else {}
+        files = folder / "run.h5", folder / "analysis.h5"
+        return summary if asked.items() <= summary.items() and all(map(self.is_whole, files)) else {}
 
     def is_whole(self, path: Path) -> bool:
         """Whether the HDF5 file ``path`` is there and was not cut off, which HDF5 sees when it opens it."""
+        return self._readable(path, lambda path: h5py.File(path).close() or True) is not None
+
+    def _readable(self, path: Path, read: Callable[[Path], T]) -> T | None:
+        """What ``read`` makes of a file; None if it is not there, or was cut off, which is noted."""
         try:
-            with h5py.File(path) as file:
-                return bool(file)
+            return read(path)
         except FileNotFoundError:
-            return False
-        except OSError as error:
+            return None
+        except (OSError, ValueError) as error:
             self.warnings.append(f"{path} cannot be read: {error}; made again")
-            return False
+            return None
 
     def make(self, case: Case, wave: xr.Dataset) -> None:
         """Simulate the member of ``case``, or scale it; raises as ``make_linear``."""
