@@ -35,8 +35,8 @@ def sampled(sweep: Sweep, share: float, seed: int) -> Sweep:
 def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
     """What the members of the ``sample`` differ by from those of the ``sweep`` (folders), the loudest last.
 
-    A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample), ``differences`` by measure and the
-    ``largest``, and whether the member ``agrees``: as many episodes, no difference above that of ``COMPARED``.
+    A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample) and whether they are the ``same`` number,
+    ``differences`` by measure and the ``largest``, and whether the member ``agrees``: none above that of ``COMPARED``.
     Raises OSError, or ValueError.
     """
     all_members, members = open_ensemble(sweep), open_ensemble(sample)
@@ -49,7 +49,8 @@ def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
         episodes = [int(np.nan_to_num(member["contact_episodes"].item(), nan=-1)) for member in pair]
         values = {name: [member[name].item() for member in pair] for name in COMPARED if name in one}
         differences = {name: abs(b - a) for name, (a, b) in values.items() if np.isfinite([a, b]).all()}
-        same = episodes[0] == episodes[1] and all(d <= COMPARED[name] for name, d in differences.items())
-        row = {"amplitude": one["amplitude"].item(), "episodes": episodes, "differences": differences, "agrees": same}
-        rows.append(row | {"largest": max(differences.values(), default=0.0)})
+        agrees = all(difference <= COMPARED[name] for name, difference in differences.items())
+        row = {"amplitude": one["amplitude"].item(), "episodes": episodes, "same": episodes[0] == episodes[1]}
+        row |= {"differences": differences, "largest": max(differences.values(), default=0.0), "agrees": agrees}
+        rows.append(row)
     return sorted(rows, key=lambda row: row["amplitude"])
