@@ -19,8 +19,9 @@ def options_of(case: CaseFile | None) -> dict[str, str]:
 
 def with_database(case: Case) -> Case:
     """``case`` with the options of ``ts`` that stand in PETSc's database, where a script has put them."""
-    found = {name: value or "true" for name, value in PETSc.Options().getAll().items()}
-    given = {n: value for n, value in found.items() if n.startswith("ts_") and not only_looks(n)} | options_of(case)
+    database = PETSc.Options().getAll()
+    names = [name for name in database if name.startswith("ts_") and not only_looks(name)]
+    given = {name: database[name] or "true" for name in names} | options_of(case)
     return case.model_copy(update={"petsc": PetscTable.model_validate(given)}) if given else case
 
 
