@@ -767,6 +767,21 @@ def test_branches_on_either_side_of_their_thresholds(tmp_path, change, expected)
     assert measure("C15", tmp_path, "printed").verdict == expected
 
 
+def test_the_in_phase_branch_is_held_against_what_it_should_pass(tmp_path):
+    """One energy fold of the 35:1 tongue is missing; what lies above 6e9 J does not count."""
+    for law in ("hertz", "bilinear"):
+        put_branch(tmp_path, law)
+    kind = np.repeat([1, 4, 5, 6, 6], [89, 62, 41, 316, 5])
+    with h5py.File(tmp_path / "nnm-hertz" / "branch-in-phase.h5", "w") as file:
+        file["kind"], file["energy"] = kind, np.repeat([5e9, 7e9], [508, 5])
+        file["resonance"] = np.where(kind == 1, 3 + 2 * (np.arange(len(kind)) % 17), 0)
+        file["frequency"] = np.full(len(kind), 318.2)
+    found = measure("C15", tmp_path, "printed")
+    assert found.value["tongues of the in-phase branch, hertz"] == 17
+    assert found.value["largest frequency (Hz) of the in-phase branch, hertz"] == 318.2
+    assert found.reason == "the hertz branch in phase has 89 fold-energy, not 90"
+
+
 def test_a_hertz_branch_without_fold_holds_in_part_and_says_so(tmp_path):
     put_branch(tmp_path, "bilinear", limit=0.9)
     put_branch(tmp_path, "hertz", folds=0, multiplier=1.0)
