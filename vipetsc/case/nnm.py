@@ -130,13 +130,13 @@ class NnmCase(CaseFile):
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The sections, with the preset's material and clearances, and everything that is wrong with them."""
         given, nnm = with_preset(table).get("contacts", {}), table.get("nnm", {})
-        own = isinstance(nnm, dict) and nnm.get("system") == "own"
-        if isinstance(given, dict) and not own:
+        lattice_free = isinstance(nnm, dict) and nnm.get("system") == "own"
+        if isinstance(given, dict) and not lattice_free:
             stated = table.get("contacts", {})
             table = table | {"contacts": {key: v for key, v in given.items() if key in MATERIAL or key in stated}}
         fields, problems = super().read(with_default_preset(table))
         lattice, contacts = fields["lattice"], fields["contacts"]
-        if not (problems or own or contacts.clearance):
+        if not (problems or lattice_free or contacts.clearance):
             count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
             fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
         return fields, problems

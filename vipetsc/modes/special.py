@@ -126,12 +126,10 @@ class _Segment:
             return [self.root(kind, test, HALVINGS)]
         if before is None or not self.left.step:
             return []
-        turn = _turn((-self.left.step, test(before)), (0.0, a), (self.length, b))
-        with suppress(ArithmeticError):
+        turn, parts = _turn((-self.left.step, test(before)), (0.0, a), (self.length, b)), tuple[_Segment, ...]()
+        with suppress(ArithmeticError):  # whether there are two is not known
             parts = self.split(turn) if turn else ()
-            if parts and a * test(parts[1].left) < 0:
-                return [part.root(kind, test, HALVINGS) for part in parts]
-        return []
+        return [part.root(kind, test, HALVINGS) for part in parts if test(part.left) * test(part.right) < 0]
 
     def root(self, kind: str, test: Test, halvings: int) -> Point:
         """The point where ``test`` vanishes; in the half with it if Newton's method fails on the way.
