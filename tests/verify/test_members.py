@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
+from tests.faults.inject import Injector
 from vipetsc.case import Case, Sweep
 from vipetsc.case.sweep import SweepTable
 from vipetsc.io.netcdf import open_netcdf
@@ -109,3 +110,9 @@ def test_files_that_were_cut_are_named_and_made_again(sweep, tmp_path):
         os.truncate(path, 100)
     once_more = run_sweep(Sweep.load(out / "case.toml"), out)
     assert once_more.made == 0 and [str(shared.with_name("run.h5")) in text for text in once_more.warnings] == [True]
+    # Where it cannot be made again the members stay as they are.
+    os.truncate(shared.with_name("run.h5"), 100)
+    injector = Injector()
+    injector.arm("member", 1, "memory")
+    assert run_sweep(Sweep.load(out / "case.toml"), out).complete
+    injector.disarm()

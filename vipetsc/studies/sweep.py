@@ -104,10 +104,10 @@ def _make_all(
     source = {key: linear_folder(folder, case) for key, case in cases.items()}
     linear = on_root(comm, lambda: {source[key]: c for key, c in cases.items() if not store.has_linear(c)})
     failures = pool.share(list(linear), lambda path: store.make_linear(linear[path]))
-    order, waves = on_root(comm, lambda: _plan(cases, source, store))
+    missing, order, waves = on_root(comm, lambda: _plan(cases, source, store))
     bar = Progress(comm, len(order), "runs", show=progress)
     made = pool.share(order, lambda key: store.make(cases[key], waves[source[key]]), bar)
-    reasons = {key: reason for key, path in source.items() if (reason := failures.get(path))} | made
+    reasons = {key: reason for key in missing if (reason := failures.get(source[key]))} | made
 
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(pool.busy / seconds))
@@ -120,8 +120,8 @@ def _make_all(
 
 def _plan(
     cases: Mapping[str, Case], source: Mapping[str, Path], store: MemberStore
-) -> tuple[list[str], dict[Path, xr.Dataset]]:
-    """The members to be made whose linear run (``source``) came out, the longest first; the waves of linear runs."""
+) -> tuple[list[str], list[str], dict[Path, xr.Dataset]]:
+    """The missing members; those of them whose linear run (``source``) came out, the longest first; linear waves."""
     missing = [key for key, case in cases.items() if not store.summary(case, current=True)]
     stored = {source[key]: store.wave(cases[key]) for key in missing}
     waves = {path: wave for path, wave in stored.items() if wave is not None}
@@ -131,7 +131,7 @@ def _plan(
         touching = np.minimum(reached(waves[source[key]], cases[key]), 10.0)
         return float(touching.sum()) + 1e-3 * float(cases[key].time.end)
 
-    return sorted((key for key in missing if source[key] in waves), key=cost, reverse=True), waves
+    return missing, sorted((key for key in missing if source[key] in waves), key=cost, reverse=True), waves
 
 
 def conclude(
