@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import tomllib
 
 from mpi4py import MPI
@@ -13,6 +14,7 @@ from tests.conftest import StopAt, assert_same_bits, datasets
 from tests.faults.inject import Injector
 from vipetsc.case import Sweep
 from vipetsc.parallel import SharedCounter, StopRequest
+from vipetsc.studies.pool import TaskPool
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = """
@@ -110,3 +112,16 @@ def test_every_number_is_drawn_once():
     everything = [number for share in comm.allgather(drawn) for number in share]
     assert sorted(everything) == list(range(200))
     counter.free()
+
+
+@pytest.mark.parallel([2])
+def test_after_a_request_on_one_rank_no_rank_begins_another_job():
+    comm, stop = MPI.COMM_WORLD, StopRequest()
+    pool = TaskPool(comm, MPI.COMM_SELF, stop)
+
+    def work(job: int) -> None:
+        time.sleep(0.01)
+        stop.requested = comm.rank == 1
+
+    assert len(pool.share(list(range(100)), work)) < 50
+    assert pool.stopped and pool.share([1, 2], work) == {}
