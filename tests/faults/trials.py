@@ -171,7 +171,7 @@ def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Itera
     for number in range(count):
         (name, ranks), duration = random.choice(sorted(seconds.items()))
         kind, rank = random.choice(("sigkill", "sigterm")), random.randrange(-1, ranks)
-        delay = round(random.random() * duration, 3)
+        delay = round(0.8 * random.random() * duration, 3)
         whom = "all" if rank < 0 else f"rank {rank}"
         yield {
             "id": f"{number}: {name} on {ranks} ranks, {kind} to {whom} after {delay} s", "do": "trial",
