@@ -18,12 +18,13 @@ from vipetsc.case import Case
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble, open_run
-from vipetsc.spectra import FEWEST, power_law
+from vipetsc.spectra import power_law
 from vipetsc.studies.members import leading_cell, linear_folder
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
 VIBRO_IMPACT = 3  # number of the region III
+FEWEST = 3  # points of a fit; which fits are called power laws `vipetsc.spectra.doubt` decides
 
 # Dimensions, units and description of what the group of a curve holds.
 LAYOUT = {
