@@ -117,8 +117,8 @@ class Continuation:
             "turn_relative": relative_turn(self.problem, last, point),
         }
         strains = {guard: change / (getattr(self.control.guards, guard) or np.inf) for guard, change in changes.items()}
-        if strains["contacts"] <= 1:  # one contact more is no reason to slow down
-            strains["contacts"] = 0.0
+        for guard in ("contacts", "turn_relative"):  # within these bounds there is no reason to slow down
+            strains[guard] *= strains[guard] > 1
         worst = max(strains, key=lambda guard: strains[guard])
         return point, strains[worst], worst
 
