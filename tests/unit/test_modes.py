@@ -496,7 +496,7 @@ def test_the_in_phase_hertz_branch_crosses_the_out_of_phase_one_and_goes_on(guar
 
     The true branch comes back from the tip, with c = 1 passed there, and no orbit repeats itself.
     """
-    problem, points = in_phase_hertz(guards=Guards() if guarded else Guards(turn_relative=0))
+    problem, points = in_phase_hertz(**({} if guarded else {"guards": Guards(turn_relative=0), "points": 200}))
     assert max(relative_turn(problem, a, b) for a, b in itertools.pairwise(points)) > 0.2
     monitor = BranchMonitor(problem, Guards())
     said = [s for s in map(monitor.check, points) if s]
@@ -505,7 +505,7 @@ def test_the_in_phase_hertz_branch_crosses_the_out_of_phase_one_and_goes_on(guar
         assert not said
         assert points[-1].energy < points[124].energy < 0.031
     else:
-        assert said[0] == "left its branch: the orbit of point 150 is another one passed 3 times"
+        assert said[0] == "left its branch: the orbit of point 200 is another one passed 3 times"
         assert is_jump(problem, points[123], points[124], NnmTable(chart="auto"))
 
 

@@ -9,6 +9,15 @@ import pytest
 from vipetsc.parallel import STOP_SIGNALS, StoppedError, StopRequest
 
 
+@pytest.fixture(autouse=True)
+def as_in_a_terminal():
+    """The signals as a shell leaves them, though tests may run under nohup or in a script's background."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in STOP_SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_is_a_request_and_a_second_one_the_end(number):
     before = {other: signal.getsignal(other) for other in STOP_SIGNALS}
@@ -37,10 +46,7 @@ def test_what_has_nothing_to_save_ends_at_once():
 
 
 def test_a_signal_that_nohup_ignores_stays_ignored():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with StopRequest().listening() as stop:
-            signal.raise_signal(signal.SIGHUP)
-            assert not stop.requested
-    finally:
-        signal.signal(signal.SIGHUP, before)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with StopRequest().listening() as stop:
+        signal.raise_signal(signal.SIGHUP)
+        assert not stop.requested

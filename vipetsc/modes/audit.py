@@ -82,7 +82,7 @@ class BranchMonitor:
         self._problem, self._guards = problem, guards
         self._linear = problem.system.linear_modes()[0] / (2 * np.pi)
         self._track = np.empty((0, problem.system.dofs + 2))
-        self._touched = False
+        self._touched = self._repeats = False
 
     def check(self, point: Point) -> str | None:
         """A sentence when the branch does what it should not; None otherwise."""
@@ -98,8 +98,11 @@ class BranchMonitor:
         places = self._guards.standstill
         if 0 < places <= len(track) and np.ptp(self._track[-places:], axis=0).max() <= self._guards.advance:
             return f"does not advance: {places} points up to {point.index} are one, at E = {point.energy:.9g} J"
-        if point.index % REPETITIONS_EVERY == 0 and (times := repetitions(self._problem, point)) > 1:
-            return f"left its branch: the orbit of point {point.index} is another one passed {times} times"
+        if point.index % REPETITIONS_EVERY == 0:
+            times = repetitions(self._problem, point)
+            twice, self._repeats = self._repeats and times > 1, times > 1  # once, it may be at the tip of a tongue
+            if twice:
+                return f"left its branch: the orbit of point {point.index} is another one passed {times} times"
         if len(track) < 10 or not self._touched:
             return None
         starts, ends = track[:-6], track[1:-5]
