@@ -68,7 +68,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     assert re.search(r"made now +0 in", again.stdout)
     changed = in_process("sweep", case, "--out", out, "--set", "drive.cycles=6")
     assert changed.returncode == 2
-    assert "holds another sweep, differing: cycles = 5; cycles = 6; --force replaces it" in changed.stderr
+    assert "holds another sweep: drive.cycles = 5 there, 6 here; --force replaces it" in changed.stderr
 
 
 def test_a_scaled_member_is_what_its_simulation_would_be(in_process, case, tmp_path):

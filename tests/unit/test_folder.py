@@ -74,7 +74,7 @@ def test_the_same_case_goes_on_and_another_is_refused(run):
             assert right.folder == run
     assert (run / "case.toml").stat() == before  # going on touches nothing
     for resume in (False, True):
-        message = "holds another run, differing: a = 1; a = 2; --force replaces it, --out chooses another folder"
+        message = "holds another run: a = 1 there, 2 here; --force replaces it, --out chooses another folder"
         with pytest.raises(FolderError, match=message), claim(run, RUN, ANEW, resume=resume):
             pass
     with pytest.raises(FolderError, match="holds no run to resume; leave out --resume"):

@@ -38,7 +38,7 @@ def test_a_case_without_options_reads_and_writes_as_before():
 
 def test_a_run_does_not_go_on_with_other_options(folder):
     assert simulate(small_case(**SHORT, petsc={"ts_rk_type": "5dp"}), folder / "run", stop=StopAt(20)).resumable
-    with pytest.raises(FolderError, match=r'differing: .*ts_rk_type = "5dp"'):
+    with pytest.raises(FolderError, match="ts_rk_type = 5dp there, nothing here"):
         simulate(small_case(**SHORT), folder / "run", resume=True)
 
 

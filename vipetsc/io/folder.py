@@ -11,9 +11,10 @@ import shutil
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from mpi4py import MPI
@@ -28,6 +29,7 @@ from vipetsc.io.lock import LOCK, FolderError, locked
 from vipetsc.parallel import on_root
 
 FORMAT_VERSION = 1
+MOST_NAMED = 6  # keys of another case that a message names
 NEW, READY, MOVING, OLD = ".new", ".ready", ".moving", ".replaced.old"
 
 Difference = Callable[[str], str | None]
@@ -150,12 +152,27 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
     earlier = (folder / kind.marker).read_text(encoding="utf-8")
     if difference or earlier == text:
         return difference(earlier) if difference else None
-    with suppress(ValueError):
-        if tomllib.loads(earlier) == tomllib.loads(text):
-            return None
-    lines = {line.strip() for line in set(earlier.splitlines()) ^ set(text.splitlines())}
-    differing = "; ".join(sorted(lines - {""}))
-    return f"holds another {kind.noun}, differing: {differing}; --force replaces it, --out chooses another folder"
+    remedy = "--force replaces it, --out chooses another folder"
+    try:
+        then, now = (dict(_keys(tomllib.loads(case))) for case in (earlier, text))
+    except tomllib.TOMLDecodeError as error:
+        return f"its {kind.marker} cannot be read ({error}); {remedy}"
+    differing = [
+        "{} = {} there, {} here".format(key, *(shorten(str(case.get(key, "nothing")), 60) for case in (then, now)))
+        for key in then | now
+        if then.get(key) != now.get(key)
+    ]
+    more = f"; and {len(differing) - MOST_NAMED} more" if len(differing) > MOST_NAMED else ""
+    return f"holds another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}" if differing else None
+
+
+def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """The keys of a case with their sections, and their values."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _keys(value, f"{path}{key}.")
+        else:
+            yield path + key, value
 
 
 def _finish_swap(path: Path, kind: FolderKind) -> None:
