@@ -83,7 +83,7 @@ def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
     assert (tmp_path / "runs" / "four-band" / "run.h5").exists()
     other = in_process("--set", "time.end=0.02", *QUICK, cwd=tmp_path)
     assert other.returncode == 2
-    assert "end = 0.01; end = 0.02; --force replaces it" in other.stderr
+    assert "time.end = 0.01 there, 0.02 here; --force replaces it" in other.stderr
     forced = in_process("--set", "time.end=0.02", *QUICK, "--force", cwd=tmp_path)
     assert forced.returncode == 0, forced.stderr
     assert "end = 0.02" in (tmp_path / "runs" / "four-band" / "case.toml").read_text()
