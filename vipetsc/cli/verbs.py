@@ -139,11 +139,13 @@ def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
         from vipetsc.figures.registry import draw_bands
 
         cell = case.lattice.unit_cell()
-        folder.mkdir(parents=True, exist_ok=True)
-        picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
         numbers = tables.bands_table(cell)
-        text = json.dumps(numbers | {"picture": str(picture)}, indent=2)
-        write_text(folder / "bands.json", text + "\n")
+        with locked(MPI.COMM_SELF, folder):
+            for leftover in folder.glob(".*.part"):  # of a command that was killed
+                leftover.unlink()
+            picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
+            text = json.dumps(numbers | {"picture": str(picture)}, indent=2)
+            write_text(folder / "bands.json", text + "\n")
         return text if options.json else f"{tables.bands_report(numbers)}\n  {picture}"
 
     echo(comm, on_root(comm, report))
