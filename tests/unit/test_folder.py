@@ -239,3 +239,13 @@ def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, c
         with claim(run, RUN, OLD):
             pass
         assert not (run / ".lock").exists()
+
+
+def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("vipetsc.io.lock._acquire", refuse)
+    with pytest.raises(PermissionError), locked(MPI.COMM_SELF, tmp_path / "a" / "b"):
+        pass
+    assert not any(tmp_path.iterdir())

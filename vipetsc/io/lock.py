@@ -39,9 +39,10 @@ def _lock(path: Path) -> Iterator[None]:
     if path.exists() and not path.is_dir():
         raise FolderError(f"{path}: is a file, not a folder; choose another --out")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    path.mkdir(parents=True, exist_ok=True)
-    descriptor = _acquire(path)
+    descriptor = None
     try:
+        path.mkdir(parents=True, exist_ok=True)
+        descriptor = _acquire(path)
         yield
     finally:
         if descriptor is not None:
