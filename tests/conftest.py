@@ -7,7 +7,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -22,8 +24,10 @@ import hypothesis
 import numpy as np
 import pytest
 
-from vipetsc.case import Case
+from vipetsc import __version__
+from vipetsc.case import Case, Sweep
 from vipetsc.cli.main import main
+from vipetsc.io.records import RecordFile
 from vipetsc.parallel import StopRequest
 
 # A first call may have to load kernels, or compile them.
@@ -71,6 +75,23 @@ def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]
         assert values.shape == second[name].shape, name
         texts = values.dtype == object  # whose bytes are addresses
         assert values.tolist() == second[name].tolist() if texts else values.tobytes() == second[name].tobytes(), name
+
+
+def put_members(folder: Path, plan: Sweep, told: Callable[[int, Case], dict[str, Any] | str], file: int = 0) -> None:
+    """A finished sweep whose members were not simulated: what is ``told`` of each, or why it failed, as its record."""
+    from vipetsc.studies.ensemble import Results
+    from vipetsc.studies.sweep import conclude
+
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "case.toml").write_text(plan.to_toml())
+    records = RecordFile(folder / f"members-{file}.jsonl")
+    for number, name in enumerate(plan.ids()):
+        row = told(number, plan.case(number))
+        about = {"id": name, "vipetsc_version": __version__, "status": "complete", "reason": "complete"}
+        about |= {"warnings": [], "cpu_seconds": 0.1, "rtol": 1e-10}
+        records.append(about | ({"status": "failed", "reason": row} if isinstance(row, str) else row))
+    records.close()
+    conclude(Results(plan, folder))
 
 
 def modified(folder: Path) -> dict[Path, int]:

@@ -77,3 +77,9 @@ def kernel_sources(package: Path) -> list[Path]:
                     files = (package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names)
                     sources |= {file for file in files if file.exists()}
     return sorted(sources)
+
+
+# Of functions that make no arrays but views: numba counts no references to theirs, which costs more than short sums do
+# (each array of a tuple, at each access). ``inlined`` ones are put in place of their calls, with the constants there.
+kernel = njit(error_model="numpy", _nrt=False)
+inlined = njit(error_model="numpy", _nrt=False, inline="always")

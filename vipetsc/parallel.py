@@ -6,7 +6,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Self, TypeVar, cast
@@ -41,15 +41,25 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
     sys.excepthook = hook
 
 
+def meet(comm: MPI.Comm) -> None:
+    """Wait for all ranks of ``comm``, asleep after a moment: those that still work need the cores."""
+    met, begin = comm.Ibarrier(), time.monotonic()
+    while not met.Test():
+        if time.monotonic() - begin > 1e-3:
+            time.sleep(1e-3)
+
+
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
-    value, error = comm.bcast(_attempt(function) if comm.rank == 0 else None)
-    return _agreed(value, error)
+    attempt = _attempt(function) if comm.rank == 0 else None
+    meet(comm)
+    return _agreed(*comm.bcast(attempt))
 
 
 def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
     value, error = _attempt(function)
+    meet(comm)
     return _agreed(value, next((e for e in comm.allgather(error) if e is not None), None))
 
 
@@ -65,6 +75,22 @@ def _agreed(value: T | None, error: Exception | None) -> T:
         error.from_root = True  # type: ignore[attr-defined]  # rank 0 raises it as well, and reports it for all
         raise error
     return cast(T, value)
+
+
+def spread(comm: MPI.Comm, rows: np.ndarray, keys: Sequence[str]) -> tuple[np.ndarray, int, int]:
+    """Sort the ``rows`` of all ranks by their ``keys``: this rank's part of them, how many come before it, all.
+
+    The parts are about as large; rows that agree in the first key stay together. All ranks must call it.
+    """
+    total, backwards = comm.allreduce(len(rows)), keys[::-1]
+    rows = rows[np.lexsort([rows[key] for key in backwards])]
+    if comm.size > 1 and total:
+        first = rows[keys[0]]
+        some = np.sort(np.concatenate(comm.allgather(first[:: total // (64 * comm.size) + 1])))
+        cuts = np.searchsorted(first, some[np.arange(1, comm.size) * len(some) // comm.size])
+        rows = np.concatenate(comm.alltoall(np.split(rows, cuts)))
+        rows = rows[np.lexsort([rows[key] for key in backwards])]
+    return rows, sum(comm.allgather(len(rows))[: comm.rank]), total
 
 
 class SharedCounter:

@@ -22,6 +22,7 @@ import pytest
 
 from tests.cli.tiny_paper import DRAWN, drawing, tiny_plan
 from tests.conftest import clean_environment
+from vipetsc.figures.study import Files
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.figures import PAPER_FIGURES
 from vipetsc.paper.make import make_paper
@@ -80,7 +81,8 @@ def test_every_figure_of_the_paper_is_offered(made):
     plan = tiny_plan()
     folders = plan.folders(made)
     assert set(folders) == {step.name for step in plan.steps}
-    stems = [stem for figure in PAPER_FIGURES for stem, _ in figure.offers(folders)]
+    with Files() as files:
+        stems = [picture.stem for figure in PAPER_FIGURES for picture in figure.offers(folders, files)]
     assert len(stems) == len(set(stems))
     assert {stem.partition("-")[0] for stem in stems} == {figure.id for figure in PAPER_FIGURES}
     drawn = {path.name for path in (made / "figures").iterdir()}

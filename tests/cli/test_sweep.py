@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
+from vipetsc.io.netcdf import open_netcdf
 
 SWEEP = """
 [lattice]
@@ -46,8 +47,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     ended = vipetsc(2, "sweep", case, "--out", out)
     assert ended.returncode == 0, ended.stderr
     index = json.loads((out / "index.json").read_text())
-    assert len(index["members"]) == 12
-    assert {row["status"] for row in index["members"]} == {"complete", "scaled"}
+    assert sum(index["members"].values()) == 12 and not index["members"]["failed"] and index["failed"] == []
     with h5py.File(out / "ensemble.h5") as file:
         amplitude = file["amplitude"][...]
         status, episodes, work = (file[n][...] for n in ("status", "contact_episodes", "work"))
@@ -61,9 +61,12 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     quiet = status[0] == 1
     assert work[0, quiet] / amplitude[quiet] ** 2 == pytest.approx(work[0, 0] / amplitude[0] ** 2, rel=1e-14)
     assert np.ptp(entropy[0, quiet]) == 0
-    for row in index["members"]:
-        files = {p.name for p in (out / row["id"]).iterdir()}
-        assert files == {"case.toml", "run.h5", "analysis.h5", "summary.json"}
+    assert {p.name for p in out.iterdir() if p.name[0] != "."} == {
+        "case.toml",
+        "members.jsonl",
+        "ensemble.h5",
+        "index.json",
+    }
     again = in_process("sweep", case, "--out", out)
     assert re.search(r"made now +0 in", again.stdout)
     changed = in_process("sweep", case, "--out", out, "--set", "drive.cycles=6")
@@ -71,27 +74,42 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     assert "holds another sweep: drive.cycles = 5 there, 6 here; --force replaces it" in changed.stderr
 
 
-def test_a_scaled_member_is_what_its_simulation_would_be(in_process, case, tmp_path):
-    in_process(
-        "sweep",
-        case,
-        "--out",
-        tmp_path / "out",
-        "--set",
-        "sweep.drive.amplitude=[0.3]",
-        "--set",
-        "sweep.contacts.sites=[1]",
-    )
-    (member,) = json.loads((tmp_path / "out" / "index.json").read_text())["members"]
-    assert member["status"] == "scaled"
-    folder = tmp_path / "out" / member["id"]
-    ended = in_process("run", folder / "case.toml", "--out", tmp_path / "run")
-    assert ended.returncode == 0, ended.stderr
-    scaled, run = datasets(folder / "run.h5"), datasets(tmp_path / "run" / "run.h5")
-    for name in ("energy/kinetic", "energy/spring", "energy/work"):
-        assert scaled[name] == pytest.approx(run[name], rel=1e-6, abs=1e-9 * run["energy/work"].max())
-    assert not scaled["impacts/onset"].size
-    assert np.array_equal(scaled["time"], run["time"])
+def test_a_member_is_made_again_whole_by_its_name_or_number(in_process, case, tmp_path):
+    """Its run has what its record says, be it simulated or scaled, and measures are the same bits."""
+    out = tmp_path / "out"
+    changes = ("--set", "sweep.drive.amplitude=[0.3, 20.0]", "--set", "sweep.contacts.sites=[1]")
+    assert in_process("sweep", case, "--out", out, *changes).returncode == 0
+    with open_netcdf(out / "ensemble.h5", "ensemble") as ensemble:
+        names, status = ensemble["member"].values.ravel(), ensemble["status"].values.ravel()
+        work, entropy = ensemble["work"].values.ravel(), ensemble["entropy/masked"].values.ravel()
+    assert status.tolist() == [1, 0]
+    for number, name in enumerate((names[0], "1")):
+        run = tmp_path / f"run-{number}"
+        ended = in_process("run", out, "--member", name, "--out", run, "--set", "output.figures=false")
+        assert ended.returncode == 0, ended.stderr
+        found, measured = datasets(run / "run.h5"), datasets(run / "analysis.h5")
+        assert found["energy/work"][-1] == pytest.approx(work[number], rel=1e-6 if status[number] else 0)
+        assert measured["entropy/masked"] == pytest.approx(entropy[number], rel=1e-6 if status[number] else 0)
+        assert found["velocity"].shape == (301, 40, 2)
+    for path, name, says in (
+        (out, "2", "--member = '2': is no member"),
+        (case, "x", "is no member"),
+        (tmp_path, "0", "case"),
+    ):
+        bad = in_process("run", path, "--member", name, "--out", tmp_path / "bad")
+        assert bad.returncode == 2 and says in bad.stderr and not (tmp_path / "bad").exists()
+
+
+def test_a_sweep_of_an_earlier_version_is_named(in_process, case, tmp_path):
+    out = tmp_path / "out"
+    changes = ("--set", "sweep.drive.amplitude=[0.3]", "--set", "sweep.contacts.sites=[1]")
+    assert in_process("sweep", case, "--out", out, *changes).returncode == 0
+    (out / "linear").mkdir()
+    for words in (("sweep", case, "--out", out, *changes), ("analyse", out)):
+        ended = in_process(*words)
+        assert ended.returncode == 2 and "holds a sweep of an earlier version" in ended.stderr
+    assert in_process("sweep", case, "--out", out, *changes, "--force").returncode == 0
+    assert not (out / "linear").exists()
 
 
 @pytest.mark.mpirun
@@ -100,8 +118,8 @@ def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
     ended = vipetsc(2, "sweep", case, "--out", out, "--set", "sweep.contacts.sites=[[20], [41], [30]]")
     assert ended.returncode == 1
     assert "contacts.sites = [41]: outside the lattice; cells count from 1 to 40" in ended.stdout
-    rows = json.loads((out / "index.json").read_text())["members"]
-    assert [row["place"][0] for row in rows if row["status"] == "failed"] == [1] * 6
+    rows = json.loads((out / "index.json").read_text())["failed"]
+    assert [row["place"][0] for row in rows] == [1] * 6
     with h5py.File(out / "ensemble.h5") as file:
         work = file["work"][...]
         assert np.isnan(work[1]).all()
@@ -127,10 +145,9 @@ def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path)
         "sweep.contacts.sites=[1]",
     )
     assert ended.returncode == 1
-    quiet, loud = json.loads((out / "index.json").read_text())["members"]
-    assert quiet["status"] == "scaled"
-    assert loud["status"] == "failed"
-    assert "t = " in loud["reason"]
+    index = json.loads((out / "index.json").read_text())
+    (loud,) = index["failed"]
+    assert index["members"]["scaled"] == 1 and loud["place"] == [0, 1] and "t = " in loud["reason"]
 
 
 @pytest.mark.parametrize("value", ["sweep.drive.amplitud=[1.0]", "sweep.feilds=true", "sweep.drive.amplitude=[0.0]"])
@@ -157,18 +174,19 @@ def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
         "sweep.contacts.sites=[2]",
     )
     assert ended.returncode == 0, ended.stderr
-    (member,) = json.loads((out / "index.json").read_text())["members"]
+    (member,) = (path.parent for path in out.glob("*/run.h5"))
+    assert {path.name for path in member.iterdir()} == {"run.h5", "analysis.h5"}
     # As a kill leaves it that comes before the run has begun.
-    shutil.rmtree(out / member["id"])
-    (out / member["id"] / "parts").mkdir(parents=True)
+    shutil.rmtree(member)
+    (member / "parts").mkdir(parents=True)
     again = in_process("sweep", out / "case.toml", "--out", out)
     assert again.returncode == 0, again.stderr
-    found = datasets(out / member["id"] / "run.h5")
+    found = datasets(member / "run.h5")
     assert found["velocity"].shape == (301, 40, 2)
-    measured = datasets(out / member["id"] / "analysis.h5")
+    measured = datasets(member / "analysis.h5")
     assert measured["partition/energy"].shape[0] == 12
-    assert measured["entropy/local"].shape == (301, 40)
-    assert measured["partition/kinetic"] == pytest.approx(measured["kinetic_energy"].sum(axis=1), rel=1e-12)
+    assert measured["entropy/local"].shape == (151, 20)
+    assert measured["partition/kinetic"] == pytest.approx(measured["kinetic_energy"][::2].sum(axis=1), rel=1e-6)
 
 
 @pytest.mark.mpirun

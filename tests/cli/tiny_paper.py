@@ -20,8 +20,8 @@ AMPLITUDES = "sweep.drive.amplitude={ log = [0.2, 50.0], count = 6 }"
 BRANCH = ("nnm.energy=[0.0, 30.0]",)
 CHANGES = {
     "scattering-amplitudes": (*DIATOMIC, "contacts.sites=2"),
-    "interband-amplitudes": FOUR_BAND,
-    "interband-one-site": (*FOUR_BAND, "sweep.drive.amplitude=[2.0, 40.0]"),
+    "interband-amplitudes": (*FOUR_BAND, "output.window=[5, 15]", "output.every=10"),
+    "interband-one-site": (*FOUR_BAND, "output.window=[10, 10]", "sweep.drive.amplitude=[2.0, 40.0]"),
     "design": ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11"),
     "nnm-hertz": BRANCH,
     "nnm-bilinear": BRANCH,

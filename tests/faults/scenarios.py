@@ -191,6 +191,9 @@ def _content(path: Path) -> dict:
             file.visititems(lambda name, item: found.update({name: _bits(item)}))
     elif path.suffix == ".csv" or path.name == "claims.json":
         found["text"] = path.read_bytes()
+    elif path.suffix == ".jsonl":
+        rows = map(json.loads, path.read_text().splitlines())
+        found = {row.get("id") or row["linear"]: (row.get("status"), row.get("measures")) for row in rows}
     elif path.name == "summary.json":
         numbers = json.loads(path.read_text())["statistics"]
         found = {key: value for key, value in numbers.items() if not key.endswith("_seconds")}

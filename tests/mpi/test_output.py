@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets, small_case
-from vipetsc.dynamics import simulate
-from vipetsc.io import store
+from vipetsc.dynamics import recorder, simulate
+from vipetsc.io import chunks
 from vipetsc.io.store import RunFolder, RunMemory
-from vipetsc.parallel import StoppedError, StopRequest, on_every_rank
+from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, spread
 
 COMM = MPI.COMM_WORLD
 
@@ -52,6 +52,33 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
 
 
 @pytest.mark.parallel([2, 3])
+def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
+    """Several sites a rank, named in no order; several chunks; fields of a window; open and closed episodes."""
+    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 20)
+    sites = {"sites": [13, 5, 6, 18, 12, 2], "clearance": [2e-4, 1e-4, 3e-5, 1e-4, 5e-5, 2e-4]}
+    for writer in ("gather", "parallel"):
+        output = {"writer": writer, "window": [2, 20], "every": 2, "stride": 3}
+        simulate(small_case(contacts=sites, output=output, time={"end": 0.04}), folder / writer)
+    gathered, together = (datasets(folder / name / "run.h5") for name in ("gather", "parallel"))
+    assert len(gathered["impacts/onset"]) > 20
+    assert (gathered["energy/dissipated_by_site"][-1] > 0).sum() > 2
+    assert_same_bits(gathered, together)
+
+
+@pytest.mark.parallel([2, 3])
+def test_rows_are_sorted_over_ranks_and_none_has_all():
+    """Ranks begin with different numbers of rows, a third with none; of equal onset the lower site comes first."""
+    random = np.random.default_rng(3)
+    table = np.zeros(900, [("onset", float), ("site", np.int64)])
+    table["onset"], table["site"] = random.integers(300, size=900) / 7, random.permutation(900)
+    rows, first, total = spread(COMM, table[[slice(700), slice(700, 900), slice(0)][COMM.rank]], ("onset", "site"))
+    expected = np.sort(table, order=("onset", "site"))
+    assert total == len(expected)
+    assert 0 < len(rows) < 1.1 * total / COMM.size + 10
+    np.testing.assert_array_equal(rows, expected[first : first + len(rows)])
+
+
+@pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("writer", ["gather", "parallel"])
 def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch, writer):
     path = folder / "run"
@@ -65,8 +92,8 @@ def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypa
             raise OSError(28, "No space left on device")
         put_chunks(*arguments)
 
-    put_chunks = store.put_chunks
-    monkeypatch.setattr(store, "put_chunks", fails)
+    put_chunks = chunks.put_chunks
+    monkeypatch.setattr(chunks, "put_chunks", fails)
     with pytest.raises(OSError, match=r"run\.h5 could not be written"):
         simulate(case, path, force=True)
     COMM.Barrier()

@@ -8,9 +8,10 @@ import xarray as xr
 
 from vipetsc import spectra
 from vipetsc.case import Case
+from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
-from vipetsc.studies import analysis
+from vipetsc.studies import velocity as velocities
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.members import leading_cell
 
@@ -30,22 +31,50 @@ def test_entropy_is_that_of_the_host_from_the_arrival_on(run):
     model = Case.of(run).model()
     host = np.ascontiguousarray(run["velocity"].values[..., model.chain.cell.host])
     measured = analyse(run, ("entropy",), arrival=0.0399)
-    expected = spectra.entropy(host, 200)
+    expected = spectra.entropy(host, 200, 2, 2)
     assert measured.attrs["entropy/start"] == pytest.approx(0.04)
     assert measured["entropy/energy_weighted"].item() == expected.energy_weighted
     assert np.array_equal(measured["entropy/history"].values, expected.snapshot)
     estimate = 0.5 * model.drive.duration + 6 / model.speed  # without a linear run: to the leading site, cell 9
     start = analyse(run, ("entropy",)).attrs["entropy/start"]
-    assert estimate < start < estimate + 2e-4
+    assert estimate < start < estimate + 4e-4
 
 
-def test_a_field_that_is_read_mass_by_mass_gives_the_same(run, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kept, limit", [(600, 20_000), (7, 60_000)])
+def test_little_memory_gives_the_same(run, tmp_path, monkeypatch, kept, limit):
+    """Of the field, 307 KB, no more than the limit is read at once; a row of a map of 7 takes 45 KB."""
     write_netcdf(tmp_path / "run.h5", run)
-    whole = analyse(run)
+    little, read = limit / 2**30, []
+
+    def slice_of(field, index):
+        read.append(np.asarray(field._field[index].values))
+        return read[-1]
+
+    monkeypatch.setattr(velocities._StoredField, "__getitem__", slice_of)
+    whole = analyse(run, options=AnalysisTable(pixels=kept, snapshot_stride=20))
     assert {"dispersion_before", "partition/energy", "bands/energy", "entropy/local"} <= set(whole.variables)
-    monkeypatch.setattr(analysis, "IN_MEMORY", 0)
+    assert max(whole["kinetic_energy"].shape) <= kept and len(whole["bands/sample"]) == 400
     with open_run(tmp_path / "run.h5") as stored:
-        xr.testing.assert_identical(analyse(stored), whole)
+        blocks = analyse(stored, options=AnalysisTable(pixels=kept, snapshot_stride=20, memory=little))
+    xr.testing.assert_allclose(blocks, whole, rtol=1e-6)
+    assert blocks.attrs == whole.attrs and read and max(v.nbytes for v in read if v.ndim == 3) <= limit
+
+
+def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
+    fine, coarse = (analyse(run, options=AnalysisTable(pixels=pixels)) for pixels in (600, 8))
+    expected = fine["kinetic_energy"].values.reshape(8, 50, 8, 3).mean(axis=(1, 3))
+    assert coarse["kinetic_energy"].values == pytest.approx(expected, rel=1e-5)
+    assert coarse["time"].values == pytest.approx(fine["time"].values.reshape(8, 50).mean(axis=1))
+    assert coarse["cell"].values.tolist() == list(range(2, 25, 3))
+    totals = [data["wavenumber_content"].values.sum(axis=1).mean() for data in (fine, coarse)]
+    totals += [data["bands/total"].values.mean() for data in (fine, coarse)]
+    assert totals == pytest.approx([totals[0]] * 4, rel=1e-5)
+    for name in ("dispersion", "dispersion_before"):
+        assert coarse[name].shape == (7, 14) and coarse[name].sum().item() == pytest.approx(
+            fine[name].sum().item(), rel=1e-5
+        )
+    bands = [data["bands/kinetic_energy"].values.mean(axis=(1, 2)) for data in (fine, coarse)]
+    assert bands[0] == pytest.approx(bands[1], rel=1e-5) and fine["bands/kinetic_energy"].dtype == np.float32
 
 
 def test_cells_before_and_after_the_first_site_are_told_apart(run):
@@ -94,4 +123,4 @@ def test_on_a_ring_the_first_site_is_the_nearest_either_way(run):
     assert "dispersion_before, dispersion_after: on a ring the wave goes both ways" in joined.attrs["left_out"]
     model = ring.model()
     estimate = 0.5 * model.drive.duration + 5 / model.speed
-    assert estimate <= joined.attrs["entropy/start"] < estimate + 2e-4
+    assert estimate <= joined.attrs["entropy/start"] < estimate + 4e-4

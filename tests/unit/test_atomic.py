@@ -81,14 +81,6 @@ def test_what_cannot_be_read_is_named(tmp_path, name, read, content):
         read(tmp_path / name)
 
 
-def test_an_index_that_cannot_be_read_is_named(tmp_path):
-    data = {"status": variable((), 0, "1", "status")}
-    write_netcdf(tmp_path / "ensemble.h5", xr.Dataset(data, attrs={"case": "[sweep]\nzip = []"}))
-    (tmp_path / "index.json").write_text("{")
-    with pytest.raises(OSError, match=r"index\.json cannot be read"):
-        open_ensemble(tmp_path)
-
-
 def test_a_file_cut_in_the_middle_is_named(tmp_path):
     for name in ("a.npy", "a.h5"):
         WRITERS[name](tmp_path / name)

@@ -11,6 +11,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.conftest import put_members
 from vipetsc.case import Case, Sweep
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.paper.claims import criteria as constants
@@ -20,7 +21,7 @@ from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvide
 from vipetsc.paper.claims.measure import READINGS, measure_claim, rounded
 from vipetsc.paper.claims.scattering import BRANCHES
 from vipetsc.spectra import FEWEST, Parts, dispersion, part_energies, power_law
-from vipetsc.studies.ensemble import COMPLETE, Outcome, assemble
+from vipetsc.studies.linear import MEASURES
 
 IDS = [f"C{i}" for i in range(1, 18)]
 SITES = [1, 2, 3, 5, 10, 20]
@@ -41,22 +42,21 @@ def curve_of(amplitude, value):
 def put_sweep(folder, table, content, episodes, work=lambda case: case.drive.amplitude**2):
     """A finished sweep in ``folder``: ``content(case)`` is each member's analysis, ``episodes(case)`` its contacts."""
     plan = Sweep.from_table(table)
-    members = plan.members()
-    outcomes = []
-    for member in members:
-        home = folder / member.id
+
+    def told(number, case):
+        home, row = folder / plan.ids()[number], content(case)
         home.mkdir(parents=True, exist_ok=True)
-        (home / "case.toml").write_text(member.case.to_toml())
         with h5py.File(home / "analysis.h5", "w") as file:
-            for name, value in content(member.case).items():
+            file.attrs["case"] = case.to_toml()
+            for name, value in row.items():
                 file[name] = value
                 if name == "bands/energy":
-                    file[name].attrs["parts"] = list(Parts.of(pass_bands(member.case.lattice.unit_cell())).names)
-        statistics = {"episodes": episodes(member.case), "work": work(member.case), "dissipated": 0.0}
-        outcomes.append(Outcome(COMPLETE, "", statistics | {"ledger_error": 0.0}))
-    index = {"members": [{"id": m.id} for m in members]}
-    (folder / "index.json").write_text(json.dumps(index))
-    assemble(plan, members, outcomes, folder)
+                    file[name].attrs["parts"] = list(Parts.of(pass_bands(case.lattice.unit_cell())).names)
+        statistics = {"episodes": episodes(case), "work": work(case), "dissipated": 0.0, "ledger_error": 0.0}
+        measures = {name: np.asarray(value).tolist() for name, value in row.items() if name in MEASURES}
+        return {"statistics": statistics | {"engine": "ts"}, "measures": measures}
+
+    put_members(folder, plan, told)
     return folder
 
 
@@ -641,7 +641,7 @@ def put_bands(root, velocity, change, laws=LAWS):
         spectrum = dispersion(v, masses, time[1]).folded()
         changed = change if case.contacts.law in laws else as_it_is
         return {
-            "time": time,
+            "bands/sample": time,
             "frequency": spectrum.frequency,
             "dispersion": spectrum.energy,
             "bands/edges": parts.edges,
@@ -832,7 +832,8 @@ def put_portraits(root, second):
     }
     folder = root / "interband-one-site"
     put_sweep(folder, table, lambda case: {"ibtet": 0.1}, lambda case: int(case.drive.amplitude > 2))
-    for member in Sweep.from_table(table).members():
+    plan = Sweep.from_table(table)
+    for name, member in zip(plan.ids(), plan.members(), strict=True):
         time = np.arange(4000) * 2e-4
         level = member.case.drive.amplitude
         wave, rough = np.sin(member.case.drive.frequency * time), np.sin(2700.0 * time)
@@ -842,7 +843,7 @@ def put_portraits(root, second):
             velocity[:, 3, 1] = velocity[:, 3, 2] = wave
         else:
             velocity[:, 3, 1], velocity[:, 3, 2] = wave, -like * wave + (1 - like) * rough
-        with h5py.File(folder / member.id / "run.h5", "w") as file:
+        with h5py.File(folder / name / "run.h5", "w") as file:
             file["time"], file["cell"], file["velocity"] = time, np.arange(1, 13), velocity
             file["sites/cell"], file["energy/work"] = [4], time
             file.attrs["case"] = member.case.to_toml()

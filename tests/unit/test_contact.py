@@ -20,7 +20,7 @@ from vipetsc.contact.law import (
     elastic_force,
     elastic_force_and_slope,
 )
-from vipetsc.contact.tracker import TRACKED, ImpactTracker
+from vipetsc.contact.tracker import TRACKED, ImpactTracker, impact_time
 from vipetsc.lattice import Contact
 
 KC, D, R = 3e5, 2e-4, 0.7
@@ -173,7 +173,7 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     assert tracker.switch(0.2, np.array([0.0, 0.25])) == 1
     assert (site["mode"], site["approach"]) == (-CLOSED, -0.05)
     assert tracker.counts[1].tolist() == (1, 1, 0, 0)
-    assert tracker.contact_time() == tracker.duration(0.05)
+    assert tracker.contact_time() == impact_time(tracker.tracks.time, 0.05)
 
     tracker.end[1] = -1.5 * D, 0.0, 0.0
     tracker.accept_step(1e-3)
@@ -181,11 +181,11 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
     tracker.end[1] = -D, 0.2, 0.0  # g = 1 + .45 (-.2/.05) < 0: the contact pulls
     tracker.accept_step(1e-3)
     (episode,) = tracker.take_episodes(np.array([0.0, 0.5]), unfinished=True)
-    assert (episode.site, episode.side, episode.onset, episode.approach_velocity) == (9, -1, 0.2, -0.01)
-    assert episode.loss == 0.25
-    assert np.isnan(episode.separation)
-    assert episode.indentation == pytest.approx(0.5 * D, rel=0.05)
-    assert episode.force > KC * (0.5 * D) ** 1.5
+    assert episode[["site", "side", "onset", "approach_velocity"]].item() == (9, -1, 0.2, -0.01)
+    assert episode["loss"] == 0.25
+    assert np.isnan(episode["separation"])
+    assert episode["indentation"] == pytest.approx(0.5 * D, rel=0.05)
+    assert episode["force"] > KC * (0.5 * D) ** 1.5
     assert tracker.counts["pulled"].tolist() == [0, 1]
 
     resumed = ImpactTracker(create_contacts(contact, [D, D]), (4, 9), 0.003)
@@ -196,12 +196,9 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
         each.start[1] = -D, 0.2, 0.0
         assert each.switch(0.3, np.array([0.0, 0.75])) == 1
         (closed,) = each.take_episodes(np.zeros(2))
-        assert (closed.separation, closed.loss, closed.indentation) == (0.3, 0.5, episode.indentation)
-        assert (each.take_episodes(np.zeros(2)), each.open, each.contacts.sites["mode"].tolist()) == (
-            [],
-            {},
-            [FREE, FREE],
-        )
+        assert closed[["separation", "loss", "indentation"]].item() == (0.3, 0.5, episode["indentation"])
+        assert each.take_episodes(np.zeros(2), unfinished=True).size == 0
+        assert each.contacts.sites["mode"].tolist() == [FREE, FREE]
         assert each.counts.tolist() == tracker.counts.tolist()
     assert tracker.contact_time() == np.inf
 
@@ -219,7 +216,21 @@ def test_the_contact_time_is_that_of_a_simulated_impact(law):
         lambda t, z: [z[1], -contact_force(contacts, 0, D + z[0], z[1])[0] / mass],
         (0, 1), [0.0, speed], rtol=1e-10, atol=1e-13, events=rate,
     )  # fmt: skip
-    assert 2 * to_rest.t[-1] == pytest.approx(ImpactTracker(contacts, (0,), mass).duration(speed), rel=1e-6)
+    assert 2 * to_rest.t[-1] == pytest.approx(
+        impact_time(ImpactTracker(contacts, (0,), mass).tracks.time, speed), rel=1e-6
+    )
+
+
+def test_the_log_takes_any_number_of_episodes():
+    tracker = ImpactTracker(create_contacts(Contact("hertz", KC), [D, D]), (7, 3), 0.003)
+    for k in range(9):
+        for rate in (0.1, -0.1):
+            tracker.start[:] = D, rate, 0.0
+            assert tracker.switch(k + (rate < 0) / 2, np.zeros(2)) == 2
+    log = tracker.take_episodes(np.zeros(2))
+    assert log["site"].tolist() == [7, 3] * 9
+    assert log["onset"].tolist() == [k // 2 for k in range(18)]
+    assert (log["separation"] - log["onset"] == 0.5).all()
 
 
 def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 import pytest
 
 from tests.conftest import small_case
 from vipetsc.contact.law import CLOSED
-from vipetsc.dynamics.energies import EnergyMeter
+from vipetsc.dynamics.energies import Energies, EnergyMeter, measure
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
+from vipetsc.dynamics.ts.sums import register_sums
 
 CELLS, DRIVEN, SITES = 7, 3, (3, 7)
 
@@ -34,6 +36,14 @@ def stiffness_matrix(chain):
             stretch[inside] = [1, -1][: len(inside)]
             k += s.stiffness * np.outer(stretch, stretch)
     return k
+
+
+def energies_of(model, layout: Layout, state) -> Energies:
+    """Energies of one state."""
+    meter = EnergyMeter(model, layout)
+    with state.localForm() as local:
+        work = local.array[meter.lattice.shape.work]
+        return meter.total(measure(local.array, meter.lattice, meter.unit)[None], np.array([work]))
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
@@ -82,18 +92,39 @@ def test_rates_motion_and_energies_are_those_of_the_equations(ends, native):
     rows = [x[SITES[i] - 1, resonator] - x[SITES[i] - 1, host] for i in range(2) for x in (u, v, acceleration)]
     np.testing.assert_allclose(motion.ravel(), rows, rtol=1e-12)
 
-    energies = EnergyMeter(model, layout).measure(engine.state)
+    energies = energies_of(model, layout, engine.state)
     assert energies.kinetic == pytest.approx(0.5 * np.sum(masses * v**2), rel=1e-12)
     assert energies.spring == pytest.approx(0.5 * u.ravel() @ springs @ u.ravel(), rel=1e-12)
     assert energies.contact == pytest.approx(float(model.contact.potential(3e-5, 1e-5)), rel=1e-10)
-    assert (energies.work, energies.dissipated) == (work, lost.sum())
+    assert (energies.work[0], energies.dissipated[0]) == (work, lost.sum())
     engine.destroy()
 
 
 def test_energies_below_the_unit_of_the_sums_add_up():
     model = small_case().model()
     layout = Layout(model, MPI.COMM_SELF)
-    meter, state = EnergyMeter(model, layout), layout.create_vector()
+    unit, state = EnergyMeter(model, layout).unit, layout.create_vector()
     first = layout.dofs * layout.owned
-    state.array[first : first + layout.owned] = np.sqrt(2 * 0.4 * meter.unit / model.chain.cell.masses[0])
-    assert meter.measure(state).kinetic == pytest.approx(0.4 * meter.unit * layout.owned, rel=1e-10)
+    state.array[first : first + layout.owned] = np.sqrt(2 * 0.4 * unit / model.chain.cell.masses[0])
+    assert energies_of(model, layout, state).kinetic == pytest.approx(0.4 * unit * layout.owned, rel=1e-10)
+
+
+@pytest.mark.parametrize("size", [1, 31, 77, 640])
+@pytest.mark.parametrize("count", [1, 4, 7, 13])
+def test_stages_are_added_as_petsc_adds_them(size, count):
+    rng = np.random.default_rng(size + count)
+    plain = PETSc.Vec().createMPI(size, comm=MPI.COMM_SELF)
+    ours = plain.duplicate()
+    register_sums(ours)
+    ours, first = ours.duplicate(), ours  # TSRK's vectors are duplicates
+    stages = [ours.duplicate() for _ in range(count)]
+    for vector in stages:
+        vector.array[:] = rng.normal(size=size)
+    factors = rng.normal(size=count) * (np.arange(count) % 3 != 1)
+    plain.array[:] = ours.array[:] = rng.normal(size=size)
+    before = ours.array.copy()
+    plain.maxpy(factors, stages)
+    ours.maxpy(factors, stages)
+    assert ours.array.tobytes() == plain.array.tobytes() != before.tobytes()
+    for vector in (plain, ours, first, *stages):
+        vector.destroy()

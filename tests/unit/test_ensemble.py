@@ -2,30 +2,19 @@
 
 import json
 
-from mpi4py import MPI
-
-import h5py
 import numpy as np
 import pytest
 import xarray as xr
 
 import vipetsc
-from vipetsc.case import Case, Sweep, case_id
-from vipetsc.io.netcdf import write_netcdf
+from tests.conftest import put_members
+from vipetsc.case import Case, Sweep
 from vipetsc.io.read import curves, open_ensemble, select
+from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
-from vipetsc.parallel import StopRequest
 from vipetsc.studies.engines import agreement, sampled
-from vipetsc.studies.ensemble import MISSING, fit_curve
-from vipetsc.studies.members import (
-    MemberStore,
-    arrival_at,
-    leading_cell,
-    linear_folder,
-    linear_wave,
-    reached,
-    read_wave,
-)
+from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, fit_curve
+from vipetsc.studies.linear import LinearRun, leading_cell, linear_name, read_linear
 from vipetsc.studies.sweep import conclude
 
 SWEEP = {
@@ -46,40 +35,33 @@ def measure(case):
     return case.drive.amplitude + 100 * sites + 1000 * case.drive.cycles + 1e5 * (case.contacts.law == "hertz")
 
 
-def put_sweep(folder, plan, failing, changed=lambda case: 0.0):
+def put_sweep(folder, plan, failing=(), changed=lambda case: 0.0):
     """A finished sweep whose members were not simulated, but have what an ensemble is made of."""
-    store, members = MemberStore(folder, plan.options, MPI.COMM_SELF, StopRequest()), plan.members()
-    for number, member in enumerate(members):
-        path = folder / member.id
-        path.mkdir(parents=True)
-        (path / "case.toml").write_text(member.case.to_toml())
-        statistics = {"episodes": number, "work": 2.0, "dissipated": 0.5, "ledger_error": 0.0}
-        summary = {"complete": True, "status": "complete", "statistics": statistics}
-        (path / "summary.json").write_text(json.dumps(summary | {"measures": ["transfer"], "fields": False}))
-        h5py.File(path / "run.h5", "w").close()
-        with h5py.File(path / "analysis.h5", "w") as file:
-            file["ibtet"] = measure(member.case) + changed(member.case)
-    outcomes, _ = conclude(plan, members, store, failing)
-    assert all(outcome.status != MISSING for outcome in outcomes)
+
+    def told(number, case):
+        statistics = {"episodes": number, "work": 2.0, "dissipated": 0.5, "ledger_error": 0.0, "engine": "ts"}
+        row = {"statistics": statistics, "measures": {"ibtet": measure(case) + changed(case)}}
+        return "ArithmeticError: overflow" if number in failing else row
+
+    put_members(folder, plan, told)
     return folder
 
 
 @pytest.fixture
 def folder(tmp_path):
     """A sweep of which one member failed."""
-    plan = Sweep.from_table(SWEEP)
-    return put_sweep(tmp_path / "all", plan, {plan.members()[5].id: "ArithmeticError: overflow"})
+    return put_sweep(tmp_path / "all", Sweep.from_table(SWEEP), failing=[5])
 
 
 def test_a_sample_is_compared_member_by_member(folder, tmp_path):
-    sample = sampled(Sweep.from_table(SWEEP), 0.5, 1)
-    assert len(sample.members()) == 12
+    sample = sampled(Sweep.from_table(SWEEP), 6, 1)
+    assert len(sample.members()) == 6
     louder = sample.members()[3].case
 
     def changed(case):
         return 2e-3 if case == louder else 5e-4
 
-    rows = agreement(folder, put_sweep(tmp_path / "sample", sample, {}, changed))
+    rows = agreement(folder, put_sweep(tmp_path / "sample", sample, changed=changed))
     assert [row["amplitude"] for row in rows] == sorted(member.case.drive.amplitude for member in sample.members())
     assert [row["amplitude"] for row in rows if not row["agrees"]] == [louder.drive.amplitude]
     for row in rows:
@@ -92,11 +74,12 @@ def test_every_member_stands_at_the_values_of_its_keys(folder):
     ensemble = open_ensemble(folder)
     assert ensemble["ibtet"].dims == ("law", "sites", "amplitude")
     assert dict(ensemble["cycles"].sizes) == {"sites": 3}
-    for member in Sweep.from_table(SWEEP).members():
-        case, number = member.case, int(np.ravel_multi_index(member.index, ensemble["ibtet"].shape))
+    sweep = Sweep.from_table(SWEEP)
+    for number, (name, member) in enumerate(zip(sweep.ids(), sweep.members(), strict=True)):
+        case = member.case
         keys = {"law": case.contacts.law, "sites": json.dumps(case.contacts.sites), "cycles": case.drive.cycles}
         one = select(ensemble, **keys, amplitude=case.drive.amplitude)
-        assert str(one["member"].item()) == member.id == case_id(case)
+        assert one["member"].item() == name and one["number"].item() == number
         assert one["contact_episodes"].item() == number or number == 5
         if number == 5:
             assert one["status"].item() == 2 and np.isnan(one["ibtet"].item())
@@ -104,8 +87,9 @@ def test_every_member_stands_at_the_values_of_its_keys(folder):
             assert one["status"].item() == 0 and one["ibtet"].item() == measure(case)
             assert one["dissipated_fraction"].item() == 0.25
     assert json.loads(ensemble.attrs["failed"]) == ["(0, 1, 1): ArithmeticError: overflow"]
-    for curve, path in curves(ensemble):
-        case = Case.load(path / "case.toml")
+    assert (json.loads(ensemble.attrs["rtol"]), json.loads(ensemble.attrs["engine"])) == ([1e-10], ["ts"])
+    for curve, first in curves(ensemble):
+        case = sweep.case(first)
         assert (case.contacts.law, case.drive.cycles) == (curve["law"].item(), curve["cycles"].item())
 
 
@@ -132,22 +116,56 @@ def test_a_linear_wave_arrives_with_its_host():
     displacement[..., cell.resonator], displacement[..., cell.host] = 3e-3, -1e-3
     dims = "time", "cell", "dof"
     data = {"time": time, "displacement": (dims, displacement), "velocity": (dims, velocity)}
-    wave = linear_wave(xr.Dataset(data, attrs={"case": case.to_toml()}))
-    assert wave["arrival"].values == pytest.approx(peak, abs=0.0026)
-    assert leading_cell(case) == 7 and arrival_at(wave, case) == wave["arrival"][6]
+    data["energy/work"] = "time", time
+    wave = LinearRun.of(xr.Dataset(data, attrs={"case": case.to_toml()}), {"work": 0.0}, (), ())
+    assert wave.arrival == pytest.approx(peak, abs=0.0026) and wave.statistics == {"work": 1.0}
+    assert leading_cell(case) == 7 and wave.arrival_at(7) == wave.arrival[6] and wave.arrival_at(0) is None
     rate = np.abs(velocity[..., cell.resonator] - velocity[..., cell.host]).max(axis=0)
-    assert wave["envelope"].values == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
-    expected = case.drive.amplitude * wave["envelope"].values[[19, 6, 2]] / np.asarray(case.contacts.clearance)
-    assert reached(wave, case) == pytest.approx(expected)
+    assert wave.envelope == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
+    expected = case.drive.amplitude * wave.envelope[[19, 6, 2]] / np.asarray(case.contacts.clearance)
+    assert wave.reached(case) == pytest.approx(expected)
 
 
-def test_a_linear_wave_of_another_version_is_made_again(tmp_path, monkeypatch):
-    case = Case.load()
-    assert read_wave(tmp_path, case) is None
-    folder = linear_folder(tmp_path, case)
-    folder.mkdir(parents=True)
-    values = {"cell": [1, 2], "envelope": ("cell", [1.0, 2.0]), "arrival": ("cell", [0.1, 0.2])}
-    write_netcdf(folder / "wave.h5", xr.Dataset(values, attrs={"vipetsc_version": vipetsc.__version__}))
-    assert read_wave(tmp_path, case, current=True)["arrival"].values.tolist() == [0.1, 0.2]
+def test_records_of_another_version_are_made_again(folder, monkeypatch):
+    sweep, case = Sweep.from_table(SWEEP), Case.load()
+    run = LinearRun(np.array([1.0, 2.0]), np.array([0.1, 0.2]), {"work": 3.0}, {7: {"ibtet": 0.1}})
+    file = RecordFile(folder / "members-1.jsonl")
+    file.append(run.record(linear_name(case)))
+    assert read_linear(folder, sweep.case(0)) is None
+    again = read_linear(folder, case)
+    assert again.record("") == run.record("") and again.arrival_at(2) == 0.2
+    assert not (Results(sweep, folder).status == MISSING).any()
     monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
-    assert read_wave(tmp_path, case) is not None and read_wave(tmp_path, case, current=True) is None
+    older = Results(sweep, folder)
+    assert (older.status == MISSING).all() and not older.linear
+
+
+def test_the_latest_record_counts_but_no_failure_after_a_success(folder):
+    sweep = Sweep.from_table(SWEEP)
+    put_members(folder, sweep, lambda number, case: "later", file=1)
+    results = Results(sweep, folder)
+    assert (results.status == FAILED).sum() == 1 and results.reasons == {5: "later"}
+    results.merge_files()
+    assert [path.name for path in folder.glob("*.jsonl")] == ["members.jsonl"]
+    text = (folder / "members.jsonl").read_bytes()
+    assert text.count(b"\n") == len(sweep.ids()) and Results(sweep, folder).reasons == {5: "later"}
+
+
+def test_a_scaled_member_has_the_measures_of_its_linear_run(tmp_path):
+    """Of its first site; equal members are one; without the linear run's record it is missing."""
+    table = SWEEP | {"sweep": {"drive": {"amplitude": [1.0, 2.0, 1.0]}}}
+    sweep = Sweep.from_table(table)
+    run = LinearRun(np.zeros(40), np.zeros(40), {}, {9: {"ibtet": 0.1}, 5: {"ibtet": 0.2, "entropy/history": [1.0]}})
+    run.measures[5]["entropy/snapshot"] = [0.0]
+    file, statistics = RecordFile(tmp_path / "members-0.jsonl"), {"episodes": 0, "dissipated": 0.0, "engine": "ts"}
+    for name, site, work in zip(sweep.ids()[:2], (5, 9), (1.0, 4.0), strict=True):
+        about = {"id": name, "vipetsc_version": vipetsc.__version__, "status": "scaled", "warnings": ["seen"]}
+        known = {"statistics": statistics | {"work": work, "ledger_error": 0.0}, "cpu_seconds": 0.0, "rtol": 1e-9}
+        file.append(about | known | {"linear": "wave", "site": site})
+    assert (Results(sweep, tmp_path).status == MISSING).all()
+    file.append(run.record("wave"))
+    _, warnings = conclude(Results(sweep, tmp_path))
+    ensemble = open_ensemble(tmp_path)
+    assert warnings == ["3 members: seen"] and ensemble["status"].values.tolist() == [SCALED] * 3
+    assert ensemble["work"].values.tolist() == [1, 4, 1] and ensemble["ibtet"].values.tolist() == [0.2, 0.1, 0.2]
+    assert np.isnan(ensemble["entropy/history"].values[1]).all()

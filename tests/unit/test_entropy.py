@@ -69,6 +69,29 @@ def test_it_is_the_entropy_of_the_transform():
     assert np.abs(local - bits(power)).max() < 1e-11
 
 
+@pytest.mark.parametrize("stride", [2, 3])
+def test_fewer_cells_have_the_entropy_they_had(stride):
+    """Nothing is lost by the folding; only the padded line may be a little longer."""
+    signal = run(3)
+    (all_local, all_weight), (local, weight) = local_entropy(signal), local_entropy(signal, stride)
+    loud = all_weight[:, ::stride] > 1e-4 * all_weight.max()
+    assert np.abs(local - all_local[:, ::stride])[loud].max() < 1e-6
+    assert weight == pytest.approx(all_weight[:, ::stride], rel=1e-6, abs=1e-9 * all_weight.max())
+    every, few = entropy(signal), entropy(signal, stride=stride)
+    for name in ("energy_weighted", "masked", "joint"):
+        assert getattr(few, name) == pytest.approx(getattr(every, name), rel=1e-3)
+
+
+def test_the_mask_is_relative_to_the_largest_weight_between_the_snapshots_too():
+    signal = run()
+    signal[5] *= 4
+    weight = local_entropy(signal)[1]
+    local, few = (array[::2] for array in local_entropy(signal))
+    above_threshold = few > 0.01 * weight.max()
+    assert entropy(signal, every=2).masked == pytest.approx(local[above_threshold].mean(), rel=1e-12)
+    assert entropy(signal[::2]).masked != pytest.approx(local[above_threshold].mean(), rel=1e-3)
+
+
 def test_one_long_transform_gives_the_same_packet():
     """The padding of every octave is enough: one long transform for all nodes changes nothing."""
     signal = packet(300.0)

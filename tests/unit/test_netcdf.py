@@ -72,6 +72,13 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_fields_stay_in_the_file_until_they_are_used(tmp_path):
+    write_netcdf(tmp_path / "a.h5", measured())
+    with open_netcdf(tmp_path / "a.h5", "run") as data:
+        variables = data.drop_vars(list(data.indexes)).variables.values()
+        assert variables and not any(variable._in_memory for variable in variables)
+
+
 def test_files_of_another_kind_are_refused(tmp_path):
     with pytest.raises(OSError, match="missing"):
         open_netcdf(tmp_path / "missing.h5", "run")

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib import rcParams
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vipetsc.case import Case
 from vipetsc.figures.lattice import lattice_page, reduced_model
-from vipetsc.figures.style import NOTE, draw_each, new_figure, rc_style, save
+from vipetsc.figures.style import NOTE, SCREEN, draw_each, new_figure, rc_style, save
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.figures import PAPER_FIGURES, describe
 from vipetsc.paper.report import numbers, sources
@@ -71,11 +71,24 @@ def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
         figure = new_figure(2, 1)
         figure.subplots().plot([0, 1])
         plain, noted = (imread(save(figure, tmp_path / f"{note or 'plain'}.png", note)) for note in ("", "coarse"))
-        strip = round(NOTE * rcParams["savefig.dpi"])
+        strip = round(NOTE * SCREEN)
     assert noted.shape[0] == pytest.approx(plain.shape[0] + strip, abs=1)
     assert noted.shape[1] == plain.shape[1]
     assert np.ptp(noted[-strip:, :, :3]) > 0.2
     assert np.abs(noted[: plain.shape[0]] - plain).mean() < 0.01
+
+
+def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: made.append(figure))
+    with rc_style():
+        figure = new_figure(2, 1)
+        figure.subplots().loglog([1, 1e4])
+        for name in ("a.png", "a.pdf"):
+            save(figure, tmp_path / name)
+    assert made == [figure]
+    (axes,) = figure.axes
+    assert len(axes.yaxis.get_minorticklocs()) <= 2 * 6 + 2
 
 
 def test_every_claim_has_a_figure_that_shows_it():

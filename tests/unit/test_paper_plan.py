@@ -9,18 +9,18 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-import numpy as np
 import pytest
+from PIL import Image
 
 import vipetsc
 from tests.conftest import assert_same_bits, datasets
 from tests.faults.inject import Injector
-from vipetsc.case import Case, Sweep, case_id
+from vipetsc.case import Case, case_id
 from vipetsc.io.folder import SEARCH, FolderError, claimed
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.paper import make
-from vipetsc.paper.figures import TRANSFER
-from vipetsc.paper.make import read_record
+from vipetsc.paper import draw, make, steps
+from vipetsc.paper.figures import TRANSFER, PaperFigure
+from vipetsc.paper.made import read_made
 from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
 from vipetsc.parallel import StoppedError, StopRequest
 from vipetsc.studies.design import search_design
@@ -102,7 +102,8 @@ def test_another_case_is_another_input_and_a_stale_step(searched):
     with claimed(MPI.COMM_SELF, step.folder(root), SEARCH, step.text, force=True):
         pass  # killed before it was made anew: what was begun is gone on with
     assert step.state(root) == BEGUN
-    step.make(root, MPI.COMM_SELF, StopRequest(), False)
+    with step.claimed(root, MPI.COMM_SELF, StopRequest(), False) as claimed_step:
+        claimed_step.make(*step.parts)
     assert step.state(root) == DONE
 
 
@@ -120,11 +121,11 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
     old, other = root / "figures" / "figS3-old.png", root / "figures" / "figS30-other.png"
     old.touch()
     other.touch()
-    make._drop_stale(plan, root)
+    draw._drop_stale(plan, root, plan.inputs(root))
     assert not old.exists() and other.exists()
     old.touch()  # drawn from the inputs of now
-    record = make._drop_stale(plan, root)
-    assert old.exists() and record == read_record(root)
+    record = draw._drop_stale(plan, root, plan.inputs(root))
+    assert old.exists() and record == read_made(root)
 
 
 def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
@@ -160,9 +161,16 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
     injector = Injector()
     injector.arm("member", 1, "exception")
     result = make.make_paper(plan, root)
-    assert result.notes == ["failed: other: a fault at member"] and result.made == ("design",) and not result.complete
+    assert (
+        result.notes == ["failed: other: InjectedError: a fault at member"]
+        and result.made == ("design",)
+        and not result.complete
+    )
     whole = make.make_paper(plan, root)
     assert whole.made == ("other",) and whole.complete and not whole.drawn
+    assert (
+        set(read_made(root)["cpu"]["steps"]) == {"other", "design"} and "CPU time" in (root / "report.html").read_text()
+    )
     found, claims = datasets(root / "design" / "design.h5"), (root / "claims.json").read_bytes()
     picture = next((root / "figures").glob("*.png"))
     for path in (
@@ -182,10 +190,13 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
         make.make_paper(plan, root)
 
 
-def test_a_sample_has_one_member_of_every_curve_and_is_the_same_again():
+def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_same_again():
     steps = {step.name: step for step in paper_plan(FULL).steps}
-    sweeps = {name for name, step in steps.items() if step.kind is Sweep and not step.checks}
-    assert sweeps == {step.checks for step in steps.values() if step.checks}
+    assert {step.checks for step in steps.values() if step.checks} == {
+        "interband",
+        "scattering",
+        "scattering-neighbours",
+    }
 
     def curve(case: Case) -> str:
         return str((case.lattice.reading, case.contacts.law, case.contacts.sites, case.drive.cycles))
@@ -193,9 +204,54 @@ def test_a_sample_has_one_member_of_every_curve_and_is_the_same_again():
     for name in ("interband", "scattering-neighbours"):
         sweep, step = steps[name].case, steps[f"{name}-ts"]
         members, sample = ([member.case for member in case.members()] for case in (sweep, step.case))
-        assert set(map(curve, sample)) == set(map(curve, members))
-        assert len(sample) == max(len(set(map(curve, members))), int(np.ceil(0.02 * len(members))))
+        assert len(sample) == len(set(map(curve, sample))) == step.sample
+        amplitudes = sorted({case.drive.amplitude for case in members})
+        places = sorted(amplitudes.index(case.drive.amplitude) for case in sample)
+        assert [place * step.sample // len(amplitudes) for place in places] == list(range(step.sample))
         assert {case.time.engine for case in sample} == {"ts"}
         tables = (case.model_dump(by_alias=True, exclude_none=True) | {"name": name} for case in sample)
         assert {case_id(Case.from_table(t, ["time.engine=auto"])) for t in tables} <= set(map(case_id, members))
         assert step.text == replace(step).text
+
+
+def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_path, monkeypatch):
+    plan, root = replace(searched[0], measure=lambda root: []), tmp_path / "paper"
+    offered: list[str] = []
+    encoded: list[int] = []
+    ordered: list[str] = []
+    offers, quantize, draw_each = PaperFigure.offers, Image.Image.quantize, draw.draw_each
+
+    def drawn(drawings, *rest):
+        ordered.extend(stem for stem, _ in drawings)
+        return draw_each(drawings, *rest)
+
+    monkeypatch.setattr(PaperFigure, "offers", lambda figure, *rest: offered.append(figure.id) or offers(figure, *rest))
+    monkeypatch.setattr(
+        Image.Image, "quantize", lambda image, *a, **k: encoded.append(image) or quantize(image, *a, **k)
+    )
+    monkeypatch.setattr(draw, "draw_each", drawn)
+    made = make.make_paper(plan, root)
+    assert ordered[0] == "figS3-design-cost-maps" and len(ordered) == 6  # the dearest first
+    assert sorted(offered) == ["fig10", "figS3"] and len(encoded) == 6 and len(made.drawn) == 12
+    cpu = read_made(root)["cpu"]
+    assert min(cpu["steps"]["design"], cpu["figures"], cpu["report"]) > 0
+    offered.clear()
+    encoded.clear()
+    assert make.make_paper(plan, root).drawn == () and offered == [] and encoded == []
+    next((root / "figures").glob("fig10-*.png")).unlink()
+    assert len(make.make_paper(plan, root).drawn) == 2 and offered == ["fig10"] and encoded == []
+    (root / "report.html").unlink()
+    make.make_paper(plan, root)
+    assert len(encoded) == 6 and (root / "report.html").read_text(encoding="utf-8").count("data-of") == 6
+
+
+def test_parts_of_all_steps_are_shared_the_longest_first(tmp_path, monkeypatch):
+    shared: list[tuple[float, str, int]] = []
+    monkeypatch.setattr(steps.TaskPool, "share", lambda pool, jobs, *rest, **options: shared.extend(jobs) or {})
+    plan = paper_plan(FULL)
+    parted = [step.name for step in plan.steps if step.parts]
+    plan = replace(plan, steps=[step for step in plan.steps if step.parts], figures=[], measure=lambda root: [])
+    make.make_paper(plan, tmp_path)
+    assert [job[1:] for job in shared[:2]] == [("nnm-hertz", 1), ("nnm-bilinear", 1)]
+    assert {name for _, name, _ in shared} == set(parted) and len(shared) == 7
+    assert [cost for cost, *_ in shared] == sorted((cost for cost, *_ in shared), reverse=True)

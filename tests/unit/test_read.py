@@ -1,7 +1,5 @@
 """Results are read back by name and by value: the site that leads, the member that is meant, its folder."""
 
-import json
-
 import h5py
 import numpy as np
 import pytest
@@ -56,7 +54,7 @@ def run(tmp_path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A sweep over law, (sites, cycles) and amplitude; the first member of the second law is no valid case."""
+    """A sweep over law, (sites, cycles) and amplitude; the first member of the second law failed."""
     value = np.arange(12.0).reshape(2, 3, 2)
     dims = "law", "sites", "amplitude"
     data = {
@@ -65,13 +63,13 @@ def folder(tmp_path):
         "cycles": ("sites", [30, 15, 30], {"long_name": "drive.cycles"}),
         "amplitude": ("amplitude", AMPLITUDES),
         "status": (dims, np.zeros((2, 3, 2), np.int8)),
+        "member": (dims, np.array([f"m{i:02d}" for i in range(12)], dtype=object).reshape(2, 3, 2)),
+        "contact_episodes": (dims, np.where(value == 6, np.nan, value)),
         "ibtet": (dims, value),
         "entropy/masked": (dims, -value),
         "fits/ibtet/exponent": (dims[:2], value[..., 0]),
     }
     write_netcdf(tmp_path / "ensemble.h5", xr.Dataset(data, attrs={"case": ENSEMBLE}))
-    ids = ["" if i == 6 else f"m{i:02d}" for i in range(12)]
-    (tmp_path / "index.json").write_text(json.dumps({"members": [{"id": i} for i in ids]}))
     for name in ("m00", "m07"):
         (tmp_path / name).mkdir()
         for file in ("run.h5", "analysis.h5"):
@@ -99,6 +97,9 @@ def test_other_files_are_refused(tmp_path, folder):
         file["time"] = 1.0
     with pytest.raises(ValueError, match="is not a sweep's ensemble of vipetsc: it has no status, case"):
         open_ensemble(tmp_path)
+    (folder / "linear").mkdir()
+    with pytest.raises(ValueError, match="holds a sweep of an earlier version"):
+        open_ensemble(folder)
 
 
 def test_members_are_selected_by_the_values_of_swept_keys(folder):
@@ -121,7 +122,7 @@ def test_members_are_selected_by_the_values_of_swept_keys(folder):
 def test_members_lead_to_their_folders(folder):
     ensemble = open_ensemble(folder)
     found = list(curves(ensemble))
-    assert [path.name for _, path in found] == ["m00", "m02", "m04", "m07", "m08", "m10"]
+    assert [number for _, number in found] == [0, 2, 4, 7, 8, 10]
     assert [curve["ibtet"].values.tolist() for curve, _ in found] == np.arange(12).reshape(6, 2).tolist()
     assert not list(curves(ensemble, "wavenumber"))
     whole = [(float(member["ibtet"]), path) for member, path in whole_members(ensemble)]

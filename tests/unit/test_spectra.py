@@ -4,19 +4,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import fft
 from scipy.integrate import trapezoid
 
 from vipetsc.lattice import Band, bloch, diatomic, four_band, pass_bands
 from vipetsc.spectra import (
     Dispersion,
     Parts,
+    bands,
     dispersion,
     front_arrival,
     ibtet,
     kinetic_energy,
     part_energies,
+    part_maps,
     ridge,
-    split,
     taper,
     wavenumber_content,
 )
@@ -26,6 +28,16 @@ MASSES = (0.5, 2.0)
 
 def noise(shape, seed=0):
     return np.random.default_rng(seed).standard_normal(shape)
+
+
+def split(signal, interval, edges):
+    """The parts of ``signal`` (t, ...) between consecutive ``edges`` in rad/s, at every sample."""
+    nt = len(signal)
+    spectrum = fft.dct(signal, type=1, axis=0)
+    part = np.searchsorted(edges, np.pi * np.arange(nt) / ((nt - 1) * interval), side="right") - 1
+    for p in range(len(edges) - 1):
+        inside = np.where((part == p).reshape(-1, *[1] * (signal.ndim - 1)), spectrum, 0.0)
+        yield fft.idct(inside, type=1, axis=0)
 
 
 @pytest.mark.parametrize(("row", "direction"), [(5, 1), (5, -1), (12, 1)])
@@ -68,12 +80,8 @@ def test_energies_obey_parseval(nt, n, seed):
 def test_parts_are_a_partition(nt, n, seed, inner):
     edges = np.array([0.0, *sorted(inner), np.inf])
     signal = noise((nt, n), seed)
-    parts = list(split(signal, 0.1, edges))
-    assert np.allclose(sum(parts), signal, atol=1e-12)
-    weights = np.ones(nt)
-    weights[[0, -1]] = 0.5
-    energies = [np.sum(weights[:, None] * p**2) for p in parts]
-    assert sum(energies) == pytest.approx(np.sum(weights[:, None] * signal**2), rel=1e-12)
+    energy = part_energies(signal[..., None], [2.0], 0.1, edges).sum(axis=0)
+    assert trapezoid(energy) == pytest.approx(trapezoid(np.sum(signal**2, axis=1)), rel=1e-12)
 
 
 def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
@@ -81,10 +89,36 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
     energy = part_energies(velocity, MASSES, 0.1, edges)
     total = kinetic_energy(velocity, MASSES).sum(axis=1)
     assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
-    monkeypatch.setattr("vipetsc.spectra.bands.BLOCK", 64 * 3)
-    assert np.allclose(part_energies(velocity, MASSES, 0.1, edges), energy, rtol=1e-12)
+    for memory in (1.0, 2e4):
+        monkeypatch.setattr("vipetsc.spectra.bands.COLUMNS", 6)
+        assert np.allclose(part_energies(velocity, MASSES, 0.1, edges, memory=memory), energy, rtol=1e-12)
     (middle,) = split(velocity, 0.1, edges[1:3])
     assert np.allclose(kinetic_energy(middle, MASSES).sum(axis=1), energy[1], rtol=1e-12)
+    maps = part_maps(velocity, MASSES, 0.1, [edges[:2], edges[1:3]], (5, 3), 1.0)
+    assert maps.shape == (2, 13, 4)
+    assert np.allclose(maps[1, 2, 1], kinetic_energy(middle, MASSES)[10:15, 3:6].mean(), rtol=1e-6)
+
+
+@settings(max_examples=60)
+@given(st.integers(2, 300), st.floats(0, 1), st.floats(0, 1), st.integers(0, 99))
+def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, seed):
+    """As many as the width of the part needs, wherever it lies and whatever the length."""
+    low, high = sorted((10 * np.pi * one, 10 * np.pi * other))
+    velocity, edges = noise((nt, 3, 2), seed), [low, high]
+    energy = sum(kinetic_energy(part, MASSES).sum(axis=1) for part in split(velocity, 0.1, edges))
+    assert np.allclose(
+        part_energies(velocity, MASSES, 0.1, edges), [energy], rtol=0, atol=1e-12 * energy.max() + 1e-300
+    )
+
+
+def test_a_narrow_part_takes_few_times_and_a_wide_one_every_stride():
+    narrow = bands._fewest_steps(895 - 640, 2 * 640, 2 * 895, 4420, 1)
+    assert 3 * 255 <= narrow < 1100
+    assert bands._fewest_steps(3300, 2 * 1100, 2 * 4400, 4420, 1) == 4420
+    assert bands._fewest_steps(3300, 2 * 1100, 2 * 4400, 4420, 10) < 460
+    velocity, edges = noise((100, 3, 2)), [0.0, 20.0, np.inf]
+    every, some = (part_energies(velocity, MASSES, 0.1, edges, stride) for stride in (1, 10))
+    assert np.allclose(every[0], some[0], rtol=1e-12) and not np.allclose(every[1], some[1], rtol=0.1)
 
 
 def test_a_tone_stays_in_its_part():

@@ -14,7 +14,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.scattering import KC, LEAST_WEIGHT, bin_colours, shown_bins
-from vipetsc.figures.study import Wave, in_pi, series_of
+from vipetsc.figures.study import Files, Sweeps, Wave, in_pi, series_of
 from vipetsc.figures.style import GREY, rc_style
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
@@ -76,7 +76,7 @@ def only(name, study):
 
 def drawn(name, study):
     """Suffixes and figures of ``name`` that a study offers."""
-    return {suffix: make() for suffix, make in FIGURES[name].function(study)}
+    return {suffix: make() for suffix, make in FIGURES[name].function(Sweeps(study, Files()))}
 
 
 def maps(figure):
@@ -103,16 +103,16 @@ def test_every_figure_is_drawn_from_files(whole):
 
 def test_nothing_is_yielded_where_the_data_lack(whole, curves):
     for name in OF_FIELDS:
-        assert list(FIGURES[name].function([curves])) == []
-        assert list(FIGURES[name].function([])) == []
+        assert list(FIGURES[name].function(Sweeps([curves], Files()))) == []
+        assert list(FIGURES[name].function(Sweeps([], Files()))) == []
     for name in OF_CURVES:
-        assert list(FIGURES[name].function([whole])) == []
+        assert list(FIGURES[name].function(Sweeps([whole], Files()))) == []
 
 
 def test_suffixes_tell_figures_apart(curves):
-    names = [suffix for suffix, _ in FIGURES["entropy_history"].function([curves])]
+    names = [suffix for suffix, _ in FIGURES["entropy_history"].function(Sweeps([curves], Files()))]
     assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
-    named = [suffix for suffix, _ in FIGURES["entropy_history"].function([curves, curves])]
+    named = [suffix for suffix, _ in FIGURES["entropy_history"].function(Sweeps([curves, curves], Files()))]
     assert named[:4] == [f"curves-{name}" for name in names]
 
 
@@ -131,7 +131,7 @@ def test_amplitudes_share_scales_and_show_what_was_measured(whole):
             np.testing.assert_allclose(image.get_array(), expected, rtol=1e-12)
             largest = max(largest, expected.max())
         assert images[0].get_clim()[1] == pytest.approx(largest)
-    case = Case.load(members(whole)[0] / "case.toml")
+    case = Sweep.of(whole).case(0)
     cell = case.model().chain.cell
     for axes in panels[6:]:
         for branch in range(2):
@@ -152,7 +152,7 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
         np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
     for row in panels:
         assert len({axes.texts[0].get_text() for axes in row}) == 1
-    (series,) = [series.snapshot_times() for series in series_of([whole])]
+    (series,) = [series.snapshot_times() for series in series_of(Sweeps([whole], Files()))]
     assert np.all(np.diff(series) > 0)
     with open_run(members(whole)[2] / "run.h5") as run:
         site = np.min(run["sites/cell"].values)
@@ -197,7 +197,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
     for line, colour in zip(segments, bin_colours(12), strict=True):
         np.testing.assert_allclose(to_rgba(line.get_color()), colour)
         kappa, frequency = line.get_data()
-        expected = bloch(Case.load(members(whole)[0] / "case.toml").model().chain.cell, np.pi * kappa).frequency[:, 1]
+        expected = bloch(Sweep.of(whole).case(0).model().chain.cell, np.pi * kappa).frequency[:, 1]
         np.testing.assert_allclose(1e3 * frequency, expected)
     panels = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("(b.")]
     assert [bool(axes.collections) for axes in panels] == [True] * 3
@@ -269,7 +269,9 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
         else:
             assert not thick
             assert (
-                lower.texts[0].get_text().startswith(("no power law: too few points (", "no power law: adjusted R² -"))
+                lower.texts[0]
+                .get_text()
+                .startswith(("no power law:\ntoo few points (", "no power law:\nadjusted R² -"))
             )
         printed = select(curves, sites=sites, **fixed | {"reading": "printed"})[f"entropy/{average}"].values
         grey = [line for line in lower.lines if line.get_color() == GREY]

@@ -10,7 +10,9 @@ from scipy.integrate import trapezoid
 
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import runs, transfer_curves
+from vipetsc.figures.panels import block_means
 from vipetsc.figures.registry import FIGURES, draw
+from vipetsc.figures.study import Files, MeasuredRun, Sweeps
 from vipetsc.figures.style import rc_style
 from vipetsc.figures.transfer import closing_error
 from vipetsc.io.netcdf import open_netcdf
@@ -61,10 +63,15 @@ def whole(tmp_path_factory):
     return made(tmp_path_factory.mktemp("whole"), **table)
 
 
+def contact_motion(folder):
+    with MeasuredRun.open(folder) as member:
+        return transfer_curves.ContactMotion.of(member)
+
+
 def drawn(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     with rc_style():
-        sweeps = [open_ensemble(folder) for folder in folders]
+        sweeps = Sweeps(map(open_ensemble, folders), Files())
         found = {suffix: make() for suffix, make in FIGURES[name].function(sweeps)}
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
     return found
@@ -134,8 +141,8 @@ def test_backbone_is_aligned_exactly(reduced):
         assert "bilinear" in file.attrs["left_out"]
         (group,) = file.values()
         about = dict(group.attrs)
-    _, folder = next(curves(open_ensemble(reduced)))
-    start = initiation_of(reduced, Case.load(folder / "case.toml"))
+    _, number = next(curves(open_ensemble(reduced)))
+    start = initiation_of(reduced, Sweep.load(reduced / "case.toml").case(number))
     curve = select(open_ensemble(reduced), law="hertz")
     work, touched = curve["work"].values, curve["contact_episodes"] > 0
     np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)
@@ -156,7 +163,7 @@ def test_backbone_is_aligned_exactly(reduced):
 
 
 def test_backbone_of_another_sweep_is_passed_over(reduced, tmp_path):
-    for name in ("ensemble.h5", "backbone.h5", "index.json"):
+    for name in ("ensemble.h5", "backbone.h5"):
         (tmp_path / name).write_bytes((reduced / name).read_bytes())
     with h5py.File(tmp_path / "backbone.h5", "r+") as file:
         file.attrs["case"] = "another"
@@ -174,7 +181,7 @@ def test_whole_members_alone_make_no_curves(whole):
 
 
 def test_nothing_to_draw_from_nothing():
-    assert all(not dict(FIGURES[name].function([])) for name in NAMES)
+    assert all(not dict(FIGURES[name].function(Sweeps([], Files()))) for name in NAMES)
 
 
 def test_transfer_has_a_panel_a_band_and_both_segments(whole):
@@ -190,6 +197,11 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole):
     # One scale of colours for the whole and its parts.
     (norm,) = {id(a.images[0].norm) for a in all_axes(figure) if a.get_title(loc="left")[:3] in ("(a)", "(b)", "(e)")}
     assert norm
+    with h5py.File(member_folder(open_ensemble(whole).isel(law=0, amplitude=1)) / "analysis.h5") as file:
+        for band, tag in enumerate("bcde"):
+            shown = panel(figure, f"({tag})").images[0]
+            np.testing.assert_allclose(shown.get_array(), block_means(file["bands/kinetic_energy"][band].T), rtol=1e-6)
+        assert shown.get_extent()[1] == pytest.approx(file["bands/sample"][-1], rel=0.02)
 
 
 def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
@@ -246,7 +258,7 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     np.testing.assert_array_equal(points[:, 0], ensemble["amplitude"])
     np.testing.assert_array_equal(points[:, 1], ensemble["ibtet"].values.ravel())
     folder = member_folder(ensemble.isel(law=0, amplitude=1))
-    motion = transfer_curves.ContactMotion.read(folder)
+    motion = contact_motion(folder)
     with open_run(folder / "run.h5") as run:
         u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
         w, clearance = u[:, 2] - u[:, 1], run["sites/clearance"].values[0]
@@ -263,7 +275,7 @@ def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatc
     folder = member_folder(open_ensemble(whole).isel(law=0, amplitude=1))
     with open_run(folder / "run.h5") as run:
         u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
-    shown = transfer_curves.ContactMotion.read(folder).displacement
+    shown = contact_motion(folder).displacement
     assert np.abs(shown[:, 1] - shown[:, 0]).max() >= np.abs(u[:, 2] - u[:, 1]).max()
     assert len(shown) < 0.1 * len(u) * runs.REFINE
 
@@ -284,7 +296,7 @@ def test_files_are_named_by_figure_and_suffix(reduced, kind):
 def test_curves_of_a_sweep(reduced):
     ensemble = open_ensemble(reduced)
     found = list(curves(ensemble))
-    assert [Case.load(folder / "case.toml").contacts.law for _, folder in found] == ["hertz", "bilinear"]
+    assert [Sweep.of(ensemble).case(number).contacts.law for _, number in found] == ["hertz", "bilinear"]
     assert [curve["law"].item() for curve, _ in found] == ["hertz", "bilinear"]
     assert list(curves(ensemble, "wavenumber")) == []
     assert member_folder(ensemble.isel(law=0, amplitude=3)).parent == reduced

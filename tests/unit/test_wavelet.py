@@ -145,7 +145,7 @@ def test_analytic_parts_reconstruct_a_packet_within_one_percent():
 def test_partition_accounts_for_its_energies(normalisation):
     velocity, masses = noise((37, 80, 2)), np.array([0.01, 0.08])
     velocity[0] = 0
-    found = partition(velocity, masses, normalisation=normalisation, fields=True)
+    found = partition(velocity, masses, normalisation=normalisation, mean_over=1)
     assert found.field.shape == (12, 37, 80)
     assert np.allclose(found.field.sum(axis=2), found.energy, rtol=1e-12)
     assert np.allclose(found.kinetic, kinetic_energy(velocity, masses).sum(axis=1), rtol=1e-12)
@@ -179,8 +179,8 @@ class Record:
 
 def test_records_are_read_in_chunks_that_do_not_matter():
     velocity = noise((40, 30))
-    whole = partition(Record(velocity), 2.0, fields=True)
-    late = partition(velocity[33:], 2.0, fields=True)
+    whole = partition(Record(velocity), 2.0, mean_over=1)
+    late = partition(velocity[33:], 2.0, mean_over=1)
     assert np.array_equal(whole.field[:, 33:], late.field)
     assert np.array_equal(whole.energy[:, 33:], late.energy)
     assert np.array_equal(local_entropy(Record(velocity))[0][33:], local_entropy(velocity[33:])[0])

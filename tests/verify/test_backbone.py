@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from vipetsc.case import Case
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
+from vipetsc.io.records import RecordFile
 from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, align, initiation_of, read_slope, relate_folders
-from vipetsc.studies.members import linear_folder
+from vipetsc.studies.linear import LinearRun, linear_name
 
 GRAZING = 0.03
 EXPONENT = -0.9
@@ -38,11 +39,8 @@ def test_energies_align_at_grazing(tmp_path):
     slope, envelope = branch(), np.zeros(20)
     envelope[[16, 8]] = 2e-4, 1e-4
     case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
-    linear = linear_folder(tmp_path, case)
-    linear.mkdir(parents=True)
-    with h5py.File(linear / "wave.h5", "w") as wave, h5py.File(linear / "run.h5", "w") as run:
-        wave["envelope"], run["energy/work"] = envelope, [0.0, 1.5e-3]
-        run["time"], run["cell"], run.attrs["case"] = [0.0, 1.0], np.arange(1, 21), case.to_toml()
+    linear = LinearRun(envelope, np.zeros(20), {"work": 1.5e-3}, {})
+    RecordFile(tmp_path / "members-0.jsonl").append(linear.record(linear_name(case)))
     initiation = initiation_of(tmp_path, case)
     assert initiation.amplitude == pytest.approx(20.0, rel=1e-14)
     assert initiation.onset == pytest.approx(9.0, rel=1e-14)

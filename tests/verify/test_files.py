@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import xarray
 
 from tests.conftest import datasets, small_case
 from vipetsc import Case, simulate
+from vipetsc.case.schema import AnalysisTable
 from vipetsc.dynamics.ts import integrator
-from vipetsc.studies.sweep import measure_run
+from vipetsc.io.lock import FolderError
+from vipetsc.io.store import RunMemory
+from vipetsc.studies.analysis import analyse
+from vipetsc.studies.reanalysis import is_measured, measure_run, reanalyse_folders
 
 
 def test_every_file_opens_in_xarray_with_units(folder):
@@ -95,3 +101,47 @@ def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
     run = datasets(folder / "run" / "run.h5")
     assert run["time"][-1] == pytest.approx(0.03)
     assert np.isfinite(run["displacement"]).all()
+
+
+def test_another_analysis_of_the_same_run(folder):
+    """It is measured anew, not refused and not simulated; anything else is another case."""
+    simulate(small_case(), folder / "run")
+    measure_run(folder / "run")
+    assert is_measured(folder / "run")
+    finer = small_case(analysis={"cell_stride": 1})
+    assert simulate(finer, folder / "run").complete
+    assert not is_measured(folder / "run")
+    measure_run(folder / "run")
+    assert is_measured(folder / "run")
+    reanalyse_folders([folder / "run"], MPI.COMM_SELF, ["analysis.snapshot_stride=3"])
+    with xarray.open_dataset(folder / "run/analysis.h5", engine="h5netcdf") as analysis:
+        assert json.loads(analysis.attrs["analysis"]) | {"cell_stride": 1, "snapshot_stride": 3} == json.loads(
+            analysis.attrs["analysis"]
+        )
+    for overrides in (["drive.amplitude=2.0"], ["output.stride=2"]):
+        with pytest.raises(FolderError, match=r"only \[analysis\] can change"):
+            reanalyse_folders([folder / "run"], MPI.COMM_SELF, overrides)
+    with pytest.raises(FolderError, match=r"drive\.amplitude"):
+        simulate(small_case(drive={"amplitude": 2.0}), folder / "run")
+
+
+@pytest.mark.parametrize("lattice, amplitude", [({"preset": "four-band", "cells": 100}, 24.33),
+                                                ({"preset": "diatomic", "cells": 200}, 1.0)])  # fmt: skip
+def test_the_default_analysis_is_near_the_full_one(lattice, amplitude):
+    """Of runs with hundreds of impacts; each file states what it left out and about what that changes."""
+    memory = RunMemory(MPI.COMM_SELF)
+    time = {"engine": "propagator", "rtol": 1e-6}
+    simulate(Case.from_table({"lattice": lattice, "drive": {"amplitude": amplitude}, "time": time}), memory)
+    everything = AnalysisTable(band_stride=1, snapshot_stride=1, cell_stride=1)
+    default, full = (analyse(memory.dataset, ("bands", "entropy"), options=some) for some in (None, everything))
+    if np.isfinite(full["ibtet"]):
+        assert default["ibtet"].item() == pytest.approx(full["ibtet"].item(), abs=5e-4)
+        assert default["ibtet_whole"].item() == pytest.approx(full["ibtet_whole"].item(), abs=5e-4)
+        np.testing.assert_allclose(default["bands/energy"][:-1], full["bands/energy"][:-1], rtol=1e-12)
+    for name in ("energy_weighted", "masked", "joint"):
+        measure = default[f"entropy/{name}"]
+        assert measure.item() == pytest.approx(full[f"entropy/{name}"].item(), rel=1e-3)
+        assert measure.attrs["snapshot_stride"] == measure.attrs["cell_stride"] == 2
+        assert 0 < measure.attrs["sampling_error"] < 0.01 * measure.item()
+    assert default["ibtet"].attrs["band_stride"] == 10 and full["ibtet"].attrs["sampling_error"] == 0
+    assert json.loads(default.attrs["analysis"])["cell_stride"] == 2

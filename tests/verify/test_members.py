@@ -1,5 +1,6 @@
 """Members of a sweep are scaled where nothing touches, and simulated where something may."""
 
+import json
 import os
 import shutil
 
@@ -9,14 +10,13 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
-from tests.faults.inject import Injector
 from vipetsc.case import Case, Sweep
-from vipetsc.case.sweep import SweepTable
-from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import open_ensemble, select
+from vipetsc.io.read import open_ensemble
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.ensemble import COMPLETE, SCALED
-from vipetsc.studies.members import MemberStore, reached, read_wave
+from vipetsc.studies.linear import linear_case, linear_name
+from vipetsc.studies.members import MemberStore
+from vipetsc.studies.reanalysis import reanalyse_folders
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = {
@@ -33,8 +33,10 @@ def sweep(tmp_path_factory):
     """Amplitudes at which the linear wave reaches .6, .85, 1.02, 1.1, 1.25 and 3 times the nearest clearance."""
     folder = tmp_path_factory.mktemp("members")
     case = Case.from_table(TABLE | {"drive": TABLE["drive"] | {"amplitude": 1.0}})
-    MemberStore(folder / "wave", SweepTable.model_validate({}), MPI.COMM_SELF, StopRequest()).make_linear(case)
-    one = reached(read_wave(folder / "wave", case), case).max()
+    plan = Sweep.from_table(TABLE | {"sweep": {"drive": {"amplitude": [1.0]}}})
+    store = MemberStore(plan, folder, MPI.COMM_SELF, StopRequest())
+    store.make_linear(linear_case(case), ())
+    one = store.linear[linear_name(case)].reached(case).max()
     shares = np.array([0.6, 0.85, 1.02, 1.1, 1.25, 3.0])
     table = TABLE | {"sweep": {"drive": {"amplitude": (shares / one).tolist()}}}
     result = run_sweep(Sweep.from_table(table), folder / "sweep")
@@ -53,25 +55,12 @@ def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(s
 
 
 def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
-    _, ensemble, folder = sweep
-    amplitude = ensemble["amplitude"].values[:2]
-    low, high = (folder / str(name) for name in ensemble["member"].values[:2])
-    factor = (amplitude[1] / amplitude[0]) ** 2
-    for file, names in {"run": ("energy/kinetic", "energy/work"), "analysis": ("bands/energy", "bands/total")}.items():
-        with open_netcdf(low / f"{file}.h5", file) as small, open_netcdf(high / f"{file}.h5", file) as large:
-            assert "velocity" not in small
-            for name in names:
-                np.testing.assert_allclose(large[name], factor * small[name], rtol=1e-13)
-            assert Case.of(large).drive.amplitude == amplitude[1]
-            if file == "run":
-                assert large["sites/cell"].values.tolist() == TABLE["contacts"]["sites"]
-                assert large["sites/clearance"].values.tolist() == TABLE["contacts"]["clearance"]
-                assert large["energy/dissipated_by_site"].shape == (large.sizes["time"], 2)
-                assert not large["energy/dissipated_by_site"].values.any()
-            else:
-                assert large["ibtet"].item() == small["ibtet"].item()
-                assert large["bands/edges"].values.tolist() == small["bands/edges"].values.tolist()
-    assert select(ensemble, amplitude=amplitude[0])["work"].item() > 0
+    _, ensemble, _ = sweep
+    amplitude, work = ensemble["amplitude"].values[:2], ensemble["work"].values[:2]
+    assert work[0] > 0 and work[1] / work[0] == pytest.approx((amplitude[1] / amplitude[0]) ** 2, rel=1e-13)
+    for name in ("ibtet", "bands/share", "entropy/history", "entropy/masked"):
+        np.testing.assert_array_equal(*ensemble[name].values[:2], name)
+    assert not ensemble["dissipated_fraction"].values[:2].any()
 
 
 def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
@@ -84,35 +73,59 @@ def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
         np.testing.assert_array_equal(thin[name].values, ensemble[name].values[2:5], name)
 
 
-def test_files_that_were_cut_are_named_and_made_again(sweep, tmp_path):
-    _, ensemble, folder = sweep
+def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
+    _, _, folder = sweep
     out = shutil.copytree(folder, tmp_path / "out")
-    before = {path.relative_to(out): datasets(path) for path in out.rglob("*.h5")}
-    scaled, *touching = (out / str(name) for name in ensemble["member"].values[[0, 3, 4, 5]])
-    (shared,) = out.glob("linear/*/analysis-*.h5")
-    damaged = [scaled / "run.h5", shared, touching[0] / "summary.json", touching[1] / "analysis.h5",
-               touching[2] / "run.h5", shared.with_name("wave.h5"), shared.with_name("run.h5")]  # fmt: skip
-    for number, path in enumerate([*damaged, out / "ensemble.h5", out / "index.json"]):
-        os.truncate(path, path.stat().st_size // 2 if number % 2 else 0)
-    again = run_sweep(Sweep.load(out / "case.toml"), out)
-    assert again.complete and again.made == 4
-    # The wave is looked at first, and what was measured from its run goes with it.
-    named = [path for path in damaged if path not in (shared, shared.with_name("run.h5"))]
-    assert len(again.warnings) == len(named)
-    for path in named:
-        (warning,) = (text for text in again.warnings if str(path) in text)
-        assert "cannot be" in warning and warning.endswith("made again")
-    assert {path.relative_to(out) for path in out.rglob("*.h5")} == set(before)
-    for path, found in before.items():
-        assert_same_bits(found, datasets(out / path))
-    # A linear run alone, with what was measured of it.
-    for path in (shared, shared.with_name("run.h5")):
-        os.truncate(path, 100)
-    once_more = run_sweep(Sweep.load(out / "case.toml"), out)
-    assert once_more.made == 0 and [str(shared.with_name("run.h5")) in text for text in once_more.warnings] == [True]
-    # Where it cannot be made again the members stay as they are.
-    os.truncate(shared.with_name("run.h5"), 100)
-    injector = Injector()
-    injector.arm("member", 1, "memory")
-    assert run_sweep(Sweep.load(out / "case.toml"), out).complete
-    injector.disarm()
+    before, plan = datasets(out / "ensemble.h5"), Sweep.load(out / "case.toml")
+    lines = (out / "members.jsonl").read_bytes().splitlines(keepends=True)
+    assert len(lines) == 7 and b'"linear"' in lines[0][:10]  # the linear run, then the members
+    for number, made in ((0, 2), (2, 1), (6, 1)):  # without the linear run, those that are scaled from it are made too
+        damaged = [line.replace(b"2", b"3", 1) if i == number else line for i, line in enumerate(lines)]
+        (out / "members.jsonl").write_bytes(b"".join(damaged))
+        again = run_sweep(plan, out)
+        assert again.complete and again.made == made
+        assert again.warnings == [
+            f"{out}/members.jsonl, line {number + 1}: cut off or damaged; what it told is made again"
+        ]
+        assert_same_bits(before, datasets(out / "ensemble.h5"))
+        assert (out / "members.jsonl").read_bytes().count(b"\n") == 7
+    for name in ("ensemble.h5", "index.json"):
+        os.truncate(out / name, 20)
+        again = run_sweep(plan, out)
+        assert again.complete and again.made == 0
+        assert_same_bits(before, datasets(out / "ensemble.h5"))
+        assert json.loads((out / "index.json").read_text())["members"]["missing"] == 0
+
+
+def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
+    """Its run keeps what it was asked to, its analysis is that of everything; damaged files are made again."""
+    table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}
+    thin = {"fields": ["velocity"], "window": [5, 9], "every": 4, "stride": 3}
+    for name, output in (("all", {}), ("thin", thin)):
+        assert run_sweep(Sweep.from_table(table | {"output": output}), tmp_path / name).complete
+    (whole, kept) = (next((tmp_path / name).glob("*/run.h5")).parent for name in ("all", "thin"))
+    assert {path.name for path in kept.iterdir()} == {"run.h5", "analysis.h5"}
+    assert_same_bits(datasets(whole / "analysis.h5"), datasets(kept / "analysis.h5"))
+    everything, found = datasets(whole / "run.h5"), datasets(kept / "run.h5")
+    assert "displacement" not in found and found["cell"].tolist() == [5, 9]
+    np.testing.assert_array_equal(found["velocity"], everything["velocity"][::3, [4, 8]])
+    np.testing.assert_array_equal(found["field_time"], everything["time"][::3])
+    np.testing.assert_array_equal(found["energy/work"], everything["energy/work"])
+    written = (kept / "analysis.h5").read_bytes()
+    assert [path.name for path in reanalyse_folders([tmp_path / "thin"], MPI.COMM_SELF)] == ["ensemble.h5"]
+    assert (kept / "analysis.h5").read_bytes() == written
+    os.truncate(kept / "run.h5", 300)
+    again = run_sweep(Sweep.from_table(table | {"output": thin}), tmp_path / "thin")
+    assert again.made == 1 and "run.h5 cannot be read" in again.warnings[0]
+    assert_same_bits(found, datasets(kept / "run.h5"))
+
+
+def test_a_linear_run_that_was_not_foreseen_is_made_where_it_is_needed(sweep, tmp_path, monkeypatch):
+    _, ensemble, _ = sweep
+    monkeypatch.setattr("vipetsc.studies.sweep.MOST_SURVEYED", 1)
+    table = TABLE | {"sweep": {"contacts": {"sites": [[8, 13], [13, 15]]}, "drive": {"amplitude": [0.1, 0.2]}}}
+    result = run_sweep(Sweep.from_table(table), tmp_path / "out")
+    assert result.complete and (result.status == SCALED).all()
+    found = open_ensemble(tmp_path / "out")["entropy/masked"].values
+    assert (found[:, 0] == found[:, 1]).all() and found[0, 0] != found[1, 0]
+    assert found[0, 0] == ensemble["entropy/masked"].values[0]

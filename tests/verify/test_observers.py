@@ -10,11 +10,14 @@ import pytest
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.dynamics import recorder, simulate
 from vipetsc.dynamics.energies import Energies
-from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample
+from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError
+from vipetsc.dynamics.samples import Block
 
 
-def sample(work: float, total: float, dissipated: float = 0.0) -> Sample:
-    return Sample(0, 0.0, None, Energies(kinetic=total, spring=0.0, contact=0.0, work=work, dissipated=dissipated))
+def block(work: list[float], total: list[float], dissipated: float = 0.0) -> Block:
+    none = np.zeros(len(work))
+    energies = Energies(np.array(total), none, none, np.array(work), none + dissipated)
+    return Block(0, np.arange(len(work)) * 1.0, energies, None, None)
 
 
 def begun(kind: type[Observer]) -> Observer:
@@ -25,38 +28,48 @@ def begun(kind: type[Observer]) -> Observer:
 
 def test_the_guard_allows_a_tenth_of_the_largest_work():
     guard = begun(Guard)
-    guard.observe(sample(work=2.0, total=1.81))
-    guard.observe(sample(work=1.0, total=1.19))  # a tenth of the largest work so far, not of the work now
+    guard.observe(block(work=[2.0], total=[1.81]))
+    guard.observe(block(work=[1.0], total=[1.19]))  # a tenth of the largest work so far, not of the work now
     with pytest.raises(RunawayError, match=r"the energy runs away: 1.21 J in the lattice, 1 J of work done"):
-        guard.observe(sample(work=1.0, total=1.21))
+        guard.observe(block(work=[1.0], total=[1.21]))
     resumed = begun(Guard)
     resumed.restore(guard.checkpoint())
-    resumed.observe(sample(work=1.0, total=1.19))
+    resumed.observe(block(work=[1.0], total=[1.19]))
     with pytest.raises(RunawayError, match="runs away"):
-        begun(Guard).observe(sample(work=1.0, total=1.19))
+        begun(Guard).observe(block(work=[1.0], total=[1.19]))
+
+
+def test_the_guard_names_the_first_bad_sample_of_a_block():
+    works, totals = [1.0, 2.0, 1.0, 1.0, np.nan, 9.0], [1.0, 2.0, 1.19, 1.21, 1.0, 9.0]
+    with pytest.raises(RunawayError, match="runs away") as runs_away:
+        begun(Guard).observe(block(works, totals))
+    assert runs_away.value.sample == 3
+    with pytest.raises(RunawayError, match="not finite") as not_finite:
+        begun(Guard).observe(block(works[:3] + works[4:], totals[:3] + totals[4:]))
+    assert not_finite.value.sample == 3
 
 
 @pytest.mark.parametrize("energies", [(np.nan, 1.0), (1.0, np.nan), (1.0, 2e6), (np.inf, 1.0)])
 def test_the_guard_refuses_what_is_not_finite(energies):
     with pytest.raises(RunawayError, match="not finite"):
-        begun(Guard).observe(sample(*energies))
+        begun(Guard).observe(block(*([energy] for energy in energies)))
 
 
 def test_a_lattice_at_rest_cannot_run_away():
-    begun(Guard).observe(sample(work=0.0, total=1e-7))  # rounding, before the drive has worked
+    begun(Guard).observe(block(work=[0.0], total=[1e-7]))  # rounding, before the drive has worked
 
 
 def test_the_ledger_of_a_resumed_run_knows_what_came_before():
     ledger = begun(Ledger)
     assert ledger.statistics() == {"ledger_error": 0.0}
-    ledger.observe(sample(work=4.0, total=2.0, dissipated=1.5))
-    ledger.observe(sample(work=3.0, total=2.75, dissipated=0.0))
+    ledger.observe(block(work=[4.0], total=[2.0], dissipated=1.5))
+    ledger.observe(block(work=[1.0, 3.0], total=[1.0, 2.75]))
     expected = {"ledger_error": 0.125, "work": 3.0, "dissipated": 0.0}
     assert ledger.statistics() == expected
     resumed = begun(Ledger)
     resumed.restore(ledger.checkpoint())
     assert resumed.statistics() == expected
-    resumed.observe(sample(work=3.5, total=3.5))
+    resumed.observe(block(work=[3.5], total=[3.5]))
     assert resumed.statistics()["ledger_error"] == 0.125
 
 
@@ -64,6 +77,7 @@ class Watch(Observer):
     """Counts samples, and keeps the largest velocity."""
 
     name = "test-watch"
+    longest = 1
     calls: list
 
     def begin(self, setup):
@@ -71,10 +85,11 @@ class Watch(Observer):
         Watch.calls = ["begin"]
         self.fastest, self.seen = 0.0, []
 
-    def observe(self, sample):
+    def observe(self, block):
         half = self.setup.layout.dofs * self.setup.layout.owned
-        self.seen.append((sample.number, sample.time))
-        self.fastest = max(self.fastest, float(np.abs(sample.state.array_r[half : 2 * half]).max()))
+        assert len(block) == 1
+        self.seen.append((block.first, float(block.times[0])))
+        self.fastest = max(self.fastest, float(np.abs(block.state.array_r[half : 2 * half]).max()))
 
     def flush(self):
         Watch.calls.append("flush")
@@ -111,6 +126,47 @@ def test_an_observer_is_taken_by_its_name_and_goes_on_with_the_run(folder):
     for name in ("fastest", "ledger_error", "work", "dissipated", "episodes", "samples", "steps", "switches", "grazes"):
         assert resumed.statistics[name] == straight.statistics[name], name
     assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "stopped")))
+
+
+class Halves(Observer):
+    """Sums the fields that are recorded, and ends the run within a block."""
+
+    name = "test-halves"
+    longest = 40
+
+    def begin(self, setup):
+        super().begin(setup)
+        self.sums = []
+
+    def observe(self, block):
+        fields = block.share.fields[:, : block.share.rows(len(block))]
+        self.sums += fields.sum(axis=(0, 2, 3)).tolist()
+        if 100 in range(block.first, block.first + len(block)):
+            raise RunawayError("far enough", 100 - block.first)
+
+    def statistics(self):
+        return {"sums": self.sums}
+
+
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_what_an_observer_refuses_within_a_block_is_not_recorded(folder, engine):
+    case = small_case(time={"end": 0.03, "engine": engine}, output={"stride": 3})
+    whole = simulate(case, folder / "whole")
+    assert whole.complete
+    result = simulate(case, folder / "run", observers=["test-halves"])
+    last = case.model().sample_interval * 99
+    assert result.sentence.startswith("far enough, at t = 0.02 s")
+    assert result.sentence.endswith(f"last good sample: t = {last:.6g} s")
+    assert result.statistics["samples"] == 100
+    run, wanted = (datasets(folder / name / "run.h5") for name in ("run", "whole"))
+    assert run["velocity"].shape[0] == run["field_time"].size == 34
+    # What the engine came to behind it is no solution.
+    assert run["impacts/onset"].tolist() == [onset for onset in wanted["impacts/onset"] if onset <= last + 4e-4]
+    assert 0 < run["impacts/onset"].size < wanted["impacts/onset"].size
+    for name in ("time", "field_time", "velocity", "displacement", "energy/kinetic", "energy/dissipated_by_site"):
+        assert run[name].tobytes() == wanted[name][: len(run[name])].tobytes(), name
+    sums = sum(run[name].sum(axis=(1, 2)) for name in ("velocity", "displacement"))
+    np.testing.assert_allclose(result.statistics["sums"][:34], sums, rtol=1e-10, atol=1e-12)
 
 
 def test_a_run_stopped_at_its_end_still_knows_its_work(folder, monkeypatch):

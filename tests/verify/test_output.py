@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorder, simulate
-from vipetsc.io import store
+from vipetsc.io import chunks
 from vipetsc.io.atomic import load_arrays, save_arrays
+from vipetsc.io.chunks import Recording
+from vipetsc.io.contents import LOSSES, SAMPLED
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.store import SAMPLED, Recording, RunMemory
+from vipetsc.io.store import RunMemory
 
 PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 
@@ -59,7 +62,7 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
         field[0] = 1.0
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(store, "put_chunks", fails)
+    monkeypatch.setattr(chunks, "put_chunks", fails)
     monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 16)
     with pytest.raises(OSError, match=r"run\.h5 could not be written: No space"):
         simulate(case, path, force=True)
@@ -94,14 +97,15 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
 
 def test_episodes_stand_in_the_order_of_their_onsets():
     """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
-    given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4)}
+    given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4), "sites/cell": np.arange(1, 4)}
     memory = RunMemory()
     memory.begin("")
-    memory.recording = Recording(given | {"sites/cell": np.arange(1, 4)}, (), False)
+    memory.recording = Recording(given, (), False, 2)
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
-        chunk = {n: np.zeros(1) if dims == "time" else np.arange(len(sites)) * 1.0 for n, (dims, *_) in SAMPLED.items()}
-        chunk |= {"impacts/site": np.array(sites), "impacts/onset": np.array(onsets)}
-        memory.append(chunk | {"field_time": np.zeros(1), "energy/dissipated_by_site": np.zeros((1, 3))})
+        log = np.zeros(len(sites), EPISODE)
+        log["site"], log["onset"], log["loss"] = sites, onsets, np.arange(len(sites))
+        chunk = dict.fromkeys(SAMPLED, np.zeros(1)) | {LOSSES: np.zeros((1, 3)), "impacts": log}
+        memory.append(chunk)
     memory.finish({}, {})
     run = memory.dataset
     assert run["impacts/onset"].values.tolist() == [0.1, 0.2, 0.3, 0.5, 0.5]
@@ -123,6 +127,9 @@ def test_arrays_come_back_as_they_were(tmp_path):
         assert back[name].dtype == values.dtype
         np.testing.assert_array_equal(back[name], values)
     assert load_arrays(tmp_path / "x.npy", ["d"]).keys() == {"d"}
+    mapped = load_arrays(tmp_path / "x.npy", copy=False)["a"]  # a rank reads only its own part of the others' states
+    assert not mapped.flags.writeable
+    np.testing.assert_array_equal(mapped, arrays["a"])
     assert [p.name for p in tmp_path.iterdir()] == ["x.npy"]
 
 

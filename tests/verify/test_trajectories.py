@@ -268,16 +268,16 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     integrator.observe(tracker.start)
     integrator._first_step = 1e-5
     integrator.advance(0.0025)  # before the rebound meets the other side
-    (episode,) = tracker.closed
+    (episode,) = integrator.take_episodes()
     velocity = integrator.state.array_r[layout.dofs * layout.owned :]
     rebound = -(velocity[layout.owned] - velocity[0])
-    assert episode.approach_velocity == pytest.approx(1.0, abs=1e-9)
-    assert episode.onset == pytest.approx(1e-3, abs=1e-9)
+    assert episode["approach_velocity"] == pytest.approx(1.0, abs=1e-9)
+    assert episode["onset"] == pytest.approx(1e-3, abs=1e-9)
     assert rebound == pytest.approx(effective_restitution(restitution), abs=1e-8)
     # The law is made for r near 1: its own error is of second order in 1 - r.
     assert abs(rebound - restitution) < (1 - restitution) ** 2
     reduced = 0.01 * 0.004 / 0.014
-    assert episode.loss == pytest.approx(0.5 * reduced * (1 - rebound**2), rel=1e-7)
+    assert episode["loss"] == pytest.approx(0.5 * reduced * (1 - rebound**2), rel=1e-7)
 
 
 def test_the_linear_ridge_lies_on_the_bloch_branch(folder):

@@ -12,7 +12,16 @@ import numpy as np
 
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid
 from vipetsc.case.resolve import build_chain, check_cell, check_contacts, check_wave, resolved, wave_speed, with_preset
-from vipetsc.case.schema import CONTACTS, ContactsTable, DriveTable, LatticeTable, OutputTable, PetscTable, TimeTable
+from vipetsc.case.schema import (
+    CONTACTS,
+    AnalysisTable,
+    ContactsTable,
+    DriveTable,
+    LatticeTable,
+    OutputTable,
+    PetscTable,
+    TimeTable,
+)
 from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
@@ -55,6 +64,7 @@ class Case(CaseFile):
     drive: DriveTable
     time: TimeTable
     output: OutputTable
+    analysis: AnalysisTable | None = None
     petsc: PetscTable | None = None
 
     builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}}

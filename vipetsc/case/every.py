@@ -7,7 +7,7 @@ from vipetsc.case.case import Case
 from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.reading import CaseError, CaseFile, Problem, read_toml, with_overrides
-from vipetsc.case.sweep import Sweep
+from vipetsc.case.sweep import MOST_TRIED, Sweep
 
 OF_SECTION: dict[str, type[CaseFile]] = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase}
 
@@ -29,7 +29,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
         try:
             case = kind.from_table(table, overrides, source)
             if isinstance(case, Sweep):
-                possible = [member.case for member in case.members() if member.case]
+                possible = [member.case for member in case.members(MOST_TRIED) if member.case]
                 cases, problems = cases or [*possible[:1]], {}
             cases.append(case)
         except CaseError as error:

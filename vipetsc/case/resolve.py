@@ -13,7 +13,6 @@ from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group
 from vipetsc.lattice.cell import cell_problems, groups_of
 
 LEAST_RESTITUTION = 0.05
-LARGEST_INDEX = 2**31 - 1
 STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 # A key of a case file takes the place of these keys of the preset.
 REPLACES = {
@@ -102,9 +101,6 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     if loose := [str(mass) for mass, number in enumerate(group) if number != group[0]]:
         remedy = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
         problems.append(Problem("lattice.cell.springs", None, remedy))
-    if 2 * lattice.cells * cell.dofs > LARGEST_INDEX:
-        remedy = f"has more than the {LARGEST_INDEX} displacements and velocities that PETSc's 32-bit indices count"
-        problems.append(Problem("lattice.cells", lattice.cells, remedy))
     return cell, problems
 
 

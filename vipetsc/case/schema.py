@@ -36,7 +36,7 @@ def once(values: list[Any]) -> list[Any]:
     return values
 
 
-MOST_SITES = 1_000_000
+MOST_CELLS, MOST_SITES = 10**12, 10**6
 
 
 def _text(value: Any) -> Any:
@@ -113,7 +113,7 @@ class LatticeTable(Section):
 
     preset: Literal["four-band", "diatomic"] | None = None
     cell: CellTable | None = None
-    cells: int = Field(300, ge=2)
+    cells: int = Field(300, ge=2, le=MOST_CELLS)
     ends: Literal["fixed", "free", "periodic"] = "fixed"
     reading: Literal["printed", "calibrated"] = "calibrated"
     lam: Positive | None = Field(None, alias="lambda")
@@ -211,6 +211,21 @@ class OutputTable(Section):
     stride: int = Field(1, ge=1)
     writer: Literal["auto", "gather", "parallel"] = "auto"
     figures: bool = True
+
+
+class AnalysisTable(Section):
+    """How finely a run is measured; the strides at 1 leave nothing out, what others change stands in ``analysis.h5``.
+
+    ``band_stride``: samples between those at which energies above the pass bands are taken; ``snapshot_stride`` and
+    ``cell_stride``: of the snapshots (500 at most) and of the cells whose entropy is taken. ``pixels``: most rows and
+    columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most that.
+    """
+
+    band_stride: int = Field(10, ge=1)
+    snapshot_stride: int = Field(2, ge=1)
+    cell_stride: int = Field(2, ge=1)
+    pixels: int = Field(600, ge=2)
+    memory: Positive = 1.0
 
 
 class PetscTable(Section):

@@ -1,22 +1,24 @@
 """Many cases from one: the section ``[sweep]`` of a case file, and the members it stands for."""
 
 import copy
+import hashlib
+import itertools
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 import tomli_w
 from pydantic import Field
 
-from vipetsc.case.case import Case, case_id
+from vipetsc.case.case import Case
 from vipetsc.case.reading import LARGEST, CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.schema import number
 
-MOST_MEMBERS = 10_000
+MOST_MEMBERS = 1_000_000
+MOST_TRIED = 1_000  # members whose cases are made to see whether a sweep can be made
 Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
 
 
@@ -40,12 +42,7 @@ class SweepMember:
 
     index: tuple[int, ...]
     case: Case | None
-    problem: str = ""
-
-    @cached_property
-    def id(self) -> str:
-        """Hash of the resolved case, which names the run's folder; empty without a case."""
-        return case_id(self.case) if self.case else ""
+    problems: Sequence[Problem] = ()
 
 
 class Sweep(CaseFile):
@@ -57,7 +54,7 @@ class Sweep(CaseFile):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The fields, and everything that is wrong with ``[sweep]``; the members' cases are read by ``members``."""
+        """The fields, and everything that is wrong with ``[sweep]``; the members' cases are made by ``member``."""
         table = dict(table)
         section = table.pop("sweep", None)
         if not isinstance(section, dict):
@@ -66,7 +63,7 @@ class Sweep(CaseFile):
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
             table["time"] = {"engine": "auto"} | table.get("time", {})
-        sections = Case.model_fields.keys() - {"name"}
+        sections = Case.model_fields.keys() - {"name", "analysis"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
         values: Values = {}
@@ -97,30 +94,63 @@ class Sweep(CaseFile):
                 put(section, key, list(values))
         return tomli_w.dumps(self.table | {"sweep": section})
 
-    def members(self) -> list[SweepMember]:
-        """All members in the order of the axes, the last varying fastest; raises CaseError if none is valid."""
-        return list(self._members)
+    @property
+    def count(self) -> int:
+        """Number of members."""
+        return math.prod(self.shape)
 
-    @cached_property
-    def _members(self) -> list[SweepMember]:
-        members, errors = [], []
-        for index in np.ndindex(self.shape):
-            try:
-                members.append(SweepMember(index, self._case_at(index)))
-            except CaseError as error:
-                errors.append(error)
-                members.append(SweepMember(index, None, "; ".join(map(str, error.problems))))
-        if len(errors) == len(members):
-            raise CaseError(errors[0].problems, self.name)
-        return members
+    def ids(self) -> list[str]:
+        """A name for every member, a hash of the table and of what its keys take; equal members have one name."""
+        whole = hashlib.sha256(json.dumps(self.table, sort_keys=True, default=str).encode())
 
-    def _case_at(self, index: tuple[int, ...]) -> Case:
-        table = copy.deepcopy(self.table)
+        def name(texts: Iterable[str]) -> str:
+            one = whole.copy()
+            one.update("".join(sorted(texts)).encode())
+            return one.hexdigest()[:16]
+
+        # What stands on an axis is written once; a sweep may have a million members.
+        rows = [
+            [dict(zip(axis, values, strict=True)) for values in zip(*axis.values(), strict=True)] for axis in self.axes
+        ]
+        texts = [[json.dumps(row, sort_keys=True, default=str) for row in axis] for axis in rows]
+        return [name(chosen) for chosen in itertools.product(*texts)]
+
+    def member(self, number: int) -> SweepMember:
+        """The member ``number`` (from 0) in the order of the axes, the last varying fastest."""
+        index = tuple(map(int, np.unravel_index(number, self.shape)))
+        table, problems = copy.deepcopy(self.table), []
         for axis, i in zip(self.axes, index, strict=True):
             for key, values in axis.items():
-                if problems := put(table, key, copy.deepcopy(values[i])):
-                    raise CaseError(problems, self.name)
-        return Case.from_table(table)
+                problems += put(table, key, copy.deepcopy(values[i]))
+        try:
+            return SweepMember(index, None, problems) if problems else SweepMember(index, Case.from_table(table))
+        except CaseError as error:
+            return SweepMember(index, None, error.problems)
+
+    def number(self, name: str) -> int:
+        """The number of the member ``name``, or of that number; raises CaseError if there is none."""
+        ids = self.ids()
+        if name in ids or (name.isdecimal() and int(name) < self.count):
+            return ids.index(name) if name in ids else int(name)
+        remedy = f"is no member; ensemble.h5 has their names (member), their numbers go from 0 to {self.count - 1}"
+        raise CaseError([Problem("--member", name, remedy)], self.name)
+
+    def case(self, number: int) -> Case:
+        """The case of the member ``number``; raises CaseError if it is no valid one."""
+        member = self.member(number)
+        if member.case is None:
+            raise CaseError(member.problems, f"{self.name}, member {number}")
+        return member.case
+
+    def members(self, most: int = MOST_MEMBERS) -> list[SweepMember]:
+        """All members in their order, or ``most`` of them drawn; raises CaseError if none of these is a valid case."""
+        numbers = np.arange(self.count)
+        if most < self.count:
+            numbers = np.sort(np.random.default_rng(0).choice(self.count, most, replace=False))
+        members = [self.member(number) for number in numbers]
+        if not any(member.case for member in members):
+            raise CaseError(members[0].problems, self.name)
+        return members
 
     def names(self) -> dict[str, str]:
         """A short name for every key that varies: its last part, or all of it where that is not unique."""

@@ -24,6 +24,8 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "case": ("case", {"nargs": "?", "metavar": "CASE", "help": "case file (TOML); the built-in one if left out"}),
     "swept": ("case", {"metavar": "CASE", "help": "case file (TOML) with a section [sweep]"}),
     "modal": ("case", {"metavar": "CASE", "help": "case file (TOML) with a section [nnm]"}),
+    "member": ("--member", {"metavar": "ID", "help": "make a member of a sweep (CASE is its file or folder) again,"
+                            " whole: its name, or its number from 0"}),
     "set": ("--set", {"action": "append", "default": [], "metavar": "SECTION.KEY=VALUE",
                       "help": "change one value; may be repeated"}),
     "out": ("--out", {"type": Path, "metavar": "DIR", "help": "output folder; one in runs/ if left out"}),
@@ -45,13 +47,13 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
 }  # fmt: skip
 
 VERBS: dict[str, tuple[Verb, str, str]] = {
-    "run": (verbs.run, "one simulation, its analysis and pictures", "case set out force resume"),
+    "run": (verbs.run, "one simulation, its analysis and pictures", "case member set out force resume"),
     "validate": (verbs.validate, "check a case; print band edges, frequency, end time, size and cost", "case set"),
     "bands": (verbs.bands, "pass bands, gaps and group velocities of a cell", "case set out json"),
     "sweep": (verbs.sweep, "every combination in [sweep]; goes on where it was", "swept set out force resume"),
     "nnm": (verbs.nnm, "nonlinear normal modes: frequency-energy branches", "modal set out force resume"),
     "design": (verbs.design, "the (lambda, eta) search of the four-band cell", "case set out force resume"),
-    "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs"),
+    "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs set"),
     "plot": (verbs.plot, "pictures of a finished run again, from its files", "path fig format"),
     "paper": (verbs.paper, "every figure and claim of the paper, and a report", "only quick list out"),
     "doctor": (verbs.doctor, "versions and what is missing", ""),

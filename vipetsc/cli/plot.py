@@ -6,6 +6,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from vipetsc.io.folder import FolderError
+from vipetsc.io.read import outdated
 from vipetsc.parallel import on_every_rank, on_root
 
 _NOT_OURS = {"design": "design.h5: is not a search", "branches": "branch-*.h5: is not a branch"}
@@ -69,11 +70,13 @@ def _prepare(source: str, folders: Sequence[Path], names: list[str] | None) -> N
         from vipetsc.studies.backbone import relate_folders
 
         for folder in folders:
+            if reason := outdated(folder):
+                raise FolderError(reason)
             if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
                 raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
         relate_folders(folders)
     elif source == "run":
-        from vipetsc.studies.sweep import is_measured, measure_run
+        from vipetsc.studies.reanalysis import is_measured, measure_run
 
         run = folders[0] / "run.h5"
         if not run.exists():

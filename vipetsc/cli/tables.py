@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
+from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.io.folder import provenance
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
@@ -66,14 +67,13 @@ def sweep_table(result: "SweepResult") -> str:
     complete, scaled, failed, missing = (result.count(status) for status in range(4))
     counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
     rows = [
-        ("members", f"{len(result.outcomes)}: {counts}"),
+        ("members", f"{result.status.size}: {counts}"),
         ("made now", f"{result.made} in {result.seconds:.1f} s"),
         ("ranks busy", ", ".join(f"{100 * share:.0f} %" for share in result.busy)),
     ]
     left = ("missing", f"{missing}; stopped on request, the same command goes on")
     rows.append(left if missing else ("leaves", str(result.folder / "ensemble.h5")))
-    members = json.loads((result.folder / "index.json").read_text(encoding="utf-8"))["members"]
-    failures = [row for row in members if row["status"] == "failed"]
+    failures = json.loads((result.folder / "index.json").read_text(encoding="utf-8"))["failed"]
     rows += [("failed", f"member {row['place']}: {row['reason']}") for row in failures[:10]]
     return table(rows)
 
@@ -81,8 +81,10 @@ def sweep_table(result: "SweepResult") -> str:
 def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
     """What follows from the case of a verb, as rows of a table."""
     if isinstance(case, Sweep):
-        impossible, counts = sum(member.case is None for member in case.members()), " x ".join(map(str, case.shape))
-        return [("sweep", f"{np.prod(case.shape)} members ({counts}), {impossible} of them impossible")]
+        tried, counts = case.members(MOST_TRIED), " x ".join(map(str, case.shape))
+        impossible = sum(member.case is None for member in tried)
+        of = "them" if len(tried) == case.count else len(tried)
+        return [("sweep", f"{case.count} members ({counts}), {impossible} of {of} impossible")]
     if isinstance(case, DesignCase):
         search = case.design
         cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
@@ -99,21 +101,22 @@ def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
 
 def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
     """What follows from a case of a run: bands, drive, times, samples, file size, cost."""
-    from vipetsc.dynamics.memory import memory_available, memory_needed
+    from vipetsc.dynamics.memory import check_indices, memory_available, memory_needed
     from vipetsc.dynamics.recorder import recorded_cells, written_together
 
     model = case.model()
+    check_indices(model)
     cell, chain, contact = model.chain.cell, model.chain, model.contact
     bands, waves = pass_bands(cell), waves_at(cell, model.drive.frequency)
     columns = len(recorded_cells(case.output, chain.cells)) * cell.dofs * len(case.output.fields)
-    size = 8 * columns * -(-model.samples // case.output.stride)
+    size = 8 * (columns * -(-model.samples // case.output.stride) + len(chain.sites) * model.samples)
     # At least one step a sample, and the top band resolved.
     steps = model.samples * max(np.ceil(model.sample_interval * bands[-1].high / 0.37), 1) * 1.3
     seconds = steps * (_STEP_SECONDS + _STEP_SECONDS_PER_MASS * chain.cells * cell.dofs / ranks)
     duration = f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
     writer = "parallel" if written_together(model, case.output, ranks) else "gather"
     engine = "ts" if case.time.engine == "ts" else "propagator"
-    needed, left = memory_needed(model, case.output, engine, ranks), memory_available() / ranks
+    needed, left = sum(memory_needed(model, case.output, engine, ranks).values()), memory_available() / ranks
     return [
         ("case", case.name),
         ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {chain.ends} ends, "

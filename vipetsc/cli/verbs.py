@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
 from vipetsc.case.every import load_every
+from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
 from vipetsc.cli.plot import draw_source, source_of
 from vipetsc.io.atomic import write_text
@@ -49,16 +50,26 @@ def _load(kind: type[AnyCase], options: argparse.Namespace, comm: MPI.Comm) -> A
     return on_root(comm, lambda: kind.load(options.case, options.set))
 
 
+def _member(options: argparse.Namespace) -> Case:
+    """The case of a member of a sweep, given by its case file or its folder; raises CaseError."""
+    path = Path(options.case or "a sweep's case")
+    plan = Sweep.load(path / "case.toml" if path.is_dir() else path)
+    number = plan.number(options.member)
+    table = plan.case(number).model_dump(by_alias=True, exclude_none=True)
+    return Case.from_table(table | {"name": f"{plan.name}-{plan.ids()[number]}", "output": {}}, options.set)
+
+
 def _output(options: argparse.Namespace, name: str) -> Path:
     return options.out or Path("runs") / name
 
 
 def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """One simulation, its analysis and pictures."""
+    """One simulation, its analysis and pictures; or a member of a sweep again, with all its fields."""
     from vipetsc.dynamics import simulate
-    from vipetsc.studies.sweep import is_measured, measure_run
+    from vipetsc.studies.reanalysis import is_measured, measure_run
 
-    case = _load(Case, options, comm)
+    case = _load(Case, options, comm) if options.member is None else on_root(comm, lambda: _member(options))
+    around = Path(options.case) if options.member else None  # a sweep, whose linear run tells when the wave arrives
     known = on_root(comm, case.warnings)
     echo_warnings(comm, known)
     folder = _output(options, case.name)
@@ -68,7 +79,7 @@ def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         echo(comm, tables.run_table(result))
         stop.check(comm)
         if case.output.fields and result.statistics["samples"] > 1:
-            on_root(comm, lambda: is_measured(folder) or measure_run(folder))
+            on_root(comm, lambda: is_measured(folder) or measure_run(folder, around))
             stop.check(comm)
             if case.output.figures:
                 echo_paths(comm, draw_source("run", [folder], comm, afresh=False))
@@ -81,8 +92,12 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     from vipetsc.studies.sweep import run_sweep
 
     plan = _load(Sweep, options, comm)
-    for member in plan.members():
-        check_options(member.case)
+
+    def check() -> None:
+        for member in plan.members(MOST_TRIED):
+            check_options(member.case)
+
+    on_root(comm, check)
     folder = _output(options, plan.name)
     with locked(comm, folder):
         result = run_sweep(plan, folder, comm, force=options.force, stop=stop, resume=options.resume, progress=True)
@@ -166,11 +181,11 @@ def design(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Measures of runs already made; of a sweep, those whose fields were kept, and its ensemble."""
-    from vipetsc.studies.sweep import reanalyse_folders
+    from vipetsc.studies.reanalysis import reanalyse_folders
 
     folders = on_root(comm, lambda: [p.parent if p.name == "run.h5" else p for p in options.path if p.exists()])
     with locked(comm, *folders):
-        echo_paths(comm, reanalyse_folders(options.path, comm))
+        echo_paths(comm, reanalyse_folders(options.path, comm, options.set))
     return DONE
 
 

@@ -7,7 +7,6 @@ that neither the order nor the partition shows in the result.
 from dataclasses import dataclass
 
 from mpi4py import MPI
-from petsc4py import PETSc
 
 import numpy as np
 
@@ -15,77 +14,98 @@ from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.law import elastic_energy
 from vipetsc.dynamics.layout import LatticeRecord, Layout, create_record
-from vipetsc.dynamics.ts.right_hand_side import displacement, relative_motion
+from vipetsc.dynamics.ts.right_hand_side import CHUNK, displacement, relative_motion
 
 _FINE = 2.0**40  # multiples of the finer rest in one unit
-_LARGEST = 2.0**50
+LARGEST = 2.0**50
 _KINETIC, _SPRING, _CONTACT, _DISSIPATED = range(4)
 
 
-@njit(error_model="numpy", forceinline=True)
-def _add(sums: np.ndarray, part: int, energy: float, unit: float) -> None:
-    """Add an energy in J to ``sums`` (part, 2) as multiples of ``unit`` and of unit/2^40."""
-    multiple = energy * (1.0 / unit)
-    whole = np.rint(multiple)
-    if abs(whole) < _LARGEST:
-        sums[part, 0] += np.int64(whole)
-        sums[part, 1] += np.int64(np.rint((multiple - whole) * _FINE))
-    else:  # not finite or far beyond the scale: the guard sees a runaway energy
-        sums[part, 0] += np.int64(_LARGEST)
+@njit(error_model="numpy")
+def _add(sums: np.ndarray, part: int, energies: np.ndarray, unit: float) -> None:
+    """Add energies in J to ``sums`` (part, 2) as multiples of ``unit`` and of unit/2^40."""
+    whole_sum = fine_sum = np.int64(0)
+    for i in range(energies.size):
+        multiple = energies[i] * (1.0 / unit)
+        whole = np.rint(multiple)
+        # Not finite or far beyond the scale: the guard sees a runaway energy.
+        is_small = abs(whole) < LARGEST
+        whole_sum += np.int64(whole if is_small else LARGEST)
+        fine_sum += np.int64(np.rint((multiple - whole) * _FINE) if is_small else 0.0)
+    sums[part, 0] += whole_sum
+    sums[part, 1] += fine_sum
 
 
-@njit(error_model="numpy", forceinline=True)
-def _cell_energies(y: np.ndarray, lattice: LatticeRecord, cell: int) -> tuple[float, float]:
-    """Kinetic and spring energy of one cell, its springs to the next cell and a wall on its left included."""
-    shape = lattice.shape
-    n, d = shape.cells, shape.dofs
-    kinetic = energy = 0.0
-    for mass in range(d):
-        v = y[(d + mass) * n + cell]
-        kinetic += 0.5 * v * v / lattice.masses[mass].inverse_mass
+@njit(error_model="numpy")
+def _kinetic_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
+    """Kinetic energies of the cells from ``first`` on."""
+    energies[:] = 0.0
+    for mass in range(lattice.shape.dofs):
+        begin = (lattice.shape.dofs + mass) * lattice.shape.cells + first
+        inverse_mass = lattice.masses[mass].inverse_mass
+        v = y[begin : begin + energies.size]
+        for i in range(energies.size):
+            energies[i] += 0.5 * v[i] * v[i] / inverse_mass
+
+
+@njit(error_model="numpy")
+def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
+    """Spring energies of the cells from ``first`` on: springs to the next cell, and the first one's to a left wall."""
+    shape, n = lattice.shape, lattice.shape.cells
+    energies[:] = 0.0
     for s in range(lattice.springs.size):
         spring = lattice.springs[s]
-        if not (spring.next_cell == 1 and cell == n - 1 and shape.right_free):
-            stretch = displacement(y, lattice, cell + spring.next_cell, spring.end) - y[spring.start * n + cell]
-            energy += 0.5 * spring.stiffness * stretch * stretch
-        if spring.next_cell == 1 and cell == 0 and shape.left_ghost < 0 and not shape.left_free:
-            energy += 0.5 * spring.stiffness * y[spring.end * n] * y[spring.end * n]
-    return kinetic, energy
+        leaves = spring.next_cell == 1 and first + energies.size == n
+        inside = energies.size - leaves
+        begin, end = spring.start * n + first, spring.end * n + first + spring.next_cell
+        here, other = y[begin : begin + inside], y[end : end + inside]
+        for i in range(inside):
+            stretch = other[i] - here[i]
+            energies[i] += 0.5 * spring.stiffness * stretch * stretch
+        if leaves and not shape.right_free:
+            stretch = displacement(y, lattice, n, spring.end) - y[spring.start * n + n - 1]
+            energies[inside] += 0.5 * spring.stiffness * stretch * stretch
+        if spring.next_cell == 1 and first == 0 and shape.left_ghost < 0 and not shape.left_free:
+            energies[0] += 0.5 * spring.stiffness * y[spring.end * n] * y[spring.end * n]
 
 
 @njit(error_model="numpy")
 def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
     """Kinetic, spring, contact and dissipated energy (4, 2), as multiples of ``unit`` and of unit/2^40."""
-    shape, contacts = lattice.shape, lattice.contacts
-    sums = np.zeros((4, 2), np.int64)
-    for cell in range(shape.cells):
-        kinetic, spring = _cell_energies(y, lattice, cell)
-        _add(sums, _KINETIC, kinetic, unit)
-        _add(sums, _SPRING, spring, unit)
-    for i in range(lattice.site_cells.size):
+    shape, contacts, sites = lattice.shape, lattice.contacts, lattice.site_cells.size
+    sums, elastic = np.zeros((4, 2), np.int64), np.empty(sites)
+    energies = np.empty(min(CHUNK, shape.cells))
+    for first in range(0, shape.cells, CHUNK):
+        of_cells = energies[: shape.cells - first]
+        _kinetic_energies(y, lattice, first, of_cells)
+        _add(sums, _KINETIC, of_cells, unit)
+        _spring_energies(y, lattice, first, of_cells)
+        _add(sums, _SPRING, of_cells, unit)
+    for i in range(sites):
         w, _ = relative_motion(y, lattice, i)
-        _add(sums, _CONTACT, elastic_energy(contacts.law, abs(w) - contacts.sites[i].clearance), unit)
-        _add(sums, _DISSIPATED, y[shape.dissipated + i], unit)
+        elastic[i] = elastic_energy(contacts.law, abs(w) - contacts.sites[i].clearance)
+    _add(sums, _CONTACT, elastic, unit)
+    _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + sites], unit)
     return sums
 
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies in J at one time: kinetic, spring and contact energy, work of the drive, dissipated energy."""
+    """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drive, dissipated."""
 
-    kinetic: float
-    spring: float
-    contact: float
-    work: float
-    dissipated: float
+    kinetic: np.ndarray
+    spring: np.ndarray
+    contact: np.ndarray
+    work: np.ndarray
+    dissipated: np.ndarray
 
     @property
-    def total(self) -> float:
+    def total(self) -> np.ndarray:
         """Kinetic, spring and contact energy together."""
         return self.kinetic + self.spring + self.contact
 
     @property
-    def residual(self) -> float:
+    def residual(self) -> np.ndarray:
         """Work - dissipated - total: zero for an exact solution."""
         return self.work - self.dissipated - self.total
 
@@ -99,21 +119,22 @@ class EnergyMeter:
 
     def __init__(self, model: Model, layout: Layout) -> None:
         self.comm = layout.comm
-        self._lattice = create_record(model, layout)
+        self.lattice = create_record(model, layout)
         speed = model.scale * model.drive.frequency
         burst = model.drive.duration * model.speed  # cells that the packet covers
         scale = sum(model.chain.cell.masses) * speed**2 * max(burst, 1.0)
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
-        self.largest = self.unit * _LARGEST  # energy in J from which on the sums saturate
+        self.largest = self.unit * LARGEST  # energy in J from which on the sums saturate
 
-    def measure(self, state: PETSc.Vec) -> Energies:
-        """Energies of ``state``, whose ghosts must be up to date; all ranks must call it."""
-        with state.localForm() as local:
-            whole, fine = measure(local.array, self._lattice, self.unit).T
-            work = local.array[self._lattice.shape.work] if self._lattice.shape.work >= 0 else 0.0
+    def total(self, sums: np.ndarray, work: np.ndarray) -> Energies:
+        """Energies of all ranks' shares: ``sums`` (sample, part, 2) of ``measure``, ``work`` (sample,) in J.
+
+        All ranks must call it.
+        """
+        whole, fine = sums.T  # (part, sample) each
         # Carrying leaves every number below 2^53: their sums over ranks, as floats, are exact.
         carried = fine >> 40
-        total = np.hstack([whole + carried, fine - (carried << 40), work])
+        total = np.vstack([whole + carried, fine - (carried << 40), work])
         self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
-        kinetic, spring, contact, dissipated = (total[:4] * self.unit + total[4:8] * (self.unit / _FINE)).tolist()
-        return Energies(kinetic, spring, contact, float(total[8]), dissipated)
+        kinetic, spring, contact, dissipated = total[:4] * self.unit + total[4:8] * (self.unit / _FINE)
+        return Energies(kinetic, spring, contact, total[8], dissipated)

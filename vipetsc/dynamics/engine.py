@@ -2,15 +2,15 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from petsc4py import PETSc
 
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.samples import Samples
 from vipetsc.parallel import StopRequest
 
 
@@ -18,8 +18,16 @@ class StalledError(RuntimeError):
     """The step size fell to the rounding of the time, or the state is not finite."""
 
 
+class Stretch(NamedTuple):
+    """How far an engine came: ``samples`` taken, whether it was ``stopped`` on request, why it stalled, if it did."""
+
+    samples: int
+    stopped: bool = False
+    stalled: str | None = None
+
+
 class Engine(ABC):
-    """Advances a lattice exactly onto given times; a subclass gives its ``name`` in case files.
+    """Advances a lattice from sample to sample; a subclass gives its ``name`` in case files.
 
     ``state`` (as ``Layout`` orders it, ghosts up to date) and ``time`` in s are those of the last time reached.
     """
@@ -38,15 +46,15 @@ class Engine(ABC):
         return None
 
     @abstractmethod
-    def advance(self, target: float) -> bool:
-        """Go on until the time is exactly ``target`` in s, the next sample; False if a stop was requested.
+    def fill(self, samples: Samples) -> Stretch:
+        """Go on through ``samples`` and take them with ``take_sample``; all ranks come equally far.
 
-        Raises StalledError, on all ranks, where no step can be taken.
+        A stop on request is at a sample, and as soon as that costs little.
         """
 
     @abstractmethod
-    def take_episodes(self, unfinished: bool = False) -> list[Episode]:
-        """Episodes closed since the last call that this rank logs; and copies of ``unfinished`` ones, as they are."""
+    def take_episodes(self, unfinished: bool = False) -> np.ndarray:
+        """Episodes closed since the last call that this rank logs, of dtype ``EPISODE``; ``unfinished`` ones, too."""
 
     @abstractmethod
     def statistics(self) -> dict[str, Any]:

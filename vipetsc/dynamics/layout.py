@@ -8,14 +8,15 @@ the left, then on the right. Mass by mass keeps every inner loop contiguous.
 Compiled kernels see a rank's part as a ``LatticeRecord``: tables of masses, springs and sites, and the drive.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import accumulate, pairwise
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vipetsc.case import Model
 from vipetsc.compiled import njit
@@ -36,13 +37,14 @@ class Layout:
         self.comm, self.cells, self.dofs = comm, chain.cells, chain.cell.dofs
         self.periodic = chain.ends == "periodic"
         cuts = [r * (self.cells // comm.size) + min(r, self.cells % comm.size) for r in range(comm.size + 1)]
-        self.ranges = list(pairwise(cuts))
-        of_ledger = (model.drive_cell, *chain.sites)
-        sizes = [2 * self.dofs * (b - a) + sum(a <= cell < b for cell in of_ledger) for a, b in self.ranges]
-        self.offsets = list(accumulate(sizes, initial=0))
-        self.start, self.stop = self.ranges[comm.rank]
-        self.owned, self.size = self.stop - self.start, sizes[comm.rank]
-        self.sites = tuple(i for i, cell in enumerate(chain.sites) if self.start <= cell < self.stop)
+        self.ranges = np.array([*pairwise(cuts)])
+        of_ledger, _ = np.histogram([model.drive_cell, *chain.sites], cuts)
+        sizes = 2 * self.dofs * np.diff(cuts) + of_ledger
+        self.offsets = np.append(0, np.cumsum(sizes))
+        self.start, self.stop = self.ranges[comm.rank].tolist()
+        self.owned, self.size = self.stop - self.start, int(sizes[comm.rank])
+        sites = np.array(chain.sites, np.int64)
+        self.sites = tuple(np.flatnonzero((sites >= self.start) & (sites < self.stop)).tolist())
         self.owns_drive = self.start <= model.drive_cell < self.stop
         self.dissipated = 2 * self.dofs * self.owned + self.owns_drive
 
@@ -55,16 +57,17 @@ class Layout:
             return left % self.cells, right % self.cells
         return (left if left >= 0 else None), (right if right < self.cells else None)
 
-    def state_indices(self, cell: int) -> list[int]:
-        """Global indices of the displacements and then of the velocities of ``cell``, mass by mass."""
-        rank = next(r for r, (a, b) in enumerate(self.ranges) if a <= cell < b)
-        a, b = self.ranges[rank]
-        return [self.offsets[rank] + i * (b - a) + cell - a for i in range(2 * self.dofs)]
+    def state_indices(self, cells: ArrayLike) -> np.ndarray:
+        """Global indices (cell, 2 dofs) of the displacements and then of the velocities of ``cells``, mass by mass."""
+        cells = np.asarray(cells, np.int64)
+        rank = np.searchsorted(self.ranges[:, 1], cells, side="right")
+        a, b = self.ranges[rank].T
+        of_mass = np.multiply.outer(b - a, np.arange(2 * self.dofs))
+        return ((self.offsets[rank] + cells - a)[:, None] + of_mass).astype(PETSc.IntType)
 
     def create_vector(self, array: np.ndarray | None = None) -> PETSc.Vec:
         """A zero state with ghosts for the neighbouring cells' displacements, in ``array`` if one is given."""
-        cells = [cell for cell in self.neighbours() if cell is not None]
-        indices = np.array([self.state_indices(cell)[: self.dofs] for cell in cells], PETSc.IntType).ravel()
+        indices = self.state_indices([cell for cell in self.neighbours() if cell is not None])[:, : self.dofs].ravel()
         array = np.zeros(self.size + indices.size) if array is None else array
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
@@ -72,20 +75,27 @@ class Layout:
         """The part ``y`` of the state in natural order: ``cells`` (cell, 2 dofs), and the ledger."""
         motion, ledger = y[: 2 * self.dofs * self.owned], y[2 * self.dofs * self.owned : self.size]
         cells = motion.reshape(2 * self.dofs, self.owned).T
-        losses = np.array([*zip(self.sites, ledger[self.owns_drive :], strict=True)], LOSS)
+        losses = np.zeros(len(self.sites), LOSS)
+        losses["site"], losses["loss"] = self.sites, ledger[self.owns_drive :]
         return {"cells": cells.copy(), "work": ledger[: self.owns_drive].copy(), "losses": losses}
 
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]], y: np.ndarray) -> None:
         """Fill this rank's part ``y`` of the state, given the checkpoints of all ranks that there were."""
-        tables = join(shares, ("cells", "work", "losses"))
-        losses = np.sort(tables["losses"], order="site")["loss"][list(self.sites)]
-        motion = tables["cells"][self.start : self.stop].T.ravel()
-        y[: self.size] = np.concatenate([motion, tables["work"][: self.owns_drive], losses])
+        tables, at = join(shares, {"work": None, "losses": "site"}), 0
+        for share in shares:  # one after the other: no rank holds all cells
+            first, stop = max(self.start, at), min(self.stop, at + len(share["cells"]))
+            if first < stop:
+                motion = y[: 2 * self.dofs * self.owned].reshape(2 * self.dofs, self.owned)
+                motion[:, first - self.start : stop - self.start] = share["cells"][first - at : stop - at].T
+            at += len(share["cells"])
+        ledger = tables["work"][: self.owns_drive], tables["losses"]["loss"][list(self.sites)]
+        y[2 * self.dofs * self.owned : self.size] = np.concatenate(ledger)
 
 
-def join(shares: Sequence[Mapping[str, np.ndarray]], names: Iterable[str]) -> dict[str, np.ndarray]:
-    """The tables ``names`` of a checkpoint's ``shares``, one after the other."""
-    return {name: np.concatenate([share[name] for share in shares]) for name in names}
+def join(shares: Sequence[Mapping[str, np.ndarray]], keys: Mapping[str, str | None]) -> dict[str, np.ndarray]:
+    """Tables of a checkpoint's ``shares``, one after the other; their rows in the order of a key, if it is given."""
+    tables = {name: np.concatenate([share[name] for share in shares]) for name in keys}
+    return {name: tables[name][np.argsort(tables[name][key])] if key else tables[name] for name, key in keys.items()}
 
 
 LOSS = np.dtype([("site", np.int64), ("loss", np.float64)])
@@ -177,7 +187,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         np.array(masses, MASS),
         np.array([c[1:] for c in couplings], COUPLING),
         np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
-        np.array([chain.sites[i] - layout.start for i in layout.sites], np.int64),
+        np.array([chain.sites[i] for i in layout.sites], np.int64) - layout.start,
         create_contacts(model.contact, [chain.clearances[i] for i in layout.sites]),
         create_burst(model.drive),
     )

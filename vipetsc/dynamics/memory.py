@@ -5,35 +5,51 @@ import resource
 from pathlib import Path
 
 from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.reading import Problem
 from vipetsc.case.schema import OutputTable
 from vipetsc.dynamics.recorder import chunk_samples, recorded_cells, written_together
+from vipetsc.io.store import GATHER_LIMIT
 
 # States that an engine holds, each of 2 numbers a mass: two for each stage of a method and its saved copies; measured.
 STAGES = {"2a": 2, "3bs": 4, "5f": 6, "5dp": 7, "5bs": 8, "6vr": 9, "7vr": 10, "8vr": 13}
 STATES_BESIDE_STAGES, PROPAGATOR_STATES = 4.6, 3.0
-# Copies of a chunk on rank 0 while it is gathered and written.
-COPIES = 3
-# Bytes of one sample's energies, of a contact site's tables and log.
-SAMPLE_BYTES, SITE_BYTES = 300, 5000
+# Copies of a chunk on the rank that keeps it, and besides on rank 0 while those of all are gathered.
+COPIES, GATHERED = 2, 3
+# Bytes of one sample's energies; of a site on every rank, and on the one that owns it.
+SAMPLE_BYTES, SITE_BYTES, OWN_SITE_BYTES = 300, 600, 2500
+REMEDIES = {
+    "lattice.cells": 'fewer cells or more machines need less, and so does time.engine = "propagator"',
+    "contacts.sites": "fewer sites or more machines need less",
+    "output.window": 'fewer cells or output.writer = "parallel" need less',
+    "time.sample_interval": "fewer samples need less",
+}
 
 
-def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) -> int:
-    """Bytes that a run of ``model`` by ``engine`` takes on the fullest of ``ranks``, beside what a process begins with.
+def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) -> dict[str, float]:
+    """Bytes that a run of ``model`` by ``engine`` takes on the fullest of ``ranks``, by the key that they grow with.
 
-    The engine's states, the fields of one chunk (gathered ones of all cells on rank 0), all samples' energies and
-    losses by site, and the sites.
+    The engine's states; sites; a chunk of fields and losses, on rank 0 a gathered one of all cells; all samples'
+    energies. What a process begins with comes besides.
     """
-    chain = model.chain
-    owned, recorded = -(-chain.cells // ranks), recorded_cells(output, chain.cells)
+    chain, recorded = model.chain, recorded_cells(output, model.chain.cells)
+    owned, per_cell = -(-chain.cells // ranks), len(output.fields) * chain.cell.dofs
+    own_sites = int(np.histogram(chain.sites, np.append(np.arange(0, chain.cells, owned), chain.cells))[0].max())
     states = 2 * STAGES[model.method] + STATES_BESIDE_STAGES if engine == "ts" else PROPAGATOR_STATES
-    cells, per_cell = min(owned, len(recorded)), len(output.fields) * chain.cell.dofs * 8
-    held, copies = (cells, 0) if written_together(model, output, ranks) else (len(recorded), COPIES)
-    fields = chunk_samples(held * per_cell) * per_cell * (cells + copies * held)
-    samples = model.samples * (SAMPLE_BYTES + 24 * len(chain.sites))
-    return int(states * 16 * chain.cell.dofs * owned + fields + samples + SITE_BYTES * len(chain.sites))
+    local, every = min(owned, len(recorded)) * per_cell + own_sites, len(recorded) * per_cell + len(chain.sites)
+    together = ranks == 1 or written_together(model, output, ranks)
+    rows = min(chunk_samples(8 * (local if together else every)), model.samples)
+    chunk = 8 * rows * (COPIES * local + (0 if together else GATHERED * every))
+    return {
+        "lattice.cells": states * 16 * chain.cell.dofs * owned,
+        "contacts.sites": SITE_BYTES * len(chain.sites) + OWN_SITE_BYTES * own_sites,
+        "output.window": chunk,
+        "time.sample_interval": model.samples * SAMPLE_BYTES,
+    }
 
 
 def memory_available() -> int:
@@ -48,12 +64,32 @@ def memory_available() -> int:
     return free if limit == resource.RLIM_INFINITY else min(free, max(limit - taken, 0))
 
 
+def check_indices(model: Model) -> None:
+    """Raise CaseError if the state has more components than this PETSc's indices count."""
+    chain, most = model.chain, int(np.iinfo(PETSc.IntType).max)
+    size = 2 * chain.cells * chain.cell.dofs + len(chain.sites) + 1
+    if size > most:
+        remedy = f"makes a state of {size} numbers, more than the {most} that the indices of this PETSc count"
+        build = "one configured --with-64-bit-indices counts more (Debian: python3-petsc4py-64-real)"
+        raise CaseError([Problem("lattice.cells", chain.cells, f"{remedy}; {build}")])
+
+
 def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm) -> None:
-    """Raise CaseError on all ranks where one has less memory left than the run needs; all must call it."""
-    needed, node = memory_needed(model, output, engine, comm.size), comm.Split_type(MPI.COMM_TYPE_SHARED)
+    """Raise CaseError on all ranks where one has less memory left than the run needs; all must call it.
+
+    Also where PETSc's indices do not count the state.
+    """
+    check_indices(model)
+    sample = 8 * len(output.fields) * model.chain.cell.dofs * len(recorded_cells(output, model.chain.cells))
+    if comm.size > 1 and output.writer == "gather" and sample > GATHER_LIMIT:
+        remedy = f'a sample of {sample / 1e9:.3g} GB is more than one message holds; "parallel" sends none'
+        raise CaseError([Problem("output.writer", output.writer, remedy)])
+    parts, node = memory_needed(model, output, engine, comm.size), comm.Split_type(MPI.COMM_TYPE_SHARED)
     share = comm.allreduce(memory_available() // node.size, MPI.MIN)
     node.Free()
+    needed = sum(parts.values())
     if needed > share:
+        key = max(parts, key=lambda part: parts[part])
         size = f"{model.chain.cells} cells, {len(model.chain.sites)} sites and {model.samples} samples"
         need = f"{size} need {needed / 1e9:.3g} GB of memory on a rank, which has {share / 1e9:.3g} GB"
-        raise CaseError([Problem("lattice.cells", None, f"{need}; take fewer of them, or more machines")])
+        raise CaseError([Problem(key, None, f"{need}; {REMEDIES[key]}")])

@@ -1,22 +1,22 @@
-"""What watches a run, sample by sample, without changing it: the contract, and the observers of every run.
+"""What watches a run, block by block of samples, without changing it: the contract, and the observers of every run.
 
 ``guard`` ends a run whose state is no solution any more, ``ledger`` keeps the error of the energy balance, ``progress``
 tells how far it is, ``recorder`` (a module of its own) keeps what is written. A further observer is a subclass of
 ``Observer`` with a name, which ``simulate`` is given.
 """
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from petsc4py import PETSc
-
 import numpy as np
 
 from vipetsc.case import Case, Model
-from vipetsc.dynamics.energies import Energies, EnergyMeter
+from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.samples import Block
 from vipetsc.io.store import RunOutput
 from vipetsc.parallel import Progress
 
@@ -27,7 +27,11 @@ LEDGER_PER_RTOL, LEAST_LEDGER, MOST_LEDGER = 100.0, 1e-8, 1e-4
 
 
 class RunawayError(RuntimeError):
-    """The state is no solution any more; says why."""
+    """The state is no solution any more from the ``sample`` of a block on; says why."""
+
+    def __init__(self, reason: str, sample: int) -> None:
+        super().__init__(reason)
+        self.sample = sample
 
 
 @dataclass(frozen=True)
@@ -42,31 +46,19 @@ class Setup:
     output: RunOutput
 
 
-@dataclass(frozen=True)
-class Sample:
-    """The lattice at one of the uniform times: ``number`` from 0, ``time`` in s.
-
-    ``state`` is ordered as ``Layout`` says, ghosts up to date; it changes with the next sample.
-    """
-
-    number: int
-    time: float
-    state: PETSc.Vec
-    energies: Energies
-
-
 class Observer:
     """Watches a run.
 
-    Calls come on all ranks in the same order: ``begin``, perhaps ``restore``, then ``observe`` for every sample;
-    whenever some observer is ``due``, and when the run is stopped on request, ``flush`` of all and then ``checkpoint``
-    of all; at the end ``finish`` and ``statistics``.
+    Calls come on all ranks in the same order: ``begin``, perhaps ``restore``, then ``observe`` for every block of
+    samples; whenever some observer is ``due``, and when the run is stopped on request, ``flush`` of all and then
+    ``checkpoint`` of all; at the end ``finish`` and ``statistics``.
 
-    A subclass has a ``name``, by which ``simulate`` finds it. It must not change the state, and what it raises it must
-    raise on all ranks.
+    A subclass has a ``name``, by which ``simulate`` finds it, and may want blocks of at most ``longest`` samples: with
+    1 it sees the state at every sample. It must not change the state, and what it raises it must raise on all ranks.
     """
 
     name: ClassVar[str]
+    longest: ClassVar[int] = sys.maxsize
     saved: ClassVar[tuple[str, ...]] = ()  # numbers among its attributes that a checkpoint keeps
     registry: ClassVar[dict[str, "type[Observer]"]] = {}
 
@@ -78,8 +70,8 @@ class Observer:
         """Make ready for a run from t = 0 on."""
         self.setup = setup
 
-    def observe(self, sample: Sample) -> None:
-        """Look at the next sample; raises RunawayError to end the run before it."""
+    def observe(self, block: Block) -> None:
+        """Look at the next samples; raises RunawayError to end the run before one of them."""
 
     @property
     def due(self) -> bool:
@@ -117,16 +109,17 @@ class Guard(Observer):
     saved = ("most_work",)
     most_work = 0.0
 
-    def observe(self, sample: Sample) -> None:
+    def observe(self, block: Block) -> None:
         """See ``Observer``."""
-        energies, largest = sample.energies, self.setup.meter.largest
-        if not (np.isfinite(energies.work) and energies.total < largest):
-            raise RunawayError("the state is not finite")
-        self.most_work = max(self.most_work, abs(energies.work))
-        if abs(energies.residual) > RUNAWAY * self.most_work and energies.total > 1e-12 * largest:
-            raise RunawayError(
-                f"the energy runs away: {energies.total:.4g} J in the lattice, {energies.work:.4g} J of work done"
-            )
+        energies, largest = block.energies, self.setup.meter.largest
+        most_work = np.maximum.accumulate(np.append(self.most_work, np.abs(energies.work)))[1:]
+        finite = np.isfinite(energies.work) & (energies.total < largest)
+        runs_away = (np.abs(energies.residual) > RUNAWAY * most_work) & (energies.total > 1e-12 * largest)
+        for k in np.flatnonzero(~finite | runs_away).tolist():
+            total, work = energies.total[k], energies.work[k]
+            reason = f"the energy runs away: {total:.4g} J in the lattice, {work:.4g} J of work done"
+            raise RunawayError(reason if finite[k] else "the state is not finite", k)
+        self.most_work = float(most_work[-1])
 
 
 class Ledger(Observer):
@@ -137,11 +130,12 @@ class Ledger(Observer):
     worst = most_work = 0.0
     work = dissipated = float("nan")
 
-    def observe(self, sample: Sample) -> None:
+    def observe(self, block: Block) -> None:
         """See ``Observer``."""
-        self.work, self.dissipated = sample.energies.work, sample.energies.dissipated
-        self.worst = max(self.worst, abs(sample.energies.residual))
-        self.most_work = max(self.most_work, abs(self.work))
+        energies = block.energies
+        self.work, self.dissipated = float(energies.work[-1]), float(energies.dissipated[-1])
+        self.worst = max(self.worst, float(np.abs(energies.residual).max()))
+        self.most_work = max(self.most_work, float(np.abs(energies.work).max()))
 
     def statistics(self) -> dict[str, Any]:
         """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end."""
@@ -168,9 +162,9 @@ class ProgressReport(Observer):
         super().begin(setup)
         self._progress = Progress(setup.layout.comm, setup.model.end, "s")
 
-    def observe(self, sample: Sample) -> None:
+    def observe(self, block: Block) -> None:
         """See ``Observer``."""
-        self._progress.update(sample.time)
+        self._progress.update(float(block.times[-1]))
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """See ``Observer``."""

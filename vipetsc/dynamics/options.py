@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 from vipetsc.case import Case, CaseError, CaseFile, Problem
 from vipetsc.case.schema import PetscTable, only_looks
-from vipetsc.dynamics.ts.right_hand_side import petsc_library
+from vipetsc.dynamics.native import petsc_library
 
 
 def options_of(case: CaseFile | None) -> dict[str, str]:

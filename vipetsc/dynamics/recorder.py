@@ -10,14 +10,18 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.case.schema import OutputTable
-from vipetsc.contact.tracker import Episode
 from vipetsc.dynamics.energies import Energies
-from vipetsc.dynamics.observers import Observer, Sample, Setup
-from vipetsc.io.store import GATHER_LIMIT, Recording
+from vipetsc.dynamics.observers import Observer, Setup
+from vipetsc.dynamics.samples import Block, Samples
+from vipetsc.io.chunks import Recording, ranges
+from vipetsc.io.contents import LOSSES
+from vipetsc.io.store import GATHER_LIMIT
 
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
 CHUNK_SAMPLES = 256
 CHUNK_BYTES = 64 * 2**20
+# Names in the file.
+ENERGIES = {part.name: f"energy/{part.name}" for part in fields(Energies)}
 
 
 def recorded_cells(output: OutputTable, cells: int) -> range:
@@ -45,6 +49,7 @@ class Recorder(Observer):
     saved = ("episodes", "deepest")
     episodes = 0
     deepest = 0.0  # indentation in m
+    end = np.inf  # time in s beyond which what engines come to in a block is no solution
 
     def begin(self, setup: Setup) -> None:
         """See ``Observer``."""
@@ -53,7 +58,6 @@ class Recorder(Observer):
         recorded = np.array(recorded_cells(output, chain.cells))
         first, stop = np.searchsorted(recorded, [layout.start, layout.stop]).tolist()
         local = recorded[first:stop] - layout.start
-        self._cells = slice(int(local[0]), int(local[-1]) + 1, output.every) if local.size else slice(0)
         # A run in memory is gathered whatever the writer is.
         together = bool(setup.output.folder) and written_together(setup.model, output, layout.comm.size)
         given = {
@@ -63,63 +67,74 @@ class Recorder(Observer):
             "sites/cell": np.array(chain.sites, np.int64) + 1,
             "sites/clearance": np.array(chain.clearances, float),
         }
-        setup.output.recording = Recording(given, tuple(output.fields), together)
-        self._columns = np.array([first, stop] if together else [0, len(recorded)])
-        most = layout.comm.allreduce(local.size, MPI.MAX) if together else len(recorded)
-        self._length = chunk_samples(len(output.fields) * layout.dofs * 8 * most)
-        self._buffer = np.empty((self._length, len(output.fields), layout.dofs, local.size))
-        self._dissipated = np.empty((self._length, len(layout.sites)))
-        self._samples: list[tuple[float, Energies]] = []
-        self._field_times: list[float] = []
+        rows = -(-setup.model.samples // output.stride)
+        setup.output.recording = Recording(given, tuple(output.fields), together, rows)
+        self._columns = np.array([[first, stop] if together else [0, len(recorded)]])
+        numbers = len(output.fields) * layout.dofs * local.size + len(layout.sites)
+        self._length = chunk_samples(8 * layout.comm.allreduce(numbers, MPI.MAX if together else MPI.SUM))
+        self._stride = output.stride
+        self._shape = len(output.fields), self._length, layout.dofs, local.size
+        self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
+        self._first = int(local[0]) if local.size else 0
+        self._begin_chunk()
 
-    def observe(self, sample: Sample) -> None:
+    def _begin_chunk(self) -> None:
+        n, self._held, self._rows, self._number = self._length, 0, 0, 0
+        self._sums, self._work = np.zeros((n, 4, 2), np.int64), np.zeros(n)
+        self._losses = np.zeros((n, len(self.setup.layout.sites)))
+        self._kept = {name: np.zeros(n) for name in ("time", *ENERGIES.values())}
+        self._fields = self.setup.output.room(self._shape)
+
+    def room(self, number: int, most: int) -> Samples:
+        """Room for the samples from ``number`` on: for as many as the chunk still takes, and at ``most`` so many."""
+        meter, output = self.setup.meter, self.setup.case.output
+        here = slice(self._held, self._held + most)
+        arrays = self._sums[here], self._work[here], self._losses[here], self._fields[:, self._rows :], self._moving
+        return Samples(number, *arrays, self._first, output.every, output.stride, meter.lattice, meter.unit)
+
+    def observe(self, block: Block) -> None:
         """See ``Observer``."""
-        layout, output = self.setup.layout, self.setup.case.output
-        y = sample.state.array_r
-        self._dissipated[len(self._samples)] = y[layout.dissipated :]
-        self._samples.append((sample.time, sample.energies))
-        if sample.number % output.stride == 0:
-            both = y[: 2 * layout.dofs * layout.owned].reshape(2, layout.dofs, layout.owned)
-            for i, name in enumerate(output.fields):
-                self._buffer[len(self._field_times), i] = both[int(name == "velocity")][:, self._cells]
-            self._field_times.append(sample.time)
+        here = slice(self._held, self._held + len(block))
+        self._kept["time"][here] = block.times
+        for part, name in ENERGIES.items():
+            self._kept[name][here] = getattr(block.energies, part)
+        self._number = block.first - self._held
+        self._held, self._rows = here.stop, self._rows + block.share.rows(len(block))
 
     @property
     def due(self) -> bool:
         """See ``Observer``: a chunk is full."""
-        return len(self._samples) == self._length
+        return self._held == self._length
 
     def flush(self, last: bool = False) -> None:
         """See ``Observer``: the samples kept so far and this rank's closed episodes become a chunk.
 
-        Rank 0's chunk holds times, energies and all ranks' episodes, the ``last`` one those that are still open, too;
-        the fields are those of a rank's own cells, or on rank 0 of all: ``columns`` says which of the recorded ones.
+        Fields, losses and episodes are those of a rank's own cells and sites, or on rank 0 of all, as ``io.chunks``
+        says; of episodes that are still open, in the ``last`` one. Rank 0's has times and energies besides.
         """
         sys.audit("vipetsc.flush")
         episodes = self.setup.engine.take_episodes(unfinished=last)
+        episodes = episodes[episodes["onset"] <= self.end]
         layout, comm, output = self.setup.layout, self.setup.layout.comm, self.setup.output
-        together = output.recording.together
-        block = np.moveaxis(self._buffer[: len(self._field_times)], 2, 3)  # (samples, field, cell, dof)
-        share = layout.sites, self._dissipated[: len(self._samples)], episodes, None if together else block
-        shares = comm.gather(share) if comm.size > 1 else [share]
+        together, part = output.recording.together, self._fields[:, : self._rows]
+        share = np.array(layout.sites, np.int64), self._losses[: self._held], episodes, part
+        shares = [share] if together or comm.size == 1 else comm.gather(share)
         chunk: dict[str, np.ndarray] = {}
         if shares is not None:
-            sites, dissipated, logs, blocks = zip(*shares, strict=True)
-            chunk |= {"time": np.array([t for t, _ in self._samples]), "field_time": np.array(self._field_times)}
-            chunk |= as_columns("energy", Energies, [energies for _, energies in self._samples])
-            order = np.argsort([site for some in sites for site in some])
-            chunk["energy/dissipated_by_site"] = np.concatenate(dissipated, axis=1)[:, order]
-            chunk |= as_columns("impacts", Episode, [episode for log in logs for episode in log])
-            chunk["impacts/site"] += 1  # counted from 1
-            block = block if together else np.concatenate(blocks, axis=2)
-        if shares is not None or together:
-            chunk |= {name: block[:, i] for i, name in enumerate(output.recording.fields)}
-            chunk["columns"] = self._columns
+            sites, losses, logs, parts = zip(*shares, strict=True)
+            numbers, log = np.concatenate(sites), np.concatenate(logs)
+            log["site"] += 1  # counted from 1
+            order = np.argsort(numbers)
+            chunk |= {LOSSES: np.concatenate(losses, axis=1)[:, order], "sites": ranges(numbers[order]), "impacts": log}
+            part = np.concatenate(parts, axis=3) if len(parts) > 1 else part
+            chunk |= dict(zip(output.recording.fields, part, strict=True)) | {"columns": self._columns}
+        if comm.rank == 0:
+            chunk |= {name: values[: self._held] for name, values in self._kept.items()}
+            chunk["field_time"] = chunk["time"][-self._number % self._stride :: self._stride]
         output.append(chunk or None)
         self.episodes += comm.allreduce(len(episodes))
-        self.deepest = comm.allreduce(max([self.deepest, *(episode.indentation for episode in episodes)]), MPI.MAX)
-        self._samples.clear()
-        self._field_times.clear()
+        self.deepest = comm.allreduce(max([self.deepest, *episodes["indentation"].tolist()]), MPI.MAX)
+        self._begin_chunk()
 
     def finish(self, stopped: bool) -> None:
         """See ``Observer``."""
@@ -139,8 +154,3 @@ class Recorder(Observer):
             return []
         beyond = f"the deepest indentation, {self.deepest:.3g} m, is beyond the contacts' radius of {radius:g} m"
         return [f"{beyond}: Hertz's law holds for indentations far below it"]
-
-
-def as_columns(group: str, record: type, rows: list[Any]) -> dict[str, np.ndarray]:
-    """``rows`` of a dataclass ``record`` as arrays ``group/<field>``."""
-    return {f"{group}/{c.name}": np.array([getattr(row, c.name) for row in rows], c.type) for c in fields(record)}

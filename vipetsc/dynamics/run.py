@@ -14,14 +14,16 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Case, Model
+from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
-from vipetsc.dynamics.engine import Engine, StalledError
+from vipetsc.dynamics.engine import Engine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
-from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Sample, Setup
+from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Setup
 from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
+from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import RUN, claimed, provenance
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
@@ -29,8 +31,8 @@ from vipetsc.parallel import StopRequest, install_abort_hook
 
 # In the order in which engine = "auto" tries them.
 ENGINES = (Propagator, Integrator)
-# The guard first: a sample that it refuses is not recorded.
-OBSERVERS = (Guard.name, Ledger.name, Recorder.name)
+# Cells times samples between two looks at requests to stop: a fraction of a second.
+BLOCK_CELLS = 1_000_000
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
 
 # In a script under mpirun, a rank that raises would leave the others waiting; who has a hook already is not disturbed.
@@ -83,11 +85,11 @@ def simulate(
     native
         Register the right-hand side natively (default) or through Python.
     stop
-        A request that ends the run at the next sample.
+        A request that ends the run at one of the next samples.
     progress
         Report progress on stderr of rank 0.
     observers
-        Names of further observers (subclasses of ``dynamics.observers.Observer``), which see every good sample.
+        Names of further observers (subclasses of ``dynamics.observers.Observer``), which see all good samples.
 
     Raises
     ------
@@ -105,7 +107,7 @@ def simulate(
     model = case.model()
     kind, refusal = select_engine(case, model)
     check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
-    watching = [*OBSERVERS, *(["progress"] if progress else []), *observers]
+    watching = [Guard.name, *observers, Ledger.name, *(["progress"] if progress else [])]
     make = partial(_simulate, case, model, partial(kind, native=native, stop=stop), refusal, watching)
     if isinstance(folder, RunOutput):
         return make(folder)
@@ -136,16 +138,18 @@ def _simulate(
     begin = time.perf_counter(), time.process_time()
     output.begin(case.to_toml())
     sys.audit("vipetsc.set-up", case.name)
-    layout = Layout(model, output.comm)
-    with petsc_options(options_of(case)):
+    with log.SET_UP, petsc_options(options_of(case)):
+        layout = Layout(model, output.comm)
         engine = create(model, layout)
     with released(engine, output.comm):
         run = Run(Setup(case, model, layout, EnergyMeter(model, layout), engine, output), watching)
         shares = output.last_state()
         if shares is not None:
             run.restore(shares)
-        ending, sentence = run.advance()
-        return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
+        with log.SAMPLES:
+            ending, sentence = run.advance()
+        with log.ENDING:
+            return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
 
 
 @contextmanager
@@ -170,11 +174,17 @@ def select_engine(case: Case, model: Model) -> tuple[type[Engine], str | None]:
 
 
 class Run:
-    """The samples of one run: its engine goes from one to the next, its observers look at each."""
+    """The samples of one run: its engine goes through a block of them, its observers look at it, the recorder last.
+
+    A sample that one of them refuses is not seen by those behind it, nor recorded.
+    """
 
     def __init__(self, setup: Setup, observers: Sequence[str]) -> None:
         self.setup = setup
-        self.observers = [Observer.registry[name]() for name in observers]
+        self.recorder = Recorder()
+        self.observers = [*(Observer.registry[name]() for name in observers), self.recorder]
+        longest = max(BLOCK_CELLS // setup.layout.cells, 1)
+        self.longest = min(longest, *(observer.longest for observer in self.observers))
         self.samples = 0
         self.last: float | None = None  # time of the last good sample
         for observer in self.observers:
@@ -191,31 +201,45 @@ class Run:
 
     def advance(self) -> tuple[str, str]:
         """Go to the end, or to where the run stops or fails: how it ended, and a sentence about it."""
-        engine, model = self.setup.engine, self.setup.model
-        while self.samples < model.samples:
-            t = self.samples * model.sample_interval
-            sys.audit("vipetsc.step")
-            try:
-                if not engine.advance(t):
-                    return STOPPED, f"stopped on request at t = {engine.time:.6g} s"
-                sample = Sample(self.samples, t, engine.state, self.setup.meter.measure(engine.state))
-                for observer in self.observers:
-                    observer.observe(sample)
-            except (StalledError, RunawayError) as error:
-                reason = f"stalled: {error}" if isinstance(error, StalledError) else str(error)
+        setup, total = self.setup, self.setup.model.samples
+        engine = setup.engine
+        while self.samples < total:
+            samples = self.recorder.room(self.samples, min(self.longest, total - self.samples))
+            stretch = engine.fill(samples)
+            failure, when = stretch.stalled and f"stalled: {stretch.stalled}", engine.time
+            block = self.block(samples, stretch.samples)
+            for observer in self.observers:
+                try:
+                    if len(block):
+                        observer.observe(block)
+                except RunawayError as error:
+                    failure, when, block = str(error), block.times[error.sample], self.block(samples, error.sample)
+            if len(block):
+                self.samples, self.last = block.first + len(block), float(block.times[-1])
+            if failure:
+                self.recorder.end = when + setup.model.sample_interval
                 good = "none" if self.last is None else f"t = {self.last:.6g} s"
-                fastest = fastest_cell(self.setup)
-                return FAILED, f"{reason}, at t = {engine.time:.6g} s ({fastest}); last good sample: {good}"
-            self.samples, self.last = self.samples + 1, t
+                return FAILED, f"{failure}, at t = {when:.6g} s ({fastest_cell(setup)}); last good sample: {good}"
+            if stretch.stopped and self.samples < total:
+                return STOPPED, f"stopped on request at t = {engine.time:.6g} s"
             if any(observer.due for observer in self.observers):
                 self.checkpoint()
-        return COMPLETE, f"complete: {model.samples} samples to t = {self.last:.6g} s"
+        return COMPLETE, f"complete: {total} samples to t = {self.last:.6g} s"
+
+    def block(self, samples: Samples, count: int) -> Block:
+        """The first ``count`` of ``samples`` as observers see them; all ranks must call it."""
+        energies = self.setup.meter.total(samples.sums[:count], samples.work[:count])
+        times = np.arange(samples.number, samples.number + count) * self.setup.model.sample_interval
+        return Block(samples.number, times, energies, samples, self.setup.engine.state)
 
     def checkpoint(self) -> None:
         """Write what a resumed run needs."""
-        for observer in self.observers:
-            observer.flush()
+        with log.RECORDER:
+            for observer in self.observers:
+                observer.flush()
         sys.audit("vipetsc.checkpoint")
+        if self.setup.output.folder is None:
+            return
         state = self.setup.engine.checkpoint() | {"samples": np.array(self.samples)}
         for observer in self.observers:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}

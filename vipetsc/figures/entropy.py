@@ -14,9 +14,8 @@ from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import percentile_norm
 from vipetsc.figures.study import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
-from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes as axes_of
-from vipetsc.io.read import member_folder, select
+from vipetsc.io.read import select
 from vipetsc.spectra import doubt, normalised
 
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
@@ -199,7 +198,8 @@ def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) -> No
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", fontsize=6)
     else:
-        axes.text(0.04, 0.04, f"no power law: {doubts}", transform=axes.transAxes, color=style.GREY, fontsize=6)
+        text = f"no power law:\n{doubts}"
+        axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", color=style.GREY, fontsize=6, in_layout=False)
     axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * amplitude[0], 1.25 * amplitude[-1]))
 
 
@@ -234,9 +234,5 @@ def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figu
 
 
 def _start_of_averages(row: xr.Dataset) -> float:
-    """When the averages over time begin, in s, from the analysis of the first member; 0 if it is gone."""
-    folder = member_folder(row.isel({AMPLITUDE: 0}))
-    if folder is None or not (folder / "analysis.h5").exists():
-        return 0.0
-    with open_netcdf(folder / "analysis.h5", "analysis") as analysis:
-        return float(analysis.attrs.get("entropy/start", 0.0))
+    """When the averages over time begin, in s."""
+    return float(np.nanmin(row["entropy/start"].values))

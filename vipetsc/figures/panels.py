@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike
 
+from vipetsc import spectra
 from vipetsc.figures import style
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
@@ -38,9 +39,7 @@ def empty_figure(reason: str) -> Figure:
 def block_means(values: np.ndarray) -> np.ndarray:
     """Means over blocks of ``values`` (row, column), so that at most ``PIXELS`` rows and columns are left."""
     for axis, length in enumerate(values.shape):
-        starts = np.arange(0, length, -(-length // PIXELS))
-        sizes = np.diff(np.append(starts, length))
-        values = np.add.reduceat(values, starts, axis=axis) / np.expand_dims(sizes, 1 - axis)
+        values = spectra.block_means(values, -(-length // PIXELS), axis)
     return values
 
 
@@ -73,7 +72,7 @@ def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, run: xr.Dat
     image = draw_map(axes, time, cells, field.values.T, norm)
     axes.set(xlabel="Time (s)", ylabel="Cell")
     if run is not None:
-        mark_sites(axes, run)
+        mark_sites(axes, run, cells=cells)
     return image
 
 
@@ -85,15 +84,17 @@ def content_map(axes: Axes, content: xr.DataArray, norm: Normalize) -> AxesImage
     return image
 
 
-def recorded_sites(run: xr.Dataset) -> np.ndarray:
-    """Cells (site), from 1, of the contact sites inside the recorded window."""
-    cells, sites = run["cell"].values, run["sites/cell"].values
+def recorded_sites(run: xr.Dataset, cells: np.ndarray | None = None) -> np.ndarray:
+    """Cells (site), from 1, of the contact sites inside the range of ``cells``, by default the recorded ones."""
+    cells, sites = run["cell"].values if cells is None else cells, run["sites/cell"].values
     return sites[(sites >= cells[0]) & (sites <= cells[-1])]
 
 
-def mark_sites(axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y") -> None:
-    """Dotted lines at the contact sites, triangles on the edge of the axis ``along`` ("x" or "y") of cells."""
-    sites = recorded_sites(run)
+def mark_sites(
+    axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y", cells: np.ndarray | None = None
+) -> None:
+    """Dotted lines at the ``recorded_sites``, triangles on the edge of the axis ``along`` ("x" or "y") of cells."""
+    sites = recorded_sites(run, cells)
     for site in sites:
         (axes.axhline if along == "y" else axes.axvline)(site, color=colour, lw=0.5, ls=style.DOTTED, alpha=0.8)
     edge = np.full(len(sites), 0.02)

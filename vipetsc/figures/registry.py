@@ -5,7 +5,6 @@ import itertools
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.figures import backbone, design, entropy, lattice, runs, scattering, transfer, transfer_curves
-from vipetsc.figures.study import table
+from vipetsc.figures.study import Files, Sweeps, table
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
@@ -108,8 +107,8 @@ def draw(
         return newest is not None and path.exists() and path.stat().st_mtime >= newest
 
     turns = itertools.count(*share)
-    with rc_style():
-        return draw_each(drawings(source, folders, names), folders[0] / "figures", formats, turns, keep=keep)
+    with rc_style(), Files() as files:
+        return draw_each(drawings(source, folders, files, names), folders[0] / "figures", formats, turns, keep=keep)
 
 
 def warned(make: Callable[[], Figure], *results: xr.Dataset) -> Callable[[], Figure]:
@@ -134,33 +133,33 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
         return save(runs.bands(cell, frequency), Path(path))
 
 
-def drawings(source: str, folders: Sequence[Path], names: Sequence[str] | None = None) -> Iterator[Drawing]:
+def drawings(
+    source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None
+) -> Iterator[Drawing]:
     """Stems and drawings of what the ``folders`` hold, as ``draw`` draws them; the first of them checks the names.
 
-    Warnings in the files are the figures' labels. Files stay open until the last drawing was asked for.
+    Warnings in the files are the figures' labels. A drawing can be called as long as its ``files`` are open.
     """
     specs = {name: FIGURES[name] for name in figure_names(source, names)}
     folder = folders[0]
-    with ExitStack() as stack:
-        if source == SWEEP:
-            ensembles = [open_ensemble(path) for path in folders if (path / "ensemble.h5").exists()]
-            for name, spec in specs.items():
-                measured = [e for e in ensembles if spec.measure in table(e)["sweep"]["measures"]]
-                for suffix, make in spec.function(measured):
-                    yield f"{name}-{suffix}" if suffix else name, warned(make, *measured)
-        elif source == BRANCHES:
-            for spec, path in itertools.product(specs.values(), sorted(folder.glob("branch-*.h5"))):
-                paths = [other / path.name for other in folders if (other / path.name).exists()]
-                stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
-                with ExitStack() as opened:
-                    branches = [opened.enter_context(open_netcdf(path, "branch")) for path in paths]
-                    yield stem, warned(partial(spec.function, paths), *branches)
-        elif source == RUN:
-            run, analysis = stack.enter_context(open_run(folder / "run.h5")), None
-            if (folder / "analysis.h5").exists():
-                analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
-            of_run = [data for data in (run, analysis) if data is not None]
-            yield from ((name, warned(partial(spec.function, run, analysis), *of_run)) for name, spec in specs.items())
-        else:
-            search = stack.enter_context(open_netcdf(folder / "design.h5", "search", ("cost", "frequency")))
-            yield from ((name, partial(spec.function, search)) for name, spec in specs.items())
+    if source == SWEEP:
+        ensembles = [files.get(path, open_ensemble) for path in folders if (path / "ensemble.h5").exists()]
+        for name, spec in specs.items():
+            measured = Sweeps((e for e in ensembles if spec.measure in table(e)["sweep"]["measures"]), files)
+            for suffix, make in spec.function(measured):
+                yield f"{name}-{suffix}" if suffix else name, warned(make, *measured)
+    elif source == BRANCHES:
+        for spec, path in itertools.product(specs.values(), sorted(folder.glob("branch-*.h5"))):
+            paths = [other / path.name for other in folders if (other / path.name).exists()]
+            stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
+            branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
+            yield stem, warned(partial(spec.function, paths), *branches)
+    elif source == RUN:
+        run, analysis = files.get(folder / "run.h5", open_run), None
+        if (folder / "analysis.h5").exists():
+            analysis = files.get(folder / "analysis.h5", partial(open_netcdf, kind="analysis"))
+        of_run = [data for data in (run, analysis) if data is not None]
+        yield from ((name, warned(partial(spec.function, run, analysis), *of_run)) for name, spec in specs.items())
+    else:
+        search = files.get(folder / "design.h5", partial(open_netcdf, kind="search", needs=("cost", "frequency")))
+        yield from ((name, partial(spec.function, search)) for name, spec in specs.items())

@@ -222,8 +222,8 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     """A snapshot, its wavelet transform cut into bins, the inverse of some, their energy in space-time (Fig. S1)."""
     member = series.runs[1]
     field = member.analysis[FIELD].load()
-    names = "cell", "partition/snapshot", "partition/bounds"
-    cells, snapshots, bounds = (member.analysis[name].values for name in names)
+    cells = member.run["cell"].values
+    snapshots, bounds = (member.analysis[f"partition/{name}"].values for name in ("snapshot", "bounds"))
     time = float(snapshots[np.argmin(np.abs(snapshots - series.snapshot_times()[2]))])
     sample = int(np.argmin(np.abs(field_time(member.run) - time)))
     signal = member.run["velocity"][sample, :, member.model.chain.cell.host].values

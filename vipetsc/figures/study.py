@@ -1,18 +1,18 @@
 """What the pictures of sweeps are drawn from: ensembles, members with their fields, and how they are named."""
 
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from fractions import Fraction
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from vipetsc.case import Case, Model
+from vipetsc.case import Case, Model, Sweep
 from vipetsc.figures import style
 from vipetsc.figures.panels import ROMAN, recorded_sites
 from vipetsc.figures.style import Drawing
@@ -25,8 +25,27 @@ AMPLITUDE = "amplitude"
 LEVELS = ("Low", "Medium", "High")
 T = TypeVar("T")
 
-Sweeps = Sequence[xr.Dataset]
-"""Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`."""
+
+class Files(ExitStack):
+    """Results opened as they are asked for, each once, until the block ends; xarray keeps few of the files open."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._opened: dict[Path, Any] = {}
+
+    def get(self, path: Path, opener: Callable[[Path], AbstractContextManager[T]]) -> T:
+        """What ``opener`` makes of ``path``; raises as it does."""
+        if path not in self._opened:
+            self._opened[path] = self.enter_context(opener(path))
+        return cast(T, self._opened[path])
+
+
+class Sweeps(list[xr.Dataset]):
+    """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`; ``files`` are those of their members."""
+
+    def __init__(self, ensembles: Iterable[xr.Dataset], files: Files) -> None:
+        super().__init__(ensembles)
+        self.files = files
 
 
 class MeasuredRun(NamedTuple):
@@ -48,13 +67,13 @@ class MeasuredRun(NamedTuple):
 
 
 def transfer_members(sweeps: Sweeps) -> Iterator[MeasuredRun]:
-    """The whole members with sites and a band above the driven one, each open until the next is asked for."""
+    """The whole members with sites and a band above the driven one."""
     for ensemble in sweeps:
         for _, folder in whole_members(ensemble):
-            with MeasuredRun.open(folder) as member:
-                # The transfer of a lattice without a higher band is not a number.
-                if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
-                    yield member
+            member = sweeps.files.get(folder, MeasuredRun.open)
+            # The transfer of a lattice without a higher band is not a number.
+            if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
+                yield member
 
 
 class Wave(NamedTuple):
@@ -135,20 +154,19 @@ def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callabl
 def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
     """Every configuration of the sweeps with full fields at its lowest, middle and highest amplitude.
 
-    ``needs`` names what their analyses must hold. Files are open until the next one is asked for.
+    ``needs`` names what their analyses must hold.
     """
     measured = [(ensemble, triples) for ensemble in sweeps if (triples := _triples(ensemble))]
     for ensemble, triple in ((ensemble, triple) for ensemble, triples in measured for triple in triples):
-        with ExitStack() as stack:
-            runs = tuple(stack.enter_context(MeasuredRun.open(folder)) for _, folder in triple)
-            if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
-                first, case = triple[0][0], runs[0].case
-                wave = Wave.of(case)
-                others = [name for name in axes(ensemble) if name not in (AMPLITUDE, "reading", "wavenumber", "sites")]
-                title = [f"{case.lattice.reading.capitalize()} reading", *(_in_words(first, n, " ") for n in others)]
-                title += [counted(len(sites_of(case)), "site")]
-                title += [f"κ* = {in_pi(wave.wavenumber)}"] if wave.band else []
-                yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), ", ".join(title), runs, wave)
+        runs = tuple(sweeps.files.get(folder, MeasuredRun.open) for _, folder in triple)
+        if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
+            first, case = triple[0][0], runs[0].case
+            wave = Wave.of(case)
+            others = [name for name in axes(ensemble) if name not in (AMPLITUDE, "reading", "wavenumber", "sites")]
+            title = [f"{case.lattice.reading.capitalize()} reading", *(_in_words(first, n, " ") for n in others)]
+            title += [counted(len(sites_of(case)), "site")]
+            title += [f"κ* = {in_pi(wave.wavenumber)}"] if wave.band else []
+            yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), ", ".join(title), runs, wave)
 
 
 def _triples(ensemble: xr.Dataset) -> list[list[tuple[xr.Dataset, Path]]]:
@@ -182,7 +200,7 @@ def grouped(items: Iterable[T], key: Callable[[T], str]) -> dict[str, list[T]]:
 
 def reading_of(ensemble: xr.Dataset) -> str:
     """The reading that all members of a sweep share which does not vary it."""
-    return next((Case.load(folder / "case.toml").lattice.reading for _, folder in curves(ensemble)), "")
+    return next((Sweep.of(ensemble).case(number).lattice.reading for _, number in curves(ensemble)), "")
 
 
 def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collection[str] | None = None) -> str:

@@ -7,15 +7,17 @@ from pathlib import Path
 from textwrap import wrap
 
 import matplotlib as mpl
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, LogLocator
 from matplotlib.transforms import Bbox
 
 from vipetsc.io.atomic import atomic_write
 
 COLUMN, PAGE = 3.4, 7.0  # widths of one and of two journal columns in inches
-NOTE = 0.16  # height in inches of the strip that a line of a note takes below a picture
+NOTE = 0.165  # height in inches of the strip that a line of a note takes below a picture
 LETTERS = 19  # of a note on an inch
+SCREEN = 200  # dots per inch of a PNG, so that a page can hold many; a PDF's maps have more
 
 # Okabe and Ito (2008): told apart with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -48,18 +50,36 @@ def new_figure(width: float, height: float, heading: str = "") -> Figure:
 def save(figure: Figure, path: Path, note: str = "") -> Path:
     """Write ``figure`` to ``path`` in the format of its suffix, atomically, with a ``note`` in a strip below it.
 
-    The figure's label stands there as well, in lines of the figure's width.
+    The figure's label stands there as well, in lines of the figure's width. What has been laid out for one format stays
+    so for the next.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    if figure.get_layout_engine():
+        _lay_out(figure)
     width, height = figure.get_size_inches()
     sentences = [*note.splitlines(), *figure.get_label().splitlines()]
     lines = [line for sentence in sentences for line in wrap(sentence, int(LETTERS * width))]
     strip, note = Bbox([[0, -NOTE * len(lines)], [width, height]]) if lines else None, "\n".join(lines)
     text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=GREY)
     with atomic_write(path) as partial_path:
-        figure.savefig(partial_path, format=path.suffix[1:], bbox_inches=strip)
+        if path.suffix == ".pdf" and not strip:
+            FigureCanvasPdf(figure).print_pdf(partial_path)  # ``savefig`` would draw it twice
+        else:
+            dpi = SCREEN if path.suffix == ".png" else None
+            figure.savefig(partial_path, format=path.suffix[1:], dpi=dpi, bbox_inches=strip)
     text.remove()
     return path
+
+
+def _lay_out(figure: Figure) -> None:
+    """Lay the figure out once, with two minor ticks a decade: eight would be most of what a page of panels costs."""
+    for axes in figure.get_axes():
+        for axis in (axes.xaxis, axes.yaxis):
+            if isinstance(locator := axis.get_minor_locator(), LogLocator):
+                locator.set_params(subs=(2.0, 5.0))
+    figure.set_dpi(SCREEN)
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine("none")
 
 
 def draw_each(

@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.study import Labels, MeasuredRun, Sweeps, grouped, transfer_members
+from vipetsc.figures.study import Files, Labels, MeasuredRun, Sweeps, grouped, transfer_members
 from vipetsc.figures.transfer_curves import Curve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
-from vipetsc.spectra import TAPER, Parts, kinetic_energy, split, taper
+from vipetsc.spectra import TAPER, taper
 
+FIELD = "bands/kinetic_energy"  # (band, t, cell)
 INPUT_CELL = 5  # the paper's cell before the sites; the one behind them is the middle of the lattice, its cell 150
 SEGMENTS = {"dispersion_before": ("Input segment", style.SKY), "dispersion_after": ("Output segment", style.YELLOW)}
 ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
@@ -32,17 +33,17 @@ LEAST_SHARE = 1e-3  # of the largest total: the error is not judged below
 def transfer(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """For every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for member in transfer_members(sweeps):
-        if "velocity" in member.run and all(name in member.analysis for name in ("kinetic_energy", *SEGMENTS)):
+        if "velocity" in member.run and all(name in member.analysis for name in (FIELD, *SEGMENTS)):
             yield Labels.of(member.case).member_stem, partial(nine_panels, member)
 
 
 def nine_panels(member: MeasuredRun) -> Figure:
     """(a) All energy, (b-e) that of every pass band, (f, g) both segments, (h, i) spectra of two cells."""
     run, cell = member.run, member.model.chain.cell
-    velocity, tags = run["velocity"].values, iter(ascii_lowercase)
+    tags = iter(ascii_lowercase)
     figure = style.new_figure(style.PAGE, 7.6, Labels.of(member.case).member)
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
-    _space_time(upper, member, velocity, tags)
+    _space_time(upper, member, tags)
     spectra, maps = panels.below_cutoff(member.analysis, cell, list(SEGMENTS)), middle.subplots(1, 2, sharey=True)
     norm = panels.log_norm(*spectra.values())
     for axes, (name, (label, colour)) in zip(maps, SEGMENTS.items(), strict=True):
@@ -53,27 +54,26 @@ def nine_panels(member: MeasuredRun) -> Figure:
     panels.colour_bar(image, maps, "Energy per bin (J)")
     shown = INPUT_CELL, member.model.chain.cells // 2
     for axes, index in zip(lower.subplots(1, 2, sharey=True), (nearest_cell(run, n) for n in shown), strict=True):
-        _spectra(axes, member, velocity[:, index])
+        _spectra(axes, member, run["velocity"][:, index].values)
         axes.set_title(f"({next(tags)}) Velocity spectra, cell {run['cell'].values[index]}")
         axes.label_outer()
     return figure
 
 
-def _space_time(page: SubFigure, member: MeasuredRun, velocity: np.ndarray, tags: Iterator[str]) -> None:
+def _space_time(page: SubFigure, member: MeasuredRun, tags: Iterator[str]) -> None:
     """Kinetic energy of all frequencies beside that of each pass band, to one scale; segments and sites marked."""
-    run, cell, energy = member.run, member.model.chain.cell, member.analysis["kinetic_energy"]
-    parts, cells, norm = Parts.of(pass_bands(cell)), run["cell"].values, panels.log_norm(energy)
-    bands = [p for p, inside in enumerate(parts.bands) if inside]
-    columns = -(-len(bands) // 2)
+    run, energy, fields = member.run, member.analysis["kinetic_energy"], member.analysis[FIELD]
+    cells, norm, names = energy["cell"].values, panels.log_norm(energy), member.analysis["bands/energy"].attrs["parts"]
+    columns = -(-len(fields) // 2)
     grid = page.add_gridspec(2, 1 + columns, width_ratios=(1.35, *[1.0] * columns))
     whole = page.add_subplot(grid[:, 0])
     image = panels.space_time_map(whole, energy, norm, run)
     whole.set_title(f"({next(tags)}) Kinetic energy")
-    for i, p in enumerate(bands):
+    for i, field in enumerate(fields):
         axes = page.add_subplot(grid[i // columns, 1 + i % columns], sharex=whole, sharey=whole)
-        (part,) = split(velocity, field_interval(run), parts.edges[p : p + 2])
-        panels.draw_map(axes, field_time(run), cells, kinetic_energy(part, cell.masses).T, norm)
-        axes.set(title=f"({next(tags)}) {parts.names[p].capitalize()}", xlabel="Time (s)")
+        panels.draw_map(axes, energy["time"].values, cells, field.values.T, norm)
+        name = np.atleast_1d(names)[int(field["bands/band"]) - 1]
+        axes.set(title=f"({next(tags)}) {name.capitalize()}", xlabel="Time (s)")
         axes.label_outer()
     panels.colour_bar(image, page.axes, "Kinetic energy of a cell (J)", aspect=35)
 
@@ -118,10 +118,10 @@ def transfer_dispersions(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Every reading and configuration: laws in rows, amplitudes in columns."""
     members = ((m.case, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis)
     for name, group in grouped(members, lambda pair: Labels.of(pair[0]).page_stem).items():
-        yield name, partial(_dispersion_table, group)
+        yield name, partial(_dispersion_table, group, sweeps.files)
 
 
-def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
+def _dispersion_table(members: Sequence[tuple[Case, Path]], files: Files) -> Figure:
     """One panel a member; colours run over five decades below each panel's own largest value."""
     runs = {(case.contacts.law, case.drive.amplitude): folder for case, folder in members}
     laws, amplitudes = sorted({law for law, _ in runs}, reverse=True), sorted({amplitude for _, amplitude in runs})
@@ -131,13 +131,13 @@ def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
         if (laws[i], amplitudes[j]) not in runs:
             panels.annotate_empty(axes, "no such run")
             continue
-        with MeasuredRun.open(runs[laws[i], amplitudes[j]]) as member:
-            cell = member.model.chain.cell
-            energy = panels.below_cutoff(member.analysis, cell, ["dispersion"])["dispersion"]
-            energy = energy / (float(energy.max()) or 1.0)
-            image = panels.dispersion_map(axes, energy, panels.log_norm(energy), cell)
-            axes.label_outer()
-            transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
+        member = files.get(runs[laws[i], amplitudes[j]], MeasuredRun.open)
+        cell = member.model.chain.cell
+        energy = panels.below_cutoff(member.analysis, cell, ["dispersion"])["dispersion"]
+        energy = energy / (float(energy.max()) or 1.0)
+        image = panels.dispersion_map(axes, energy, panels.log_norm(energy), cell)
+        axes.label_outer()
+        transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
         axes.set_title(f"({'abcdef'[i]}.{j + 1}) {laws[i].capitalize()}, {amplitudes[j]:.4g} N")
         axes.text(0.03, 0.41, transferred, color="white", transform=axes.transAxes)
     panels.colour_bar(image, grid, "Energy per bin over its largest", aspect=35)
@@ -147,7 +147,7 @@ def _dispersion_table(members: Sequence[tuple[Case, Path]]) -> Figure:
 def band_energies(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Energies of all parts and their sum over time for every whole member; mean shares for every sweep."""
     for member in transfer_members(sweeps):
-        if member.analysis.sizes["bands/part"] and member.analysis.sizes["time"] > 1:
+        if member.analysis.sizes["bands/part"] and "bands/total" in member.analysis:
             yield Labels.of(member.case).member_stem, partial(energies_over_time, member)
     with_shares = (curve for curve in transfer_curves(sweeps) if "bands/share" in curve.data)
     for name, curves in grouped(with_shares, lambda curve: Labels.of(curve.case).page_stem).items():
@@ -170,7 +170,7 @@ def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndar
 def energies_over_time(member: MeasuredRun) -> Figure:
     """The parts and their sum against the total (mean over a period of the drive), and how far they miss it."""
     analysis = member.analysis
-    time, parts, total = (analysis[name].values for name in ("time", "bands/energy", "bands/total"))
+    time, parts, total = (analysis[name].values for name in ("bands/sample", "bands/energy", "bands/total"))
     samples = max(round(2 * np.pi / member.model.drive.frequency / (time[1] - time[0])), 1)
     series = np.stack([time, total, parts.sum(axis=0), *parts])
     time, mean_total, mean_sum, *mean_parts = sliding_window_view(series, samples, axis=1).mean(axis=2)
@@ -191,7 +191,7 @@ def energies_over_time(member: MeasuredRun) -> Figure:
     below = np.mean(error[np.isfinite(error)] <= LARGEST_ERROR)
     text = f"whole record: {100 * whole:.2g} %; at most 1 % for {100 * below:.3g} % of the time"
     lower.text(0.5, 0.93, text, ha="center", va="top", transform=lower.transAxes)
-    lower.set(yscale="log", ylim=(1e-4, 1e3), xlim=analysis["time"][[0, -1]], xlabel="Time (s)", ylabel="Error (%)")
+    lower.set(yscale="log", ylim=(1e-4, 1e3), xlim=series[0, [0, -1]], xlabel="Time (s)", ylabel="Error (%)")
     lower.set_title("(b) Sum of the parts against the total")
     return figure
 

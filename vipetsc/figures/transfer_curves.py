@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vipetsc.case import Case
+from vipetsc.case import Case, Sweep
 from vipetsc.figures import style
 from vipetsc.figures.panels import note, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
-from vipetsc.figures.study import AMPLITUDE, Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
+from vipetsc.figures.study import AMPLITUDE, Files, Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, field_interval, field_time
 from vipetsc.spectra import doubt
@@ -37,8 +37,9 @@ def transfer_curves(sweeps: Sweeps) -> Iterator[Curve]:
     ``peak`` is the index of the largest "ibtet", ``floor`` the transfer without any contact, NaN if all members touch.
     """
     for ensemble in sweeps:
-        for row, folder in curves(ensemble, AMPLITUDE) if "ibtet" in ensemble else ():
-            case, data = Case.load(folder / "case.toml"), row.sortby(AMPLITUDE)
+        sweep = Sweep.of(ensemble)
+        for row, number in curves(ensemble, AMPLITUDE) if "ibtet" in ensemble else ():
+            case, data = sweep.case(number), row.sortby(AMPLITUDE)
             transfer = data["ibtet"].values
             if sites_of(case) and np.isfinite(transfer).sum() >= FEWEST:
                 untouched = transfer[data["contact_episodes"].values == 0]
@@ -144,17 +145,16 @@ class ContactMotion(NamedTuple):
     ibtet: float
 
     @classmethod
-    def read(cls, folder: Path) -> Self:
-        """The member in ``folder`` for ``PERIODS`` of the drive about its largest relative displacement."""
-        with MeasuredRun.open(folder) as member:
-            run, cell = member.run, member.model.chain.cell
-            motion = run.sel(cell=run["sites/cell"].values[0]).isel(dof=[cell.host, cell.resonator])
-            displacement, velocity = motion["displacement"].values, motion["velocity"].values
-            middle = int(np.argmax(np.abs(displacement[:, 1] - displacement[:, 0])))
-            half = round(PERIODS * np.pi / member.model.drive.frequency / field_interval(run))
-            shown = slice(max(middle - half, 0), middle + half + 1)
-            u, v, _ = refined(displacement[shown], velocity[shown], field_time(run)[shown])
-            return cls(member.case, u, v, float(member.analysis["ibtet"]))
+    def of(cls, member: MeasuredRun) -> Self:
+        """The ``member`` for ``PERIODS`` of the drive about its largest relative displacement."""
+        run, cell = member.run, member.model.chain.cell
+        motion = run.sel(cell=run["sites/cell"].values[0]).isel(dof=[cell.host, cell.resonator])
+        displacement, velocity = motion["displacement"].values, motion["velocity"].values
+        middle = int(np.argmax(np.abs(displacement[:, 1] - displacement[:, 0])))
+        half = round(PERIODS * np.pi / member.model.drive.frequency / field_interval(run))
+        shown = slice(max(middle - half, 0), middle + half + 1)
+        u, v, _ = refined(displacement[shown], velocity[shown], field_time(run)[shown])
+        return cls(member.case, u, v, float(member.analysis["ibtet"]))
 
 
 def phase_regimes(sweeps: Sweeps) -> Iterator[style.Drawing]:
@@ -166,15 +166,16 @@ def phase_regimes(sweeps: Sweeps) -> Iterator[style.Drawing]:
             folders.setdefault(_settings(member.case), []).append(member.folder)
     curves = {(_settings(curve.case), *sites_of(curve.case)): curve for curve in transfer_curves(sweeps)}
     for name, of_setting in folders.items():
-        yield name, partial(_regimes, of_setting, curves)
+        yield name, partial(_regimes, of_setting, sweeps.files, curves)
 
 
 def _settings(case: Case) -> str:
     return f"{case.contacts.law}-{Labels.of(case).page_stem}"
 
 
-def _regimes(folders: Sequence[Path], curves: Mapping[tuple[Any, ...], Curve]) -> Figure:
-    motions = sorted(map(ContactMotion.read, folders), key=lambda motion: motion.case.drive.amplitude)
+def _regimes(folders: Sequence[Path], files: Files, curves: Mapping[tuple[Any, ...], Curve]) -> Figure:
+    motions = [ContactMotion.of(files.get(folder, MeasuredRun.open)) for folder in folders]
+    motions.sort(key=lambda motion: motion.case.drive.amplitude)
     case = motions[0].case
     labels, (site,) = Labels.of(case), sites_of(case)
     columns = -(-len(motions) // 2)

@@ -69,10 +69,13 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
             file.write(np.ascontiguousarray(values).data)
 
 
-def load_arrays(path: Path, wanted: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """What ``save_arrays`` wrote, or the ``wanted`` arrays of it; raises OSError that names the file."""
+def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
+    """What ``save_arrays`` wrote, or the ``wanted`` arrays of it; without a ``copy``, read where it is used.
+
+    Raises OSError that names the file.
+    """
     try:
         record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
-        return {name: np.array(record[name]) for name in (record.dtype.names if wanted is None else wanted)}
+        return {name: np.array(record[name], copy=copy) for name in (record.dtype.names if wanted is None else wanted)}
     except (OSError, ValueError) as error:
         raise OSError(f"{path} cannot be read: {error}") from error

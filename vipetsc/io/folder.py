@@ -40,19 +40,20 @@ class FolderKind:
     """What a folder of results holds; patterns as of ``Path.glob``.
 
     ``noun``: one of them; ``results``: what shows that a folder holds some; ``beside``: what else is theirs;
-    ``marker``: the file that names what the results are of.
+    ``marker``: the file that names what the results are of; ``free``: its section that may change beside results.
     """
 
     noun: str
     results: tuple[str, ...]
     beside: tuple[str, ...] = ("figures",)
     marker: str = "case.toml"
+    free: str = ""
 
 
-RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "figures"))
+RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "figures"), free="analysis")
 BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
 SEARCH = FolderKind("search", ("design.h5",))
-SWEEP = FolderKind("sweep", ("index.json", "linear"), ("*/", "ensemble.h5", "backbone.h5"))
+SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, SWEEP, PAPER)
 
@@ -137,7 +138,7 @@ def _claim(
             raise FolderError(f"{path}: {problem}")
     if not going_on or (folder / kind.marker).read_text(encoding="utf-8") != text:
         write_text(folder / kind.marker, text)
-    for temporary in [p for where in ("", "*/", "linear/*/") for p in folder.glob(f"{where}.*.part")]:
+    for temporary in [p for where in ("", "*/") for p in folder.glob(f"{where}.*.part")]:
         if temporary.parent == folder or not (temporary.parent / LOCK).exists():  # where nobody else is writing
             temporary.unlink(missing_ok=True)
     return folder, going_on
@@ -160,7 +161,7 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
     differing = [
         "{} = {} there, {} here".format(key, *(shorten(str(case.get(key, "nothing")), 60) for case in (then, now)))
         for key in then | now
-        if then.get(key) != now.get(key)
+        if then.get(key) != now.get(key) and key.partition(".")[0] != kind.free
     ]
     more = f"; and {len(differing) - MOST_NAMED} more" if len(differing) > MOST_NAMED else ""
     return f"holds another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}" if differing else None

@@ -118,6 +118,8 @@ def _flat(groups: dict[str, xr.Dataset]) -> xr.Dataset:
         for name, item in data.variables.items():
             around = [[above / str(dim) for above in (node, *node.parents)] for dim in item.dims]
             dims = [next((path for path in paths if path in scales), paths[0]) for paths in around]
-            variables[str(node / str(name)).strip("/")] = item._replace(dims=[str(dim).strip("/") for dim in dims])
+            renamed = item.copy(deep=False)  # values stay in the file
+            renamed.dims = tuple(str(dim).strip("/") for dim in dims)
+            variables[str(node / str(name)).strip("/")] = renamed
         attributes |= {str(node / str(key)).strip("/"): value for key, value in data.attrs.items()}
     return xr.Dataset(variables, attrs=attributes)

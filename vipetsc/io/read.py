@@ -5,7 +5,6 @@ measures over one dimension a swept axis; ``select`` picks members by the values
 from 1, units stand in the attributes.
 """
 
-import json
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,24 +56,28 @@ def nearest_cell(run: xr.Dataset, cell: int) -> int:
 def open_ensemble(folder: str | Path) -> xr.Dataset:
     """The ensemble of the sweep in ``folder``, read whole: measures over one dimension a swept axis.
 
-    A dimension is named after its axis' first key; further keys of a zipped axis are coordinates on it. ``member`` is
-    the name of each member's folder, empty where the case of a member is no valid one; the attribute ``folder`` is
-    the sweep's. Raises OSError if ``ensemble.h5`` or ``index.json`` cannot be read, ValueError if it is no ensemble of
-    ours.
+    A dimension is named after its axis' first key; further keys of a zipped axis are coordinates on it. ``number`` is
+    each member's, from 0; the attribute ``folder`` is the sweep's. Raises OSError if ``ensemble.h5`` cannot be read,
+    ValueError if it is no ensemble of ours, or one of an earlier version.
     """
     folder = Path(folder)
+    if reason := outdated(folder):
+        raise ValueError(reason)
     with open_netcdf(folder / "ensemble.h5", "sweep's ensemble", ("status", "case")) as file:
         data = file.assign_attrs(folder=str(folder)).load()
     keys = [key for group in tomllib.loads(data.attrs["case"])["sweep"]["zip"] for key in group]
     data = data.set_coords(
         [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in keys]
     )
-    try:
-        rows = json.loads((folder / "index.json").read_text(encoding="utf-8"))["members"]
-    except (OSError, ValueError, KeyError) as error:
-        raise OSError(f"{folder / 'index.json'} cannot be read: {error}") from error
-    ids = np.array([row["id"] for row in rows], dtype=object).reshape(data["status"].shape)
-    return data.assign(member=(data["status"].dims, ids, {"long_name": "name of the member's folder"}))
+    number = np.arange(data["status"].size).reshape(data["status"].shape)
+    return data.assign(number=(data["status"].dims, number, {"long_name": "number of the member, from 0"}))
+
+
+def outdated(folder: Path) -> str:
+    """Empty; of a sweep of an earlier version, which has a folder for every member, what is to be done about it."""
+    remedy = "the verb sweep makes it again with --force, or elsewhere with --out"
+    text = f"{folder}: holds a sweep of an earlier version, a folder for every member; {remedy}"
+    return text if (folder / "linear").is_dir() else ""
 
 
 def select(data: Selectable, **wanted: Any) -> Selectable:
@@ -104,14 +107,13 @@ def axes(ensemble: xr.Dataset) -> tuple[str, ...]:
     return tuple(map(str, ensemble["status"].dims))
 
 
-def member_folder(member: xr.Dataset) -> Path | None:
-    """Folder of one member (``case.toml``, ``run.h5``, ``analysis.h5``); None where its case was no valid one."""
-    identity = str(member["member"].item())
-    return Path(member.attrs["folder"]) / identity if identity else None
+def member_folder(member: xr.Dataset) -> Path:
+    """Folder of one member (``run.h5``, ``analysis.h5``), if its fields were kept."""
+    return Path(member.attrs["folder"]) / str(member["member"].item())
 
 
-def curves(ensemble: xr.Dataset, along: str = "amplitude") -> Iterator[tuple[xr.Dataset, Path]]:
-    """Every curve over the axis ``along``, and the folder of its first member with a valid case.
+def curves(ensemble: xr.Dataset, along: str = "amplitude") -> Iterator[tuple[xr.Dataset, int]]:
+    """Every curve over the axis ``along`` with a member that came out, and the number of the first such.
 
     Nothing if the sweep has no such axis.
     """
@@ -120,10 +122,9 @@ def curves(ensemble: xr.Dataset, along: str = "amplitude") -> Iterator[tuple[xr.
         return
     for index in np.ndindex(*(ensemble.sizes[name] for name in others)):
         curve = ensemble.isel(dict(zip(others, index, strict=True)))
-        folders = [member_folder(curve.isel({along: i})[["member"]]) for i in range(curve.sizes[along])]
-        first = next((folder for folder in folders if folder), None)
-        if first:
-            yield curve, first
+        came_out = curve["number"].values[np.isfinite(curve["contact_episodes"].values)]
+        if came_out.size:
+            yield curve, int(came_out[0])
 
 
 def whole_members(ensemble: xr.Dataset) -> Iterator[tuple[xr.Dataset, Path]]:
@@ -133,5 +134,5 @@ def whole_members(ensemble: xr.Dataset) -> Iterator[tuple[xr.Dataset, Path]]:
     for index in np.ndindex(*ensemble["status"].shape):
         member = ensemble.isel(dict(zip(axes(ensemble), index, strict=True)))
         folder = member_folder(member)
-        if folder and (folder / "run.h5").exists() and (folder / "analysis.h5").exists():
+        if (folder / "run.h5").exists() and (folder / "analysis.h5").exists():
             yield member, folder

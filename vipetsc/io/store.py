@@ -2,10 +2,9 @@
 
 While a run goes on, its samples are kept as chunks: chunk k holds those between the checkpoints k - 1 and k. A chunk
 and a checkpoint are named arrays; a rank writes its share of each into a file of its own, so nothing is sent while a
-run goes on. Every share says what it is of, so that another number of ranks can go on with it: fields come with
-``columns``, the half-open range of the recorded cells that they are of. When the run has ended, the chunks become one
-dataset in the layout of ``io.netcdf``. Its fields (t, cell, dof) are too large to be held whole: they are copied chunk
-by chunk, to a file of one rank or to one that all ranks share.
+run goes on. Every share says what it is of, so that another number of ranks can go on with it. When the run has
+ended, ``io.chunks`` puts them together. Fields (t, cell, dof) and losses (t, site) are too large to be held whole: they
+are copied chunk by chunk, to a file of one rank or to one that all ranks share; these hold a part of the log each.
 """
 
 import json
@@ -14,7 +13,7 @@ import sys
 import tomllib
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,57 +23,16 @@ import h5py
 import numpy as np
 import xarray as xr
 
+from vipetsc.io import chunks
 from vipetsc.io.atomic import Arrays, discard, load_arrays, save_arrays, unwritten, write_text
+from vipetsc.io.chunks import Recording
+from vipetsc.io.contents import LOSSES
 from vipetsc.io.lock import FolderError
-from vipetsc.io.netcdf import add_variable, put_dataset, tabulated
+from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run
-from vipetsc.parallel import on_every_rank, on_root
+from vipetsc.parallel import on_every_rank, on_root, spread
 
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
-FIELDS = {
-    "displacement": {"units": "m", "long_name": "displacement of each mass"},
-    "velocity": {"units": "m/s", "long_name": "velocity of each mass"},
-}
-# Name in the file: dimensions, units, text. What a chunk holds besides fields, and what is known from the beginning.
-SAMPLED = {
-    "time": ("time", "s", "time"),
-    "field_time": ("field_time", "s", "time of the recorded fields"),
-    "energy/kinetic": ("time", "J", "kinetic energy"),
-    "energy/spring": ("time", "J", "energy of the springs"),
-    "energy/contact": ("time", "J", "elastic energy of the contacts"),
-    "energy/work": ("time", "J", "work done by the drive"),
-    "energy/dissipated": ("time", "J", "energy dissipated in contacts"),
-    "energy/dissipated_by_site": ("time site", "J", "energy dissipated at each site"),
-    "impacts/site": ("episode", "1", "site, counted from 1"),
-    "impacts/side": ("episode", "1", "side of the clearance: +1 or -1"),
-    "impacts/onset": ("episode", "s", "time of onset"),
-    "impacts/approach_velocity": ("episode", "m/s", "relative velocity at onset, w'_minus"),
-    "impacts/separation": ("episode", "s", "time of separation; NaN if still in contact"),
-    "impacts/indentation": ("episode", "m", "largest indentation"),
-    "impacts/force": ("episode", "N", "largest contact force"),
-    "impacts/loss": ("episode", "J", "energy dissipated in the episode"),
-}
-GIVEN = {
-    "cell": ("cell", "1", "cell, counted from 1"),
-    "dof": ("dof", "1", "mass within the cell, from 1"),
-    "site": ("site", "1", "contact site, from 1"),
-    "episode": ("episode", "1", "contact episode, by onset"),
-    "sites/cell": ("site", "1", "cell of the site"),
-    "sites/clearance": ("site", "m", "clearance of the site"),
-}
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What the chunks of a run hold.
-
-    ``given``: the arrays of ``GIVEN``, but for the episodes; ``fields``: those of ``FIELDS`` that are recorded;
-    ``together``: whether all ranks write the fields into one file that they share, instead of rank 0 alone.
-    """
-
-    given: Arrays
-    fields: tuple[str, ...]
-    together: bool
 
 
 class RunFolder:
@@ -120,6 +78,10 @@ class RunFolder:
     def _summarise(self, told: Mapping[str, Any]) -> None:
         write_text(self.folder / "summary.json", json.dumps(told, indent=2, allow_nan=False) + "\n")
 
+    def room(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Room (field, sample, dof, cell) for this rank's fields of the next chunk."""
+        return np.empty(shape)
+
     def append(self, chunk: Arrays | None) -> None:
         """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
 
@@ -163,7 +125,7 @@ class RunFolder:
         number, size = on_root(self.comm, last_complete)
         self.count = number + 1
         paths = [self._state(number, rank, size) for rank in range(size)]
-        return on_every_rank(self.comm, lambda: [load_arrays(path) for path in paths]) if paths else None
+        return on_every_rank(self.comm, lambda: [load_arrays(path, copy=False) for path in paths]) if paths else None
 
     def _chunk(self, number: int, rank: int) -> Path:
         return self._parts / f"part-{number:06d}-{rank}.npy"
@@ -183,22 +145,27 @@ class RunFolder:
         """
         target, aside, together = self.folder / "run.h5", self.folder / ".run.h5.part", self.recording.together
 
-        def read_chunks() -> xr.Dataset | None:
+        def read_chunks() -> tuple[xr.Dataset, np.ndarray] | None:
             sys.audit("vipetsc.assemble", str(target))
-            return dataset_without_fields(self, attributes) if together or self.comm.rank == 0 else None
+            writes = together or self.comm.rank == 0
+            return (chunks.small_dataset(self, attributes), chunks.read_log(self)) if writes else None
 
         def write() -> None:
-            if data is None:
-                return
             try:
                 with h5py.File(aside, "w", **({"driver": "mpio", "comm": self.comm} if together else {})) as file:
                     put_dataset(file, data, write=self.comm.rank == 0)
-                    dims = field_dimensions(data)
-                    shape = [data.sizes[dim] for dim in dims]
+                    columns, sizes = chunks.log_columns(log, first), {**data.sizes, "episode": total}
                     # All of them first: ranks create together, but each copies and may fail alone.
-                    fields = {n: add_variable(file, n, dims, shape, float, FIELDS[n]) for n in self.recording.fields}
-                    for name, field in fields.items():
-                        put_chunks(field, self, name)
+                    large = {}
+                    for name in (*columns, LOSSES, *self.recording.fields):
+                        dims, about = chunks.described(name, data)
+                        dtype = columns[name].dtype if name in columns else float
+                        large[name] = add_variable(file, name, dims, [sizes[dim] for dim in dims], dtype, about)
+                    for name, dataset in large.items():
+                        if name not in columns:
+                            chunks.put_chunks(dataset, self, name)
+                        elif log.size:
+                            dataset[first : first + log.size] = columns[name]
             except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
                 raise unwritten(target, error) from error
 
@@ -210,8 +177,11 @@ class RunFolder:
             discard(self._parts)
 
         try:
-            data = on_every_rank(self.comm, read_chunks)  # a rank that cannot must not leave the others creating a file
-            on_every_rank(self.comm, write)
+            # A rank that cannot must not leave the others creating a file.
+            parts = on_every_rank(self.comm, read_chunks)
+            if parts:
+                data, (log, first, total) = parts[0], spread(chunks.writers(self), parts[1], ("onset", "site"))
+            on_every_rank(self.comm, write if parts else lambda: None)
             on_root(self.comm, conclude)
         finally:
             if self.comm.rank == 0:
@@ -222,6 +192,7 @@ class RunMemory:
     """Keeps a run in memory: ``dataset`` on rank 0 of ``comm``, None on the others and before its end.
 
     It is used as a ``RunFolder``. Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
+    They lie in memory as (t, dof, cell): on one rank the engine writes them where they stay.
     """
 
     folder = None
@@ -233,13 +204,33 @@ class RunMemory:
 
     def begin(self, case: str) -> None:
         """Make ready."""
-        self.case, self.count = case, 0
+        self.case, self.count, self._rows = case, 0, 0
         self._chunks: list[Arrays] = []
+        vars(self).pop("_fields", None)
+
+    @cached_property
+    def _fields(self) -> np.ndarray:
+        sizes = (len(self.recording.given[name]) for name in ("dof", "cell"))
+        return np.empty((len(self.recording.fields), self.recording.rows, *sizes))
+
+    def room(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Room (field, sample, dof, cell) for this rank's fields of the next chunk."""
+        return self._fields[:, self._rows :][:, : shape[1]] if self.comm.size == 1 else np.empty(shape)
 
     def append(self, chunk: Arrays | None) -> None:
         """Keep the next chunk."""
-        self._chunks.append(chunk or {})
+        arrays = dict(chunk or {})
+        fields = [arrays.pop(name) for name in self.recording.fields if name in arrays]
+        rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
+        if self.comm.size > 1 and fields:
+            self._fields[:, rows] = fields
+        self._rows = rows.stop
+        self._chunks.append(arrays)
         self.count += 1
+
+    def ranks(self, number: int) -> list[int]:
+        """Rank 0 alone."""
+        return [0]
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
         """Chunk ``number`` of this rank, which has what is ``wanted``."""
@@ -254,47 +245,13 @@ class RunMemory:
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Make the dataset; all ranks must call it."""
         if self.comm.rank == 0:
-            self.dataset = dataset_without_fields(self, attributes)
-            for name, values in joined(self, self.recording.fields).items():
-                self.dataset[name] = field_dimensions(self.dataset), values, FIELDS[name]
+            self.dataset = chunks.small_dataset(self, attributes)
+            log, *_ = spread(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
+            fields = dict(zip(self.recording.fields, self._fields[:, : self._rows].swapaxes(2, 3), strict=True))
+            for name, values in {**chunks.joined(self, [LOSSES]), **chunks.log_columns(log), **fields}.items():
+                dims, about = chunks.described(name, self.dataset)
+                self.dataset[name] = dims, values, about
         self._chunks = []
 
 
 RunOutput = RunFolder | RunMemory
-
-
-def joined(output: RunOutput, names: Collection[str]) -> dict[str, np.ndarray]:
-    """The arrays ``names`` of rank 0, those of all chunks one after the other."""
-    chunks = [output.read(number, 0, names) for number in range(output.count)]
-    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
-
-
-def dataset_without_fields(output: RunOutput, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """All of a run but its fields, from the chunks of rank 0; episodes in the order of their onsets."""
-    arrays = joined(output, SAMPLED)
-    order = np.lexsort((arrays["impacts/site"], arrays["impacts/onset"]))
-    arrays |= {name: values[order] for name, values in arrays.items() if name.startswith("impacts/")}
-    if len(arrays["field_time"]) == len(arrays["time"]):
-        del arrays["field_time"]
-    arrays |= {**output.recording.given, "episode": np.arange(1, len(order) + 1)}
-    return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": output.case, **attributes})
-
-
-def field_dimensions(data: xr.Dataset) -> list[str]:
-    """Dimensions of the fields beside ``data``."""
-    return ["field_time" if "field_time" in data else "time", "cell", "dof"]
-
-
-def put_chunks(field: h5py.Dataset, output: RunFolder, name: str) -> None:
-    """Copy the field ``name`` of all chunks to ``field``; ranks that write together share the files."""
-    first, comm = 0, output.comm
-    for number in range(output.count):
-        rows = output.read(number, 0, ["field_time"])["field_time"].size
-        for rank in output.ranks(number):
-            if output.recording.together and rank % comm.size != comm.rank:
-                continue
-            share = output.read(number, rank, [name, "columns"])
-            # h5py leaves out empty selections, on which writing together would hang.
-            if share[name].size:
-                field[first : first + rows, slice(*share["columns"])] = share[name]
-        first += rows

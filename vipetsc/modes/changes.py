@@ -12,13 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.contact.search import first_upcrossing_after_start
 
 # Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
 NONE, CROSSING, EXTREMUM = 0, 1, 2
 # Attempts at an extremum, and of one landing in all.
 EXTREMUM_ATTEMPTS, MOST_ATTEMPTS = 40, 120
+# Of a polynomial of degree 5 in the share of a step, the lowest first.
+Coefficients = tuple[float, float, float, float, float, float]
 # A slope at the start below this share of the curvature is the rounding of an extremum.
 ROUNDING = 1e-8
 
@@ -41,7 +43,7 @@ class Change(NamedTuple):
     attempts: int
 
 
-@njit
+@kernel
 def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, int]:
     """The next attempt after one that ended with (w, w', w'') = ``motion``: Newton's method, or bisection.
 
@@ -71,35 +73,32 @@ def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, i
     return Change(contact, side, sign, offset, False, 0.0, length, 0.5 * length, 0), NONE
 
 
-@njit
-def hermite(a: np.ndarray, b: np.ndarray, h: float, sign: float, offset: float, c: np.ndarray) -> None:
-    """Coefficients c (6,) of sign * w - offset on [0, 1] from (w, w', w'') at both ends of a step h."""
+@kernel
+def hermite(a: np.ndarray, b: np.ndarray, h: float, sign: float, offset: float) -> Coefficients:
+    """Coefficients of sign * w - offset on [0, 1] from (w, w', w'') at both ends of a step h."""
     g0, r0, s0 = sign * a[0] - offset, sign * a[1] * h, sign * a[2] * h * h
     g1, r1, s1 = sign * b[0] - offset, sign * b[1] * h, sign * b[2] * h * h
     d = g1 - g0 - r0 - 0.5 * s0
     e = r1 - r0 - s0
     f = s1 - s0
-    c[0], c[1], c[2] = g0, r0, 0.5 * s0
-    c[3] = 10.0 * d - 4.0 * e + 0.5 * f
-    c[4] = -15.0 * d + 7.0 * e - f
-    c[5] = 6.0 * d - 3.0 * e + 0.5 * f
+    return g0, r0, 0.5 * s0, 10.0 * d - 4.0 * e + 0.5 * f, -15.0 * d + 7.0 * e - f, 6.0 * d - 3.0 * e + 0.5 * f
 
 
-@njit
-def _value(c: np.ndarray, x: float) -> float:
+@kernel
+def _value(c: Coefficients, x: float) -> float:
     return c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * c[5]))))
 
 
-@njit
-def _slope(c: np.ndarray, x: float) -> float:
+@kernel
+def _slope(c: Coefficients, x: float) -> float:
     """Slope at x; just after 0, for a step that starts on an extremum."""
     if x == 0.0 and abs(c[1]) <= ROUNDING * abs(c[2]):
         return c[2]
     return c[1] + x * (2.0 * c[2] + x * (3.0 * c[3] + x * (4.0 * c[4] + x * 5.0 * c[5])))
 
 
-@njit
-def _bisect(c: np.ndarray, low: float, high: float, sign: float) -> float:
+@kernel
+def _bisect(c: Coefficients, low: float, high: float, sign: float) -> float:
     """Where the polynomial turns positive between low and high; given a ``sign``, where its slope no longer has it."""
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -112,8 +111,8 @@ def _bisect(c: np.ndarray, low: float, high: float, sign: float) -> float:
     return 0.5 * (low + high)
 
 
-@njit
-def _extremum(c: np.ndarray, share: float) -> float:
+@kernel
+def _extremum(c: Coefficients, share: float) -> float:
     """The zero of the slope near ``share``, in its quarter of the step."""
     low = 0.25 * min(np.floor(4.0 * share), 3.0)
     sign = _slope(c, low)
@@ -136,8 +135,8 @@ def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
     return low + share * (1.0 - low)
 
 
-@njit
-def first_rise(c: np.ndarray) -> tuple[float, int]:
+@njit(_nrt=True)  # makes arrays, also where it is called from kernels
+def first_rise(c: Coefficients) -> tuple[float, int]:
     """Where a gap that starts at or below zero first rises through it: share of the step, outcome."""
     margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))  # above the interpolant's error
     b1 = c[0] + c[1] / 5.0  # Bernstein coefficients bound the gap

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel
 from vipetsc.modes import flow
 from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
 from vipetsc.modes.flow import Flow, FlowError
+from vipetsc.modes.system import System
 
 # Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed.
 DONE, STUCK, FULL = range(3)
@@ -23,106 +24,125 @@ RTOL, RTOL_SENSITIVITY = 1e-13, 1e-11
 MOST_CHANGES = 2000
 STAGES = 12
 _TABLEAU = np.loadtxt(Path(__file__).with_suffix(".csv"), delimiter=",")
-A, (B, E3, E5) = _TABLEAU[:STAGES], _TABLEAU[STAGES:]
+A, B, E3, E5 = _TABLEAU[:STAGES], *_TABLEAU[STAGES:]
 
 
 class Stepper(NamedTuple):
-    """What a step reads and writes: rates at its ``stages`` (STAGES, 2n, 1 + m), state and rates at its end.
+    """What a step reads and writes: rates at its ``stages`` (STAGES, rows, 1 + m), states at its ``start`` and ``end``.
 
-    Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian.
+    Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian. The 2n
+    rows are padded to a multiple of 8, so that sums over stages have no remainder. Those are done on ``flat``: stages,
+    errors, start and end with one dimension in place of two. ``errors`` (2, rows, 1 + m): of orders 3 and 5, over h.
     """
 
     step: flow.Step
     omega_ref: float
     stages: np.ndarray
+    errors: np.ndarray
+    start: np.ndarray
     end: np.ndarray
     end_rates: np.ndarray
+    flat: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
-@njit
-def _scaled_error(stepper: Stepper, y: np.ndarray, h: float) -> float:
-    """The new state from the stages, and the largest error of a column over what is allowed."""
-    k, out = stepper.stages, stepper.end
-    size, columns = y.shape
-    error = 0.0
-    for j in range(columns):
+@kernel
+def _combine(stepper: Stepper, weights: np.ndarray, h: float) -> None:
+    """The end from the start and weighted rates. All stages, a number that the compiler knows: unused ones weigh 0."""
+    k, _, y, end = stepper.flat
+    for e in range(end.size):
+        total = 0.0
+        for r in range(STAGES):
+            total += weights[r] * k[r, e]
+        end[e] = y[e] + h * total
+
+
+@kernel
+def _scaled_error(stepper: Stepper, h: float) -> float:
+    """The largest error of a column over what is allowed; infinite if the step overflowed."""
+    y, end, errors, error, zero = stepper.start, stepper.end, stepper.errors, 0.0, 0.0
+    for value in stepper.flat[3]:
+        zero += 0.0 * value
+    if zero != 0.0:
+        return np.inf
+    (k, estimates, _, _), n = stepper.flat, stepper.step.system.inverse_mass.size
+    for e in range(estimates.shape[1]):
+        e3, e5 = 0.0, 0.0
+        for r in range(STAGES):
+            e3 += E3[r] * k[r, e]
+            e5 += E5[r] * k[r, e]
+        estimates[0, e], estimates[1, e] = e3, e5
+    for j in range(y.shape[1]):
         fifth, third, scale = 0.0, 0.0, 0.0
-        for i in range(size):
-            total, e5, e3 = 0.0, 0.0, 0.0
-            for r in range(STAGES):
-                total += B[r] * k[r, i, j]
-                e5 += E5[r] * k[r, i, j]
-                e3 += E3[r] * k[r, i, j]
-            out[i, j] = y[i, j] + h * total
-            unit = 1.0 if i < size // 2 else 1.0 / stepper.omega_ref
-            fifth = max(fifth, abs(e5) * unit)
-            third = max(third, abs(e3) * unit)
-            scale = max(scale, abs(out[i, j]) * unit, abs(y[i, j]) * unit)
+        for i in range(2 * n):
+            unit = 1.0 if i < n else 1.0 / stepper.omega_ref
+            fifth = max(fifth, abs(errors[1, i, j]) * unit)
+            third = max(third, abs(errors[0, i, j]) * unit)
+            scale = max(scale, abs(end[i, j]) * unit, abs(y[i, j]) * unit)
         if fifth > 0.0:
             allowed = (RTOL if j == 0 else RTOL_SENSITIVITY) * scale
             error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / allowed)
     return error
 
 
-@njit
-def _advance(stepper: Stepper, y: np.ndarray, h: float) -> float:
-    """One step of length ``h`` from ``y``, whose rates are the first stage; returns the scaled error."""
-    step, k, out = stepper.step, stepper.stages, stepper.end
-    size, columns = y.shape
+@kernel
+def _advance(stepper: Stepper, h: float) -> float:
+    """One step of length ``h`` from the start, whose rates are the first stage; returns the scaled error."""
+    step = stepper.step
     for s in range(1, STAGES):
-        for i in range(size):
-            for j in range(columns):
-                total = 0.0
-                for r in range(s):
-                    total += A[s, r] * k[r, i, j]
-                out[i, j] = y[i, j] + h * total
-        flow.rates(step.system, step.side, out, k[s])
-    error = _scaled_error(stepper, y, h)
-    flow.observe(step, out, stepper.end_rates, step.end)
-    return error
+        _combine(stepper, A[s], h)
+        flow.rates(step.system, step.side, stepper.end, stepper.stages[s])
+    _combine(stepper, B, h)
+    return _scaled_error(stepper, h)
 
 
-@njit
-def _land(stepper: Stepper, y: np.ndarray, t: float, h: float, change: Change) -> tuple[float, bool]:
+@kernel
+def _land(stepper: Stepper, t: float, h: float, change: Change) -> tuple[float, bool]:
     """Repeat the step of length ``h`` at time ``t`` so that it ends on a change: its length, whether it is one."""
+    step = stepper.step
     for _ in range(MOST_ATTEMPTS):
         length = change.length
-        _advance(stepper, y, length)
+        _advance(stepper, length)
+        flow.observe(step, stepper.end, stepper.end_rates, step.end)
         floor = 1e-15 * h if change.extremum else 1e-16 * (t + h)
-        change, outcome = correct(change, stepper.step.end[change.contact], floor)
+        change, outcome = correct(change, step.end[change.contact], floor)
         if outcome != NONE:
             break
     return length, outcome != EXTREMUM
 
 
-@njit
-def _flow(stepper: Stepper, y: np.ndarray, duration: float, events: np.ndarray) -> tuple[int, int, float]:
-    """Advance ``y`` (2n, 1 + m) in place over ``duration`` seconds.
+@kernel
+def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, int, float]:
+    """Advance the ``start`` in place over ``duration`` seconds.
 
     Returns the outcome (DONE, STUCK or FULL), the number of ``events`` (capacity, 4) filled with time, contact, side
     and kind (1 onset, -1 separation), and the seconds with a contact closed.
     """
     step, largest = stepper.step, 1.0 / stepper.omega_ref
-    t, closed, count = 0.0, 0.0, 0
+    (_, _, start, end), t, closed, count = stepper.flat, 0.0, 0.0, 0
     h = min(0.1 * largest, duration)
+    flow.close(step.system, stepper.start, step.side)
+    flow.observe(step, stepper.start, stepper.stages[0], step.start)
     while t < duration:
-        flow.observe(step, y, stepper.stages[0], step.start)
         last = t + h >= duration * (1.0 - 1e-15)
         if last:
             h = duration - t
         elif h < flow.SMALLEST_STEP * duration:
             return STUCK, count, closed
-        error = _advance(stepper, y, h)
+        error = _advance(stepper, h)
         if not error < 1.0:
+            if not error < 1e300:
+                stepper.stages[1:] = 0.0  # or a number that overflowed would stay in the sums
             h *= max(0.2, 0.9 * error ** (-0.125)) if error < 1e300 else 0.1
             continue
+        flow.observe(step, stepper.end, stepper.end_rates, step.end)
         grown = min(largest, h * min(6.0, 0.9 * max(error, 1e-12) ** (-0.125)))
         change = flow.first_change(step, h)
         changed = change.contact >= 0
         if changed:
-            h, changed = _land(stepper, y, t, h, change)
-        y[:] = stepper.end
-        closed += h if np.any(step.side != 0) else 0.0
+            h, changed = _land(stepper, t, h, change)
+        for e in range(end.size):
+            start[e] = end[e]
+        closed += h if np.any(step.side) else 0.0
         t = duration if last and change.contact < 0 else t + h
         h = grown
         if changed:
@@ -131,6 +151,7 @@ def _flow(stepper: Stepper, y: np.ndarray, duration: float, events: np.ndarray) 
             events[count, 0], events[count, 1] = t, change.contact
             events[count, 2], events[count, 3] = change.side, flow.switch(step, change)
             count += 1
+        flow.observe(step, stepper.start, stepper.stages[0], step.start)
     return DONE, count, closed
 
 
@@ -139,12 +160,23 @@ class Dop853Flow(Flow):
 
     name = "compiled"
 
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        rows, columns = 2 * system.dofs, 1 + 2 * system.dofs
+        block = np.zeros((STAGES + 5, -(-rows // 8) * 8, columns))
+        flat = block.reshape(len(block), -1)
+        stages, errors, (start, end, end_rates) = np.split(block, [STAGES, STAGES + 2])
+        sums = flat[:STAGES], flat[STAGES : STAGES + 2], flat[STAGES + 2], flat[STAGES + 3]
+        step = flow.begin(self.compiled, start)
+        self._stepper = Stepper(step, 1.0, stages, errors, start, end, end_rates, sums)
+        self._events = np.empty((MOST_CHANGES, 4))
+
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
-        events, stages = np.empty((MOST_CHANGES, 4)), np.empty((STAGES, *y.shape))
-        step, omega = flow.begin(self.compiled, y), self.omega_ref(period)
-        stepper = Stepper(step, omega, stages, np.empty_like(y), np.empty_like(y))
-        outcome, count, closed = _flow(stepper, y, duration, events)
+        state = self._stepper.start[: len(y)]
+        state[:] = y
+        stepper = self._stepper._replace(omega_ref=self.omega_ref(period))
+        outcome, count, closed = _flow(stepper, duration, self._events)
         if outcome != DONE:
             why = {STUCK: "the step became too small", FULL: f"more than {MOST_CHANGES} contact changes"}
             raise FlowError(f"the flow stopped after {count} contact changes in {duration:.6g} s: {why[outcome]}")
-        return y, events[:count].copy(), closed
+        return state, self._events[:count].copy(), closed

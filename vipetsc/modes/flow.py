@@ -10,13 +10,14 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import inlined, kernel, njit
 from vipetsc.contact.law import ForceLaw, elastic_force_and_slope
 from vipetsc.modes.changes import EXTREMUM, NONE, Change, first_rise, hermite
 from vipetsc.modes.system import System
 
 CONTACT = np.dtype([("clearance", np.float64), ("stiffness", np.float64), ("exponent", np.float64)])
 SPRING = np.dtype([("quadratic", np.float64), ("cubic", np.float64)])
+Shape = tuple[int, int, int]  # see restore
 # A step below this fraction of the interval means that the flow is stuck.
 SMALLEST_STEP = 1e-15
 
@@ -45,72 +46,81 @@ class Step(NamedTuple):
     end: np.ndarray
 
 
-@njit
-def elongation(row: np.ndarray, u: np.ndarray) -> float:
-    """Row times displacements (n,)."""
+@inlined
+def elongation(rows: np.ndarray, c: int, y: np.ndarray, first: int, j: int, n: int) -> float:
+    """Row ``c`` of ``rows`` (rows, n) times n entries of column ``j`` of ``y``, from ``first`` on."""
     z = 0.0
-    for k in range(row.size):
-        z += row[k] * u[k]
+    for k in range(n):
+        z += rows[c, k] * y[first + k, j]
     return z
 
 
-@njit
-def _add(u: np.ndarray, pull: np.ndarray, row: np.ndarray, force: float, slope: float) -> None:
-    for j in range(u.shape[1]):
-        along = force if j == 0 else slope * elongation(row, u[:, j])
-        for i in range(row.size):
-            pull[i, j] -= row[i] * along
+@inlined
+def _add(rows: np.ndarray, c: int, law: tuple[float, float], y: np.ndarray, pull: np.ndarray, shape: Shape) -> None:
+    """Add the pull of a spring with the elongations ``rows[c]`` u: its force on the orbit, its slope on variations."""
+    (force, slope), (first, n, columns) = law, shape
+    for j in range(columns):
+        along = force if j == 0 else slope * elongation(rows, c, y, 0, j, n)
+        for i in range(n):
+            pull[first + i, j] -= rows[c, i] * along
 
 
-@njit
-def restore(system: CompiledSystem, side: np.ndarray, u: np.ndarray, pull: np.ndarray) -> None:
-    """Forces that ``pull`` (n, 1 + m) back the orbit, column 0 of ``u`` (n, 1 + m), and its variations, in N."""
-    n, columns = u.shape
+@inlined
+def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.ndarray, shape: Shape) -> None:
+    """Forces in N that pull back the orbit, column 0 of ``y`` (n or more, 1 + m), and its variations.
+
+    ``shape``, their first row in ``pull``, n and 1 + m, may be constants, so that the compiler knows all loops.
+    """
+    first, n, columns = shape
     for i in range(n):
-        pull[i] = 0.0
+        for j in range(columns):
+            pull[first + i, j] = 0.0
         for k in range(n):
             s = system.stiffness[i, k]
             if s != 0.0:
                 for j in range(columns):
-                    pull[i, j] -= s * u[k, j]
+                    pull[first + i, j] -= s * y[k, j]
     for c in range(side.size):
         if side[c] != 0:
-            contact, row = system.contacts[c], system.rows[c]
-            x = side[c] * elongation(row, u[:, 0]) - contact.clearance
+            contact = system.contacts[c]
+            x = side[c] * elongation(system.rows, c, y, 0, 0, n) - contact.clearance
             # past the exit, which is landed on anyway, the law is odd
             force, slope = elastic_force_and_slope(ForceLaw(contact.stiffness, contact.exponent, 0.0, False, 0.0), x)
-            _add(u, pull, row, side[c] * force, slope)
+            _add(system.rows, c, (side[c] * force, slope), y, pull, shape)
     for s in range(system.springs.size):
-        a, b, z = system.springs[s].quadratic, system.springs[s].cubic, elongation(system.spring_rows[s], u[:, 0])
-        _add(u, pull, system.spring_rows[s], (a + b * z) * z * z, (2.0 * a + 3.0 * b * z) * z)
+        a, b, z = system.springs[s].quadratic, system.springs[s].cubic, elongation(system.spring_rows, s, y, 0, 0, n)
+        _add(system.spring_rows, s, ((a + b * z) * z * z, (2.0 * a + 3.0 * b * z) * z), y, pull, shape)
 
 
-@njit
+@kernel
 def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarray) -> None:
     """Time derivative ``dy`` of the orbit, column 0, and variations of ``y`` (2n, 1 + m): displacements, velocities."""
-    n = y.shape[0] // 2
-    restore(system, side, y[:n], dy[n:])
-    dy[:n] = y[n:]
+    n, columns = system.inverse_mass.size, y.shape[1]
+    if n == 2 and columns == 5:  # the reduced model: numbers that the compiler knows
+        restore(system, side, y, dy, (2, 2, 5))
+    else:
+        restore(system, side, y, dy, (n, n, columns))
     for i in range(n):
-        dy[n + i] *= system.inverse_mass[i]
+        for j in range(columns):
+            dy[i, j] = y[n + i, j]
+            dy[n + i, j] *= system.inverse_mass[i]
 
 
-@njit
+@kernel
 def observe(step: Step, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
     """Rates ``dy`` of the state ``y``, and w, w' and w'' of every contact into ``motion`` (contacts, 3)."""
     rates(step.system, step.side, y, dy)
-    n = y.shape[0] // 2
+    n, rows = step.system.inverse_mass.size, step.system.rows
     for c in range(motion.shape[0]):
-        row = step.system.rows[c]
-        motion[c, 0], motion[c, 1] = elongation(row, y[:n, 0]), elongation(row, y[n:, 0])
-        motion[c, 2] = elongation(row, dy[n:, 0])
+        motion[c, 0], motion[c, 1] = elongation(rows, c, y, 0, 0, n), elongation(rows, c, y, n, 0, n)
+        motion[c, 2] = elongation(rows, c, dy, n, 0, n)
 
 
-@njit
-def close(system: CompiledSystem, u: np.ndarray, side: np.ndarray) -> None:
-    """The sides on which the contacts are closed at displacements ``u`` (n,), 0 for open ones."""
+@kernel
+def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
+    """The sides on which the contacts are closed at the displacements in column 0 of ``y``, 0 for open ones."""
     for c in range(side.size):
-        w = elongation(system.rows[c], u)
+        w = elongation(system.rows, c, y, 0, 0, system.inverse_mass.size)
         side[c] = np.sign(w) if abs(w) > system.contacts[c].clearance else 0
 
 
@@ -119,29 +129,28 @@ def begin(system: CompiledSystem, y: np.ndarray) -> Step:
     """The record of a flow's steps, which begins at the state ``y``."""
     contacts = system.contacts.size
     step = Step(system, np.empty(contacts, np.int64), np.empty((contacts, 3)), np.empty((contacts, 3)))
-    close(system, y[: y.shape[0] // 2, 0], step.side)
+    close(system, y, step.side)
     return step
 
 
-@njit
+@kernel
 def first_change(step: Step, h: float) -> Change:
     """The first change of a contact in a step of length ``h``, with the first attempt at it."""
-    gap, first = np.empty(6), 1.0
+    first = 1.0
     change = Change(-1, 0, 0.0, 0.0, False, 0.0, h, h, 0)
     for c in range(step.side.size):
         clearance = step.system.contacts[c].clearance
         for s in (-1, 1):
             if step.side[c] == 0 or step.side[c] == s:
                 sign, offset = (float(s), clearance) if step.side[c] == 0 else (-float(s), -clearance)
-                hermite(step.start[c], step.end[c], h, sign, offset, gap)
-                share, outcome = first_rise(gap)
+                share, outcome = first_rise(hermite(step.start[c], step.end[c], h, sign, offset))
                 if outcome != NONE and share < first:
                     first = share
                     change = Change(c, s, sign, offset, outcome == EXTREMUM, 0.0, h, share * h, 0)
     return change
 
 
-@njit
+@kernel
 def switch(step: Step, change: Change) -> int:
     """Close or open the contact of a ``change``: 1 for an onset, -1 for a separation."""
     onset = step.side[change.contact] == 0
@@ -158,15 +167,14 @@ class Arc:
     """A piece of an orbit of ``duration`` seconds.
 
     ``start`` and ``end`` (2n,) hold displacements in m, then velocities in m/s; ``sensitivity`` (2n, 2n) is
-    d end/d start; ``acceleration`` (2, n) in m/s^2 at both ends; ``events`` (changes, 4) lists time in s,
-    contact, side (1 or -1) and kind (1 onset, -1 separation); ``closed`` the seconds with a contact closed.
+    d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1) and kind (1 onset, -1 separation);
+    ``closed`` the seconds with a contact closed.
     """
 
     duration: float
     start: np.ndarray
     end: np.ndarray
     sensitivity: np.ndarray
-    acceleration: np.ndarray
     events: np.ndarray
     episodes: int
     closed: float
@@ -201,11 +209,9 @@ class Flow(ABC):
         """
         y = np.hstack([np.asarray(start, float)[:, None], np.eye(len(start))])
         y, events, closed = self._advance(y, duration, period)
-        n, system = self.system.dofs, self.system
-        end, sensitivity = y[:, 0].copy(), y[:, 1:].copy()
-        acceleration = np.array([-system.forces(z[:n]) / system.masses for z in (start, end)])
-        episodes = int(np.sum(system.gaps(start[:n]) > 0) + np.sum(events[:, 3] == 1))
-        return Arc(duration, start, end, sensitivity, acceleration, events, episodes, closed)
+        closed_at_start = np.count_nonzero(self.system.gaps(start[: self.system.dofs]) > 0)
+        episodes = closed_at_start + np.count_nonzero(events[:, 3] == 1)
+        return Arc(duration, start, y[:, 0].copy(), y[:, 1:].copy(), events, episodes, closed)
 
     @abstractmethod
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:

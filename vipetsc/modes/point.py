@@ -40,7 +40,6 @@ def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
     root = np.sqrt(problem.system.masses)
     n, quarter, s = len(root), problem.map.quarter, arc.sensitivity
     a, b, c, d = (root[:, None] * block / root for block in (s[:n, :n], s[:n, n:], s[n:, :n], s[n:, n:]))
-    trivial = (arc.start[n:] if problem.map.start == "centre" else arc.acceleration[0]) * root
     if problem.map.fraction == 1.0:  # the whole period needs no mirror image
         product = (a - np.eye(n)) / 2
     elif problem.map.start == "rest":
@@ -50,6 +49,8 @@ def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
     if n == 2:  # the trace is more exact than a projection
         rest = np.array([np.trace(product)])
     else:
+        centre, u, v = problem.map.start == "centre", arc.start[:n], arc.start[n:]
+        trivial = (v if centre else -problem.system.forces(u) / problem.system.masses) * root
         basis = np.linalg.svd(trivial[None, :])[2][1:].T
         rest = np.linalg.eigvals(basis.T @ product @ basis)
     traces = 1 - 2 * rest if quarter else 1 + 2 * rest

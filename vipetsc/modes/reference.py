@@ -117,9 +117,9 @@ class Tsrk(Flow):
 def _forces(system: CompiledSystem, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Restoring forces (n,) in N and tangent stiffness (n, n) in N/m at displacements ``u`` (n,) in m."""
     side, columns = np.empty(system.contacts.size, np.int64), np.hstack((u.reshape(-1, 1), np.eye(u.size)))
-    close(system, u, side)
+    close(system, columns, side)
     pull = np.empty_like(columns)
-    restore(system, side, columns, pull)
+    restore(system, side, columns, pull, (0, u.size, columns.shape[1]))
     return -pull[:, 0], -pull[:, 1:]
 
 

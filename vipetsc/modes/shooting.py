@@ -34,6 +34,7 @@ class Relative:
                 scale = min(max(abs(row @ x), pair.clearance), self.size)
                 self.weights[pair.resonator] = row / scale
         self.inverse = np.linalg.inv(self.weights)
+        self._derivative = block_diag(self.inverse, period)
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
         """The unknowns of initial values and period."""
@@ -45,7 +46,7 @@ class Relative:
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
         """d(x, period)/d xi."""
-        return block_diag(self.inverse, self.period)
+        return self._derivative
 
 
 class Logarithmic:
@@ -212,7 +213,8 @@ class Shooting:
 
     def jacobian(self, arc: Arc) -> np.ndarray:
         """Derivative (n, n + 1) of the residual with respect to initial values and period."""
-        rate = np.append(arc.end[self.system.dofs :], arc.acceleration[1])[self._zero]
+        n, masses = self.system.dofs, self.system.masses
+        rate = arc.end[n:] if self.map.end == "centre" else -self.system.forces(arc.end[:n]) / masses
         return np.column_stack([arc.sensitivity[self._zero, self._free], self.map.fraction * rate])
 
     def energy(self, x: np.ndarray) -> float:

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from scipy.optimize import brentq
@@ -138,15 +138,17 @@ class _Segment:
         """
         sys.audit("vipetsc.landing", kind)
 
+        at = cache(self.at)  # the root is one of the places where a value was asked for
+
         def value(arclength: float) -> float:
             if arclength == 0:
                 return test(self.left)
-            return test(self.right) if arclength == self.length else test(self.at(arclength))
+            return test(self.right) if arclength == self.length else test(at(arclength))
 
         accuracy = 1e-11 if kind == "grazing" else 1e-14
         try:
             arclength = brentq(value, 0.0, self.length, xtol=accuracy * self.length, rtol=1e-14)
-            point = self.at(arclength)
+            point = at(arclength)
             return replace(point, kind=kind, step=self.begin + point.step)
         except (ArithmeticError, ValueError) as error:
             if halvings == 0:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 from pydantic import TypeAdapter
@@ -16,11 +16,19 @@ from vipetsc.case import Case
 from vipetsc.case.schema import PRESETS
 from vipetsc.figures.lattice import lattice_page, reduced_model
 from vipetsc.figures.registry import FIGURES, drawings
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.study import Files
 
 READINGS = "calibrated", "printed"
 TRANSFER = "interband"  # the sweep that is laid over branches
 RELATED = "nnm-hertz", "nnm-bilinear", "nnm-hertz-calibrated", "nnm-bilinear-calibrated"
+
+
+class Picture(NamedTuple):
+    """A picture to come: the stem of its files' names, what draws it, and about how long that takes in s."""
+
+    stem: str
+    make: Callable[[], Figure]
+    cost: float
 
 
 @dataclass(frozen=True)
@@ -28,7 +36,7 @@ class Part:
     """Pictures of a figure: of the registry's ``figure`` from ``steps``, or a ``schematic`` from ``arguments``.
 
     Of the registry's pictures those are taken whose names hold all of ``only``; ``stem`` names them, with ``{stem}``
-    for the registry's name.
+    for the registry's name. ``cost`` is the CPU time in s that one takes.
     """
 
     figure: str = ""
@@ -37,6 +45,7 @@ class Part:
     stem: str = "{stem}"
     schematic: str = ""
     arguments: Sequence[Any] = ()
+    cost: float = 0.7
 
 
 @dataclass(frozen=True)
@@ -59,15 +68,16 @@ class PaperFigure:
         """The steps whose results the figure shows."""
         return tuple(dict.fromkeys(step for part in self.parts for step in part.steps))
 
-    def offers(self, folders: Mapping[str, Path]) -> Iterator[Drawing]:
-        """The stems and drawings that the ``folders`` (step -> folder) of finished steps allow."""
+    def offers(self, folders: Mapping[str, Path], files: Files) -> Iterator[Picture]:
+        """The pictures that the ``folders`` of finished steps (by name) allow, drawn while ``files`` are open."""
         for part in self.parts:
             for reading in READINGS if part.schematic else ():
-                yield f"{self.id}-{part.stem}-{reading}", partial(SCHEMATICS[part.schematic], reading, *part.arguments)
+                schematic = partial(SCHEMATICS[part.schematic], reading, *part.arguments)
+                yield Picture(f"{self.id}-{part.stem}-{reading}", schematic, part.cost)
             finished = [folders[step] for step in part.steps if step in folders]
-            for stem, make in drawings(FIGURES[part.figure].source, finished, [part.figure]) if finished else ():
+            for stem, make in drawings(FIGURES[part.figure].source, finished, files, [part.figure]) if finished else ():
                 if all(f"-{word}-" in f"{stem}-" for word in part.only):
-                    yield f"{self.id}-{part.stem.format(stem=stem)}", make
+                    yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", make, part.cost)
 
 
 def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:

@@ -6,13 +6,13 @@ How far each step has come, and what figures and claims are made from.
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from mpi4py import MPI
 
@@ -21,25 +21,26 @@ import numpy as np
 
 import vipetsc
 from vipetsc.case import DesignCase, NnmCase, Sweep
-from vipetsc.io.folder import NEW, FolderError
+from vipetsc.io.folder import NEW, FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import open_ensemble
-from vipetsc.modes.follow import claim_branches, follow_all
+from vipetsc.io.read import open_ensemble, outdated
+from vipetsc.modes.follow import Follower, claim_branches
 from vipetsc.modes.system import System
 from vipetsc.paper.claims import measure_claims
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import StopRequest
 from vipetsc.studies.design import search_design
 from vipetsc.studies.engines import agreement, sampled
-from vipetsc.studies.ensemble import FAILED
+from vipetsc.studies.ensemble import FAILED, Results
 from vipetsc.studies.sweep import run_sweep
 
 FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
-SAMPLE, SEED = 0.02, 2024  # share of a sweep's members that are made by the other engine as well, and how it is drawn
-TS_COST = 3.0  # s of CPU time of one of them
+SEED = 2024  # of the members that are made by the other engine as well
+TS_COST = 2.5  # s of CPU time of one of them
+IN_PHASE = 10  # times as long as the other branch takes the one that goes through all tongues
 RELATION = "backbone.h5"  # beside a sweep that is laid over branches
 
 # Steps that a claim is measured from, and figures that bear on it are drawn from, besides those that these show.
@@ -49,13 +50,20 @@ StepCase = Sweep | NnmCase | DesignCase
 KINDS: dict[str, type[StepCase]] = {"sweep": Sweep, "branches": NnmCase, "search": DesignCase}
 
 
+class Claimed(NamedTuple):
+    """How a part of a step is made, on one rank, and how all of them take the place of earlier ones, on all ranks."""
+
+    make: Callable[[int], object]
+    publish: Callable[[], None] = lambda: None
+
+
 @dataclass(frozen=True)
 class Step:
     """One case made in ``root/<name>``: a sweep, branches or a search.
 
     ``kind`` of case and its ``file``, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time
-    in s of all of it (of a member, for sweeps) on a core of the 2020s, used until rates are measured. With ``checks``,
-    the name of another step, it makes a sample of that sweep's members by the engine ``ts``.
+    in s of a part (of a member, for sweeps) on a core of the 2020s, used until rates are measured. With ``checks``,
+    the name of another step, it makes ``sample`` of that sweep's members by the engine ``ts``.
     """
 
     name: str
@@ -64,6 +72,7 @@ class Step:
     changes: tuple[str, ...] = ()
     cost: float = 1.0
     checks: str = ""
+    sample: int = 0
 
     def folder(self, root: Path) -> Path:
         """Where the step's files are."""
@@ -73,7 +82,7 @@ class Step:
     def case(self) -> StepCase:
         """The resolved case; raises CaseError."""
         case = self.kind.load(self.file, self.changes)
-        return sampled(case, SAMPLE, SEED) if self.checks and isinstance(case, Sweep) else case
+        return sampled(case, self.sample, SEED) if self.checks and isinstance(case, Sweep) else case
 
     @cached_property
     def text(self) -> str:
@@ -88,22 +97,32 @@ class Step:
             names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
         return [self.folder(root) / name for name in names]
 
-    def make(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
-        """Make what is missing on all ranks of ``comm``, everything if ``afresh``; may leave early on ``stop``.
+    @property
+    def parts(self) -> dict[int, float]:
+        """What single ranks make, by number with CPU times in s: branches by mode, the search; nothing of a sweep."""
+        if isinstance(self.case, NnmCase):
+            return {mode: self.cost * (IN_PHASE if mode == 1 else 1) for mode in self.case.nnm.modes}
+        return {} if isinstance(self.case, Sweep) else {1: self.cost}
+
+    @contextmanager
+    def claimed(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> Iterator[Claimed]:
+        """The folder of a step of parts, claimed on all ranks to make what is missing, everything if ``afresh``."""
+        case, folder = self.case, self.folder(root)
+        if isinstance(case, NnmCase):
+            with claim_branches(case, folder, comm, afresh) as claim:
+                follower = partial(Follower, case, claim.folder, provenance(comm), stop=stop, resume=claim.going_on)
+                yield Claimed(lambda mode: follower().follow(mode - 1), claim.publish)
+        else:
+            assert isinstance(case, DesignCase)
+            yield Claimed(lambda part: search_design(case, folder, afresh))
+
+    def sweep(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
+        """Make what is missing of a sweep on all ranks, everything if ``afresh``; may leave early on ``stop``.
 
         Returns warnings about what was made.
         """
-        case, folder = self.case, self.folder(root)
-        if isinstance(case, Sweep):
-            return run_sweep(case, folder, comm, force=afresh, stop=stop, progress=True).warnings
-        if isinstance(case, NnmCase):
-            with claim_branches(case, folder, comm, afresh) as claim:
-                follow_all(case, claim.folder, comm, claim.going_on, stop=stop)
-                if not stop.agreed(comm):
-                    claim.publish()
-        else:
-            on_root(comm, lambda: search_design(case, folder, afresh))
-        return []
+        assert isinstance(self.case, Sweep)
+        return run_sweep(self.case, self.folder(root), comm, force=afresh, stop=stop, progress=True).warnings
 
     def state(self, root: Path) -> str:
         """DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
@@ -113,6 +132,8 @@ class Step:
         if not self._is_same_case(marker.read_text(encoding="utf-8")):
             begun = self.folder(root) / NEW / "case.toml"  # what is to replace them
             return BEGUN if begun.exists() and self._is_same_case(begun.read_text(encoding="utf-8")) else STALE
+        if outdated(self.folder(root)):
+            return STALE
         return DONE if all(map(self._is_complete, self.results(root))) else BEGUN
 
     def _is_complete(self, path: Path) -> bool:
@@ -138,8 +159,8 @@ class Step:
         if state == DONE:
             return 0.0
         if not isinstance(self.case, Sweep):
-            return self.cost
-        times = _cpu_times(self.folder(root)) if state == BEGUN else []
+            return sum(self.parts.values())
+        times = [*Results(self.case, self.folder(root)).cpu_seconds.values()] if state == BEGUN else []
         rate = max(float(np.mean(times)), self.cost) if times else self.cost  # measuring a run takes time as well
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
 
@@ -218,8 +239,8 @@ def paper_plan(grid: str = FULL) -> Plan:
         changes = [*row.get("changes", ()), *(row.get("quick", ()) if grid == QUICK else ())]
         if row["kind"] == "sweep":  # the figures of the paper are drawn from all sweeps together
             changes.insert(0, "output.figures=false")
-        steps.append(Step(name, KINDS[row["kind"]], file, tuple(changes), row["cost"]))
-    steps += [replace(s, name=f"{s.name}-ts", cost=TS_COST, checks=s.name) for s in steps if s.kind is Sweep]
+        steps.append(Step(name, KINDS[row["kind"]], file, tuple(changes), row["cost"], sample=row.get("sample", 0)))
+    steps += [replace(s, name=f"{s.name}-ts", cost=TS_COST, checks=s.name) for s in steps if s.sample]
     return Plan(grid, tuple(steps), note=COARSE if grid == QUICK else "")
 
 
@@ -232,7 +253,7 @@ def _sweep_statistics(folder: Path) -> dict[str, Any]:
         "members": status.size,
         "episodes": int(np.nansum(ensemble["contact_episodes"].values)),
         "ledger": float(np.nanmax(ensemble["ledger_error"].values, initial=0.0)),
-        "cpu": sum(_cpu_times(folder)),
+        "cpu": sum(Results(Sweep.of(ensemble), folder).cpu_seconds.values()),
     }
 
 
@@ -247,13 +268,6 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
             endings.append(f"{branch.attrs['name']}: {', '.join(told)}")
     failed = sum("failed" in ending for ending in endings)
     return {"points": len(residuals), "residual": max(residuals, default=0.0), "endings": endings, "failed": failed}
-
-
-def _cpu_times(folder: Path) -> list[float]:
-    """CPU times in s of the members in ``folder`` that are complete; 0 for scaled ones."""
-    summaries = [read_json(path) or {} for path in folder.glob("*/summary.json")]
-    statistics = [summary.get("statistics", {}) for summary in summaries if summary.get("complete")]
-    return [0.0 if "scaled_from" in s else float(s.get("cpu_seconds", 0.0)) for s in statistics]
 
 
 def read_json(path: Path) -> Any:

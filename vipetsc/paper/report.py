@@ -1,9 +1,12 @@
 """What is told of the paper: one page with everything in it, for any screen and for print, and a table of verdicts."""
 
 import base64
+import hashlib
 import io
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -15,11 +18,10 @@ from PIL import Image  # type: ignore[import-untyped]
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.paper.figures import READINGS, PaperFigure, describe
-from vipetsc.paper.plan import SAMPLE
 from vipetsc.studies.engines import COMPARED
 
-WIDEST = 1500  # pixels of a picture in the page
-COLOURS = 200
+COLOURS = 256  # of a picture in the page
+ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
 VERDICTS = HOLDS, IN_PART, FAILS, UNMEASURED
 
 
@@ -30,15 +32,23 @@ def write_report(
     pictures: Sequence[tuple[PaperFigure, Sequence[Path]]],
     statistics: Mapping[str, Mapping[str, Any]],
     versions: Mapping[str, Any],
+    cpu: Mapping[str, Any],
 ) -> None:
     """Write the page to ``path``, whole or not at all.
 
-    From the rows of ``claims.json``, the pictures (PNG) of every figure, numbers about the steps by name, and versions;
-    ``note`` is not empty for coarse grids.
+    From the rows of ``claims.json``, the pictures (PNG) of every figure, numbers about the steps by name, versions, and
+    the ``cpu`` time in s of "steps" by name, "figures" and "claims"; ``note`` is not empty for coarse grids. Pictures
+    that the page at ``path`` shows already are taken from there.
     """
+    encoded = dict(ENCODED.findall(path.read_text(encoding="utf-8"))) if path.exists() else {}
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.loader = PackageLoader("vipetsc.paper", ".")
-    environment.filters |= {"numbers": numbers, "sources": sources, "picture": picture, "describe": describe}
+    environment.filters |= {
+        "numbers": numbers,
+        "sources": sources,
+        "picture": partial(picture, encoded),
+        "describe": describe,
+    }
     verdicts = Counter((claim["reading"], claim["verdict"]) for claim in claims)
     readings = [r for r in READINGS if any(reading == r for reading, _ in verdicts)]
     page = environment.get_template("report.html").render(
@@ -53,19 +63,21 @@ def write_report(
         branches={name: row for name, row in statistics.items() if "points" in row},
         checks={name.removesuffix("-ts"): row["agreement"] for name, row in statistics.items() if "agreement" in row},
         bounds=COMPARED,
-        share=SAMPLE,
+        cpu=cpu,
     )
     write_text(path, page)
 
 
-def picture(path: Path) -> tuple[int, int, str]:
-    """Width and height in pixels as shown in the page, and the picture as a data URI, no larger than needed."""
-    with Image.open(path) as image:
-        width = min(image.width, WIDEST)
-        small = image.convert("RGB").resize((width, round(image.height * width / image.width)), Image.LANCZOS)
-    out = io.BytesIO()
-    small.quantize(COLOURS, dither=Image.Dither.NONE).save(out, "png", optimize=True)
-    return *small.size, "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
+def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str]:
+    """Width and height in pixels, a hash of the file, and the picture as a data URI, ``encoded`` or made now."""
+    data = path.read_bytes()
+    key, out = hashlib.sha256(data).hexdigest(), io.BytesIO()
+    with Image.open(io.BytesIO(data)) as image:
+        if key not in encoded:
+            indexed = image.convert("RGB").quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+            indexed.save(out, "png")
+        uri = encoded.get(key) or "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
+        return image.width, image.height, key, uri
 
 
 def numbers(named: Mapping[str, float | None]) -> list[str]:

@@ -1,7 +1,8 @@
 """Measures on sampled fields, in plain numpy and scipy: Fourier, wavelets, band energies, entropy, power laws."""
 
-from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, split
-from vipetsc.spectra.entropies import Entropy, entropy, local_entropy
+from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, part_maps
+from vipetsc.spectra.entropies import Entropy, averages, entropy, local_entropy
 from vipetsc.spectra.fits import FEWEST, PowerLaw, doubt, normalised, power_law
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
+from vipetsc.spectra.pooling import block_means, block_sums, blocks
 from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform

@@ -7,6 +7,9 @@ With the Morlet transform X (kappa, x) of a snapshot (``vipetsc.spectra.wavelet`
     joint over kappa and x   H_j(t) = H(t) - sum_x Q log2 Q                                            (c)
     masked   the mean of H over the points (x, t) with W > .01 max W                                   (d)
 
+A filtered snapshot holds positive wavenumbers alone, so its spectrum folded onto every n-th wavenumber of the padded
+line gives it at every n-th cell without loss; only the sums over x are then sums over fewer cells.
+
 Averages are taken from the linear wave's arrival on. A plain mean over all points shows no trend: cells at rest would
 count in it as much as the others.
 """
@@ -16,14 +19,16 @@ from functools import lru_cache
 
 import numpy as np
 from scipy import fft
+from scipy.ndimage import uniform_filter1d
 
 from vipetsc.compiled import njit
 from vipetsc.spectra.wavelet import padded_length, transform_filters
 
 NODES = 60
 KC = 12.0  # centre wavenumber of the wavelets
-CHUNK = 4  # snapshots that are transformed together
-GROUP = 4  # nodes that are filtered together
+CHUNK = 8  # snapshots that are transformed together
+GROUP = 8  # nodes that are filtered together
+LOUD = 8  # snapshots that are sought for the largest weight, by their energy over as many cells
 FLOOR = 0.01
 """Points below this fraction of the largest weight are masked, Eq. (d)."""
 
@@ -32,8 +37,8 @@ FLOOR = 0.01
 class Entropy:
     """Entropies in bits over the wavenumber nodes; the means are over the samples from ``start`` on.
 
-    ``local`` H and ``weight`` W (t, cell) of Eq. (a), 0 where nothing moves (W in the signal's unit squared);
-    ``snapshot`` (t) of Eq. (b), 0 at rest, and its mean ``energy_weighted``; ``joint``, the mean of Eq. (c);
+    ``local`` H and ``weight`` W (t, cell) of Eq. (a) at the cells taken, 0 where nothing moves (W in the signal's unit
+    squared); ``snapshot`` (t) of Eq. (b), 0 at rest, and its mean ``energy_weighted``; ``joint``, the mean of Eq. (c);
     ``masked``, Eq. (d), with the standard deviation ``error`` over the cells of each one's masked time mean.
     """
 
@@ -46,25 +51,37 @@ class Entropy:
     error: float
 
 
-def entropy(velocity: np.ndarray, start: int = 0) -> Entropy:
+def entropy(velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 1) -> Entropy:
     """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
 
     ``velocity`` may be an HDF5 dataset: a few snapshots at a time are read. ``start`` is the sample of the linear
-    wave's arrival at the first site. Raises ValueError if no sample comes from there on, or one is not finite.
+    wave's arrival at the first site. Every ``every``-th sample is transformed, and every ``stride``-th cell averaged
+    over; the largest weight of Eq. (d) is sought in the other samples too. Raises ValueError if no sample comes from
+    ``start`` on, or one is not finite.
     """
     nt = len(velocity)
     if not 0 <= start < nt:
         raise ValueError(f"start = {start}: outside the {nt} samples")
-    local, weight = local_entropy(velocity)
+    local, weight = local_entropy(velocity[::every], stride)
+    largest = 0.0
+    if every > 1:
+        energy = uniform_filter1d(np.square(velocity[start:]), LOUD, axis=1).max(axis=1)
+        largest = local_entropy(velocity[start:][np.argsort(energy)[-LOUD:]], stride)[1].max()
+    return averages(local, weight, min(-(-start // every), len(local) - 1), stride, largest)
+
+
+def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, largest: float = 0.0) -> Entropy:
+    """The averages of ``local`` and ``weight`` (t, cell) of every ``stride``-th cell; ``largest`` of other weights."""
     # Eqs. (b) and (c) over the cells of each snapshot.
-    largest = weight.max(axis=1, keepdims=True)
-    share = np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0)
+    peak = weight.max(axis=1, keepdims=True)
+    share = np.divide(weight, peak, out=np.zeros_like(weight), where=peak > 0)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1.0)
     snapshot = np.einsum("tc,tc->t", share, local)
     position = -np.sum(share * np.log2(share, out=np.zeros_like(share), where=share > 0), axis=1)
-    means = float(snapshot[start:].mean()), float((snapshot + position)[start:].mean())
+    joint = snapshot + np.where(peak[:, 0] > 0, position + np.log2(stride), 0.0)  # bits of the cells between
+    means = float(snapshot[start:].mean()), float(joint[start:].mean())
     # Eq. (d), of all cells and of each.
-    above_threshold = weight[start:] > FLOOR * weight[start:].max()
+    above_threshold = weight[start:] > FLOOR * max(weight[start:].max(), largest)
     count = above_threshold.sum(axis=0)
     sums = np.where(above_threshold, local[start:], 0.0).sum(axis=0)
     counted = count > 0
@@ -74,13 +91,13 @@ def entropy(velocity: np.ndarray, start: int = 0) -> Entropy:
     return Entropy(local, weight, snapshot, *means, float(sums.sum() / count.sum()), float(np.std(of_cells)))
 
 
-def local_entropy(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """H (t, cell) in bits and W (t, cell) of ``velocity`` (t, cell), a few snapshots at a time.
+def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """H (t, cell) in bits and W (t, cell) at every ``stride``-th cell of ``velocity`` (t, cell), in chunks of time.
 
     Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude.
     """
     nt, cells = velocity.shape
-    local, weight = np.empty((nt, cells)), np.empty((nt, cells))
+    local, weight = np.empty((2, nt, -(-cells // stride)))
     for first in range(0, nt, CHUNK):
         rows = slice(first, min(first + CHUNK, nt))
         signal = np.asarray(velocity[rows], dtype=float)
@@ -89,12 +106,14 @@ def local_entropy(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             raise ValueError(f"velocity: not finite in samples {first} to {rows.stop - 1}")
         exponent = np.frexp(largest)[1]
         signal = np.ldexp(signal, -exponent[:, None])
-        total, s_log_s = np.zeros(signal.shape), np.zeros(signal.shape)
-        for length, groups in _octaves(cells):
-            spectrum = fft.rfft(signal, length)
-            for band, filters in groups:
-                x = np.zeros((len(signal), len(filters), length), dtype=complex)
-                np.multiply(spectrum[:, None, band], filters, out=x[:, :, band])
+        total, s_log_s = np.zeros((2, len(signal), local.shape[1]))
+        for length, groups in _octaves(cells, stride):
+            spectrum = fft.rfft(signal, length * stride)
+            for filters in groups:
+                x = np.zeros((len(signal), len(filters[0][1]), length), dtype=complex)
+                for band, values in filters:
+                    first = band.start % length
+                    x[:, :, first : first + values.shape[1]] += spectrum[:, None, band] * values
                 _accumulate(fft.ifft(x, overwrite_x=True), total, s_log_s)
         _entropies(total, s_log_s, local[rows])
         weight[rows] = np.ldexp(total, 2 * exponent[:, None])
@@ -102,22 +121,24 @@ def local_entropy(velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=8)
-def _octaves(cells: int) -> list[tuple[int, list[tuple[slice, np.ndarray]]]]:
-    """For each octave of nodes the padded length, which its lowest node sets, and its filters.
+def _octaves(cells: int, stride: int) -> list[tuple[int, list[list[tuple[slice, np.ndarray]]]]]:
+    """For each octave of nodes the transforms' length, the padded one over ``stride``, and its filters.
 
-    The filters come in groups: the band where any of them lets something through, and what they are there (kappa, k).
+    The lowest node sets the padded length. The filters come in groups: the bands where any of them lets something
+    through, cut at multiples of the length, and what they are there (kappa, k).
     """
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
     octaves = []
     for number in range(int(np.log2(NODES)) + 1):
         some = kappa[2**number - 1 : 2 ** (number + 1) - 1]
-        length, groups = padded_length(cells, KC, some[0]), []
-        filters = transform_filters(some, KC, length)
+        length, groups = fft.next_fast_len(-(-padded_length(cells, KC, some[0]) // stride)), []
+        filters = transform_filters(some, KC, length * stride) / stride
         for first in range(0, len(some), GROUP):
             group = filters[first : first + GROUP]
             inside = np.flatnonzero(group.max(axis=0) > np.finfo(float).eps * group.max())
-            band = slice(inside[0], inside[-1] + 1)
-            groups.append((band, group[:, band]))
+            cuts = range(inside[0] // length * length, inside[-1] + 1, length)
+            bands = [slice(max(inside[0], cut), min(inside[-1] + 1, cut + length)) for cut in cuts]
+            groups.append([(band, group[:, band]) for band in bands])
         octaves.append((length, groups))
     return octaves
 

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
+from vipetsc.spectra.pooling import block_means, block_sums, blocks
+
 TAPER = 0.1
 
 
@@ -31,6 +33,12 @@ class Dispersion:
         energy = self.energy[zero:].copy()
         energy[1 : zero + 1] += self.energy[:zero][::-1]
         return Dispersion(self.wavenumber[zero:], self.frequency, energy)
+
+    def pooled(self, wavenumbers: int, frequencies: int) -> "Dispersion":
+        """The same with bins ``wavenumbers`` and ``frequencies`` times as wide, at their middles."""
+        energy = block_sums(block_sums(self.energy, wavenumbers, 0), frequencies, 1)
+        middles = block_means(self.wavenumber, wavenumbers, 0), block_means(self.frequency, frequencies, 0)
+        return Dispersion(*middles, energy)
 
 
 def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
@@ -74,29 +82,35 @@ def dispersion(
     tapers: tuple[float, float] = (TAPER, TAPER),
     lengths: tuple[int, int] | None = None,
     highest: float = np.inf,
+    rows: slice = slice(None),
+    memory: float = np.inf,
 ) -> Dispersion:
     """Energy over wavenumber and frequency by 2-D FFT of mass-weighted velocities, added over the masses.
 
     ``velocity`` (t, cell, dof) in m/s every ``interval`` s, of which the window ``cells`` is taken; ``masses`` (dof)
     in kg, ones for a plain velocity spectrum. ``tapers``: the fractions of the (time, space) window under cosine flanks
     at its two ends together. ``lengths``: of the transforms (time, space), zero-padded; by default the next that are
-    fast. Frequencies above ``highest`` (rad/s) are dropped.
+    fast. Frequencies above ``highest`` (rad/s) are dropped; of the others those ``rows`` are returned. No more than
+    ``memory`` bytes of the velocity are read at once.
 
     Returns the energy on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
     """
     t, x = velocity.shape[0], len(range(velocity.shape[1])[cells])
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
-    frequency = frequency[frequency <= highest]
-    window = taper(t, tapers[0])[:, None] * taper(x, tapers[1])
-    energy = np.zeros((len(frequency), nx))
+    taken = range(nt)[: np.count_nonzero(frequency <= highest)][rows]
+    frequency, in_time, in_space = frequency[taken], taper(t, tapers[0])[:, None], taper(x, tapers[1])
+    energy, spectrum = np.zeros((len(taken), nx)), np.empty((len(taken), x), dtype=complex)
+    first = range(velocity.shape[1])[cells].start
     for j, mass in enumerate(np.asarray(masses)):
-        spectrum = fft.rfft(np.asarray(velocity[:, cells, j]) * window, nt, axis=0)[: len(frequency)]
+        for some in blocks(x, 8 * t, memory):
+            signal = np.asarray(velocity[:, first + some.start : first + some.stop, j])
+            spectrum[:, some] = fft.rfft(signal * in_time * in_space[some], nt, axis=0)[taken]
         # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
-        spectrum = fft.ifft(spectrum, nx, axis=1, norm="forward")
-        energy += mass * (spectrum.real**2 + spectrum.imag**2)
+        waves = fft.ifft(spectrum, nx, axis=1, norm="forward")
+        energy += mass * (waves.real**2 + waves.imag**2)
     energy /= 2 * t * nt * nx
-    energy[1 : (nt + 1) // 2] *= 2
+    energy[[0 < row < (nt + 1) // 2 for row in taken]] *= 2
     order = np.roll(np.arange(nx), (nx - 1) // 2)
     wavenumber = 2 * np.pi * np.where(order > nx // 2, order - nx, order) / nx
     return Dispersion(wavenumber, frequency, energy.T[order])

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
+from vipetsc.spectra.pooling import block_means
+
 LOWEST = np.pi / 60
 """Lowest node in rad per cell; what lies below it belongs to the first bin."""
 
@@ -168,7 +170,7 @@ def filter_bank(cells: int, kc: float = 6.0, normalisation: Normalisation = "ana
 class Partition:
     """Kinetic energies in J of the parts v_b of a velocity field.
 
-    ``energy`` (bin, t) summed over the lattice, ``field`` (bin, t, cell) or None, ``kinetic`` (t) of the velocities
+    ``energy`` (bin, t) summed over the lattice, ``field`` (bin, t, cell') or None, ``kinetic`` (t) of the velocities
     themselves, ``reconstructed`` (t): KE_rec = 1/2 sum m (sum_b v_b)^2. Both 0 at rest: ``error`` (t) =
     |KE_rec - KE| / KE, the paper's Eq. (A8), and ``cross_share`` (t) = 1 - sum_b KE_b / KE, the energy in products of
     different parts.
@@ -183,12 +185,12 @@ class Partition:
 
 
 def partition(
-    velocity: np.ndarray, masses: ArrayLike, normalisation: Normalisation = "analytic", fields: bool = False
+    velocity: np.ndarray, masses: ArrayLike, normalisation: Normalisation = "analytic", mean_over: int = 0
 ) -> Partition:
     """Partition the kinetic energy of ``velocity``, (t, cell) or (t, cell, dof) in m/s, by wavenumber bins.
 
     ``masses`` in kg, (dof) or a scalar. A few snapshots at a time are held, so ``velocity`` may be an HDF5
-    dataset. With ``fields`` the energies in space-time are kept too.
+    dataset. The energies in space-time are kept as means over ``mean_over`` cells, if that is not 0.
     """
     mass_list = np.atleast_1d(np.asarray(masses, dtype=float))
     nt, cells = velocity.shape[:2]
@@ -196,7 +198,7 @@ def partition(
         raise ValueError(f"masses: {len(mass_list)} given for velocities of shape {velocity.shape}")
     bank = filter_bank(cells, normalisation=normalisation)
     energy, kinetic, reconstructed = np.zeros((BINS, nt)), np.zeros(nt), np.zeros(nt)
-    field = np.zeros((BINS, nt, cells)) if fields else None
+    field = np.zeros((BINS, nt, -(-cells // mean_over))) if mean_over else None
     for first in range(0, nt, CHUNK):
         rows = slice(first, min(first + CHUNK, nt))
         block = np.asarray(velocity[rows], dtype=float).reshape(-1, cells, len(mass_list))
@@ -208,7 +210,7 @@ def partition(
             energy[:, rows] += 0.5 * mass * np.einsum("btc,btc->bt", parts, parts)
             reconstructed[rows] += 0.5 * mass * np.einsum("tc,tc->t", whole, whole)
             if field is not None:
-                field[:, rows] += 0.5 * mass * parts**2
+                field[:, rows] += 0.5 * mass * block_means(parts**2, mean_over, 2)
     missing = np.stack([np.abs(reconstructed - kinetic), kinetic - energy.sum(axis=0)])
     shares = np.divide(missing, kinetic, out=np.zeros_like(missing), where=kinetic > 0)
     return Partition(energy, field, kinetic, reconstructed, *shares)

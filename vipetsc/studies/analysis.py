@@ -8,7 +8,6 @@ gaps, and the inter-band targeted energy transfer. The measures themselves stand
 import json
 import sys
 from collections.abc import Collection
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,24 +16,28 @@ from scipy import fft
 
 import vipetsc
 from vipetsc import spectra
-from vipetsc.case import Case
+from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
-from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import cells_between
+from vipetsc.studies.velocity import VelocityRecord, options_of
 
-FORMAT_VERSION = 2
-IN_MEMORY = 2**30  # bytes of velocity that are read at once; larger fields are read mass by mass
-MAP_SIZE = 20_000_000  # values of a (t, cell) map that are kept; longer records are thinned out in time
+FORMAT_VERSION = 3
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
-SNAPSHOTS = 500  # at most this many samples are transformed by wavelets; averages over time need no more
+SNAPSHOTS = 500  # at most this many samples are transformed by wavelets
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those who window the record
 ENDS = 0.02  # share of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 
 # What is measured of a run whose fields are kept; "maps" are the space-time maps of the other measures.
 FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "maps")
+# Of a member of a sweep whose fields are kept, by the sweep's ``measures``: what its pictures show.
+WHOLE = {
+    "entropy": ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "maps"),
+    "transfer": ("kinetic", "dispersion", "bands", "maps"),
+}
 
-# Dimensions, units and description of every variable; dimensions of a group are named without it.
+# Dimensions, units and description of every variable; dimensions of a group are named without it, so none may be
+# called as one outside that the group uses.
 LAYOUT = {
     "time": ("time", "s", "time"),
     "cell": ("cell", "1", "cell"),
@@ -50,9 +53,12 @@ LAYOUT = {
     "bands/edge": ("bands/edge", "1", "edge of a part"),
     "bands/part": ("bands/part", "1", "part of the frequency axis"),
     "bands/edges": ("bands/edge", "rad/s", "edges of the pass bands and gaps"),
-    "bands/energy": ("bands/part time", "J", "kinetic energy of a part"),
+    "bands/sample": ("bands/sample", "s", "time of a sample"),
+    "bands/energy": ("bands/part bands/sample", "J", "kinetic energy of a part"),
+    "bands/band": ("bands/band", "1", "part that holds pass bands"),
+    "bands/kinetic_energy": ("bands/band time cell", "J", "kinetic energy of a part in a cell"),
     "bands/above": ("bands/part", "1", "1 for a pass band above the driven one"),
-    "bands/total": ("time", "J", "kinetic energy"),
+    "bands/total": ("bands/sample", "J", "kinetic energy"),
     "bands/share": ("bands/part", "1", "mean share of a part after the wave's arrival"),
     "entropy/snapshot": ("entropy/snapshot", "s", "time of a snapshot"),
     "entropy/history": ("entropy/snapshot", "bit", "energy-weighted mean entropy of a snapshot"),
@@ -60,8 +66,9 @@ LAYOUT = {
     "entropy/masked": ("", "bit", "mean entropy where the wave is louder than 1 % of its loudest"),
     "entropy/joint": ("", "bit", "mean over time of the entropy over cells and wavenumbers together"),
     "entropy/error": ("", "bit", "deviation over the cells of the masked time mean"),
-    "entropy/local": ("entropy/snapshot cell", "bit", "entropy over wavenumbers at a cell"),
-    "entropy/weight": ("entropy/snapshot cell", "m2/s2", "wavelet energy at a cell"),
+    "entropy/cell": ("entropy/cell", "1", "cell"),
+    "entropy/local": ("entropy/snapshot entropy/cell", "bit", "entropy over wavenumbers at a cell"),
+    "entropy/weight": ("entropy/snapshot entropy/cell", "m2/s2", "wavelet energy at a cell"),
     "partition/snapshot": ("partition/snapshot", "s", "time of a snapshot"),
     "partition/bin": ("partition/bin", "1", "wavenumber bin"),
     "partition/bound": ("partition/bound", "1", "bound of a bin"),
@@ -75,96 +82,77 @@ LAYOUT = {
 }
 
 
-def analyse(run: xr.Dataset, measures: Collection[str] = FULL, arrival: float | None = None) -> xr.Dataset:
+def analyse(
+    run: xr.Dataset,
+    measures: Collection[str] = FULL,
+    arrival: float | None = None,
+    options: AnalysisTable | None = None,
+) -> xr.Dataset:
     """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
     Of ``FULL`` those ``measures`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
-    estimated from the group velocity: half the burst and the way to the site. What the run cannot give (no sites, a
-    single cell) is left out and named in the attribute ``left_out``; what the samples and cells that were kept do not
-    resolve is named in the list ``warnings`` as well.
+    estimated from the group velocity: half the burst and the way to the site. ``options`` are the case's where none
+    are given. What the run cannot give (no sites, a single cell) is left out and named in the attribute ``left_out``;
+    what the samples and cells that were kept do not resolve is named in the list ``warnings`` as well.
     """
     sys.audit("vipetsc.analyse")
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
     about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}
+    options = options or options_of(run)
+    about["analysis"] = told(options)
     if "velocity" not in run:
         return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
-    record = _Record(run)
+    record = VelocityRecord(run, options)
     nt, cells = record.velocity.shape[:2]
     measures = set(measures) - record.unresolved()
-    step = -(-nt * cells // MAP_SIZE) if "maps" in measures else -(-nt // SNAPSHOTS)
-    values: dict[str, Any] = {"time": record.time, "cell": record.cells}
-    if "kinetic" in measures:
-        values["kinetic_energy"] = record.kinetic
-    if "wavenumber" in measures and cells > 1:
-        content = spectra.wavenumber_content(record.velocity, record.masses)
-        values["wavenumber"], values["wavenumber_content"] = content
+    values: dict[str, Any] = _maps(record, measures) if {"kinetic", "wavenumber"} & measures else {}
     if nt < 2:
         record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
         values |= _dispersions(record) if "dispersion" in measures else {}
-        values |= _bands(record) if "bands" in measures else {}
+        values |= _bands(record, measures) if "bands" in measures else {}
         values |= _wavelets(record, measures, arrival) if cells > 1 else {}
     if cells == 1:
         record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
     left_out = "; ".join(record.left_out + record.warnings)
-    about |= {"thinning": step, "left_out": left_out, "warnings": json.dumps(record.warnings)}
+    about |= {"left_out": left_out, "warnings": json.dumps(record.warnings)}
     about |= record.attributes.pop("", {})
+    dims = {dim for name in values for dim in LAYOUT[name][0].split()}
+    axes = {"time": record.mean_time, "cell": record.mean_cells, "bands/sample": record.time}
+    values = {name: axis for name, axis in axes.items() if name in dims} | values
     data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
     for name, attributes in record.attributes.items():
         data[name].attrs.update(attributes)
-    return data.isel(time=slice(None, None, step))
+    return data
 
 
-class _Record:
-    """What the measures need of a run, and what they tell besides their values: attributes, and what is left out.
-
-    ``masses`` (dof) in kg, ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) and
-    ``site``, the leading one's cell, as numbers from 1. ``attributes`` are those of variables, of groups under "".
-    """
-
-    def __init__(self, run: xr.Dataset) -> None:
-        field, leading = run["velocity"], leading_site(run)
-        self.model = Case.of(run).model()
-        self.masses = np.asarray(self.model.chain.cell.masses)
-        self.velocity: Any = _StoredField(field) if field.nbytes > IN_MEMORY else field.values
-        self.time, self.interval, self.cells = field_time(run), field_interval(run), run["cell"].values
-        self.site = None if leading is None else int(run["sites/cell"].values[leading])
-        self.attributes: dict[str, dict[str, Any]] = {}
-        self.left_out: list[str] = []
-        self.warnings: list[str] = []
-
-    def unresolved(self) -> set[str]:
-        """Measures that would take waves for longer or slower ones in what was kept; warns of them."""
-        top, every = pass_bands(self.model.chain.cell)[-1].high, int(np.diff(self.cells).max(initial=1))
-        names: set[str] = set()
-        if self.interval * top >= np.pi:
-            text = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
-            self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
-            names |= {"dispersion", "bands"}
-        if every > 1:
-            text = f"fields of one cell in {every} do not resolve waves shorter than {2 * every} cells"
-            self.warnings.append(f"{text}: wavenumber_content, dispersion, partition and entropy are not measured")
-            names |= {"wavenumber", "dispersion", "partition", "entropy"}
-        return names
-
-    @cached_property
-    def kinetic(self) -> np.ndarray:
-        """Kinetic energy (t, cell) in J."""
-        return spectra.kinetic_energy(self.velocity, self.masses)
+def told(options: AnalysisTable) -> str:
+    """The ``options`` that results depend on, as the attribute ``analysis`` of a file tells them."""
+    return json.dumps(options.model_dump(exclude={"memory"}))
 
 
-class _StoredField:
-    """A field (t, cell, dof) that stays in its file; what is sliced is read."""
+def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
+    """Kinetic energy of cells and of wavenumbers over time, from blocks of samples."""
+    (nt, cells, dofs), (samples, _) = record.velocity.shape, record.sizes
+    kinetic, contents, total, wavenumber = [], [], [], np.zeros(0)
+    for rows in spectra.blocks(-(-nt // samples), 8 * samples * cells * dofs, record.memory):
+        held = np.asarray(record.velocity[rows.start * samples : rows.stop * samples])
+        energy = spectra.kinetic_energy(held, record.masses)
+        total.append(energy.sum(axis=1))
+        kinetic.append(record.mean(energy))
+        if "wavenumber" in measures and cells > 1:
+            wavenumber, content = spectra.wavenumber_content(held, record.masses)
+            size = -(-cells // (2 * record.options.pixels))
+            wavenumber = spectra.block_means(wavenumber, size, 0)
+            contents.append(spectra.block_sums(spectra.block_means(content, samples, 0), size, 1).astype(np.float32))
+    values = {"kinetic_energy": np.concatenate(kinetic)} if "kinetic" in measures else {}
+    if "kinetic" in measures and "bands" in measures and nt > 1:
+        values["bands/total"] = np.concatenate(total)
+    return values | ({"wavenumber": wavenumber, "wavenumber_content": np.concatenate(contents)} if contents else {})
 
-    def __init__(self, field: xr.DataArray) -> None:
-        self._field, self.shape = field, field.shape
 
-    def __getitem__(self, index: Any) -> np.ndarray:
-        return np.asarray(self._field[index].values)
-
-
-def _dispersions(record: _Record) -> dict[str, Any]:
+def _dispersions(record: VelocityRecord) -> dict[str, Any]:
     """Dispersion of all cells, of those before and of those after the first site."""
     nt, cells = record.velocity.shape[:2]
     if cells < 2:
@@ -183,29 +171,38 @@ def _dispersions(record: _Record) -> dict[str, Any]:
         windows |= {"dispersion_before": before, "dispersion_after": after}
     lengths = fft.next_fast_len(nt, real=True), cells
     highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
+    count = np.count_nonzero(2 * np.pi * fft.rfftfreq(lengths[0], record.interval) <= highest)
+    sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, count)]
     measured = record.velocity, record.masses, record.interval
+    given: dict[str, Any] = {"lengths": lengths, "highest": highest, "memory": record.memory}
     for name, window in windows.items():
         if len(range(cells)[window]) < 2:
             record.left_out.append(f"{name}: fewer than two of its cells were recorded")
             continue
         # A wave that crosses the border of a window would smear over all wavenumbers.
-        tapers = spectra.TAPER, spectra.TAPER if name == "dispersion" else 0.5
-        spectrum = spectra.dispersion(*measured, cells=window, tapers=tapers, lengths=lengths, highest=highest).folded()
-        values |= {"frequency": spectrum.frequency, name: spectrum.energy}
+        given |= {"cells": window, "tapers": (spectra.TAPER, spectra.TAPER if name == "dispersion" else 0.5)}
+        pieces = []
+        for some in spectra.blocks(-(-count // sizes[1]), 16 * cells * sizes[1], record.memory):
+            rows = slice(some.start * sizes[1], some.stop * sizes[1])
+            pieces.append(spectra.dispersion(*measured, **given, rows=rows).folded().pooled(*sizes))
+        energy = np.concatenate([part.energy for part in pieces], axis=1).astype(np.float32)
+        frequency = np.concatenate([part.frequency for part in pieces])
+        values |= {"wavenumber": pieces[0].wavenumber, "frequency": frequency, name: energy}
     return values
 
 
-def _bands(record: _Record) -> dict[str, Any]:
+def _bands(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     """Energies of the pass bands and gaps, and the inter-band transfer from the wave's arrival on."""
-    parts = spectra.Parts.of(pass_bands(record.model.chain.cell))
-    energy = spectra.part_energies(record.velocity, record.masses, record.interval, parts.edges)
+    parts, stride = spectra.Parts.of(pass_bands(record.model.chain.cell)), record.options.band_stride
+    measured = record.velocity, record.masses, record.interval, parts.edges
+    energy = spectra.part_energies(*measured, stride, record.memory)
     above = parts.above(record.model.drive.frequency)
     if record.site is None:
         after = int(np.searchsorted(record.time, record.model.drive.duration))
         first, reason = min(after, len(record.time) - 1), "the drive ends (the lattice has no sites)"
     else:
         at = int(np.argmin(np.abs(record.cells - record.site)))
-        first = spectra.front_arrival(record.kinetic[:, at])
+        first = spectra.front_arrival(spectra.kinetic_energy(record.velocity[:, at], record.masses))
         reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
     # The filters see less than the waves' length at the record's ends.
     nt, ends = len(record.time), int(np.ceil(ENDS * len(record.time)))
@@ -215,50 +212,84 @@ def _bands(record: _Record) -> dict[str, Any]:
     moving = total > 0
     about = {"start": record.time[first], "starts_when": f"{reason}, or after the first {ENDS:.0%} of the record"}
     about |= {"end": record.time[last - 1], "ends_when": f"before the last {ENDS:.0%} of the record"}
-    record.attributes |= {"bands/energy": {"parts": list(parts.names)}, "bands/share": about, "ibtet": about}
-    record.attributes["ibtet_whole"] = {"start": about["start"], "end": record.time[-1]}
-    return {
+    names = {"parts": list(parts.names)}
+    record.attributes |= {"bands/energy": names, "bands/share": about | names}
+    coarse, some = energy.copy(), np.arange(0, nt, 2 * stride)
+    coarse[-1] = np.interp(np.arange(nt), some, energy[-1, some])
+    values: dict[str, Any] = {}
+    whole = {"start": about["start"], "end": record.time[-1]}
+    for name, stop, times in (("ibtet", last, about), ("ibtet_whole", nt, whole)):
+        values[name], doubled = (spectra.ibtet(e[:, :stop], above, first) for e in (energy, coarse))
+        error = abs(doubled - values[name]) if stride > 1 else 0.0
+        record.attributes[name] = times | {"band_stride": stride, "sampling_error": error}
+    if "maps" in measures:
+        bands = np.flatnonzero([bool(inside) for inside in parts.bands])
+        values["bands/band"] = bands + 1
+        ranges = np.column_stack([parts.edges[bands], parts.edges[bands + 1]])
+        values["bands/kinetic_energy"] = spectra.part_maps(*measured[:3], ranges, record.sizes, record.memory)
+    return values | {
         "bands/edge": np.arange(len(parts.edges)),
         "bands/part": np.arange(1, len(parts.names) + 1),
         "bands/edges": parts.edges,
         "bands/energy": energy,
         "bands/above": above.astype(np.int8),
-        "bands/total": record.kinetic.sum(axis=1),
         "bands/share": (energy[:, first:last][:, moving] / total[moving]).mean(axis=1),
-        "ibtet": spectra.ibtet(energy[:, :last], above, first),
-        "ibtet_whole": spectra.ibtet(energy, above, first),
     }
 
 
-def _wavelets(record: _Record, measures: Collection[str], arrival: float | None) -> dict[str, Any]:
+def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float | None) -> dict[str, Any]:
     """Wavenumber entropy of the host velocity, and partition of the velocity, at snapshots."""
     nt, cells = record.velocity.shape[:2]
-    values: dict[str, Any] = {}
     if cells > MOST_CELLS and {"partition", "entropy"} & set(measures):
         record.left_out.append(f"partition, entropy: more than {MOST_CELLS} cells were recorded")
-        return values
-    stride, maps, cell = -(-nt // (SNAPSHOTS + 1)), "maps" in measures, record.model.chain.cell
-    time = record.time[::stride]
-    if "entropy" in measures:
-        reason = "the largest host velocity at the first site in the linear run"
-        if arrival is None:
-            chain, start = record.model.chain, record.model.drive_cell
-            distance = 0 if record.site is None else cells_between(record.site - 1, start, chain.cells, chain.ends)
-            arrival = float(0.5 * record.model.drive.duration + distance / record.model.speed)
-            reason = "half the burst and the way to the first site at the group velocity"
-        # A record that ends before keeps its last snapshot.
-        start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
-        entropy = spectra.entropy(np.ascontiguousarray(record.velocity[::stride, :, cell.host]), start)
-        names = "energy_weighted", "masked", "joint", "error", *(("local", "weight") if maps else ())
-        values |= {"entropy/snapshot": time, "entropy/history": entropy.snapshot}
-        values |= {f"entropy/{name}": getattr(entropy, name) for name in names}
-        record.attributes[""] = {"entropy/start": time[start], "entropy/starts_when": reason}
-    if "partition" in measures:
-        partition = spectra.partition(record.velocity[::stride], record.masses, fields=maps)
-        bins = len(partition.energy)
-        names = "energy", "kinetic", "reconstructed", "error", "cross_share"
-        values |= {"partition/snapshot": time, "partition/bin": np.arange(1, bins + 1)}
-        values |= {"partition/bound": np.arange(bins + 1), "partition/bounds": np.arange(bins + 1) * np.pi / bins}
-        values |= {f"partition/{name}": getattr(partition, name) for name in names}
-        values |= {"partition/kinetic_energy": partition.field} if maps else {}
+        return {}
+    stride, maps = -(-nt // (SNAPSHOTS + 1)), "maps" in measures
+    values = _partition(record, stride * record.options.snapshot_stride, maps) if "partition" in measures else {}
+    return values | (_entropies(record, stride, arrival, maps) if "entropy" in measures else {})
+
+
+def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps: bool) -> dict[str, Any]:
+    """Entropy of the host velocity at every ``stride``-th sample, with its ``maps``."""
+    options, time = record.options, record.time[:: stride * record.options.snapshot_stride]
+    reason = "the largest host velocity at the first site in the linear run"
+    if arrival is None:
+        chain, start = record.model.chain, record.model.drive_cell
+        distance = 0 if record.site is None else cells_between(record.site - 1, start, chain.cells, chain.ends)
+        arrival = float(0.5 * record.model.drive.duration + distance / record.model.speed)
+        reason = "half the burst and the way to the first site at the group velocity"
+    # A record that ends before keeps its last snapshot.
+    start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
+    host = np.ascontiguousarray(record.velocity[::stride, :, record.model.chain.cell.host])
+    entropy = spectra.entropy(host, start * options.snapshot_stride, options.cell_stride, options.snapshot_stride)
+    local, weight = entropy.local[start:], entropy.weight[start:]
+    doubled = spectra.averages(local[::2, ::2], weight[::2, ::2], 0, 2 * options.cell_stride, weight.max())
+    values: dict[str, Any] = {"entropy/snapshot": time, "entropy/history": entropy.snapshot}
+    for name in ("energy_weighted", "masked", "joint", "error"):
+        values[f"entropy/{name}"] = getattr(entropy, name)
+        about = options.model_dump(include={"snapshot_stride", "cell_stride"})
+        about |= {"sampling_error": abs(getattr(doubled, name) - getattr(entropy, name))}
+        record.attributes[f"entropy/{name}"] = about
+    record.attributes[""] = {"entropy/start": time[start], "entropy/starts_when": reason}
+    if maps:
+        size = -(-entropy.local.shape[1] // options.pixels)
+        values["entropy/cell"] = spectra.block_means(record.cells[:: options.cell_stride], size, 0)
+        for name in ("local", "weight"):
+            values[f"entropy/{name}"] = spectra.block_means(getattr(entropy, name), size, 1).astype(np.float32)
+    return values
+
+
+def _partition(record: VelocityRecord, every: int, maps: bool) -> dict[str, Any]:
+    """Kinetic energies of the wavenumber bins at every ``every``-th sample, with their ``maps``."""
+    time = record.time[::every]
+    blocks = spectra.blocks(len(time), 8 * np.prod(record.velocity.shape[1:]), record.memory)
+    windows = (record.velocity[some.start * every : some.stop * every : every] for some in blocks)
+    mean_over = record.sizes[1] if maps else 0
+    parts = [spectra.partition(window, record.masses, mean_over=mean_over) for window in windows]
+    bins = len(parts[0].energy)
+    names = "energy", "kinetic", "reconstructed", "error", "cross_share"
+    values: dict[str, Any] = {"partition/snapshot": time, "partition/bin": np.arange(1, bins + 1)}
+    values |= {"partition/bound": np.arange(bins + 1), "partition/bounds": np.arange(bins + 1) * np.pi / bins}
+    values |= {f"partition/{name}": np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in names}
+    if maps:
+        values["partition/kinetic_energy"] = np.concatenate([p.field for p in parts], axis=1).astype(np.float32)
     return values

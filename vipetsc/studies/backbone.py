@@ -14,12 +14,12 @@ import xarray as xr
 from scipy.optimize import minimize_scalar
 
 import vipetsc
-from vipetsc.case import Case
+from vipetsc.case import Case, Sweep
 from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
-from vipetsc.io.read import curves, open_ensemble, open_run
+from vipetsc.io.read import curves, open_ensemble
 from vipetsc.spectra import power_law
-from vipetsc.studies.members import leading_cell, linear_folder
+from vipetsc.studies.linear import leading_cell, read_linear
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
@@ -90,11 +90,11 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
     the smallest amplitude that touches a site is its clearance over the envelope at 1 N. The envelope is that of
     w^2 + (w'/Om)^2, so it does not depend on where the samples fall.
     """
-    linear = linear_folder(folder, case)
+    linear = read_linear(folder, case)
+    if linear is None:
+        raise OSError(f"{folder}: its records tell of no linear run of this lattice and drive")
     sites = np.asarray(case.contacts.sites)
-    with open_netcdf(linear / "wave.h5", "linear wave") as wave, open_run(linear / "run.h5") as run:
-        touching = np.asarray(case.contacts.clearance) / wave["envelope"].values[sites - 1]
-        work = float(run["energy/work"][-1])
+    touching, work = np.asarray(case.contacts.clearance) / linear.envelope[sites - 1], linear.statistics["work"]
     amplitude = float(touching[np.argmax(sites == leading_cell(case))])
     return Initiation(amplitude, work * amplitude**2, float(touching.min()))
 
@@ -141,8 +141,9 @@ def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
     slopes, folder = [read_slope(branch / BRANCH) for branch in branches], Path(ensemble.attrs["folder"])
     related: dict[str, xr.Dataset] = {}
     left_out: list[str] = []
-    for curve, member in curves(ensemble):
-        case = Case.load(member / "case.toml")
+    sweep = Sweep.of(ensemble)
+    for curve, number in curves(ensemble):
+        case = sweep.case(number)
         sites = len(np.asarray(case.contacts.sites))
         if not sites:
             continue

@@ -8,23 +8,25 @@ import numpy as np
 from vipetsc.case import Sweep
 from vipetsc.case.reading import put
 from vipetsc.io.read import axes, open_ensemble, select
-from vipetsc.studies.ensemble import AMPLITUDE, FITTED
+from vipetsc.studies.ensemble import AMPLITUDE
+from vipetsc.studies.linear import FITTED
 
 COMPARED = {name: 1e-3 for name in FITTED} | {"dissipated_fraction": 1e-3}
 """Measures that are compared, and by how much they may differ (1, bit) where the motion is not chaotic."""
 
 
-def sampled(sweep: Sweep, share: float, seed: int) -> Sweep:
-    """Members of ``sweep`` for the engine ``ts``: one of every curve over the amplitude, a ``share`` of all if more.
+def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
+    """``count`` members of ``sweep`` for the engine ``ts``, on as many of its curves over the amplitude.
 
-    They are drawn from ``seed``, and stand on one axis. Raises StopIteration if the amplitude does not vary.
+    Curves are drawn from ``seed``, and of the amplitudes, cut into ``count`` equal parts, one in each: few members go
+    from no contact to hard contact. They stand on one axis. Raises StopIteration if the amplitude does not vary.
     """
     random, number = np.random.default_rng(seed), np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
     along = next(i for i, axis in enumerate(sweep.axes) if AMPLITUDE in axis)
     curves = np.moveaxis(number, along, -1).reshape(-1, sweep.shape[along])
-    chosen = random.permuted(curves, axis=1)[:, 0]
-    further = max(int(np.ceil(share * number.size)) - len(chosen), 0)
-    chosen = np.sort(np.append(chosen, random.permutation(np.setdiff1d(number, chosen))[:further]))
+    count = min(count, len(curves))
+    at = ((np.arange(count) + random.random(count)) * curves.shape[1] / count).astype(int)
+    chosen = np.sort(random.permutation(curves)[np.arange(count), at])
     section = sweep.options.model_dump() | {"fields": False, "zip": [[key for axis in sweep.axes for key in axis]]}
     for axis, places in zip(sweep.axes, np.unravel_index(chosen, sweep.shape), strict=True):
         for key, values in axis.items():

@@ -2,39 +2,32 @@
 
 import json
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import xarray as xr
 
 import vipetsc
-from vipetsc.case import Sweep, SweepMember
+from vipetsc.case import Sweep
 from vipetsc.case.sweep import coordinate
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
+from vipetsc.io.records import Line, Record, merge_records, read_records
 from vipetsc.spectra import FEWEST, doubt, normalised, power_law
-from vipetsc.studies.analysis import LAYOUT
+from vipetsc.studies.linear import FITTED, MEASURES, RECORDS, LinearRun, record_files
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached before a stop
 COMPLETE, SCALED, FAILED, MISSING = range(4)
 AMPLITUDE = "drive.amplitude"
-FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
 
-# Further dimension, units and description of what is known of a member: statistics of its run, then of its analysis.
+# What is known of a member's run, as ``MEASURES`` are of its analysis.
 STATISTICS = {
     "contact_episodes": ("", "1", "contact episodes"),
     "dissipated_fraction": ("", "1", "dissipated energy over the drive's work"),
     "work": ("", "J", "work done by the drive"),
     "ledger_error": ("", "1", "largest error of the energy ledger over the work"),
-}
-MEASURES = {name: LAYOUT[name] for name in (*FITTED, "ibtet_whole", "entropy/error")} | {
-    "entropy/history": ("snapshot", "bit", "entropy of a snapshot"),
-    "entropy/snapshot": ("snapshot", "s", "time of a snapshot"),
-    "bands/share": ("part", "1", "mean share of a pass band or gap after the wave's arrival"),
 }
 UNITS = {
     AMPLITUDE: "N",
@@ -65,85 +58,144 @@ FIT = {
 }
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a member ended: the index of its ``status`` in ``STATUS``, why, and its run's statistics."""
+class Results:
+    """What the records of the sweep ``plan`` in ``folder`` tell, those of other versions and sweeps left out.
 
-    status: int
-    reason: str = ""
-    statistics: dict[str, Any] = field(default_factory=dict)
+    ``status`` (member): how each ended, an index of ``STATUS``; ``reasons`` of those that failed by number; ``tables``
+    (member, or member and a list, padded with NaN) of what was measured by name, for the first of equal members;
+    ``errors`` the largest that is said of each; ``used`` tolerances, engines and options of the analysis; ``linear``
+    runs by name; ``lines`` where the records stand. ``first`` (member) is the number of the first member that is equal.
+    ``warnings`` by number are about the members, ``damaged`` tells of lines that could not be used.
+    """
+
+    def __init__(self, plan: Sweep, folder: Path) -> None:
+        self.plan, self.folder, self.ids = plan, folder, plan.ids()
+        self.status = np.full(plan.count, MISSING, np.int8)
+        self.reasons: dict[int, str] = {}
+        self.tables: dict[str, np.ndarray] = {}
+        self.linear: dict[str, LinearRun] = {}
+        self.lines: dict[str, Line] = {}
+        self.parts: set[tuple[str, ...]] = set()
+        self.warnings: dict[int, list[str]] = {}
+        self.damaged: list[str] = []
+        self.cpu_seconds: dict[int, float] = {}
+        self.used: dict[str, set[Any]] = {"rtol": set(), "engine": set(), "analysis": set()}
+        self.errors: dict[str, float] = {}
+        number_of: dict[str, int] = {}
+        self.first = np.array([number_of.setdefault(name, number) for number, name in enumerate(self.ids)])
+        scaled: dict[int, tuple[str, int]] = {}
+        self.files = record_files(folder)
+        for record, line in (pair for path in self.files for pair in read_records(path, self.damaged.append)):
+            if record["vipetsc_version"] != vipetsc.__version__:
+                continue
+            if "envelope" in record:
+                run, name = LinearRun.of_record(record), record["linear"]
+                self.linear[name], self.lines[f"{name} {[*run.measures]}"] = run.joined(self.linear.get(name)), line
+            elif (number := number_of.get(record["id"])) is not None:
+                self._enter(number, record, line)
+                if record["status"] == STATUS[SCALED]:
+                    scaled[number] = record["linear"], record["site"]
+        self._scale(scaled)
+        self.status = self.status[self.first]
+
+    def _enter(self, number: int, record: Record, line: Line) -> None:
+        """Take what a ``record`` tells of a member; the latest counts, a failure only where nothing else is there."""
+        if record["status"] == STATUS[FAILED] and self.status[number] in (COMPLETE, SCALED):
+            return
+        self.status[number], self.lines[record["id"]] = STATUS.index(record["status"]), line
+        self.reasons.pop(number, None)
+        if record["status"] == STATUS[FAILED]:
+            self.reasons[number] = record["reason"]
+            return
+        known = record["statistics"]
+        row = {"contact_episodes": known["episodes"], "ledger_error": known["ledger_error"], "work": known["work"]}
+        row["dissipated_fraction"] = known["dissipated"] / known["work"] if known["work"] else np.nan
+        self._put(number, row | record.get("measures", {}))
+        # An amplitude sweep goes below the onset on purpose.
+        self.warnings[number] = [text for text in record["warnings"] if not text.startswith("no contact")]
+        self.cpu_seconds[number] = record["cpu_seconds"]
+        for name, value in (("rtol", record["rtol"]), ("engine", known["engine"])):
+            self.used[name].add(value)
+
+    def _put(self, number: int | list[int], row: Record) -> None:
+        """Enter what was measured of a member, or the same of several, into the tables."""
+        if parts := row.get("parts"):
+            self.parts.add(tuple(parts))
+        if options := row.get("analysis"):
+            self.used["analysis"].add(options)
+        for name, error in row.get("errors", {}).items():
+            self.errors[name] = max(error, self.errors.get(name, 0.0))
+        for name in row.keys() - {"parts", "analysis", "errors"}:
+            value = np.asarray(row[name], float)
+            if name not in self.tables:
+                self.tables[name] = np.full((len(self.ids), *value.shape), np.nan)
+            table = self.tables[name]
+            if value.ndim and len(value) > table.shape[1]:
+                wider = (0, 0), (0, len(value) - table.shape[1])
+                self.tables[name] = table = np.pad(table, wider, constant_values=np.nan)
+            table[(number, *map(slice, value.shape))] = value
+
+    def _scale(self, scaled: Mapping[int, tuple[str, int]]) -> None:
+        """Give scaled members the measures of their linear runs; those whose record is lost are missing."""
+        members: dict[tuple[str, int], list[int]] = {}
+        for number, source in scaled.items():
+            if self.status[number] == SCALED:
+                members.setdefault(source, []).append(number)
+        for (name, site), numbers in members.items():
+            if name in self.linear and site in self.linear[name].measures:
+                self._put(numbers, self.linear[name].measures[site])
+            else:
+                self.status[numbers] = MISSING
+
+    def merge_files(self) -> None:
+        """Put the records of all ranks together in one file, without those that count no more."""
+        if self.damaged or self.files != [self.folder / RECORDS]:
+            parts = [path for path in self.files if path.name != RECORDS]
+            merge_records(self.folder / RECORDS, self.lines.values(), parts)
 
 
-def assemble(
-    plan: Sweep, members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path, warnings: Sequence[str] = ()
-) -> None:
-    """Write ``folder/ensemble.h5`` from the members' files, with ``warnings`` about them, whole or not at all.
+def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
+    """Write ``ensemble.h5`` from the ``results`` of a sweep, with ``warnings`` about them, whole or not at all.
 
     A dimension for every axis, named after its first key, with a coordinate for every key; NaN where a member
     failed. The file depends on the members alone, not on when or on how many ranks they were made.
     """
-    sys.audit("vipetsc.merge", str(folder))
-    rows = _rows(members, outcomes, folder)
-    names, data = plan.names(), {}
+    sys.audit("vipetsc.merge", str(results.folder))
+    plan, names = results.plan, results.plan.names()
+    data: Variables = {}
     for axis in plan.axes:
         for key, values in axis.items():
             data[names[key]] = variable(names[next(iter(axis))], coordinate(values), UNITS.get(key, "1"), key)
     dims = tuple(names[next(iter(axis))] for axis in plan.axes)
 
-    status = np.array([outcome.status for outcome in outcomes], np.int8).reshape(plan.shape)
     flags = {"flag_values": np.arange(MISSING, dtype=np.int8), "flag_meanings": " ".join(STATUS[:MISSING])}
-    data["status"] = variable(dims, status, "1", "how the member ended", **flags)
-    parts = {row["parts"] for row in rows if "parts" in row}
+    data["status"] = variable(dims, results.status.reshape(plan.shape), "1", "how the member ended", **flags)
+    ids = np.array(results.ids, dtype=object).reshape(plan.shape)
+    data["member"] = variable(dims, ids, "1", "name of the member, and of its folder if it has one")
     for name, (further, *texts) in (STATISTICS | MEASURES).items():
-        table = _table(rows, name, plan.shape)
-        if further == "part" and len(parts) != 1:  # cells whose bands overlap differently have no common parts
+        table = results.tables.get(name, np.full(plan.count, np.nan))[results.first]
+        if further == "part" and len(results.parts) != 1:  # cells whose bands overlap differently have no common parts
             continue
-        if name in STATISTICS or table.ndim > len(dims) or not np.isnan(table).all():
-            data[name] = variable((*dims, *further.split()), table, *texts)
+        if name in STATISTICS or table.ndim > 1 or not np.isnan(table).all():
+            said: dict[str, Any] = {"sampling_error": results.errors[name]} if name in results.errors else {}
+            table = table.reshape(*plan.shape, *table.shape[1:])
+            data[name] = variable((*dims, *further.split()), table, *texts, **said)
     if "entropy/history" in data:
         number = np.arange(data["entropy/history"].shape[-1])
         data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
         data["entropy/time"] = data.pop("entropy/snapshot")
     if "bands/share" in data:
-        data["bands/share"].attrs["parts"] = list(parts.pop())
+        data["bands/share"].attrs["parts"] = list(*results.parts)
         number = np.arange(1, data["bands/share"].shape[-1] + 1)
         data["part"] = variable("part", number, "1", "part of the frequency axis")
-    failed = [f"{m.index}: {o.reason}" for m, o in zip(members, outcomes, strict=True) if o.status == FAILED]
+    places = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
+    numbers = results.first[results.status == FAILED]
+    failed = [f"{tuple(place)}: {results.reasons[n]}" for place, n in zip(places, numbers, strict=True)]
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
+    about |= {name: sorted(values) for name, values in results.used.items()}
     about |= {"case": plan.to_toml(), "failed": failed, "warnings": json.dumps(warnings)}
     data |= _fits(data, names[AMPLITUDE]) if AMPLITUDE in names else {}
-    write_netcdf(folder / "ensemble.h5", xr.Dataset(data, attrs=about))
-
-
-def _rows(members: Sequence[SweepMember], outcomes: Sequence[Outcome], folder: Path) -> list[dict[str, Any]]:
-    """What is known of every member by name; empty for those that failed. Equal members are read once."""
-    measures: dict[str, dict[str, Any]] = {}
-    rows: list[dict[str, Any]] = []
-    for identity, outcome in zip((member.id for member in members), outcomes, strict=True):
-        if outcome.status == FAILED:
-            rows.append({})
-            continue
-        if identity not in measures:
-            # With h5py, since a sweep may have thousands of members and xarray takes 30 ms to open a file.
-            with h5py.File(folder / identity / "analysis.h5") as file:
-                row = {name: file[name][()] for name in MEASURES if name in file}
-                row |= {"parts": tuple(file["bands/energy"].attrs["parts"])} if "bands/share" in row else {}
-                measures[identity] = row
-        known = outcome.statistics
-        row = {"contact_episodes": known["episodes"], "ledger_error": known["ledger_error"], "work": known["work"]}
-        row["dissipated_fraction"] = known["dissipated"] / known["work"] if known["work"] else np.nan
-        rows.append(measures[identity] | row)
-    return rows
-
-
-def _table(rows: Sequence[dict[str, Any]], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """What ``name`` is of all members in the sweep's ``shape``; lists have a further axis, padded with NaN."""
-    values = [np.asarray(row.get(name, np.nan), float) for row in rows]
-    longest = max((value.shape for value in values), key=lambda one: (len(one), one))
-    table = np.full((len(rows), *longest), np.nan)
-    for i, value in enumerate(values):
-        table[(i, *map(slice, value.shape))] = value
-    return table.reshape(*shape, *longest)
+    write_netcdf(results.folder / "ensemble.h5", xr.Dataset(data, attrs=about))
 
 
 def _fits(data: Variables, along: str) -> Variables:

@@ -8,9 +8,10 @@ from typing import TypeVar
 
 from mpi4py import MPI
 
-from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, on_root
+from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, meet, on_root
 
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # no other member could be written either
+BLOCKS = 100  # that each team draws, at least, so that none waits long for the last
 PATIENCE = 5.0  # s that a rank whose member failed waits for the rest of its team to have failed as well
 MADE, UNMADE, LEFT, ENDED = range(4)  # how a job ended; the later counts if ranks differ
 
@@ -28,33 +29,41 @@ class TaskPool:
         self.stopped, self.busy = False, 0.0
 
     def share(
-        self, jobs: Sequence[Job], work: Callable[[Job], None], progress: Progress | None = None
-    ) -> dict[Job, str]:
-        """Do all ``jobs``; returns for each one done the reason why it failed, "" if it did not. Collective.
+        self,
+        jobs: Sequence[Job],
+        work: Callable[[Job], None],
+        progress: Progress | None = None,
+        fail: Callable[[Job, str], None] = lambda job, reason: None,
+    ) -> int:
+        """Do all ``jobs``, those that come first first; returns how many came out. Collective.
 
-        Raises OSError on all ranks when the disk is full.
+        ``fail`` is called on the first rank of a team with a job that failed, and why. Raises OSError on all ranks when
+        the disk is full.
         """
         drawn, ended = SharedCounter(self.comm), SharedCounter(self.comm)
-        reasons: dict[Job, str] = {}
-        leader, ending, reason = self.team.rank == 0, MADE, ""
+        block = max(len(jobs) * self.team.size // (BLOCKS * self.comm.size), 1)  # many small jobs are drawn together
+        leader, ending, reason, made, end, number = self.team.rank == 0, MADE, "", 0, 0, 0
         while not (self.stopped or self.stop.agreed(self.team)):
-            number = self.team.bcast(drawn.draw() if leader else None)
+            if number == end:
+                number = self.team.bcast(drawn.draw(block) if leader else None)
+                end = min(number + block, len(jobs))
             if number >= len(jobs):
                 break
-            job, begin = jobs[number], time.perf_counter()
-            ending, reason = self._end(job, work)
+            begin = time.perf_counter()
+            ending, reason = self._end(jobs[number], work, fail)
             self.busy += time.perf_counter() - begin
             if ending in (LEFT, ENDED):
                 break
-            reasons[job] = reason
+            made, number = made + (ending == MADE), number + 1
             done = ended.draw(1 if leader else 0)
             if progress:
                 progress.update(done + 1)
         else:
             ending = LEFT
         if ending in (LEFT, ENDED):
-            drawn.draw(len(jobs))  # so that no team begins another
-        shares = self.comm.allgather((ending, reason, reasons))
+            drawn.draw(len(jobs))  # so that no team begins another block
+        meet(self.comm)
+        shares = self.comm.allgather((ending, reason, made if leader else 0))
         self.stopped = any(ending == LEFT for ending, *_ in shares)
         if progress:
             progress.close()
@@ -66,9 +75,9 @@ class TaskPool:
                 raise OSError(full)
 
         on_root(self.comm, check)
-        return {job: reason for *_, share in shares for job, reason in share.items()}
+        return sum(made for *_, made in shares)
 
-    def _end(self, job: Job, work: Callable[[Job], None]) -> tuple[int, str]:
+    def _end(self, job: Job, work: Callable[[Job], None], fail: Callable[[Job, str], None]) -> tuple[int, str]:
         """Do a ``job`` with the whole team: how it ended, and why.
 
         A rank that fails alone leaves the others in the midst of it, where they wait for ever: its exception is raised.
@@ -88,4 +97,10 @@ class TaskPool:
             if failure and time.monotonic() - since > PATIENCE:
                 raise failure
             time.sleep(1e-3)
-        return max(self.team.allgather(ending))
+        ending = max(self.team.allgather(ending))
+        if ending[0] == UNMADE:
+            try:
+                on_root(self.team, lambda: fail(job, ending[1]))
+            except OSError as error:
+                return ENDED, str(error)
+        return ending

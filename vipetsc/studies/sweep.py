@@ -1,46 +1,41 @@
-"""Every member of a sweep, over all ranks: linear runs first, then the longest; resumes, and goes on past failures.
-
-The measures of runs already made, of one or of all members of a sweep whose fields were kept, are taken anew here too.
-"""
+"""Every member of a sweep, over all ranks: linear runs first, then the longest; resumes, and goes on past failures."""
 
 import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mpi4py import MPI
 
+import h5py
 import numpy as np
-import xarray as xr
 
 import vipetsc
-from vipetsc.case import Case, Sweep, SweepMember
+from vipetsc.case import Case, Sweep
+from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, FolderError, claimed
-from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.read import open_run
-from vipetsc.parallel import Progress, StopRequest, on_every_rank, on_root
-from vipetsc.studies.analysis import analyse
-from vipetsc.studies.ensemble import COMPLETE, FAILED, MISSING, SCALED, STATUS, Outcome, assemble
-from vipetsc.studies.members import MemberStore, arrival_at, linear_folder, reached, read_wave
+from vipetsc.io.read import outdated
+from vipetsc.parallel import Progress, StopRequest, on_root
+from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
+from vipetsc.studies.linear import LinearRun, leading_cell, linear_name
+from vipetsc.studies.members import MemberStore
 from vipetsc.studies.pool import TaskPool
 
-FORMAT_VERSION = 1
+MOST_SURVEYED = 10_000  # members whose cases are made beforehand, for their linear runs and what they will cost
 
 
 @dataclass(frozen=True)
 class SweepResult:
-    """How a sweep ended: outcomes in the members' order.
+    """How a sweep ended: ``status`` (member), an index of ``studies.ensemble.STATUS``.
 
     ``made`` counts the members simulated or scaled now; ``busy`` (rank) is the share of the time in which each
-    rank worked on members. ``warnings`` are sentences about files made again and about the members' results.
+    rank worked on members. ``warnings`` are sentences about records made again and about the members' results.
     """
 
-    outcomes: list[Outcome]
+    status: np.ndarray
     made: int
     seconds: float
     busy: tuple[float, ...]
@@ -59,7 +54,7 @@ class SweepResult:
 
     def count(self, status: int) -> int:
         """Number of members that ended so."""
-        return [outcome.status for outcome in self.outcomes].count(status)
+        return int((self.status == status).sum())
 
 
 def run_sweep(
@@ -72,156 +67,145 @@ def run_sweep(
     resume: bool = False,
     progress: bool = False,
 ) -> SweepResult:
-    """Make every member of ``plan`` in ``folder``, then ``index.json`` and ``ensemble.h5``.
+    """Make every member of ``plan`` in ``folder``, then ``ensemble.h5`` and ``index.json``.
 
     Members that are complete and made by this version are not made again, so a sweep that was killed goes on where
     it was; ``force`` begins anew and replaces the sweep in the folder when the new one has ended, ``resume`` needs one
     to go on with. A member that fails is recorded with its reason and the others go on. All ranks of
     ``comm`` make members; ``[sweep] ranks`` of them share each.
 
-    Raises CaseError if no member is a valid case, FolderError if the folder holds anything but this sweep.
+    Raises CaseError if no member is a valid case (of those drawn, where they are many), FolderError if the folder holds
+    anything but this sweep.
     """
-    members = plan.members()
+    on_root(comm, lambda: plan.members(MOST_TRIED)[:0])
     with claimed(comm, folder, SWEEP, plan.to_toml(), force=force, resume=resume) as claim:
-        result = _make_all(plan, members, claim.folder, comm, stop or StopRequest(), progress)
+        if reason := on_root(comm, lambda: outdated(claim.folder)):
+            raise FolderError(reason)
+        result = _make_all(plan, claim.folder, comm, stop or StopRequest(), progress)
         if not result.resumable:
             claim.publish()
     return replace(result, folder=claim.path)
 
 
-def _make_all(
-    plan: Sweep, members: Sequence[SweepMember], folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool
-) -> SweepResult:
-    """Make what is missing of the ``members`` in ``folder``, on all ranks, and put together what is there."""
+def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> SweepResult:
+    """Make what is missing of the members in ``folder``, on all ranks, and put together what is there."""
     begin = time.perf_counter()
     sys.audit("vipetsc.plan", plan.name)
     team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
     pool = TaskPool(comm, team, stop)
-    store = MemberStore(folder, plan.options, team, stop)
+    store = MemberStore(plan, folder, team, stop, comm.rank)
 
-    cases = {m.id: m.case for m in members if m.case}
     # What there is and what comes first is decided on one rank: another may not see the files of the others yet.
-    source = {key: linear_folder(folder, case) for key, case in cases.items()}
-    linear = on_root(comm, lambda: {source[key]: c for key, c in cases.items() if not store.has_linear(c)})
-    failures = pool.share(list(linear), lambda path: store.make_linear(linear[path]))
-    missing, order, waves = on_root(comm, lambda: _plan(cases, source, store))
+    survey = _Survey(plan)
+    linear, store.linear = on_root(comm, lambda: survey.look(folder))
+    pool.share(list(linear), lambda name: store.make_linear(*linear[name]))
+    for name, run in (item for known in comm.allgather(store.linear) for item in known.items()):
+        store.linear[name] = run if isinstance(run, str) else run.joined(store.linear.get(name))
+    order = on_root(comm, lambda: survey.order(store.linear))
     bar = Progress(comm, len(order), "runs", show=progress)
-    made = pool.share(order, lambda key: store.make(cases[key], waves[source[key]]), bar)
-    reasons = {key: reason for key in missing if (reason := failures.get(source[key]))} | made
+    made = pool.share(order, store.make, bar, store.fail)
+    store.file.close()
 
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(pool.busy / seconds))
-    noticed = [warning for warnings in comm.allgather(store.warnings) for warning in warnings]
-    outcomes, warnings = on_root(comm, lambda: conclude(plan, members, store, reasons))
+
+    def put_together() -> tuple[np.ndarray, list[str]]:
+        results = Results(plan, folder) if linear or order else survey.results
+        status, warnings = conclude(results, afresh=bool(order))
+        return status, [*dict.fromkeys([*survey.results.damaged, *survey.lost, *warnings])]
+
+    status, warnings = on_root(comm, put_together)
     team.Free()
-    count = sum(reason == "" for reason in made.values())
-    return SweepResult(outcomes, count, seconds, busy, folder, [*dict.fromkeys(noticed), *warnings])
+    return SweepResult(status, made, seconds, busy, folder, warnings)
 
 
-def _plan(
-    cases: Mapping[str, Case], source: Mapping[str, Path], store: MemberStore
-) -> tuple[list[str], list[str], dict[Path, xr.Dataset]]:
-    """The missing members; those of them whose linear run (``source``) came out, the longest first; linear waves."""
-    missing = [key for key, case in cases.items() if not store.summary(case, current=True)]
-    stored = {source[key]: store.wave(cases[key]) for key in missing}
-    waves = {path: wave for path, wave in stored.items() if wave is not None}
+class _Survey:
+    """What there is of a sweep and what is missing, on one rank.
 
-    def cost(key: str) -> float:
-        """Relative cost of a member: contacts at every site that the linear wave would reach, samples anyhow."""
-        touching = np.minimum(reached(waves[source[key]], cases[key]), 10.0)
-        return float(touching.sum()) + 1e-3 * float(cases[key].time.end)
+    Of the missing members, if they are many, some are drawn that stand for the others: they tell which linear runs are
+    needed, and what a member costs.
+    """
 
-    return missing, sorted((key for key in missing if source[key] in waves), key=cost, reverse=True), waves
+    results: Results
+
+    def __init__(self, plan: Sweep) -> None:
+        self.plan, self.lost = plan, list[str]()
+
+    def look(self, folder: Path) -> tuple[dict[str, tuple[Case, list[int]]], dict[str, LinearRun | str]]:
+        """The cases of missing linear runs by name, with the first sites to measure them for; the runs that are there.
+
+        Members that have failed are missing, and those whose fields cannot be read.
+        """
+        results = self.results = Results(self.plan, folder)
+        missing = (results.status != COMPLETE) & (results.status != SCALED)
+        if self.plan.options.fields:
+            files = "run.h5", "analysis.h5"
+            missing |= [not all(is_whole(folder / name / file, self.lost) for file in files) for name in results.ids]
+        self.missing = np.unique(results.first[missing])
+        drawn = self.missing
+        if len(drawn) > MOST_SURVEYED:
+            drawn = np.sort(np.random.default_rng(0).choice(drawn, MOST_SURVEYED, replace=False))
+        members = [(number, self.plan.member(number).case) for number in drawn]
+        self.drawn = [(number, case, linear_name(case)) for number, case in members if case]
+        needed: dict[str, tuple[Case, list[int]]] = {}
+        for _, case, name in self.drawn:
+            _, sites = needed.setdefault(name, (case, []))
+            if not self.plan.options.fields and leading_cell(case) not in sites:
+                sites.append(leading_cell(case))
+        for name, (_, sites) in [*needed.items()]:
+            if name in results.linear:
+                sites[:] = [site for site in sites if site not in results.linear[name].measures]
+                if not sites:
+                    del needed[name]
+        return needed, dict(results.linear if len(drawn) else {})
+
+    def order(self, linear: dict[str, LinearRun | str]) -> list[int]:
+        """The missing members, the longest first: contacts at every site that the linear wave would reach cost most."""
+        cost, known = [0.0], [-1]
+        for number, case, name in self.drawn:
+            if isinstance(run := linear.get(name), LinearRun):
+                cost.append(float(np.minimum(run.reached(case), 10.0).sum()) + 1e-3 * float(case.time.end))
+                known.append(number)
+        # One that is not known costs what the last one before it does that is.
+        place = np.searchsorted(known, self.missing, "right") - 1
+        return list(self.missing[np.argsort(-np.array(cost)[place], kind="stable")].tolist())
 
 
-def conclude(
-    plan: Sweep, members: Sequence[SweepMember], store: MemberStore, reasons: Mapping[str, str], afresh: bool = False
-) -> tuple[list[Outcome], list[str]]:
+def is_whole(path: Path, lost: list[str]) -> bool:
+    """Whether an HDF5 file is there and was not cut off, which HDF5 sees; if it was, ``lost`` says so."""
+    try:
+        h5py.File(path).close()
+    except OSError as error:
+        lost += [f"{path} cannot be read: {error}; made again"] if path.exists() else []
+        return False
+    return True
+
+
+def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[str]]:
     """Write ``ensemble.h5``, once no member is missing, and ``index.json``; how the members ended, and warnings.
 
-    ``reasons`` names the members (by id) that were made just now, and why they failed. What is there stays as it is
-    if there are none, unless ``afresh``.
+    What is there stays as it is unless it is of other results, or ``afresh``.
     """
-    sys.audit("vipetsc.conclude", str(store.folder))
-    outcomes, rows, warned = [], [], Counter[str]()
-    for member in members:
-        outcome = Outcome(MISSING)
-        if reason := reasons.get(member.id) or member.problem:
-            outcome = Outcome(FAILED, reason)
-        elif member.case and (summary := store.summary(member.case)):
-            status = SCALED if "scaled_from" in summary["statistics"] else COMPLETE
-            outcome = Outcome(status, summary["status"], summary["statistics"])
-            # An amplitude sweep goes below the onset on purpose.
-            warned.update(text for text in summary.get("warnings", ()) if not text.startswith("no contact"))
-        outcomes.append(outcome)
-        ending = {"status": STATUS[outcome.status], "reason": outcome.reason}
-        rows.append({"place": member.index, "id": member.id} | ending)
-    names = plan.names()
-    axes = [{"keys": [*axis], "names": [names[k] for k in axis], "values": [*axis.values()]} for axis in plan.axes]
-    index = {"format_version": FORMAT_VERSION, "sweep": plan.name, "axes": axes, "members": rows}
+    plan, folder, status = results.plan, results.folder, results.status
+    sys.audit("vipetsc.conclude", str(folder))
+    failed = [
+        {"place": np.unravel_index(n, plan.shape), "id": results.ids[n], "reason": results.reasons[results.first[n]]}
+        for n in np.flatnonzero(status == FAILED)
+    ]
+    count = {name: int((status == code).sum()) for code, name in enumerate(STATUS)}
+    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__, "sweep": plan.name}
+    index = about | {"members": count, "failed": failed}
+    warned = Counter(text for first in results.first for text in results.warnings.get(int(first), ()))
     warnings = [f"{count} members: {sentence}" for sentence, count in warned.items()]
-    path, text = store.folder / "index.json", json.dumps(index, indent=1) + "\n"
+    path, text = folder / "index.json", json.dumps(index, indent=1, default=int) + "\n"
     told = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
-    finished = all(outcome.status != MISSING for outcome in outcomes)
     # The index comes last: with it and nothing made since, the ensemble is that of these members.
-    if finished and (reasons or afresh or not told or not store.is_whole(store.folder / "ensemble.h5")):
-        assemble(plan, members, outcomes, store.folder, warnings)
+    if not count[STATUS[MISSING]]:
+        lost: list[str] = []
+        if afresh or not told or not is_whole(folder / "ensemble.h5", lost):
+            assemble(results, warnings)
+        warnings += lost
+        results.merge_files()
     if not told:
         write_text(path, text)
-    return outcomes, warnings
-
-
-def reanalyse_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
-    """Measure the runs in ``paths`` (folders of runs or sweeps, or ``run.h5``); returns the files written.
-
-    The runs are shared over the ranks of ``comm``. Members of a sweep that kept no fields stay as they are; the
-    sweep's ensemble is put together anew.
-
-    Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
-    """
-    runs = on_root(comm, lambda: [folder for path in paths for folder in _measurable(path)])
-
-    def reassemble(folder: Path) -> Path:
-        plan = Sweep.load(folder / "case.toml")
-        store = MemberStore(folder, plan.options, MPI.COMM_SELF, StopRequest())
-        outcomes, _ = conclude(plan, plan.members(), store, {}, afresh=True)
-        if any(outcome.status == MISSING for outcome in outcomes):
-            raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
-        return folder / "ensemble.h5"
-
-    measured = on_every_rank(comm, lambda: [measure_run(folder) for folder in runs[comm.rank :: comm.size]])
-    written = sorted(path for paths in comm.allgather(measured) for path in paths)
-    return written + on_root(comm, lambda: [reassemble(path) for path in paths if (path / "index.json").exists()])
-
-
-def _measurable(path: Path) -> Iterator[Path]:
-    """The folders of the runs in ``path`` that can be measured, every run checked; raises FolderError."""
-    folder = path.parent if path.name == "run.h5" else path
-    sweep = (folder / "index.json").exists()
-    if not sweep and not (folder / "run.h5").exists():
-        raise FolderError(f"{path}: holds no run.h5; the folder of a finished run or sweep is needed")
-    for file in sorted(folder.glob("*/run.h5")) if sweep else [folder / "run.h5"]:
-        try:
-            with open_run(file) as run:
-                if "velocity" in run or not (file.parents[1] / "index.json").exists():
-                    yield file.parent
-        except (OSError, ValueError, KeyError) as error:
-            raise FolderError(f"{file}: is not a run of vipetsc ({error})") from None
-
-
-def measure_run(folder: Path) -> Path:
-    """Write ``folder/analysis.h5`` and return its path; a sweep knows when the wave arrives. Raises as ``open_run``."""
-    with open_run(folder / "run.h5") as run:
-        case = Case.of(run)
-        arrival = arrival_at(read_wave(folder.parent, case), case)
-        write_netcdf(folder / "analysis.h5", analyse(run, arrival=arrival))
-    return folder / "analysis.h5"
-
-
-def is_measured(folder: Path) -> bool:
-    """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
-    with open_run(folder / "run.h5") as run:
-        expected = {key: run.attrs.get(key) for key in ("case", "status")} | {"vipetsc_version": vipetsc.__version__}
-        with suppress(OSError), open_netcdf(folder / "analysis.h5", "analysis") as analysis:  # it is there, and whole
-            return all(analysis.attrs.get(key) == value for key, value in expected.items())
-    return False
+    return status, warnings

@@ -48,8 +48,8 @@ in the cells within r. Nothing else of the forces' history is needed.
 **6. Clusters and ranks** (``forces``, ``stencil``). DoFs within r cells of one another must be solved for together and
 form a cluster. Every rank that owns a cell within r of a cluster advances it, from the same numbers to the same bits,
 so that one exchange of ``HaloRegions`` a step is all that ranks must say to each other. ``engine`` weighs a step's cost
-against the size of its clusters. Its loop over the steps is compiled as a whole, and enters Python where a state is
-complete, ranks exchange cells, or sites switch.
+against the size of its clusters. Its loop over a block of samples is compiled as a whole: ranks agree on requests and
+failures at a block's end, to which a rank that cannot follow its contacts goes on without them.
 
 References
 ----------

@@ -83,10 +83,11 @@ class Cluster(NamedTuple):
 
     The DoFs of a cluster are its sites, those of ``contacts``, and where it is in reach the driven mass with the
     ``burst``. ``response`` (dof, dof of the same cluster, term) is the motion of one after an impulse on another, times
-    H; ``interval`` is H in s, ``atol`` in m/s. ``taylor`` (dof, 2 term) holds the series of the free motion about the
-    present position, ``site_motion`` (dof, 3) w, w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those
-    of the step's forces about its end, ``energy`` (dof,) in J what sites dissipated and the work of the drive;
-    ``history`` (dof,) is of dtype ``HISTORY``, ``state`` (cluster,) of dtype ``SUBSTEP_STATE``.
+    H; ``interval`` is H in s, ``atol`` in m/s; a contact begins with the share ``first_substep`` of its duration.
+    ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``site_motion`` (dof, 3) w,
+    w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
+    ``energy`` (dof,) in J what sites dissipated and the work of the drive; ``history`` (dof,) is of dtype ``HISTORY``,
+    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``.
     """
 
     contacts: Contacts
@@ -97,6 +98,7 @@ class Cluster(NamedTuple):
     omega_max_h: float
     rtol: float
     atol: float
+    first_substep: float
     taylor: np.ndarray
     site_motion: np.ndarray
     moments: np.ndarray

@@ -1,7 +1,7 @@
 """The engine of exact linear steps; the package's docstring has the method."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -11,14 +11,15 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.compiled import njit
-from vipetsc.contact.tracker import Episode
-from vipetsc.dynamics.engine import Engine, StalledError
+from vipetsc.contact.tracker import Tracks
+from vipetsc.dynamics.engine import Engine, StalledError, Stretch
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.advance import CHANGED, DONE, FAILED, advance_cluster
+from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.collocation import Cluster
-from vipetsc.dynamics.propagator.forces import Forces, group_dofs, select_cluster
+from vipetsc.dynamics.propagator.forces import Forces, follow_contacts, group_dofs
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries, apply_impulses, expand_free_motion
-from vipetsc.dynamics.propagator.stencil import HaloRegions, Stencil, apply_propagator, create_stencil
+from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.samples import Samples, no_samples, take_sample
 from vipetsc.parallel import StopRequest
 
 # Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
@@ -27,12 +28,8 @@ LARGEST_OMEGA_H = 3.2
 MOST_PARTS = 16
 # Sites of one cluster beyond which plain time stepping costs less.
 MOST_SITES = 32
-# Changes of one cluster in one step beyond which it counts as stalled.
-MOST_CHANGES = 5_000
 # Rough costs that decide the step's length, in us: a step, a cell in it, a sample's contacts per site of a cluster.
 STEP_COST, CELL_COST, SITE_COST = 20.0, 0.03, 10.0
-# What steps hand over; CHANGED and FAILED are those of ``advance_cluster``.
-ARRIVED, STEPPED = 3, 4
 
 
 @lru_cache(maxsize=4)
@@ -52,18 +49,23 @@ def step_series(model: Model) -> StepSeries | None:
         too_long = max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
         if too_long or model.chain.cells <= 2 * series.reach:
             continue
-        sizes = np.array([len(group) for group in group_dofs(model, series.reach)])
+        sizes = np.diff(group_dofs(model, series.reach).first)
         cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
         if cost < least:
             best, least = series, cost
     return best
 
 
+PROGRESS = np.dtype([(name, np.int64) for name in ("steps", "last", "failed", "cluster")] + [("time", float)])
+"""Steps done and the last one to do; of a failure the step, beyond the last if there is none, the cluster or -1, the
+time in s."""
+
+
 class States(NamedTuple):
     """Two states that steps read and write in turn; a sample interval in s has ``parts`` steps.
 
     ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, ``ghosts`` the
-    neighbouring ones, the last columns of ``HaloRegions``.
+    neighbouring ones, the last columns of ``HaloRegions``. ``progress`` (1,) is of dtype ``PROGRESS``.
     """
 
     components: np.ndarray
@@ -71,45 +73,49 @@ class States(NamedTuple):
     ghosts: int
     parts: int
     sample_interval: float
+    progress: np.ndarray
 
 
 @njit(error_model="numpy")
 def take_steps(
-    states: States, steps: int, stencil: Stencil, columns: np.ndarray, dofs: DofTables, clusters: Cluster
-) -> Iterator[tuple[int, int, float]]:
-    """Go on after so many linear ``steps``; hand over to Python where needed: why, for which cluster, the time in s.
+    states: States, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
+) -> tuple[int, np.ndarray]:
+    """Go on to the last step and take the ``samples`` on the way; returns PETSc's error code and the log of ``tracks``.
 
-    ``ARRIVED``: the state is complete. ``STEPPED``: a step is done, the columns are to be exchanged.
-    ``CHANGED``: sites of a cluster are to be switched. ``FAILED``: the contacts of a cluster cannot be followed.
+    Several ranks go on to the end even if one fails, which then goes on without contacts: they do not ask one another
+    at each step.
     """
-    rows, owned = columns.shape[0], states.owned
-    while True:
+    rows, owned, progress, error = halo.columns.shape[0], states.owned, states.progress[0], 0
+    while error == 0:
+        steps = progress.steps
         state, out = states.components[steps % 2], states.components[1 - steps % 2]
         cells, next_cells = state[: rows * owned].reshape(rows, owned), out[: rows * owned].reshape(rows, owned)
         begin = steps // states.parts * states.sample_interval + steps % states.parts * clusters.interval
-        ghosts = columns[: rows // 2, columns.shape[1] - states.ghosts :]
-        state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
-        yield ARRIVED, -1, begin
-        apply_propagator(stencil, cells, columns, next_cells)
-        for c in range(clusters.state.size):
-            may_touch = expand_free_motion(dofs, c, columns, clusters.taylor)
+        error = exchange(halo, steps % 2, cells)
+        k = steps // states.parts - samples.number if steps % states.parts == 0 else -1
+        if steps == progress.last or 0 <= k < samples.work.size:
+            ghosts = halo.columns[: rows // 2, halo.columns.shape[1] - states.ghosts :]
+            state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
+            if 0 <= k < samples.work.size and not take_sample(state, k, samples) and progress.failed > progress.last:
+                progress.failed, progress.cluster = steps, -1
+        failed = progress.failed <= progress.last
+        if steps == progress.last or (failed and halo.scatter == 0):
+            break
+        apply_propagator(stencil, cells, halo.columns, next_cells)
+        for c in range(0 if failed else clusters.state.size):
+            may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
             is_driven = dofs.first[c + 1] - 1 == dofs.driven and begin < clusters.burst.duration
-            if not (may_touch or is_driven):
-                continue
-            cluster = select_cluster(clusters, dofs, c)
-            substep_state = cluster.state[0]
-            substep_state.begin, substep_state.position = begin, 0.0
-            substep_state.drive_end = (clusters.burst.duration - begin) / clusters.interval
-            cluster.moments[:] = 0.0
-            for change in range(MOST_CHANGES):
-                outcome = advance_cluster(cluster)
-                if outcome == DONE:
+            if may_touch or is_driven:
+                going, tracks = follow_contacts(clusters, dofs, c, tracks, begin)
+                if not going:
+                    progress.failed, progress.cluster = steps, c
+                    progress.time = begin + clusters.state[c].position * clusters.interval
                     break
-                now = begin + cluster.state[0].position * clusters.interval
-                yield (outcome if change < MOST_CHANGES - 1 else FAILED), c, now
-            apply_impulses(dofs, dofs.first[c], cluster.moments, next_cells)
-        steps += 1
-        yield STEPPED, -1, begin
+                first, stop = dofs.first[c], dofs.first[c + 1]
+                apply_impulses(dofs, first, clusters.moments[first:stop], next_cells)
+        if progress.failed > progress.last or halo.scatter != 0:
+            progress.steps += 1
+    return error, tracks.log
 
 
 class Propagator(Engine):
@@ -122,29 +128,23 @@ class Propagator(Engine):
         assert series is not None, "refused"
         self.series = series
         self._layout, self._stop = layout, stop or StopRequest()
-        self._halo = HaloRegions(layout)
-        self._forces = Forces(model, layout, series, self._halo)
-        self._stencil = create_stencil(series, layout, self._halo)
-        ghosts = [self._halo.add(cell, 1) for cell in layout.neighbours() if cell is not None]
-        self._halo.bind_columns()
+        self._regions = HaloRegions(layout)
+        self._forces = Forces(model, layout, series, self._regions)
+        self._stencil = create_stencil(series, layout, self._regions)
+        ghosts = [self._regions.add(cell, 1) for cell in layout.neighbours() if cell is not None]
         self._components = np.zeros((2, layout.size + layout.dofs * len(ghosts)))
         self._states = [layout.create_vector(components) for components in self._components]
+        self._halo = self._regions.bind_columns(self._states)
+        self._progress = np.zeros(1, PROGRESS)
         parts = round(model.sample_interval / series.interval)
-        self._record = States(self._components, layout.owned, len(ghosts), parts, model.sample_interval)
-        self._status = np.zeros(2)
-        self._start(0)
+        self._record = States(self._components, layout.owned, len(ghosts), parts, model.sample_interval, self._progress)
+        self._nothing = no_samples(model, layout)
+        self.state, self.time = self._states[0], 0.0
 
-    def _start(self, steps: int) -> None:
-        """Go on from the state after so many ``steps``."""
-        self.steps, forces = steps, self._forces
-        self._events = take_steps(self._record, steps, self._stencil, self._halo.columns, forces.dofs, forces.clusters)
-        self._arrive()
-
-    def _arrive(self) -> None:
-        """Exchange cells, and complete the state with the ghosts and the ledger."""
-        self.state = self._states[self.steps % 2]
-        self._halo.exchange(self.state)
-        _, _, self.time = next(self._events)
+    @property
+    def steps(self) -> int:
+        """Linear steps done."""
+        return int(self._progress["steps"][0])
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
@@ -155,37 +155,60 @@ class Propagator(Engine):
             if model.chain.cells > 2 * shortest.reach:
                 return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
             return f"{model.chain.cells} cells are fewer than the propagator's band"
-        groups = ([model.chain.sites[i] + 1 for i in group if i >= 0] for group in group_dofs(model, series.reach))
-        _, cells = max((len(cells), sorted(cells)) for cells in groups)
-        if len(cells) > MOST_SITES:
-            return (
-                f"{len(cells)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
-                f" another (at most {MOST_SITES} may)"
-            )
-        return None
+        numbers, first = group_dofs(model, series.reach)
+        counts = np.add.reduceat(numbers >= 0, first[:-1], dtype=np.int64)
+        largest = int(counts.argmax())
+        if counts[largest] <= MOST_SITES:
+            return None
+        cells = sorted(model.chain.sites[i] + 1 for i in numbers[first[largest] :][: counts[largest]])
+        return (
+            f"{len(cells)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
+            f" another (at most {MOST_SITES} may)"
+        )
+
+    def fill(self, samples: Samples) -> Stretch:
+        """See ``Engine``; a stop is at the last sample."""
+        sys.audit("vipetsc.step")
+        return self._go(samples.number + len(samples.work) - 1, samples)
 
     def advance(self, target: float) -> bool:
-        """Step until the time is exactly ``target`` in s, a multiple of the sample interval; see ``Engine``."""
-        last = round(target / self._record.sample_interval) * self._record.parts
-        while self.steps < last:
-            for event, cluster, now in self._events:
-                if event != CHANGED:
-                    break
-                sys.audit("vipetsc.landing")
-                self._forces.switch(cluster, now)
-            # Any rank's failure or request counts on all.
-            self._status[:] = self._stop.requested, event == FAILED
-            self._layout.comm.Allreduce(MPI.IN_PLACE, self._status, MPI.MAX)
-            if event == FAILED:
-                sites = ", ".join(str(site + 1) for site in self._forces.trackers[cluster].numbers)
-                raise StalledError(f"the contacts of sites {sites} at {now:.9g} s")
-            if self._status[1]:
-                raise StalledError("contacts on another rank")
-            self.steps += 1
-            self._arrive()
-        return not self._status[0]
+        """Go on to the sample at ``target`` in s and take none; False if a stop was requested, on all ranks.
 
-    def take_episodes(self, unfinished: bool = False) -> list[Episode]:
+        Raises StalledError, on all ranks, where no step can be taken.
+        """
+        stretch = self._go(round(target / self._record.sample_interval), self._nothing)
+        if stretch.stalled is not None:
+            raise StalledError(stretch.stalled)
+        return not stretch.stopped
+
+    def _go(self, last: int, samples: Samples) -> Stretch:
+        forces, comm, progress, parts = self._forces, self._layout.comm, self._progress[0], self._record.parts
+        progress["last"], progress["failed"], progress["cluster"] = last * parts, last * parts + 1, -1
+        arrays = forces.dofs, forces.clusters, forces.tracker.tracks, samples
+        with PROPAGATOR:
+            error, log = take_steps(self._record, self._stencil, self._halo, *arrays)
+        if error:
+            raise RuntimeError(f"PETSc could not exchange cells: error {error}")
+        forces.tracker.tracks = forces.tracker.tracks._replace(log=log)
+        # Any rank's failure or request counts on all.
+        status = np.array([progress["failed"], -int(self._stop.requested)])
+        comm.Allreduce(MPI.IN_PLACE, status, MPI.MIN)
+        failed, stop = status.tolist()
+        self.state, self.time = self._states[self.steps % 2], self._time(min(failed, self.steps))
+        if failed > progress["last"]:
+            return Stretch(len(samples.work), bool(stop))
+        sites, reason = forces.sites(int(progress["cluster"])), "the state is not finite"
+        if sites:
+            reason = f"the contacts of sites {', '.join(map(str, sites))} at {progress['time']:.9g} s"
+        _, reason = min(comm.allgather((int(progress["failed"]), reason)))
+        return Stretch(failed // parts - samples.number + 1, bool(stop), reason)
+
+    def _time(self, steps: int) -> float:
+        """Time in s after so many ``steps``."""
+        record = self._record
+        return steps // record.parts * record.sample_interval + steps % record.parts * self.series.interval
+
+    def take_episodes(self, unfinished: bool = False) -> np.ndarray:
         """See ``Engine``."""
         return self._forces.take_episodes(unfinished)
 
@@ -197,7 +220,7 @@ class Propagator(Engine):
             "interval": self.series.interval,
             "bandwidth": self.series.reach,
             "terms": self.series.terms,
-            "nonzeros": int(np.count_nonzero(self._stencil.values)),
+            "nonzeros": int(np.count_nonzero(self.series.interior())),
             "truncation": self.series.truncation,
         }  # fmt: skip
 
@@ -211,10 +234,11 @@ class Propagator(Engine):
         steps = int(shares[0]["steps"])
         self._layout.restore(shares, self._components[steps % 2])
         self._forces.restore(shares)
-        self._start(steps)
+        self._progress["steps"] = steps
+        self.state, self.time = self._states[steps % 2], self._time(steps)
 
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
-        self._halo.destroy()
+        self._regions.destroy()
         for state in self._states:
             state.destroy()

@@ -4,9 +4,8 @@ Sec. 5 and 6 of the derivation in the package's docstring.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import chain, compress
 from math import factorial
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -15,16 +14,18 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Extremes
-from vipetsc.contact.law import Contacts, create_contacts
-from vipetsc.contact.tracker import LIMITS, TRACKED, Episode, ImpactTracker
+from vipetsc.contact.law import FREE, Contacts, create_contacts
+from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, impact_time, switch_sites, update_episode, with_room
 from vipetsc.dynamics.layout import Layout, create_burst, join
-from vipetsc.dynamics.propagator.advance import ORDER
+from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1
+# Changes of one cluster in one step beyond which it counts as stalled.
+MOST_CHANGES = 5_000
 FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY), ("cluster", SUBSTEP_STATE)])
 """A DoF of ``contact_dofs`` in a checkpoint: its number, -1 for the driven mass, and what its cluster's record has."""
 
@@ -43,22 +44,36 @@ def contact_dofs(model: Model) -> np.ndarray:
     return dofs
 
 
-def group_dofs(model: Model, reach: int) -> list[list[int]]:
-    """Groups of ``contact_dofs`` of which each is within ``reach`` cells of another, in the lattice's order.
+class Groups(NamedTuple):
+    """Groups of ``contact_dofs``: the ``numbers`` (dof,) of group g are ``first[g]`` to ``first[g + 1]``.
 
     In each group the sites' numbers come first, in their own order, then -1 for the driven mass.
     """
-    cells = contact_dofs(model)["cell"].tolist()
-    groups: list[list[int]] = []
-    for dof in sorted(range(-1, len(cells) - 1), key=lambda dof: cells[dof]):
-        if groups and cells[dof] - cells[groups[-1][-1]] <= reach:
-            groups[-1].append(dof)
-        else:
-            groups.append([dof])
-    joined = model.chain.ends == "periodic" and len(groups) > 1
-    if joined and cells[groups[0][0]] + model.chain.cells - cells[groups[-1][-1]] <= reach:
-        groups[0] = groups.pop() + groups[0]
-    return [sorted(group, key=lambda dof: (dof < 0, dof)) for group in groups]
+
+    numbers: np.ndarray
+    first: np.ndarray
+
+
+def group_dofs(model: Model, reach: int) -> Groups:
+    """Groups of ``contact_dofs`` of which each is within ``reach`` cells of another, in the lattice's order."""
+    lattice = model.chain
+    cells = np.array([*lattice.sites, model.drive_cell])
+    numbers = np.append(np.arange(len(lattice.sites)), -1)
+    order, group = np.argsort(cells), np.zeros(len(cells), np.int64)
+    group[order[1:]] = np.cumsum(np.diff(cells[order]) > reach)
+    if lattice.ends == "periodic" and cells.min() + lattice.cells - cells.max() <= reach:
+        group[group == group.max()] = 0
+    first = np.append(0, np.cumsum(np.bincount(group)))
+    return Groups(numbers[np.lexsort((numbers, numbers < 0, group))], first)
+
+
+def _reaching(groups: Groups, cells: np.ndarray, reach: int, layout: Layout) -> Groups:
+    """Those of ``groups``, whose DoFs are in ``cells``, that have a DoF within ``reach`` of the rank's cells."""
+    ways = (-layout.cells, 0, layout.cells) if layout.periodic else (0,)
+    near = [(cells + way >= layout.start - reach) & (cells + way < layout.stop + reach) for way in ways]
+    sizes = np.diff(groups.first)
+    feels = np.logical_or.reduceat(np.any(near, axis=0), groups.first[:-1]) & (layout.owned > 0)
+    return Groups(groups.numbers[np.repeat(feels, sizes)], np.append(0, np.cumsum(sizes[feels])))
 
 
 @njit(error_model="numpy")
@@ -75,6 +90,7 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
         clusters.omega_max_h,
         clusters.rtol,
         clusters.atol,
+        clusters.first_substep,
         clusters.taylor[first:stop],
         clusters.site_motion[first:sites],
         clusters.moments[first:stop],
@@ -82,6 +98,55 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
         clusters.history[first:stop],
         clusters.state[c : c + 1],
     )
+
+
+@njit(error_model="numpy")
+def update_extremes(cluster: Cluster, tracks: Tracks) -> None:
+    """Bring the open episodes of a cluster up to date."""
+    for i in range(cluster.contacts.sites.size):
+        if cluster.contacts.sites[i].mode != FREE:
+            history = cluster.history[i]
+            reached = Extremes(history.indentation, history.force, history.smallest_force)
+            update_episode(cluster.contacts, tracks, i, reached)
+
+
+@njit(error_model="numpy")
+def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
+    """Switch the sites of a cluster that have landed, ``now`` in s; sets the length of the next substep."""
+    contacts, state = cluster.contacts, cluster.state[0]
+    update_extremes(cluster, tracks)
+    was_free = contacts.sites["mode"] == FREE
+    state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, now)
+    is_free = contacts.sites["mode"] == FREE
+    for i in np.flatnonzero(was_free & ~is_free):
+        duration, history = impact_time(tracks.time, abs(contacts.sites[i].approach)), cluster.history[i]
+        history.onset, history.duration = now, duration
+        history.indentation, history.force, history.smallest_force = 0.0, 0.0, 0.0
+        state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
+    if is_free.all():
+        state.length = 1.0
+
+
+@njit(error_model="numpy")
+def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, begin: float) -> tuple[bool, Tracks]:
+    """Advance cluster ``c`` through the step that begins at ``begin`` in s, from one switching to the next.
+
+    Returns whether that was possible, and ``tracks`` with as much room as was needed.
+    """
+    cluster = select_cluster(clusters, dofs, c)
+    state, first = cluster.state[0], dofs.first[c]
+    state.begin, state.position = begin, 0.0
+    state.drive_end = (clusters.burst.duration - begin) / clusters.interval
+    cluster.moments[:] = 0.0
+    for _ in range(MOST_CHANGES):
+        outcome = advance_cluster(cluster)
+        if outcome != CHANGED:
+            return outcome == DONE, tracks
+        tracks = with_room(tracks)
+        sites = tracks.sites[first : first + cluster.contacts.sites.size]
+        now = begin + state.position * cluster.interval
+        _switch(cluster, Tracks(sites, tracks.log, tracks.closed, tracks.time), now)
+    return False, tracks
 
 
 class Forces:
@@ -92,12 +157,13 @@ class Forces:
 
     def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
         self._comm = layout.comm
-        dofs, r = contact_dofs(model), series.reach
-        groups = [g for g in group_dofs(model, r) if (_owned_cells(dofs["cell"][g], r, layout) >= 0).any()]
+        all_dofs, every = contact_dofs(model), group_dofs(model, series.reach)
+        groups = _reaching(every, all_dofs["cell"][every.numbers], series.reach, layout)
+        dofs = all_dofs[groups.numbers]
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
-        count, terms = len(self.dofs.column), series.terms
+        count, terms = len(dofs), series.terms
         self.clusters = Cluster(
-            contacts=create_contacts(model.contact, dofs["clearance"][list(chain(*groups))].tolist()),
+            contacts=create_contacts(model.contact, dofs["clearance"]),
             burst=create_burst(model.drive),
             response=_responses(groups, self.dofs, model, series),
             nodes=collocation(2 * terms),
@@ -105,56 +171,37 @@ class Forces:
             omega_max_h=series.omega_max_h,
             rtol=model.rtol,
             atol=model.atol[1],
+            first_substep=FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0),
             taylor=np.zeros((count, 2 * terms)),
             site_motion=np.zeros((count, 3)),
             moments=np.zeros((count, 2 * terms)),
             energy=np.zeros(count),
             history=np.zeros(count, HISTORY),
-            state=np.zeros(len(groups), SUBSTEP_STATE),
+            state=np.zeros(len(groups.first) - 1, SUBSTEP_STATE),
         )
         self.clusters.state["length"] = 1.0
-        self._first_substep = FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0)
-        self._numbers = list(chain(*groups))
-        self._logs = np.array([layout.start <= dofs["cell"][group[0]] < layout.stop for group in groups], bool)
-        self._clusters = [select_cluster(self.clusters, self.dofs, c) for c in range(len(groups))]
-        self.trackers = []
-        for group, cluster in zip(groups, self._clusters, strict=True):
-            sites = group[: cluster.contacts.sites.size]
-            self.trackers.append(ImpactTracker(cluster.contacts, sites, model.chain.cell.reduced_mass))
-            self.trackers[-1].start = cluster.site_motion
+        leaders = dofs["cell"][groups.first[:-1]]
+        self._logs = (leaders >= layout.start) & (leaders < layout.stop)
+        self._mine = np.repeat(self._logs, np.diff(groups.first))  # DoFs
+        self._numbers, self._logged = groups.numbers, np.zeros(len(all_dofs), bool)
+        self._logged[groups.numbers[self._mine]] = True
+        self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist(), model.chain.cell.reduced_mass)
 
-    def switch(self, c: int, now: float) -> None:
-        """Switch the sites of cluster ``c`` that have landed, ``now`` in s; sets the length of the next substep."""
-        tracker, cluster = self.trackers[c], self._clusters[c]
-        self._update_episodes(c)
-        before = set(tracker.open)
-        cluster.state["switches"] += tracker.switch(now, cluster.energy)
-        for site in set(tracker.open) - before:
-            duration = tracker.duration(abs(float(tracker.contacts.sites["approach"][site])))
-            cluster.history[site] = now, duration, 0.0, 0.0, 0.0
-            first = self._first_substep * duration / cluster.interval
-            cluster.state["length"] = min(cluster.state["length"][0], first)
-        if not tracker.open:
-            cluster.state["length"] = 1.0
+    def sites(self, c: int) -> list[int]:
+        """The sites, counted from 1, of cluster ``c``; none of -1."""
+        numbers = self._numbers[self.dofs.first[c] : self.dofs.first[c + 1]] if c >= 0 else self._numbers[:0]
+        return (numbers[numbers >= 0] + 1).tolist()
 
-    def _update_episodes(self, c: int) -> None:
-        for site, episode in self.trackers[c].open.items():
-            _, _, *extremes = self._clusters[c].history[site].tolist()
-            self.trackers[c].update_episode(site, episode, Extremes(*extremes))
-
-    def take_episodes(self, unfinished: bool) -> list[Episode]:
+    def take_episodes(self, unfinished: bool) -> np.ndarray:
         """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
-        episodes = []
-        for c, (tracker, cluster) in enumerate(zip(self.trackers, self._clusters, strict=True)):
-            if unfinished:
-                self._update_episodes(c)
-            closed = tracker.take_episodes(cluster.energy, unfinished)
-            episodes += closed if self._logs[c] else []
-        return episodes
+        if unfinished:
+            update_extremes(self.clusters, self.tracker.tracks)
+        episodes = self.tracker.take_episodes(self.clusters.energy, unfinished)
+        return episodes[self._logged[episodes["site"]]]
 
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
-        sites = self.checkpoint()["sites"]["counts"]
+        sites = self.tracker.counts[self._mine]
         total = np.array([*(self.clusters.state[name][self._logs].sum() for name in COUNTS),
                           *(sites[name].sum() for name in LIMITS)])  # fmt: skip
         self._comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
@@ -162,21 +209,18 @@ class Forces:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """``forces`` and ``sites`` of the clusters that this rank logs."""
-        sizes, clusters = np.diff(self.dofs.first), self.clusters
-        forces = np.zeros(len(self._numbers), FORCE)
+        clusters, forces = self.clusters, np.zeros(len(self._numbers), FORCE)
         forces["number"], forces["energy"], forces["history"] = self._numbers, clusters.energy, clusters.history
-        forces["cluster"] = np.repeat(clusters.state, sizes)
-        sites = [np.zeros(0, TRACKED), *(tracker.checkpoint() for tracker in compress(self.trackers, self._logs))]
-        return {"forces": forces[np.repeat(self._logs, sizes)], "sites": np.concatenate(sites)}
+        forces["cluster"] = np.repeat(clusters.state, np.diff(self.dofs.first))
+        return {"forces": forces[self._mine], "sites": self.tracker.checkpoint()[self._mine & (self._numbers >= 0)]}
 
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go back to a checkpoint; all ranks that a cluster reaches go on from the same numbers."""
-        tables = {name: np.sort(table, order="number") for name, table in join(shares, ("forces", "sites")).items()}
-        mine = tables["forces"][np.array(self._numbers, int) + 1]  # from -1, the driven mass
+        tables = join(shares, {"forces": "number", "sites": "number"})
+        mine = tables["forces"][self._numbers + 1]  # from -1, the driven mass
         self.clusters.energy[:], self.clusters.history[:] = mine["energy"], mine["history"]
         self.clusters.state[:] = mine["cluster"][self.dofs.first[:-1]]
-        for tracker in self.trackers:
-            tracker.restore(tables["sites"])
+        self.tracker.restore(tables["sites"])
 
 
 def _owned_cells(cells: np.ndarray, reach: int, layout: Layout) -> np.ndarray:
@@ -186,45 +230,52 @@ def _owned_cells(cells: np.ndarray, reach: int, layout: Layout) -> np.ndarray:
     return np.where((around >= layout.start) & (around < layout.stop), around - layout.start, -1)
 
 
-def create_dof_tables(
-    groups: list[list[int]], model: Model, layout: Layout, series: StepSeries, halo: HaloRegions
-) -> DofTables:
+def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> DofTables:
     """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
-    numbers = list(chain.from_iterable(groups))
-    dofs, r = contact_dofs(model)[numbers], series.reach
+    numbers, dofs, r = groups.numbers, contact_dofs(model)[groups.numbers], series.reach
     # DoFs away from the ends share their rows.
-    keys = [(number < 0, -1 if series.is_interior(dof["cell"]) else dof["cell"])
-            for number, dof in zip(numbers, dofs, strict=True)]  # fmt: skip
-    rows = {}
-    for key, dof in dict(zip(keys, dofs, strict=True)).items():
-        around = series.rows(dof["cell"], dof["cell"] - r, 2 * r + 1).astype(float)
-        rows[key] = np.einsum("i,imjc->jcm", dof["form"], around)
+    kinds = 2 * np.where(series.is_interior(dofs["cell"]), -1, dofs["cell"]) + (numbers < 0)
+    _, examples, table = np.unique(kinds, return_index=True, return_inverse=True)
+    rows = []
+    for dof in dofs[examples]:
+        around = series.rows(int(dof["cell"]), int(dof["cell"]) - r, 2 * r + 1).astype(float)
+        rows.append(np.einsum("i,imjc->jcm", dof["form"], around))
+    places = np.full(len(model.chain.sites) + 1, -1)
+    places[numbers] = np.arange(len(numbers))
     return DofTables(
-        column=np.array([halo.add(cell - r, 2 * r + 1) for cell in dofs["cell"]], np.int64),
+        column=halo.add(dofs["cell"] - r, 2 * r + 1),
         owned=_owned_cells(dofs["cell"], r, layout),
-        table=np.array([list(rows).index(key) for key in keys], np.int64),
-        rows=np.array(list(rows.values())).reshape(len(rows), layout.dofs, 2 * r + 1, series.terms),
+        table=table,
+        rows=np.array(rows).reshape(len(rows), layout.dofs, 2 * r + 1, series.terms),
         factors=np.array([series.interval ** (k % 2) / factorial(k) for k in range(2 * series.terms)]),
         inverse_masses=1 / np.asarray(model.chain.cell.masses),
         # An onset within rounding of the clearance is one.
         clearance=dofs["clearance"] * (1 - 1e-9),
-        driven=numbers.index(-1) if -1 in numbers else -1,
-        first=np.cumsum([0, *map(len, groups)]),
-        ledger=np.array([numbers.index(dof) for dof in (-1,) * layout.owns_drive + layout.sites], np.int64),
+        driven=int(places[-1]),
+        first=groups.first,
+        ledger=places[[*(-1,) * layout.owns_drive, *layout.sites]],
     )
 
 
-def _responses(groups: list[list[int]], tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
+def _responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
     """Motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H, in powers 2 m + 1 of s."""
-    dofs, cells, factors = contact_dofs(model), model.chain.cells, tables.factors[1::2] * series.interval
-    response = np.zeros((len(tables.column), max(map(len, groups), default=0), series.terms))
-    for group, first in zip(groups, tables.first[:-1], strict=True):
-        for i, target in enumerate(dofs[group], first):
-            for j, source in enumerate(dofs[group]):
-                offset = source["cell"] - target["cell"]
-                if model.chain.ends == "periodic":
-                    offset = (offset + cells // 2) % cells - cells // 2
-                if abs(offset) <= series.reach:
-                    weights = tables.inverse_masses * source["form"]
-                    response[i, j] = factors * (weights @ tables.rows[tables.table[i], :, series.reach + offset])
+    dofs, n, (first, r) = contact_dofs(model), model.chain.cells, (groups.first, series.reach)
+    factors, cells = tables.factors[1::2] * series.interval, dofs["cell"][groups.numbers]
+    # After an impulse on a site, on the driven mass: (source, table, cell, term).
+    weights = tables.inverse_masses * dofs["form"][[0, -1]]
+    of_source = [
+        [[factors * (weight @ rows[:, c]) for c in range(2 * r + 1)] for rows in tables.rows] for weight in weights
+    ]
+    sizes = np.diff(first)
+    response = np.zeros((len(cells), max(sizes, default=0), series.terms))
+    for j in range(response.shape[1]):
+        targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
+        sources = np.repeat(first[:-1], sizes)[targets] + j
+        offsets = cells[sources] - cells[targets]
+        if model.chain.ends == "periodic":
+            offsets = (offsets + n // 2) % n - n // 2
+        near = np.abs(offsets) <= r
+        targets, sources, offsets = targets[near], sources[near], offsets[near]
+        is_driven = (groups.numbers[sources] < 0).astype(np.int64)
+        response[targets, j] = np.array(of_source)[is_driven, tables.table[targets], r + offsets]
     return response

@@ -4,12 +4,14 @@ With them, the free motion of the contact DoFs and, by Maxwell's reciprocity, wh
 lattice: sec. 1, 2 and 5 of the derivation in the package's docstring.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from math import factorial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import LANDED_W
@@ -64,6 +66,16 @@ class StepSeries:
         return self._powers()
 
     @cached_property
+    def _near_end(self) -> Callable[[int], np.ndarray]:
+        """As ``_interior``, of a cell near an end; each is computed once."""
+
+        def powers(cell: int) -> np.ndarray:
+            cells = np.arange(cell - self._width, cell + self._width + 1)
+            return self._powers((cells >= 0) & (cells < self.chain.cells))
+
+        return cache(powers)
+
+    @cached_property
     def _share(self) -> np.ndarray:
         """Magnitudes of P's entries (2 dof, 2 dof, cell) for it, a velocity counted as omega times a displacement."""
         n, omega = self.chain.cell.dofs, self.omega_max_h / self.interval
@@ -111,14 +123,14 @@ class StepSeries:
 
         Cells beyond an end of the chain get zeros; those of a periodic chain count on beyond it.
         """
-        cells = np.arange(cell - self._width, cell + self._width + 1)
-        powers = self._interior if self.is_interior(cell) else self._powers((cells >= 0) & (cells < self.chain.cells))
-        begin = first - cells[0] + count
+        powers = self._interior if self.is_interior(cell) else self._near_end(int(cell))
+        begin = first - cell + self._width + count
         return np.pad(powers, [(0, 0), (0, 0), (0, 0), (count, count)])[..., begin : begin + count]
 
-    def is_interior(self, cell: int) -> bool:
-        """Whether the ends lie outside the reach of ``cell``."""
-        return self.chain.ends == "periodic" or self.reach <= cell < self.chain.cells - self.reach
+    def is_interior(self, cells: ArrayLike) -> np.ndarray:
+        """Whether the ends lie outside the reach of each of ``cells``."""
+        beyond = np.asarray(cells) - self.reach
+        return (beyond >= 0) & (beyond < self.chain.cells - 2 * self.reach) | (self.chain.ends == "periodic")
 
     def stencil(self, rows: np.ndarray) -> np.ndarray:
         """P's rows (2 dof, 2 dof, cell), displacements before velocities, of masses with ``rows``.

@@ -15,10 +15,13 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.contact.changes import Change, first_change, switching
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
-from vipetsc.contact.tracker import LIMITS, Episode, ImpactTracker
-from vipetsc.dynamics.engine import Engine, StalledError
+from vipetsc.contact.tracker import LIMITS, ImpactTracker
+from vipetsc.dynamics import log
+from vipetsc.dynamics.engine import Engine, StalledError, Stretch
 from vipetsc.dynamics.layout import Layout, create_record, join
+from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.dynamics.ts.right_hand_side import observe, register, right_hand_side
+from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.parallel import StopRequest
 
 # PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
@@ -55,12 +58,15 @@ class Integrator(Engine):
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
         self.time = 0.0
         self.state = layout.create_vector()
+        if native:
+            register_sums(self.state)
         self.saved = self.state.duplicate()
         self.ts = self._create_ts(model, layout, native)
         self._first_step = 0.002 / model.drive.frequency
         options = PETSc.Options()
         self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
         self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
+        self._interval = model.sample_interval
         self._stop = stop or StopRequest()
         self._any_open = False
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
@@ -119,8 +125,24 @@ class Integrator(Engine):
         with self.state.localForm() as local:
             observe(self.time if time is None else time, local.array, self.lattice, motion)
 
+    def fill(self, samples: Samples) -> Stretch:
+        """See ``Engine``; a sample at which it stops is not taken."""
+        for k in range(len(samples.work)):
+            sys.audit("vipetsc.step")
+            try:
+                if not self.advance((samples.number + k) * self._interval):
+                    return Stretch(k, stopped=True)
+            except StalledError as error:
+                return Stretch(k, stalled=str(error))
+            with self.state.localForm() as local:
+                take_sample(local.array, k, samples)
+        return Stretch(len(samples.work))
+
     def advance(self, target: float) -> bool:
-        """See ``Engine``."""
+        """Go on to the sample at ``target`` in s and take none; False if a stop was requested, on all ranks.
+
+        Raises StalledError, on all ranks, where no step can be taken.
+        """
         # The drive's end is a kink of its third derivative: a step ends there.
         burst_end = self.lattice.burst.duration
         if self.time < burst_end < target and not self.advance(burst_end):
@@ -157,12 +179,14 @@ class Integrator(Engine):
         self.counts["steps"] += 1
         end = target if count == 1 else self.time + h
         self.observe(self.tracker.end, end)
-        change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h)
+        with log.SEARCH:
+            change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h)
         earliest = np.array([change.share, -float(self._stop.requested)])
         self.comm.Allreduce(MPI.IN_PLACE, earliest, MPI.MIN)
         share, stop = earliest.tolist()
         if share <= 1.0:
-            self._land(h, share, change)
+            with log.LANDING:
+                self._land(h, share, change)
         else:
             self.tracker.accept_step(h)
             self.time = end
@@ -235,7 +259,7 @@ class Integrator(Engine):
         self.observe(tracker.start)
         self.ts.restartStep()
 
-    def take_episodes(self, unfinished: bool = False) -> list[Episode]:
+    def take_episodes(self, unfinished: bool = False) -> np.ndarray:
         """See ``Engine``: those of the owned sites."""
         return self.tracker.take_episodes(self.state.array_r[self.lattice.shape.dissipated :], unfinished)
 
@@ -257,9 +281,9 @@ class Integrator(Engine):
 
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
         """See ``Engine``."""
-        tables, common = join(shares, ("sites", "counts")), shares[0]
+        tables, common = join(shares, {"sites": "number", "counts": None}), shares[0]
         self.layout.restore(shares, self.state.array)
-        self.tracker.restore(np.sort(tables["sites"], order="number"))
+        self.tracker.restore(tables["sites"])
         self.time = float(common["time"])
         self.step, self.free_step, any_open = common["steps"].tolist()
         self._any_open = bool(any_open)

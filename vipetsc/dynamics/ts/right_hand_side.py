@@ -5,20 +5,27 @@ result does not depend on the partition, to the last bit.
 """
 
 import ctypes
-from collections.abc import Callable
 from typing import Any, get_type_hints
 
 from petsc4py import PETSc
 
 import numpy as np
-from llvmlite import binding
 from numba import carray, types
 from numba.core.ccallback import CFunc
-from numba.extending import intrinsic
 
 from vipetsc.compiled import cfunc, njit
 from vipetsc.contact.law import FREE, SITE, Contacts, ForceLaw, contact_force
 from vipetsc.dynamics.layout import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape, drive_force
+from vipetsc.dynamics.native import (
+    bind_symbols,
+    external,
+    get_read,
+    get_write,
+    petsc_library,
+    pointer,
+    restore_read,
+    restore_write,
+)
 
 # Cells in one pass: what a pass touches stays in the first-level cache.
 CHUNK = 512
@@ -155,63 +162,39 @@ CONTEXT = np.dtype(
 """A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables."""
 
 
-# Functions of PETSc for compiled code; handles and pointers are int64.
-_external: Any = types.ExternalFunction
 _ghosts_begin, _ghosts_end = (
-    _external(f"VecGhostUpdate{part}", types.int32(types.int64, types.int32, types.int32)) for part in ("Begin", "End")
+    external(f"VecGhostUpdate{part}", types.int32(types.int64, types.int32, types.int32)) for part in ("Begin", "End")
 )
-_get_read, _restore_read, _get_write, _restore_write = (
-    _external(f"Vec{verb}Array{access}", types.int32(types.int64, types.int64))
-    for access in ("Read", "Write")
-    for verb in ("Get", "Restore")
-)
-
-
-def petsc_library() -> ctypes.CDLL:
-    """The PETSc that petsc4py is linked to: its extension module's handle also finds PETSc's symbols."""
-    return ctypes.CDLL(PETSc.__file__)
-
-
-def _pointer_of(typing_context: Any, address: Any) -> tuple[Any, Callable]:
-    """An int64 address as a void pointer."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
-
-    return types.voidptr(types.int64), generate
-
-
-_pointer: Any = intrinsic(_pointer_of)
 
 
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
-    context: Any = carray(_pointer(address), (1,), CONTEXT)[0]
+    context: Any = carray(pointer(address), (1,), CONTEXT)[0]
     shape = context.shape
     error = (_ghosts_begin(u, 1, 0) or _ghosts_end(u, 1, 0)) if shape.exchange else 0
-    error = error or _get_read(u, address)
+    error = error or get_read(u, address)
     if error != 0:
         return error
     state = context.array
-    error = _get_write(f, address)
+    error = get_write(f, address)
     if error != 0:
         return error
     at, size = context.address, context.length
     lattice = LatticeRecord(
         shape,
-        carray(_pointer(at.masses), (size.masses,), MASS),
-        carray(_pointer(at.couplings), (size.couplings,), COUPLING),
-        carray(_pointer(at.springs), (size.springs,), SPRING),
-        carray(_pointer(at.site_cells), (size.site_cells,), np.int64),
-        Contacts(context.law, carray(_pointer(at.sites), (size.sites,), SITE)),
+        carray(pointer(at.masses), (size.masses,), MASS),
+        carray(pointer(at.couplings), (size.couplings,), COUPLING),
+        carray(pointer(at.springs), (size.springs,), SPRING),
+        carray(pointer(at.site_cells), (size.site_cells,), np.int64),
+        Contacts(context.law, carray(pointer(at.sites), (size.sites,), SITE)),
         context.burst,
     )
-    rate = carray(_pointer(context.array), (shape.owned,), np.float64)
-    right_hand_side(t, carray(_pointer(state), (shape.ghosted,), np.float64), rate, lattice)
-    error = _restore_write(f, address)
+    rate = carray(pointer(context.array), (shape.owned,), np.float64)
+    right_hand_side(t, carray(pointer(state), (shape.ghosted,), np.float64), rate, lattice)
+    error = restore_write(f, address)
     if error != 0:
         return error
     context.array = state
-    return _restore_read(u, address)
+    return restore_read(u, address)
 
 
 def compile_callback() -> CFunc:
@@ -219,10 +202,7 @@ def compile_callback() -> CFunc:
 
     ``context`` is the address of a ``CONTEXT`` record. Raises AttributeError where PETSc hides its symbols.
     """
-    library = petsc_library()
-    for function in (_ghosts_begin, _ghosts_end, _get_read, _restore_read, _get_write, _restore_write):
-        address = ctypes.cast(getattr(library, function.symbol), ctypes.c_void_p).value
-        binding.add_symbol(function.symbol, address)
+    bind_symbols((_ghosts_begin, _ghosts_end, get_read, restore_read, get_write, restore_write))
     return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)
 
 

@@ -45,7 +45,7 @@ class MeasuredRun:
 
     def __init__(self, folder: Path, analysis: xr.Dataset, episodes: int) -> None:
         self.folder, self.analysis, self.episodes = folder, analysis, episodes
-        self.case = Case.load(folder / "case.toml")
+        self.case = Case.of(analysis)
         self.amplitude = self.case.drive.amplitude
 
     @property
@@ -150,7 +150,7 @@ class Evidence(ExitStack):
         for i in range(members.sizes["amplitude"]):
             member = members.isel(amplitude=i)
             folder = member_folder(member)
-            if folder is None or not (folder / "analysis.h5").exists():
+            if not (folder / "analysis.h5").exists():
                 raise MissingEvidence(f"{step}: the member at {member['amplitude']:g} N failed or is missing")
             analysis = self.open(step, folder.name, "analysis.h5", needs=needs)
             runs.append(MeasuredRun(folder, analysis, int(member["contact_episodes"])))

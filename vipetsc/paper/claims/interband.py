@@ -119,7 +119,7 @@ def split_errors(run: MeasuredRun) -> dict[str, float]:
     the filters see less than a period. The shares must be those of an independent spectrum, the space-time one, and
     lie in the parts that the paper counts.
     """
-    names = ("time", "bands/edges", "bands/energy", "bands/total", "frequency", "dispersion")
+    names = ("bands/sample", "bands/edges", "bands/energy", "bands/total", "frequency", "dispersion")
     time, edges, energy, total, frequency, dispersion = run.arrays(*names)
     drive, parts = run.case.model().drive, energy.sum(axis=0)
     samples = min(max(round(2 * np.pi / drive.frequency / (time[1] - time[0])), 1), len(time))

@@ -1,0 +1,83 @@
+"""What is taken of the state at every sample: room that an engine fills in compiled code, and what observers see."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from vipetsc.case import Model
+from vipetsc.compiled import njit
+from vipetsc.dynamics.energies import LARGEST, Energies, measure
+from vipetsc.dynamics.layout import LatticeRecord, Layout, create_record
+
+
+class Samples(NamedTuple):
+    """Room for consecutive samples of a rank, the first of which has the ``number``; empty arrays take nothing.
+
+    Energies: ``sums`` (sample, part, 2) as ``measure`` gives them, ``work`` (sample,) and ``losses`` (sample, owned
+    site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose numbers ``stride``
+    divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from ``first_cell`` on,
+    n = ``every``.
+    """
+
+    number: int
+    sums: np.ndarray
+    work: np.ndarray
+    losses: np.ndarray
+    fields: np.ndarray
+    moving: np.ndarray
+    first_cell: int
+    every: int
+    stride: int
+    lattice: LatticeRecord
+    unit: float
+
+    def rows(self, samples: int) -> int:
+        """Number of the first so many ``samples`` whose fields are recorded."""
+        return -(-(self.number + samples) // self.stride) + -self.number // self.stride
+
+
+@njit(error_model="numpy")
+def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
+    """Put the rank's part ``y`` of the state, ghosts up to date, in as sample ``k``; False if it is not finite."""
+    shape, number = samples.lattice.shape, samples.number + k
+    samples.sums[k] = measure(y, samples.lattice, samples.unit)
+    if shape.work >= 0:
+        samples.work[k] = y[shape.work]
+    samples.losses[k] = y[shape.dissipated : shape.owned]
+    if number % samples.stride == 0:
+        row, n = number // samples.stride - (samples.number + samples.stride - 1) // samples.stride, shape.cells
+        for i in range(samples.fields.shape[0]):
+            for j in range(shape.dofs):
+                out, first = samples.fields[i, row, j], (j + shape.dofs * samples.moving[i]) * n + samples.first_cell
+                for c in range(out.size):
+                    out[c] = y[first + c * samples.every]
+    return samples.sums[k, :, 0].max() < LARGEST and abs(samples.work[k]) < np.inf
+
+
+def no_samples(model: Model, layout: Layout) -> Samples:
+    """Room for none."""
+    none, sums = np.zeros(0), np.zeros((0, 4, 2), np.int64)
+    fields = np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1
+    return Samples(0, sums, none, none.reshape(0, 0), *fields, create_record(model, layout), 1.0)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive samples of a run: ``times`` (sample,) in s, the number ``first`` of the first one, from 0.
+
+    ``energies`` are those of the whole lattice, arrays (sample,). ``share``: this rank's share, where ``losses`` and
+    ``fields`` begin with these samples. ``state`` is the last one that the engine came to, ordered as ``Layout`` says,
+    ghosts up to date; it changes with the next block.
+    """
+
+    first: int
+    times: np.ndarray
+    energies: Energies
+    share: Samples
+    state: PETSc.Vec
+
+    def __len__(self) -> int:
+        return len(self.times)

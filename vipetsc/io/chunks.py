@@ -1,0 +1,109 @@
+"""The chunks of a run put together, as one dataset in the layout of ``io.netcdf`` or as the parts of a file.
+
+Every share of a chunk says what it is of: fields (sample, dof, cell) are of the ranges ``columns`` of the recorded
+cells, losses (sample, site) of the ranges ``sites``; ``impacts`` are episodes. Rank 0's has ``SAMPLED`` besides.
+"""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from mpi4py import MPI
+
+import h5py
+import numpy as np
+import xarray as xr
+
+from vipetsc.io.atomic import Arrays
+from vipetsc.io.contents import GIVEN, LARGE, LOSSES, SAMPLED
+from vipetsc.io.netcdf import tabulated
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the chunks of a run hold.
+
+    ``given``: the arrays of ``GIVEN``; ``fields``: names of those that are recorded; ``together``: whether all ranks
+    write into one file that they share, instead of rank 0 alone; ``rows``: samples in a field of the whole run.
+    """
+
+    given: Arrays
+    fields: tuple[str, ...]
+    together: bool
+    rows: int
+
+
+class Chunks(Protocol):
+    """The ``count`` chunks of a run; chunk k has a share of each of ``ranks(k)``, from which ``read`` reads arrays."""
+
+    comm: MPI.Comm
+    case: str
+    count: int
+    recording: Recording
+
+    def ranks(self, number: int) -> list[int]: ...  # noqa: D102
+    def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays: ...  # noqa: D102
+
+
+def ranges(numbers: np.ndarray) -> np.ndarray:
+    """Half-open ranges (range, 2) of consecutive ``numbers``."""
+    breaks = np.diff(numbers, prepend=-2, append=-2) != 1
+    return np.stack([numbers[breaks[:-1]], numbers[breaks[1:]] + 1], axis=1)
+
+
+def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
+    """The arrays ``names`` of rank 0, those of all chunks one after the other."""
+    chunks = [output.read(number, 0, names) for number in range(output.count)]
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
+
+
+def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
+    """What is known of a run from the beginning, and what rank 0 keeps of every sample."""
+    arrays = {**joined(output, SAMPLED), **output.recording.given}
+    if len(arrays["field_time"]) == len(arrays["time"]):
+        del arrays["field_time"]
+    return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": output.case, **attributes})
+
+
+def described(name: str, data: xr.Dataset) -> tuple[list[str], dict[str, str]]:
+    """Dimensions and attributes of a variable of ``LARGE`` beside ``data``, whose time may be that of the fields."""
+    dims, units, text = LARGE[name]
+    dims = dims if "field_time" in data else dims.replace("field_time", "time")
+    return dims.split(), {"units": units, "long_name": text}
+
+
+def writers(output: Chunks) -> MPI.Comm:
+    """The ranks that write together, or this one."""
+    return output.comm if output.recording.together else MPI.COMM_SELF
+
+
+def shares(output: Chunks, number: int, wanted: Collection[str]) -> Iterator[Arrays]:
+    """Those of chunk ``number`` that this rank reads; ranks that write together share them out."""
+    comm = writers(output)
+    return (output.read(number, rank, wanted) for rank in output.ranks(number) if rank % comm.size == comm.rank)
+
+
+def read_log(output: Chunks) -> np.ndarray:
+    """The episodes that this rank reads, in no order."""
+    return np.concatenate([share["impacts"] for k in range(output.count) for share in shares(output, k, ["impacts"])])
+
+
+def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
+    """The variables of the episodes ``log``, in order, of which so many come before the ``first``."""
+    names = log.dtype.names or ()
+    return {"episode": np.arange(first, first + len(log)) + 1} | {f"impacts/{name}": log[name] for name in names}
+
+
+def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
+    """Copy the losses or a field, ``name``, of all chunks to ``dataset``; ranks that write together share them."""
+    first, (time, of) = 0, ("time", "sites") if name == LOSSES else ("field_time", "columns")
+    for number in range(output.count):
+        rows = output.read(number, 0, [time])[time].size
+        for share in shares(output, number, [name, of]):
+            values, at = np.moveaxis(share[name], -1, 1), 0
+            for start, stop in share[of].tolist():
+                # h5py leaves out empty selections, on which writing together would hang.
+                if rows and start < stop:
+                    dataset[first : first + rows, start:stop] = values[:, at : at + stop - start]
+                at += stop - start
+        first += rows

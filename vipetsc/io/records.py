@@ -1,0 +1,95 @@
+"""Records of a long task: lines of JSON, appended as they come, each with a checksum.
+
+A kill loses at most the line that is being written. What a line with a wrong checksum told is as if it had never been.
+"""
+
+import json
+import sys
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, cast
+
+from vipetsc.io.atomic import atomic_write, unwritten
+
+Record = dict[str, Any]
+CHECK = b', "crc32": "%08x"}\n'  # how a line ends: CRC-32 of the record without it
+CHECK_LENGTH = len(CHECK % 0)
+
+
+class Line(NamedTuple):
+    """Where a record stands: its file, and the first byte and the number of bytes in it."""
+
+    path: Path
+    start: int
+    length: int
+
+    def record(self) -> Record:
+        """What the line tells."""
+        with self.path.open("rb") as file:
+            file.seek(self.start)
+            return _told(file.read(self.length))
+
+
+def _told(line: bytes) -> Record:
+    """The record in a ``line``, without its checksum."""
+    return cast(Record, json.loads(line[:-CHECK_LENGTH] + b"}"))
+
+
+class RecordFile:
+    """Appends records to the file ``path``, which is made with the first."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file: Any = None
+
+    def append(self, record: Record) -> None:
+        """Write ``record`` behind those that are there; raises OSError that names the file."""
+        text = json.dumps(record).encode()
+        line = memoryview(text[:-1] + CHECK % zlib.crc32(text))
+        try:
+            sys.audit("vipetsc.append", str(self.path))
+            if self._file is None:
+                self._file = self.path.open("a+b", buffering=0)
+                if self._file.tell() and (self._file.seek(-1, 2), self._file.read(1))[1] != b"\n":
+                    self._file.write(b"\n")  # a line that was cut off must not spoil this one
+            while line:  # a disk that is nearly full takes a part
+                line = line[self._file.write(line) :]
+        except OSError as error:
+            raise unwritten(self.path, error) from error
+
+    def close(self) -> None:
+        """Close the file until the next record."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def read_records(path: Path, damaged: Callable[[str], None]) -> Iterator[tuple[Record, Line]]:
+    """The records in ``path`` and where they stand; ``damaged`` is told of lines that are not whole.
+
+    Raises OSError if the file cannot be read.
+    """
+    sys.audit("vipetsc.read", str(path))
+    start = 0
+    with path.open("rb") as file:
+        for number, line in enumerate(file, 1):
+            if line.endswith(CHECK % zlib.crc32(line[:-CHECK_LENGTH] + b"}")):
+                yield _told(line), Line(path, start, len(line))
+            else:
+                damaged(f"{path}, line {number}: cut off or damaged; what it told is made again")
+            start += len(line)
+
+
+def merge_records(path: Path, lines: Iterable[Line], merged: Iterable[Path]) -> None:
+    """Write the ``lines`` to ``path``, whole or not at all, and remove the files that were ``merged``."""
+    with atomic_write(path) as aside, aside.open("wb") as file, ExitStack() as stack:
+        sources: dict[Path, BinaryIO] = {}
+        for old, start, length in lines:
+            if old not in sources:
+                sources[old] = stack.enter_context(old.open("rb"))
+            sources[old].seek(start)
+            file.write(sources[old].read(length))
+    for old in merged:
+        old.unlink(missing_ok=True)

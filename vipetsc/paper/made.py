@@ -1,0 +1,44 @@
+"""What was made of the paper, from which inputs, and at what cost: ``made.json``."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from vipetsc.io.atomic import write_text
+from vipetsc.paper.plan import read_json
+
+MADE = "made.json"
+FORMATS = ("png", "pdf")
+LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".html": b"</html>"}  # what such files end with
+
+Made = dict[str, Any]
+"""Hashes of inputs of "claims" and "report", of "figures" by id with the stems of their pictures.
+
+"cpu": CPU time in s of all ranks that "steps" by name, "figures", "claims" and "report" took.
+"""
+
+
+def read_made(root: Path) -> Made:
+    """``made.json``, or an empty record, after which everything is made again."""
+    cpu = {"steps": {}, "figures": 0.0, "claims": 0.0, "report": 0.0}
+    return {"figures": {}, "cpu": cpu} | (read_json(root / MADE) or {})
+
+
+def write_made(root: Path, record: Made) -> None:
+    """Write ``made.json`` if it holds another record."""
+    if record != read_made(root):
+        write_text(root / MADE, json.dumps(record, indent=1) + "\n")
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a picture or page is there to its end."""
+    if not path.exists():
+        return False
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 32, 0))
+        return LAST[path.suffix] in file.read()
+
+
+def is_drawn(root: Path, stem: str) -> bool:
+    """Whether a picture is there in every format."""
+    return all(is_whole(root / "figures" / f"{stem}.{kind}") for kind in FORMATS)

@@ -1,0 +1,23 @@
+"""Blocks of arrays: of those that do not fit into memory, and of rows that are one in a map."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+
+def blocks(count: int, size: float, memory: float) -> Iterator[slice]:
+    """Slices that divide ``count`` items of ``size`` bytes each so that none takes more than ``memory`` bytes."""
+    together = int(max(min(memory / size, count), 1))
+    return (slice(first, min(first + together, count)) for first in range(0, count, together))
+
+
+def block_sums(values: np.ndarray, size: int, axis: int) -> np.ndarray:
+    """Sums of each ``size`` consecutive ``values`` along ``axis``; the last block may be shorter."""
+    return np.add.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
+
+
+def block_means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
+    """As ``block_sums``, means."""
+    shape = [1] * values.ndim
+    shape[axis] = -1
+    return block_sums(values, size, axis) / block_sums(np.ones(values.shape[axis]), size, 0).reshape(shape)

@@ -1,0 +1,141 @@
+"""Linear runs: what the members of a sweep share that differ in contacts and amplitude alone.
+
+Until the first contact a lattice is linear, so displacements go with the drive's amplitude and energies with its
+square. The linear run, under 1 N and without contacts, tells which members nothing touches; those are that run, scaled.
+"""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+
+import vipetsc
+from vipetsc.case import Case, case_id
+from vipetsc.io.read import field_time
+from vipetsc.io.records import Record, read_records
+from vipetsc.lattice.chain import cells_between
+from vipetsc.studies.analysis import LAYOUT, analyse
+
+# A member is scaled where its linear wave stays below this share of every clearance: the largest w between samples
+# exceeds the sampled envelope by less than the rest for any burst of a few cycles.
+MARGIN = 0.9
+PARTS = "members-*.jsonl"  # records of the ranks, until all are put together in
+RECORDS = "members.jsonl"
+
+# What the ensemble takes of a member's analysis: further dimension, units and description.
+FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
+MEASURES = {name: LAYOUT[name] for name in (*FITTED, "ibtet_whole", "entropy/error")} | {
+    "entropy/start": ("", "s", "time at which averages of the entropy begin"),
+    "entropy/history": ("snapshot", "bit", "entropy of a snapshot"),
+    "entropy/snapshot": ("snapshot", "s", "time of a snapshot"),
+    "bands/share": ("part", "1", "mean share of a pass band or gap after the wave's arrival"),
+}
+
+
+class LinearRun(NamedTuple):
+    """A linear wave, what is known of its run, and the measures of the members in which nothing touches.
+
+    ``envelope`` (cell): largest sqrt(w^2 + (w'/Om)^2) in m of the contact pair's relative displacement w, Om the
+    drive's angular frequency. ``arrival`` (cell): time in s of the largest host velocity, the paper's t_hat when taken
+    at the first site. ``statistics`` are the run's, ``measures`` by first site (cell) what ``measured`` gives.
+    """
+
+    envelope: np.ndarray
+    arrival: np.ndarray
+    statistics: dict[str, Any]
+    measures: dict[int, Record]
+
+    @classmethod
+    def of(cls, run: xr.Dataset, statistics: dict[str, Any], sites: Collection[int], names: Collection[str]) -> Self:
+        """Of a ``run`` with both fields of all cells, measured for each of the first ``sites`` (cells; 0 for none)."""
+        model = Case.of(run).model()
+        cell, fields = model.chain.cell, (run["displacement"].values, run["velocity"].values)
+        w, rate = (field[..., cell.resonator] - field[..., cell.host] for field in fields)
+        envelope = np.sqrt(np.max(w**2 + (rate / model.drive.frequency) ** 2, axis=0))
+        arrival = field_time(run)[np.argmax(np.abs(fields[1][..., cell.host]), axis=0)]
+        wave = cls(envelope, arrival, statistics | {"work": float(run["energy/work"][-1])}, {})
+        for site in sites:
+            wave.measures[site] = measured(analyse(with_site(run, site), names, wave.arrival_at(site)))
+        return wave
+
+    def arrival_at(self, site: int) -> float | None:
+        """The paper's t_hat in s, when the wave is largest at the first ``site`` (cell); None for no site."""
+        return float(self.arrival[site - 1]) if site else None
+
+    def reached(self, case: Case) -> np.ndarray:
+        """Linear relative displacement over clearance (site) at the amplitude of ``case``."""
+        envelope = self.envelope[np.asarray(case.contacts.sites, int) - 1]
+        return np.asarray(abs(case.drive.amplitude) * envelope / np.asarray(case.contacts.clearance or [], float))
+
+    def joined(self, other: "LinearRun | str | None") -> "LinearRun":
+        """The run with the measures that another record of it tells as well."""
+        return self._replace(measures=other.measures | self.measures) if isinstance(other, LinearRun) else self
+
+    def record(self, name: str) -> Record:
+        """The run as the record ``name``."""
+        told = self._asdict() | {"envelope": self.envelope.tolist(), "arrival": self.arrival.tolist()}
+        return {"linear": name, "vipetsc_version": vipetsc.__version__} | told
+
+    @classmethod
+    def of_record(cls, record: Record) -> Self:
+        """The run that a ``record`` tells of."""
+        envelope, arrival = (np.array(record[name], float) for name in ("envelope", "arrival"))
+        measures = {int(site): row for site, row in record["measures"].items()}
+        return cls(envelope, arrival, record["statistics"], measures)
+
+
+def measured(analysis: xr.Dataset) -> Record:
+    """What the ensemble takes from an ``analysis``: ``MEASURES`` and what is said of them.
+
+    ``parts`` of the frequency axis by name, ``errors`` by the samples left out, the options of the ``analysis``.
+    """
+    row: Record = {name: analysis[name].values.tolist() for name in MEASURES if name in analysis}
+    errors = {name: analysis[name].attrs.get("sampling_error") for name in row}
+    row |= {"errors": {name: float(error) for name, error in errors.items() if error is not None}}
+    row |= {"analysis": analysis.attrs["analysis"]} if "analysis" in analysis.attrs else {}
+    row |= {"parts": list(analysis["bands/share"].attrs["parts"])} if "bands/share" in row else {}
+    return row | ({"entropy/start": float(analysis.attrs["entropy/start"])} if "entropy/history" in row else {})
+
+
+def linear_case(case: Case) -> Case:
+    """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone share it."""
+    table = case.model_dump(by_alias=True, exclude_none=True)
+    table["contacts"] = {"sites": 0}
+    table["drive"]["amplitude"] = 1.0
+    table["output"] = {}
+    return Case.from_table(table | {"name": "linear"})
+
+
+def linear_name(case: Case) -> str:
+    """The name of the linear run of ``case``: a hash of its resolved case."""
+    return case_id(linear_case(case))
+
+
+def leading_cell(case: Case) -> int:
+    """Cell (1-based) of the site nearest to the drive; 0 without sites."""
+    cells = np.asarray(case.contacts.sites, np.int64)
+    distance = cells_between(cells, case.drive.cell, case.lattice.cells, case.lattice.ends)
+    return int(cells[np.argmin(distance)]) if cells.size else 0
+
+
+def with_site(linear: xr.Dataset, site: int) -> xr.Dataset:
+    """The ``linear`` run with a ``site`` (cell; 0 for none) that nothing touches."""
+    cells = [site] if site else []
+    return linear.drop_dims("site").assign({"sites/cell": ("site", np.array(cells, np.int64))})
+
+
+def read_linear(sweep: Path, case: Case) -> LinearRun | None:
+    """The linear run of ``case`` in the folder of a ``sweep``; None if its records tell of none."""
+    run, name = None, linear_name(case)
+    for path in record_files(sweep):
+        for record, _ in read_records(path, lambda text: None):
+            if record.get("linear") == name and "envelope" in record:
+                run = LinearRun.of_record(record)
+    return run
+
+
+def record_files(sweep: Path) -> list[Path]:
+    """The files with records in the folder of a ``sweep``, the latest last."""
+    return [path for path in (sweep / RECORDS, *sorted(sweep.glob(PARTS))) if path.exists()]

@@ -1,0 +1,103 @@
+"""The measures of runs already made, of one or of all members of a sweep whose fields were kept, taken anew."""
+
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from mpi4py import MPI
+
+import vipetsc
+from vipetsc.case import Case, Sweep
+from vipetsc.io.folder import FolderError
+from vipetsc.io.netcdf import open_netcdf, write_netcdf
+from vipetsc.io.read import open_run, outdated
+from vipetsc.io.records import RecordFile
+from vipetsc.parallel import on_every_rank, on_root
+from vipetsc.studies.analysis import FULL, analyse, told
+from vipetsc.studies.ensemble import MISSING, Results
+from vipetsc.studies.linear import PARTS, leading_cell, measured, read_linear
+from vipetsc.studies.members import keeps_all, measures_of
+from vipetsc.studies.sweep import conclude
+from vipetsc.studies.velocity import options_of
+
+
+def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str] = ()) -> list[Path]:
+    """Measure the runs in ``paths`` (folders of runs or sweeps, or ``run.h5``); returns the files written.
+
+    ``overrides`` are of ``[analysis]``, and of runs alone: members that kept no fields could not follow.
+
+    The runs are shared over the ranks of ``comm``. Members of a sweep that kept no fields stay as they are; the
+    sweep's ensemble is put together anew.
+
+    Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
+    """
+
+    def look() -> tuple[list[tuple[Path, Path, Collection[str]]], list[Path]]:
+        sweeps = [path for path in paths if (path / "index.json").exists()]
+        if refused := [text for text in overrides if sweeps or not text.startswith("analysis.")]:
+            raise FolderError(f"{refused[0]}: of a run that is there only [analysis] can change, of a sweep nothing")
+        return [run for path in paths for run in _measurable(path)], sweeps
+
+    runs, sweeps = on_root(comm, look)
+
+    def reassemble(folder: Path) -> Path:
+        results = Results(Sweep.load(folder / "case.toml"), folder)
+        if (results.status == MISSING).any():
+            raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
+        file = RecordFile(folder / PARTS.replace("*", "0"))
+        for name in results.ids:
+            if (folder / name / "analysis.h5").exists():
+                with open_netcdf(folder / name / "analysis.h5", "analysis") as analysis:
+                    file.append(results.lines[name].record() | {"measures": measured(analysis)})
+        file.close()
+        conclude(Results(results.plan, folder), afresh=True)
+        return folder / "ensemble.h5"
+
+    mine = on_every_rank(comm, lambda: [measure_run(*run, overrides) for run in runs[comm.rank :: comm.size]])
+    written = sorted(path for paths in comm.allgather(mine) for path in paths)
+    return written + on_root(comm, lambda: list(map(reassemble, sweeps)))
+
+
+def _measurable(path: Path) -> Iterator[tuple[Path, Path, Collection[str]]]:
+    """Folder, sweep and measures of the runs in ``path`` that can be measured, all checked; raises FolderError."""
+    folder = path.parent if path.name == "run.h5" else path
+    sweep = (folder / "index.json").exists()
+    if reason := outdated(folder):
+        raise FolderError(reason)
+    if not sweep and not (folder / "run.h5").exists():
+        raise FolderError(f"{path}: holds no run.h5; the folder of a finished run or sweep is needed")
+    measures = measures_of(Sweep.load(folder / "case.toml")) if sweep else FULL
+    for file in sorted(folder.glob("*/run.h5")) if sweep else [folder / "run.h5"]:
+        try:
+            with open_run(file) as run:
+                if not sweep or keeps_all(Case.of(run)):
+                    yield file.parent, file.parents[1], measures
+        except (OSError, ValueError, KeyError) as error:
+            raise FolderError(f"{file}: is not a run of vipetsc ({error})") from None
+
+
+def measure_run(
+    folder: Path, sweep: Path | None = None, measures: Collection[str] = FULL, overrides: Sequence[str] = ()
+) -> Path:
+    """Write ``folder/analysis.h5`` and return its path; raises as ``open_run``.
+
+    When the wave arrives, the ``sweep`` knows of which the run is a member, by default that around its folder.
+    ``overrides`` are of ``[analysis]``.
+    """
+    with open_run(folder / "run.h5") as run:
+        case = Case.of(run)
+        linear = read_linear(sweep or folder.parent, case)
+        arrival = linear.arrival_at(leading_cell(case)) if linear else None
+        options = options_of(run, folder, overrides)
+        write_netcdf(folder / "analysis.h5", analyse(run, measures, arrival, options))
+    return folder / "analysis.h5"
+
+
+def is_measured(folder: Path) -> bool:
+    """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
+    with open_run(folder / "run.h5") as run:
+        expected = {key: run.attrs.get(key) for key in ("case", "status")} | {"vipetsc_version": vipetsc.__version__}
+        expected["analysis"] = told(options_of(run, folder))
+        with suppress(OSError), open_netcdf(folder / "analysis.h5", "analysis") as analysis:  # it is there, and whole
+            return all(analysis.attrs.get(key) == value for key, value in expected.items())
+    return False

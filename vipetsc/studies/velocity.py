@@ -1,0 +1,76 @@
+"""What is measured: the velocity that a run kept, in memory or in its file, with what its case says of it."""
+
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from vipetsc import spectra
+from vipetsc.case import Case
+from vipetsc.case.reading import read_toml
+from vipetsc.case.schema import AnalysisTable
+from vipetsc.io.read import field_interval, field_time, leading_site
+from vipetsc.lattice import pass_bands
+
+
+def options_of(run: xr.Dataset, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
+    """``[analysis]`` of a ``run``, as the case in its ``folder`` has it now if it has one, with ``overrides``."""
+    marker = folder / "case.toml" if folder else None
+    table = read_toml(marker) if marker and marker.exists() else tomllib.loads(run.attrs["case"])
+    return Case.from_table(table, overrides).analysis or AnalysisTable.model_validate({})
+
+
+class VelocityRecord:
+    """What the measures need of a run, and what they tell besides their values: attributes, and what is left out.
+
+    ``masses`` (dof) in kg, ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) and
+    ``site``, the leading one's cell, as numbers from 1. ``sizes`` are the blocks (samples, cells) of which maps hold
+    the means, at ``mean_time`` and ``mean_cells``; ``memory`` in bytes. ``attributes`` are those of variables, of
+    groups under "".
+    """
+
+    def __init__(self, run: xr.Dataset, options: AnalysisTable) -> None:
+        field, leading = run["velocity"], leading_site(run)
+        self.options, self.memory = options, options.memory * 2**30
+        self.model = Case.of(run).model()
+        self.masses = np.asarray(self.model.chain.cell.masses)
+        self.velocity: Any = _StoredField(field) if field.nbytes > self.memory else field.values
+        self.time, self.interval, self.cells = field_time(run), field_interval(run), run["cell"].values
+        self.site = None if leading is None else int(run["sites/cell"].values[leading])
+        self.sizes = -(-len(self.time) // options.pixels), -(-len(self.cells) // options.pixels)
+        self.mean_time = spectra.block_means(self.time, self.sizes[0], 0)
+        self.mean_cells = spectra.block_means(self.cells, self.sizes[1], 0) if self.sizes[1] > 1 else self.cells
+        self.attributes: dict[str, dict[str, Any]] = {}
+        self.left_out: list[str] = []
+        self.warnings: list[str] = []
+
+    def unresolved(self) -> set[str]:
+        """Measures that would take waves for longer or slower ones in what was kept; warns of them."""
+        top, every = pass_bands(self.model.chain.cell)[-1].high, int(np.diff(self.cells).max(initial=1))
+        names: set[str] = set()
+        if self.interval * top >= np.pi:
+            text = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
+            self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
+            names |= {"dispersion", "bands"}
+        if every > 1:
+            text = f"fields of one cell in {every} do not resolve waves shorter than {2 * every} cells"
+            self.warnings.append(f"{text}: wavenumber_content, dispersion, partition and entropy are not measured")
+            names |= {"wavenumber", "dispersion", "partition", "entropy"}
+        return names
+
+    def mean(self, energy: np.ndarray) -> np.ndarray:
+        """Means of ``energy`` (t, cell) over the blocks of a map."""
+        return spectra.block_means(spectra.block_means(energy, self.sizes[0], 0), self.sizes[1], 1).astype(np.float32)
+
+
+class _StoredField:
+    """A field (t, cell, dof) that stays in its file; what is sliced is read."""
+
+    def __init__(self, field: xr.DataArray) -> None:
+        self._field, self.shape = field, field.shape
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return np.asarray(self._field[index].values)
