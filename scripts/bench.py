@@ -1,9 +1,10 @@
 """Work and precision of vipetsc's engines beside their peers, interleaved, in CPU time at equal error.
 
 The lattice is the four-band one of 300 cells with its five sites, A = 30 N, conservative; all solvers return the
-velocities every 2e-4 s, on one core. Peers step over kinks of the contact law without locating them. Writes
-``latest.json`` and pictures. The full bench takes about a quarter of an hour, ``--quick`` a minute or two;
-``--large`` adds the whole program on a million cells (minutes).
+velocities every 2e-4 s, on one core. Then members of a sweep, the paper's budget (from where ``paper`` left it),
+scaling over cells and ranks with a model of many ranks, set-up and files of large lattices. Writes ``latest.json``
+and pictures. The full bench takes about a quarter of an hour, ``--quick`` three minutes; ``--large`` adds the whole
+program on a million cells (minutes).
 """
 
 from __future__ import annotations
@@ -25,23 +26,36 @@ petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI
 
+from bench_members import member_seconds, paper_budget
 from bench_ours import own_solvers, right_hand_side_us
 from bench_peers import parameters, peers
 from bench_precision import lattice_case, work_precision
 from bench_report import draw, markdown
-from bench_scaling import large, scaling, whole_runs
+from bench_scaling import builds, large, scaling, whole_runs
 
 from vipetsc.case import Case
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
 
-PARTS = ("precision", "whole", "scaling")
+PARTS = ("precision", "whole", "members", "scaling", "builds")
+NEEDED = {
+    "odeint": "g++ and libboost-dev",
+    "ARKODE": "g++ and libsundials-dev",
+    "TSRK": "mpicxx, pkg-config and petsc-dev",
+    "diffrax": "the environment that scripts/bench makes (packages diffrax and jax)",
+}
 FULL = {
     "tolerances": [float(f"1e-{k}") for k in range(5, 14)],
     "rounds": 5,
-    "cells": [300, 3000, 30_000, 300_000, 10**6],
+    "cells": [300, 3000, 30_000, 100_000, 300_000, 10**6],
+    "sizes": [(10**6, 1000), (10**6, 10**5), (10**7, 10**4)],
 }
-QUICK = {"tolerances": [1e-6, 1e-8, 1e-10, 1e-12], "rounds": 1, "cells": [300, 30_000]}
+QUICK = {
+    "tolerances": [1e-7, 1e-9, 1e-11, 1e-13],
+    "rounds": 1,
+    "cells": [300, 30_000, 100_000],
+    "sizes": [(10**6, 10**5)],
+}
 
 
 def options_from(arguments: list[str]) -> argparse.Namespace:
@@ -49,12 +63,13 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         "scripts/bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--quick", action="store_true", help="four tolerances, one round, up to 30,000 cells")
+    parser.add_argument("--quick", action="store_true", help="four tolerances, one round, up to 100,000 cells")
     parser.add_argument("--only", choices=PARTS, action="append", help="measure only this part (may be repeated)")
     parser.add_argument("--large", action="store_true", help="also the whole program on a million cells")
     parser.add_argument("--rounds", type=int, help="interleaved repetitions")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change the compared case")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="where results go")
+    parser.add_argument("--paper", type=Path, default=Path("runs/paper"), help="folder that `paper` left")
     parser.add_argument("--table", action="store_true", help="print the README's tables from the last results, no more")
     options = parser.parse_args(arguments)
     if options.rounds is not None and options.rounds < 1:
@@ -75,15 +90,20 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         if "precision" in parts:
             solvers = own_solvers() | peers(Path(folder))
-            for name, needed in (("odeint", "g++ and libboost-dev"), ("TSRK", "mpicxx, pkg-config and petsc-dev")):
+            for name, needed in NEEDED.items():
                 if not any(solver.startswith(name) for solver in solvers):
                     print(f"bench: goes on without {name}, which needs {needed}", file=sys.stderr)
             found |= work_precision(solvers, case, options.tolerances, options.rounds)
         if "whole" in parts:
             found["whole"] = whole_runs(Path(folder), options.rounds)
             found["right_hand_side_us"] = right_hand_side_us(case)
+        if "members" in parts:
+            found["members"] = member_seconds(Path(folder), min(options.rounds, 3))
+            found["paper"] = paper_budget(options.paper)
         if "scaling" in parts:
             found["scaling"] = scaling(options.cells, min(options.rounds, 3))
+        if "builds" in parts:
+            found["builds"] = builds(options.sizes)
         if options.large:
             found["large"] = large(Path(folder), 1)
     found["minutes"] = (time.perf_counter() - begin) / 60
@@ -96,8 +116,9 @@ def tell(found: dict) -> None:
         result = row.get("failure") or f"error {row['error']:.2e}  {row['seconds']:.3f} s CPU"
         print(f"{row['solver']:<20} rtol {row['rtol']:<8.2g} {result}")
     for name, ratio in found["ratios"].items():
-        low, high = found["spread"][name]
-        print(f"{name}: {ratio:.2f} ({low:.2f} to {high:.2f})")
+        if name.endswith("at 1e-08"):
+            low, high = found["spread"][name]
+            print(f"{name}: {ratio:.2f} ({low:.2f} to {high:.2f})")
     for run in found.get("large", {}).get("runs", []):
         print(f"runs/large.toml, {run['ranks']} rank(s): {run['steps']} steps, {run['wall']:.1f} s, "
               f"{run['peak_gib_a_rank']:.2f} GiB a rank, triad {run['triad_gb_per_second']:.1f} GB/s")  # fmt: skip

@@ -12,8 +12,11 @@ from bench_peers import Solution, Solver
 
 from vipetsc.case import Case
 from vipetsc.case.schema import TimeTable
+from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.run import select_engine
+from vipetsc.dynamics.observers import Guard, Ledger, Setup
+from vipetsc.dynamics.run import Run, select_engine
+from vipetsc.io.store import RunMemory
 
 
 def engines() -> tuple[str, ...]:
@@ -22,42 +25,59 @@ def engines() -> tuple[str, ...]:
 
 
 class Flight:
-    """A case in motion on the ranks of ``comm``, from sample to sample, by the engine that it asks for.
+    """A case in motion on the ranks of ``comm``, by the engine that it asks for; the run is kept in memory.
 
     Raises RuntimeError if that engine refuses the case: another one's time would stand under its name.
     """
 
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
-        self.model = case.model()
-        self.layout = Layout(self.model, comm)
+        self.case, self.model = case, case.model()
         kind, refused = select_engine(case, self.model)
         if refused:
             raise RuntimeError(refused)
-        self.engine = kind(self.model, self.layout)
+        self.output = RunMemory(comm)
+        self.output.begin(case.to_toml())
+        self.layout = layout = Layout(self.model, comm)
+        self.engine = kind(self.model, layout)
+        setup = Setup(case, self.model, layout, EnergyMeter(self.model, layout), self.engine, self.output)
+        self._run = Run(setup, (Guard.name, Ledger.name))
 
-    def advance(self, sample: int) -> None:
-        """Go to a sample; samples must be taken in turn."""
-        self.engine.advance(sample * self.model.sample_interval)
+    def advance(self, begin: int, end: int) -> None:
+        """Go from a sample to a later one and record none; ``ts`` ends a step at each, the propagator anyhow."""
+        targets = range(begin + 1, end + 1) if self.engine.name == "ts" else [end]
+        for sample in targets:
+            self.engine.advance(sample * self.model.sample_interval)
 
-    @property
-    def velocity(self) -> np.ndarray:
-        """Owned velocities (cell, dof) in m/s."""
+    def velocities(self) -> tuple[np.ndarray, float]:
+        """All velocities (sample, cell, dof) in m/s on one rank, and the CPU seconds that they took.
+
+        ``ts`` goes from sample to sample, the propagator in blocks, by the run's own loop with its energies. Raises
+        RuntimeError where the run fails.
+        """
         n, d = self.layout.owned, self.layout.dofs
-        return self.engine.state.array_r[d * n : 2 * d * n].reshape(d, n).T
+        begin = time.process_time()
+        if self.engine.name == "ts":
+            sampled = np.empty((self.model.samples, d, n))
+            for k in range(self.model.samples):
+                self.engine.advance(k * self.model.sample_interval)
+                sampled[k] = self.engine.state.array_r[d * n : 2 * d * n].reshape(d, n)
+            return sampled.swapaxes(1, 2), time.process_time() - begin
+        ending, sentence = self._run.advance()
+        seconds = time.process_time() - begin
+        if ending != "complete":
+            raise RuntimeError(sentence)
+        self._run.finish(ending, sentence, (0.0, 0.0), {})
+        assert self.output.dataset is not None
+        return self.output.dataset.velocity.values, seconds
 
 
 def solve(case: Case) -> Solution:
     """The case by its own engine on one rank."""
-    flight = Flight(case, MPI.COMM_SELF)
-    model = flight.model
-    sampled = np.empty((model.samples, model.chain.cells, model.chain.cell.dofs))
-    begin = time.process_time()
-    for k in range(model.samples):
-        flight.advance(k)
-        sampled[k] = flight.velocity
-    seconds = time.process_time() - begin
+    output = case.output.model_copy(update={"fields": ["velocity"]})
+    flight = Flight(case.model_copy(update={"output": output}), MPI.COMM_SELF)
+    sampled, seconds = flight.velocities()
     flight.engine.destroy()
-    return Solution(sampled.reshape(model.samples, -1), seconds)
+    return Solution(sampled.reshape(flight.model.samples, -1), seconds)
 
 
 def own_solvers() -> dict[str, Solver]:

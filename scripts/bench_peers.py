@@ -1,12 +1,13 @@
-"""The peers: C++ odeint and plain TSRK compiled from scripts/peers, SciPy's DOP853 on numpy and on numba.
+"""The peers: C++ odeint, ARKODE and plain TSRK compiled from scripts/peers, diffrax, SciPy's DOP853 (numpy, numba).
 
-All of them solve the case's own lattice and return its velocities at the case's samples. They step over kinks of the
-contact law without locating them, as such programs do. Conservative cases only.
+All of them solve the case's own lattice and return its velocities at the case's samples. ARKODE ends its steps at
+contact changes by its root finding; the others step over kinks of the contact law. Conservative cases only.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import time
 from collections.abc import Callable
@@ -26,7 +27,12 @@ from vipetsc.lattice import Chain, Contact, ToneBurst
 SOURCES = Path(__file__).parent / "peers"
 BOOST = Path("/usr/include/boost/numeric/odeint.hpp")
 # The last one lets g++ vectorise odeint's sums over 13 stages: a quarter off fehlberg78's time.
-FLAGS = ("-O3", "-march=native", "-std=c++17", "--param", "vect-max-version-for-alias-checks=100")
+FLAGS = ("-O3", "-march=native", "-std=c++17", "-fopenmp-simd", "--param", "vect-max-version-for-alias-checks=100")
+ARKODE = Path("/usr/include/arkode/arkode_erkstep.h")
+# scripts/bench makes this environment: diffrax needs another numpy than Debian's.
+DIFFRAX = Path(__file__).parents[1] / ".venv-diffrax" / "bin" / "python"
+ONE_THREAD = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
+PATIENCE = 300  # seconds that a peer may take for one solution
 
 RightHandSide = Callable[[float, np.ndarray], np.ndarray]
 
@@ -64,22 +70,20 @@ def parameters(model: Model) -> str:
 
 
 def compile_peers(folder: Path) -> dict[str, Path]:
-    """Build the C++ peers into ``folder``; those whose compiler or library is not installed are left out.
-
-    Raises RuntimeError if a compiler fails.
-    """
+    """Build the C++ peers into ``folder``; those that cannot be built here are left out."""
     commands = {}
     if BOOST.exists():
         commands["odeint"] = ["g++", *FLAGS, str(SOURCES / "odeint.cpp")]
+    if ARKODE.exists():
+        commands["arkode"] = ["g++", *FLAGS, str(SOURCES / "arkode.cpp"), "-lsundials_arkode", "-lsundials_nvecserial"]
     if which("mpicxx") and which("pkg-config"):
         petsc = subprocess.run(["pkg-config", "--cflags", "--libs", "PETSc"], capture_output=True, text=True)
         if petsc.returncode == 0:
             commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc.stdout.split()]
     programs = {name: (folder / name).resolve() for name in commands}
-    building = [subprocess.Popen([*commands[name], "-o", str(path)]) for name, path in programs.items()]
-    if any([compiler.wait() for compiler in building]):
-        raise RuntimeError("a peer could not be compiled, see the message above")
-    return programs
+    building = {name: subprocess.Popen([*commands[name], "-o", str(path)]) for name, path in programs.items()}
+    ended = {name: compiler.wait() for name, compiler in building.items()}
+    return {name: path for name, path in programs.items() if ended[name] == 0}
 
 
 def compiled(program: Path, method: str, folder: Path) -> Solver:
@@ -90,13 +94,55 @@ def compiled(program: Path, method: str, folder: Path) -> Solver:
         given, output = folder / "parameters.txt", folder / "samples.bin"
         given.write_text(parameters(model))
         rtol = case.time.rtol
-        command = [program, given, method, rtol, WEAKEST * rtol, output]
-        ended = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+        command = list(map(str, [program, given, method, rtol, WEAKEST * rtol, output]))
+        try:
+            ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
+        except subprocess.TimeoutExpired as error:
+            raise RuntimeError(f"{program.name} {method} took more than {PATIENCE} s") from error
         if ended.returncode:
             raise RuntimeError(f"{program.name} {method} failed: {(ended.stderr.strip() or '?').splitlines()[-1]}")
-        sampled = np.fromfile(output).reshape(model.samples, model.chain.cell.dofs, model.chain.cells)
-        seconds = json.loads(ended.stdout)["cpu_seconds"]
-        return Solution(sampled.transpose(0, 2, 1).reshape(model.samples, -1), seconds)
+        return _solution(output, model, json.loads(ended.stdout)["cpu_seconds"])
+
+    return solve
+
+
+def _solution(output: Path, model: Model, seconds: float) -> Solution:
+    """What a peer wrote: doubles (sample, mass, cell)."""
+    sampled = np.fromfile(output).reshape(model.samples, model.chain.cell.dofs, model.chain.cells)
+    return Solution(sampled.transpose(0, 2, 1).reshape(model.samples, -1), seconds)
+
+
+def diffrax(folder: Path) -> Solver:
+    """diffrax's Dopri8 as a solver: one process, which compiles once, on one core; it ends with its input."""
+    given, output = folder / "parameters.txt", folder / "diffrax.bin"
+    core = min(os.sched_getaffinity(0))
+    command = ["taskset", "-c", str(core), str(DIFFRAX), str(SOURCES / "diffrax_dopri8.py"), str(output)]
+
+    @cache
+    def process() -> subprocess.Popen[str]:
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | ONE_THREAD
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=environment,
+        )
+
+    def solve(case: Case) -> Solution:
+        model, running = case.model(), process()
+        given.write_text(parameters(model))
+        assert running.stdin and running.stdout
+        try:
+            running.stdin.write(f"{given} {case.time.rtol} {WEAKEST * case.time.rtol}\n")
+            running.stdin.flush()
+        except BrokenPipeError:
+            pass
+        answer = running.stdout.readline()
+        if not answer:
+            raise RuntimeError("diffrax failed")
+        return _solution(output, model, json.loads(answer)["cpu_seconds"])
 
     return solve
 
@@ -187,7 +233,18 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
 def peers(folder: Path) -> dict[str, Solver]:
     """Every peer this machine has, by name; ``folder`` takes programs and passing files."""
     programs = compile_peers(folder)
-    wanted = [("odeint", "dopri5"), ("odeint", "fehlberg78"), ("tsrk", "5dp"), ("tsrk", "8vr")]
-    shown = {"odeint": "odeint", "tsrk": "TSRK"}
-    found = {f"{shown[p]} {method}": compiled(programs[p], method, folder) for p, method in wanted if p in programs}
+    methods = {
+        "odeint dopri5": ("odeint", "dopri5"),
+        "odeint fehlberg78": ("odeint", "fehlberg78"),
+        "ARKODE dopri5": ("arkode", "ARKODE_DORMAND_PRINCE_7_4_5"),
+        "TSRK 5dp": ("tsrk", "5dp"),
+        "TSRK 8vr": ("tsrk", "8vr"),
+    }
+    found = {
+        name: compiled(programs[program], method, folder)
+        for name, (program, method) in methods.items()
+        if program in programs
+    }
+    if DIFFRAX.exists():
+        found["diffrax Dopri8"] = diffrax(folder)
     return found | {"DOP853 numba": scipys(compiled_right_hand_side), "DOP853 numpy": scipys(plain_right_hand_side)}

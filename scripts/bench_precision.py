@@ -51,6 +51,8 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
     Every round runs each solver at each tolerance once, in turn. ``seconds`` is the median over rounds.
     """
     exact, about = reference(solvers, case)
+    # The first call of an engine loads what is compiled.
+    solvers["vipetsc propagator"](case)
     rows: dict[tuple[str, float], dict] = {}
     for _ in range(rounds):
         for rtol in tolerances:

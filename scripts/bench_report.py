@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench_model import model_tables
 from bench_precision import ERRORS, at_equal_error
+from bench_targets import table as target_table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -18,12 +20,14 @@ _LOOKS = {
     "vipetsc ts": (style.BLUE, "o", "-"),
     "odeint dopri5": (style.BLACK, "s", "-"),
     "odeint fehlberg78": (style.BLACK, "^", ":"),
+    "ARKODE dopri5": (style.SKY, "s", "-."),
+    "diffrax Dopri8": (style.ORANGE, "^", "-"),
     "TSRK 5dp": (style.GREEN, "s", "--"),
     "TSRK 8vr": (style.GREEN, "^", "--"),
     "DOP853 numba": (style.PURPLE, "D", "-."),
     "DOP853 numpy": (style.ORANGE, "D", "-."),
 }
-_OTHER = (style.SKY, "v", "-")
+_OTHER = (style.GREY, "v", "-")
 
 
 def solver_names(found: dict[str, Any]) -> list[str]:
@@ -38,8 +42,16 @@ def curve(found: dict[str, Any], solver: str) -> list[tuple[float, float]]:
 
 def markdown(found: dict[str, Any]) -> str:
     """The README's summary of what was measured: CPU time at equal error, whole runs, scaling."""
-    parts = {"rows": _precision_table, "whole": _whole_sentence, "scaling": _scaling_table}
-    return "\n\n".join(tell(found) for key, tell in parts.items() if found.get(key)) + "\n"
+    parts = {
+        "rows": _precision_table,
+        "whole": _whole_sentence,
+        "paper": _paper_sentence,
+        "scaling": _scaling_table,
+        "builds": _builds_table,
+    }
+    told = [tell(found) for key, tell in parts.items() if found.get(key)]
+    told += [model_tables(found.get("scaling", [])), target_table(found)]
+    return "\n\n".join(filter(None, told)) + "\n"
 
 
 def _precision_table(found: dict[str, Any]) -> str:
@@ -72,6 +84,27 @@ def _whole_sentence(found: dict[str, Any]) -> str:
     )
 
 
+def _paper_sentence(found: dict[str, Any]) -> str:
+    budget = found["paper"]
+    stages = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in sorted(budget.items(), key=lambda s: -s[1]))
+    return f"The paper: {sum(budget.values()):.0f} s of CPU over all ranks. By stage: {stages}."
+
+
+def _builds_table(found: dict[str, Any]) -> str:
+    lines = [
+        "| cells | sites | ranks | set-up (s) | velocities written (GB) | in (s) | peak GiB a rank |",
+        "|---" * 7 + "|",
+    ]
+    for row in found["builds"]:
+        told = f"| {row['cells']:,} | {row['sites']:,} | {row['ranks']} | "
+        if "failure" in row:
+            lines.append(told + "failed | | | |")
+            continue
+        written = f"{row['file_gb']:.2g} | {row['write_s']:.2g}"
+        lines.append(told + f"{row['set_up_s']:.2g} | {written} | {row['peak_gib_a_rank']:.2f} |")
+    return "\n".join(lines)
+
+
 def _scaling_table(found: dict[str, Any]) -> str:
     lines = [
         "| engine | cells | ranks | ms per 2e-4 s | two ranks gain (bare memory gains) | peak GiB a rank"
@@ -79,6 +112,9 @@ def _scaling_table(found: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for row in found["scaling"]:
+        if "failure" in row:
+            lines.append(f"| {row['engine']} | {row['cells']:,} | | failed | | | |")
+            continue
         gain = f"{row['speedup']:.2f} ({row['memory_speedup']:.2f})" if "speedup" in row else ""
         lines.append(
             f"| {row['engine']} | {row['cells']:,} | {row['ranks']} | {row['wall_ms']:.3g} | {gain}"
@@ -94,6 +130,7 @@ def _power(value: float) -> str:
 def draw(found: dict[str, Any], folder: Path) -> list[Path]:
     """``work-precision.png`` and ``scaling.png`` in ``folder``, each where it was measured."""
     pictures = {"rows": ("work-precision", work_precision_figure), "scaling": ("scaling", scaling_figure)}
+    found = found | {"scaling": [row for row in found.get("scaling", []) if "failure" not in row]}
     paths = []
     for name, make in (picture for key, picture in pictures.items() if found.get(key)):
         paths.append(folder / f"{name}.png")

@@ -1,4 +1,4 @@
-"""Scaling in cells and ranks, memory, bandwidth; and whole runs of the program."""
+"""Scaling in cells and ranks, memory, bandwidth, set-up and files; and whole runs of the program."""
 
 from __future__ import annotations
 
@@ -18,37 +18,66 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
 WORKER = Path(__file__).with_name("bench_worker.py")
+PATIENCE = 300  # seconds that one measurement may take
+MOST_TS_CELLS = 300_000  # beyond which `ts` takes minutes and shows nothing more
 
 
 def on_ranks(ranks: int, task: str, **arguments: object) -> dict:
-    """What the worker's ``task`` measures on ``ranks``."""
+    """What the worker's ``task`` measures on ``ranks``; raises RuntimeError if it fails."""
     # This process has its own MPI: the mpirun it starts must not inherit that.
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
     command = ["mpirun", "-n", str(ranks), sys.executable, str(WORKER), task, json.dumps(arguments)]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=PATIENCE)
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError(f"{task} on {ranks} ranks took more than {PATIENCE} s") from error
     if ended.returncode:
         raise RuntimeError(f"{task} on {ranks} ranks failed: {ended.stderr.strip()[-2000:]}")
     return json.loads(ended.stdout.strip().splitlines()[-1])
 
 
 def scaling(cells: Iterable[int], rounds: int) -> list[dict]:
-    """One row for each engine, length and number of ranks: medians over ``rounds``, the ranks in turn."""
+    """One row for each engine, length and number of ranks; a row that failed says why."""
     rows = []
     for engine in engines():
         for n in cells:
-            turns: dict[int, list[dict]] = {1: [], 2: []}
-            # Long enough to time, short enough to wait for.
-            intervals = max(10, min(200, 1_000_000 // n))
-            for _ in range(rounds):
-                for ranks, found in turns.items():
-                    found.append(on_ranks(ranks, "flight", engine=engine, cells=n, intervals=intervals))
-            for ranks, found in turns.items():
-                medians = {key: statistics.median(turn[key] for turn in found) for key in found[0] if key != "ranks"}
-                rows.append({"engine": engine, "cells": n, "ranks": ranks} | medians)
-            pairs = list(zip(turns[1], turns[2], strict=True))
-            for key, about in (("wall_ms", "speedup"), ("triad_gb_per_second", "memory_speedup")):
-                gain = statistics.median(one[key] / two[key] for one, two in pairs)
-                rows[-1][about] = gain if about == "speedup" else 1 / gain
+            if engine == "ts" and n > MOST_TS_CELLS:
+                continue
+            try:
+                rows += _pair(engine, n, rounds)
+            except RuntimeError as failure:
+                rows.append({"engine": engine, "cells": n, "ranks": 0, "failure": str(failure)})
+    return rows
+
+
+def _pair(engine: str, cells: int, rounds: int) -> list[dict]:
+    """The rows of one and of two ranks: medians over ``rounds``, the ranks in turn."""
+    turns: dict[int, list[dict]] = {1: [], 2: []}
+    # Long enough to time, short enough to wait for.
+    intervals = max(10, min(200, 1_000_000 // cells))
+    for _ in range(rounds):
+        for ranks, found in turns.items():
+            found.append(on_ranks(ranks, "flight", engine=engine, cells=cells, intervals=intervals))
+    rows: list[dict] = []
+    for ranks, found in turns.items():
+        medians = {key: statistics.median(turn[key] for turn in found) for key in found[0] if key != "ranks"}
+        rows.append({"engine": engine, "cells": cells, "ranks": ranks} | medians)
+    pairs = list(zip(turns[1], turns[2], strict=True))
+    for key, about in (("wall_ms", "speedup"), ("triad_gb_per_second", "memory_speedup")):
+        gain = statistics.median(one[key] / two[key] for one, two in pairs)
+        rows[-1][about] = gain if about == "speedup" else 1 / gain
+    return rows
+
+
+def builds(sizes: Iterable[tuple[int, int]]) -> list[dict]:
+    """Set-up and files of runs of so many cells and sites, on one rank and on two."""
+    rows = []
+    for cells, sites in sizes:
+        for ranks in (1, 2):
+            try:
+                rows.append(on_ranks(ranks, "build", cells=cells, sites=sites))
+            except RuntimeError as failure:
+                rows.append({"cells": cells, "sites": sites, "ranks": ranks, "failure": str(failure)})
     return rows
 
 

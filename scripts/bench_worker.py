@@ -1,17 +1,23 @@
-"""What the bench runs under mpirun: ``bench_worker.py flight|large JSON``; rank 0 prints what it measured as JSON."""
+"""What the bench runs under mpirun: ``bench_worker.py flight|build|large JSON``; rank 0 prints its measures as JSON."""
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
 import resource
 import sys
+import tempfile
 import time
+from pathlib import Path
+from typing import Any
 
 import petsc4py
 
 petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numba
 import numpy as np
@@ -22,6 +28,34 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
 COMM = MPI.COMM_WORLD
+# A run's phases, as its audit events name them; "read" is everything before the first.
+PHASES = ("claim", "set-up", "step", "checkpoint", "flush", "assemble", "conclude", "clean", "swap")
+
+# Of PETSc's log; the first two are PETSc's own.
+EVENTS = ("VecScatterBegin", "TSStep", "Propagator", "ContactSearch", "Landing", "Recorder")
+
+
+class Counting(MPI.Intracomm):
+    """A communicator that counts the reductions over it, which PETSc does not see."""
+
+    reductions: int
+    __module__ = "mpi4py.MPI"  # what petsc4py asks of a communicator
+
+    def __new__(cls, comm: MPI.Intracomm) -> Counting:
+        """As ``comm``, with no reduction yet."""
+        counting = super().__new__(cls, comm)
+        counting.reductions = 0
+        return counting
+
+    def allreduce(self, *arguments: Any, **named: Any) -> Any:
+        """Counted."""
+        self.reductions += 1
+        return super().allreduce(*arguments, **named)
+
+    def Allreduce(self, *arguments: Any, **named: Any) -> None:
+        """Counted."""
+        self.reductions += 1
+        super().Allreduce(*arguments, **named)
 
 
 @numba.njit
@@ -53,19 +87,19 @@ def peak() -> float:
 def flight(engine: str, cells: int, intervals: int) -> dict:
     """Milliseconds a sample interval of a lattice of ``cells``, once a short burst has reached its full strength."""
     case = lattice_case([f"lattice.cells={cells}", f"time.engine={engine}", "drive.cycles=3", "output.window=[1, 9]"])
-    moving = Flight(case, COMM)
+    comm = Counting(COMM)
+    moving = Flight(case, comm)
     model = moving.model
     first = round(model.drive.duration / 3 / model.sample_interval)
-    for k in range(1, first + 1):
-        moving.advance(k)
+    moving.advance(0, first)
     COMM.Barrier()
     wall, cpu = time.perf_counter(), time.process_time()
-    for k in range(first + 1, first + intervals + 1):
-        moving.advance(k)
+    moving.advance(first, first + intervals)
     COMM.Barrier()
     wall = (time.perf_counter() - wall) / intervals
     cpu = COMM.allreduce(time.process_time() - cpu) / intervals
     memory = peak()
+    traffic = counted(moving, comm, first + intervals, min(intervals, 50))
     gigabytes = bandwidth()
     state = 2 * 8 * model.chain.cell.dofs * cells
     return {
@@ -75,7 +109,68 @@ def flight(engine: str, cells: int, intervals: int) -> dict:
         "triad_gb_per_second": gigabytes,
         # No method can do with less than reading and writing the state once an interval.
         "share_of_bandwidth_limit": 2 * state / (1e9 * gigabytes) / wall,
+    } | traffic
+
+
+def counted(moving: Flight, comm: Counting, done: int, intervals: int) -> dict[str, float]:
+    """Messages and bytes that a rank sends to one neighbour, and reductions of all ranks, in a sample interval.
+
+    Messages are what PETSc's log has of its scatters, reductions those of its steps and those over ``comm``; ms are
+    those of this rank's ``EVENTS``.
+    """
+    PETSc.Log.begin()
+
+    def logged() -> np.ndarray:
+        events = [PETSc.Log.Event(name).getPerfInfo() for name in EVENTS]
+        scatter, step = events[:2]
+        traffic = scatter["numMessages"], scatter["messageLength"], step["numReductions"] + comm.reductions
+        return np.array([*traffic, *(1e3 * event["time"] for event in events)])
+
+    before = logged()
+    moving.advance(done, done + intervals)
+    # PETSc counts a message where it is sent and where it is received; of two ranks, each has one neighbour.
+    messages, length, reductions, *spent = ((logged() - before) / intervals).tolist()
+    found = {"messages": messages / 2, "message_bytes": length / 2, "reductions": reductions}
+    return found | {f"{name}_ms": seconds for name, seconds in zip(EVENTS, spent, strict=True)}
+
+
+def build(cells: int, sites: int) -> dict:
+    """A run from its tables to its folder, of three samples and all velocities: wall seconds by phase, and sizes."""
+    marks: list[tuple[str, float]] = []
+
+    def mark(event: str, _: object) -> None:
+        phase = event.removeprefix("vipetsc.")
+        if event.startswith("vipetsc.") and phase in PHASES:
+            marks.append((phase, time.perf_counter()))
+
+    sys.addaudithook(mark)
+    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_FOLDER")) as own:
+        folder = Path(COMM.bcast(own))
+        simulate(_spread(1000, 10), folder / "compiles", COMM)
+        marks[:] = [("read", time.perf_counter())]
+        simulate(_spread(cells, sites), folder / "run", COMM)
+        marks.append(("end", time.perf_counter()))
+        size = (folder / "run" / "run.h5").stat().st_size
+        COMM.Barrier()
+    seconds: dict[str, float] = {}
+    for (phase, begin), (_, end) in itertools.pairwise(marks):
+        seconds[phase] = seconds.get(phase, 0.0) + end - begin
+    writing = sum(seconds.get(phase, 0.0) for phase in ("flush", "assemble", "conclude"))
+    found = {"cells": cells, "sites": sites, "seconds": seconds, "set_up_s": seconds["read"] + seconds["set-up"]}
+    return found | {"write_s": writing, "file_gb": size / 1e9, "peak_gib_a_rank": peak()}
+
+
+def _spread(cells: int, sites: int) -> Case:
+    """A lattice with evenly spread sites that nothing reaches in three samples."""
+    places = np.linspace(cells // 10, cells - cells // 10, sites).round().astype(int).tolist()
+    table = {
+        "name": "build",
+        "lattice": {"preset": "four-band", "cells": cells},
+        "contacts": {"sites": places, "clearance": 2e-3},
+        "time": {"sample_interval": 2e-4, "end": 4e-4, "engine": "propagator"},
+        "output": {"fields": ["velocity"], "writer": "parallel", "figures": False},
     }
+    return Case.from_table(table)
 
 
 def large(folder: str) -> dict:
@@ -86,6 +181,6 @@ def large(folder: str) -> dict:
 
 
 if __name__ == "__main__":
-    measured = {"flight": flight, "large": large}[sys.argv[1]](**json.loads(sys.argv[2]))
+    measured = {"flight": flight, "build": build, "large": large}[sys.argv[1]](**json.loads(sys.argv[2]))
     if COMM.rank == 0:
         print(json.dumps({"ranks": COMM.size} | measured))

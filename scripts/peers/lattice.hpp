@@ -68,8 +68,11 @@ class Lattice {
 
     int size() const { return 2 * dofs * cells; }
 
-    // Time derivative of y at time t; allocates nothing.
-    void derivative(const double *__restrict y, double *__restrict f, double t) const {
+    const std::vector<Site> &sites() const { return sites_; }
+
+    // Time derivative of y at time t; allocates nothing. With `held`, whether a site touches and on which side (0, 1, -1)
+    // is what that says, and the force goes on smoothly where the masses would part.
+    void derivative(const double *__restrict y, double *__restrict f, double t, const signed char *held = nullptr) const {
         const int half = dofs * cells;
         double *acceleration = f + half;
         for (int i = 0; i < half; ++i) f[i] = y[half + i];
@@ -89,9 +92,10 @@ class Lattice {
         }
         for (const Site &site : sites_) {
             const double w = y[site.resonator] - y[site.host];
-            const double x = std::abs(w) - site.clearance;
-            if (x > 0) {
-                const double force = std::copysign(contact_ * (hertz_ ? x * std::sqrt(x) : x), w);
+            const int side = held ? *held++ : (w > 0 ? 1 : -1);
+            const double x = side * w - site.clearance;
+            if (held ? side != 0 : x > 0) {
+                const double force = side * contact_ * (hertz_ ? x * std::sqrt(std::abs(x)) : x);
                 acceleration[site.host] += force * per_host_;
                 acceleration[site.resonator] -= force * per_resonator_;
             }

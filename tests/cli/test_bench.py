@@ -40,6 +40,10 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
     wanted = {"vipetsc ts", "TSRK 5dp", "TSRK 8vr", "DOP853 numba", "DOP853 numpy"}
     if Path("/usr/include/boost/numeric/odeint.hpp").exists():
         wanted |= {"odeint dopri5", "odeint fehlberg78"}
+    if Path("/usr/include/arkode/arkode_erkstep.h").exists():
+        wanted.add("ARKODE dopri5")
+    if (SCRIPTS.parent / ".venv-diffrax" / "bin" / "python").exists():
+        wanted.add("diffrax Dopri8")
     assert wanted <= errors.keys()
     for solver, falling in errors.items():
         # Kinks that Fehlberg's estimate overlooks leave its error uneven.
@@ -55,15 +59,24 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
 
 
 @pytest.mark.mpirun
-def test_a_flight_on_two_ranks_is_timed_beside_its_memory(monkeypatch):
+def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    from bench_scaling import on_ranks
+    from bench_scaling import builds, on_ranks
 
     row = on_ranks(2, "flight", engine="ts", cells=30, intervals=3)
     assert row["ranks"] == 2
     assert row["wall_ms"] > 0
     assert 0 < row["share_of_bandwidth_limit"] < 1
     assert 0.01 < row["peak_gib_a_rank"] < 4
+    # Each stage of a step sends the ghosts of a cell, 4 displacements and 4 velocities or half of them.
+    assert row["messages"] >= 13
+    assert row["message_bytes"] / row["messages"] in (32, 64)
+    assert row["reductions"] > row["messages"] / 14  # one of PETSc's own a step, and ours
+    assert row["TSStep_ms"] > row["ContactSearch_ms"] > 0  # events of PETSc's log
+    (alone, together) = builds([(200, 3)])
+    assert together["ranks"] == 2
+    assert together["file_gb"] == pytest.approx(alone["file_gb"], rel=0.2)
+    assert min(together["set_up_s"], together["write_s"], together["seconds"]["step"]) > 0
 
 
 @pytest.mark.parametrize(
@@ -75,6 +88,34 @@ def test_what_cannot_be_measured_is_refused(tmp_path, monkeypatch, arguments):
 
     assert main([*arguments, "--out", str(tmp_path / "none")]) == 2
     assert not (tmp_path / "none").exists()
+
+
+def test_a_model_of_many_ranks_and_the_targets_read_the_same_rows(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from bench_model import LATENCY, ScalingModel, model_tables
+    from bench_targets import table, targets
+
+    common = {"engine": "propagator", "messages": 1.0, "message_bytes": 0.0, "reductions": 1.0}
+    rows = [common | {"cells": n, "ranks": r, "wall_ms": 1e-5 * n / r} for n in (300, 10**5) for r in (1, 2)]
+    rows[1] |= {"speedup": 2.0, "memory_speedup": 2.0}
+    rows[3] |= {"speedup": 1.4, "memory_speedup": 2.0}
+    rows[2] |= {"share_of_bandwidth_limit": 0.4}
+    rows.append({"engine": "ts", "cells": 300, "ranks": 0, "failure": "no memory"})
+    model = ScalingModel(rows, "propagator")
+    # 1e-8 s a cell and a message to each neighbour and ten in turn for the reduction.
+    assert model.total(1024 * 2000, 1024) == pytest.approx(2e-5 + 12 * LATENCY)
+    assert model.total(10**6, 1) == pytest.approx(1e-2)
+    assert model_tables(rows).count("| propagator |") == 3
+    assert "| ts |" not in model_tables(rows)
+    rows[0] |= {"share_of_bandwidth_limit": 0.1}
+    found = {
+        "scaling": rows,
+        "ratios": {"odeint dopri5 / vipetsc propagator at 1e-08": 21.0},
+        "members": {"diatomic": 1.0},
+    }
+    met = {target.name: target.met for target in targets(found)}
+    assert list(met.values()) == [True, True, False, True, False]
+    assert table(found).count("| yes |") == 3
 
 
 def test_equal_error_is_interpolated_in_logarithms_and_never_beyond_the_points(monkeypatch):

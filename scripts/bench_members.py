@@ -1,0 +1,80 @@
+"""One member of a sweep, all in: simulated, measured and recorded by the sweep itself; and the paper's budget."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from vipetsc.case import Sweep
+from vipetsc.studies.sweep import run_sweep
+
+RUNS = Path(__file__).parents[1] / "runs"
+MEMBERS = 4
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A sweep of the paper's: its case file, what is changed in its tables, and an amplitude with many contacts."""
+
+    file: str
+    changes: dict[str, dict[str, Any]]
+    measures: tuple[str, ...]
+    amplitude: float
+
+
+KINDS = {
+    "four-band": Kind(
+        "interband.toml",
+        {"lattice": {"reading": "calibrated"}, "contacts": {"sites": 5}},
+        ("transfer", "entropy"),
+        24.33,
+    ),
+    "diatomic": Kind(
+        "scattering.toml",
+        {"lattice": {"reading": "calibrated"}, "contacts": {"sites": 5}, "drive": {"wavenumber": "5pi/9"}},
+        ("entropy",),
+        1.0,
+    ),
+}
+
+
+def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
+    """CPU seconds of a whole sweep over so many amplitudes, which lie close together."""
+    table = tomllib.loads((RUNS / kind.file).read_text(encoding="utf-8")) | {"name": folder.name}
+    for section, changes in kind.changes.items():
+        table[section] = table.get(section, {}) | changes
+    amplitudes = [kind.amplitude * (1 + 1e-4 * k) for k in range(members)]
+    table["sweep"] = {"measures": list(kind.measures), "drive": {"amplitude": amplitudes}}
+    begin = time.process_time()
+    result = run_sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
+    if not result.complete:
+        raise RuntimeError(f"a member of {kind.file} failed: {result.status.tolist()}")
+    return time.process_time() - begin
+
+
+def member_seconds(folder: Path, rounds: int) -> dict[str, float]:
+    """CPU seconds of one more member of a sweep: what ``1 + MEMBERS`` take more than one, median of ``rounds``."""
+    found: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for turn in range(rounds + 1):
+        for kind, seconds in found.items():
+            one, all_in = (_sweep_seconds(KINDS[kind], n, folder / f"{kind}-{turn}-{n}") for n in (1, 1 + MEMBERS))
+            if turn:  # the first one fills caches
+                seconds.append((all_in - one) / MEMBERS)
+    return {kind: statistics.median(seconds) for kind, seconds in found.items()}
+
+
+def paper_budget(folder: Path) -> dict[str, float]:
+    """CPU seconds of the paper by stage, from what ``paper`` left in ``folder``; empty if it left nothing."""
+    made = folder / "made.json"
+    if not made.exists():
+        return {}
+    told = json.loads(made.read_text(encoding="utf-8")).get("cpu", {})
+    stages = {name: float(seconds) for name, seconds in told.get("steps", {}).items()}
+    return stages | {name: float(seconds) for name, seconds in told.items() if name != "steps"}

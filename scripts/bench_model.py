@@ -1,0 +1,81 @@
+"""A model of many ranks from what one and two ranks measured here; each assumption is stated beside the tables."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+RANKS = (1, 64, 1024)
+LATENCY, BANDWIDTH = 2e-6, 10e9  # s a message, bytes/s a rank: a common cluster's network
+WEAK, STRONG = 100_000, 10_000_000  # cells a rank, cells in all
+
+
+class ScalingModel:
+    """Seconds that an engine takes for a sample interval on many ranks.
+
+    ``rows`` are those of ``bench_scaling.scaling``. Cells cost what one rank took here for so many, interpolated in
+    logarithms, times what sharing the memory with a second rank costs a rank. A rank exchanges with two neighbours,
+    one after the other, as many messages and bytes as one of two ranks sent here; a reduction takes as many messages
+    in turn as the ranks have binary digits. Contacts are taken as spread evenly; nothing overlaps.
+    """
+
+    def __init__(self, rows: list[dict[str, Any]], engine: str) -> None:
+        good = sorted((r for r in rows if r["engine"] == engine and "failure" not in r), key=lambda r: r["cells"])
+        alone, paired = ([r for r in good if r["ranks"] == ranks] for ranks in (1, 2))
+        if not alone or not paired:
+            raise ValueError(f"{engine} was not measured on one rank and on two")
+        self._cells, self._seconds = [r["cells"] for r in alone], [r["wall_ms"] / 1e3 for r in alone]
+        self.shared = max(1.0, 2 / paired[-1]["memory_speedup"])
+        self.messages, self.bytes, self.reductions = (
+            max(r[key] for r in paired) for key in ("messages", "message_bytes", "reductions")
+        )
+
+    def compute(self, cells: float) -> float:
+        """Seconds of one rank for so many cells; beyond the measured ones, in proportion to them."""
+        largest = self._cells[-1]
+        within = np.exp(np.interp(np.log(min(cells, largest)), np.log(self._cells), np.log(self._seconds)))
+        return float(within) * max(1.0, cells / largest) * self.shared
+
+    def communicate(self, ranks: int) -> float:
+        """Seconds that a rank sends, receives and reduces."""
+        if ranks == 1:
+            return 0.0
+        exchange = 2 * (self.messages * LATENCY + self.bytes / BANDWIDTH)
+        return exchange + self.reductions * math.ceil(math.log2(ranks)) * LATENCY
+
+    def total(self, cells: float, ranks: int) -> float:
+        """Seconds of ``ranks`` for ``cells`` in all."""
+        return self.compute(cells / ranks) + self.communicate(ranks)
+
+
+def model_tables(rows: list[dict[str, Any]]) -> str:
+    """Weak and strong scaling by the model, and its assumptions, in Markdown."""
+    lines = []
+    for engine in dict.fromkeys(row["engine"] for row in rows):
+        try:
+            model = ScalingModel(rows, engine)
+        except ValueError:
+            continue
+        for name, size, each in (("weak", WEAK, True), ("strong", STRONG, False)):
+            alone = model.total(size, 1)
+            cells = []
+            for ranks in RANKS:
+                seconds = model.total(size * ranks if each else size, ranks)
+                efficiency = alone / seconds / (1 if each else ranks)
+                cells.append(f"{1e3 * seconds:.3g} ({100 * efficiency:.0f} %)")
+            what = f"{size:,} cells " + ("a rank" if each else "in all")
+            lines.append(f"| {engine} | {name}, {what} | " + " | ".join(cells) + " |")
+        lines.append(
+            f"| {engine} | a rank and interval: {model.messages:.3g} messages and {model.bytes:.3g} bytes to each"
+            f" neighbour, {model.reductions:.3g} reductions |" + " |" * len(RANKS)
+        )
+    if not lines:
+        return ""
+    head = "| engine | model: ms per 2e-4 s (efficiency) | " + " | ".join(f"{n} ranks" for n in RANKS) + " |"
+    assumed = (
+        f"Assumed: {1e6 * LATENCY:g} us a message, {BANDWIDTH / 1e9:g} GB/s a rank, log2(ranks) messages in turn a"
+        " reduction, cells at what they cost here with both cores on the memory, contacts spread evenly, no overlap."
+    )
+    return "\n".join([head, "|---|---|" + "---|" * len(RANKS), *lines, "", assumed])

@@ -1,0 +1,113 @@
+"""Peer: diffrax's Dopri8 on JAX, compiled, in double precision on one CPU thread; runs in an environment of its own.
+
+``diffrax_dopri8.py OUTPUT`` reads lines ``PARAMETERS RTOL ATOL`` and answers each with one line of JSON, after it has
+written the sampled velocities (m/s, doubles, as the C++ peers do). Compiling is not counted. Samples are
+interpolated, which costs less at equal error than landing on them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_platforms", "cpu")
+
+
+def words_of(path: str) -> Iterator[str]:
+    """The words of a parameter file in turn."""
+    with open(path, encoding="utf-8") as file:
+        yield from file.read().split()
+
+
+class Lattice:
+    """The lattice of a parameter file, in units of the drive's linear wave: see lattice.hpp."""
+
+    def __init__(self, path: str) -> None:
+        words = words_of(path)
+
+        def numbers(count: int, key: str = "") -> list[float]:
+            if key and next(words) != key:
+                raise ValueError(f"{path}: expected {key!r}")
+            return [float(next(words)) for _ in range(count)]
+
+        self.cells, self.dofs, self.walls = map(int, numbers(3, "lattice"))
+        samples, interval = numbers(2, "sampling")
+        self.scale, self.rate = numbers(2, "scale")
+        self.masses = np.array(numbers(self.dofs, "masses")) * self.rate**2
+        self.couplings = [numbers(4) for _ in range(int(numbers(1, "couplings")[0]))]
+        hertz, stiffness, host, resonator = numbers(4, "contact")
+        self.exponent = 1.5 if hertz else 1.0
+        self.stiffness = stiffness * (np.sqrt(self.scale) if hertz else 1.0)
+        self.host, self.resonator = int(host), int(resonator)
+        sites = np.array(numbers(2 * int(numbers(1, "sites")[0]))).reshape(-1, 2)
+        self.sites, self.clearances = sites[:, 0].astype(int), sites[:, 1] / self.scale
+        cell, mass, amplitude, frequency, self.cycles = numbers(5, "drive")
+        self.driven = int(mass), int(cell)
+        self.drive, self.drive_rate = amplitude / (self.scale * self.masses[int(mass)]), frequency / self.rate
+        self.times = np.arange(int(samples)) * interval * self.rate
+
+    def derivative(self, t: jax.Array, y: jax.Array, _: None) -> jax.Array:
+        """Time derivative of y (displacement or velocity, mass, cell)."""
+        u = y[0]
+        outside = jnp.pad(u, ((0, 0), (1, 1)))
+        pulls = [jnp.zeros(self.cells) for _ in range(self.dofs)]
+        for mass, offset, other, stiffness in self.couplings:
+            m, o, shift = int(mass), int(other), int(offset)
+            strengths = np.full(self.cells, stiffness / self.masses[m])
+            if shift and not self.walls:
+                strengths[0 if shift < 0 else -1] = 0.0
+            pulls[m] += strengths * (outside[o, 1 + shift : 1 + shift + self.cells] - u[m])
+        acceleration = jnp.stack(pulls)
+        w = u[self.resonator, self.sites] - u[self.host, self.sites]
+        force = jnp.sign(w) * self.stiffness * jnp.maximum(jnp.abs(w) - self.clearances, 0.0) ** self.exponent
+        acceleration = acceleration.at[self.host, self.sites].add(force / self.masses[self.host])
+        acceleration = acceleration.at[self.resonator, self.sites].add(-force / self.masses[self.resonator])
+        phase = self.drive_rate * t
+        driving = (phase > 0) & (phase < 2 * np.pi * self.cycles)
+        burst = self.drive * (1 - jnp.cos(phase / self.cycles)) * jnp.sin(phase)
+        return jnp.stack([y[1], acceleration.at[self.driven].add(jnp.where(driving, burst, 0.0))])
+
+    def solver(self) -> Callable[[float, float], diffrax.Solution]:
+        """The compiled solution as a function of the two tolerances."""
+        term, times = diffrax.ODETerm(self.derivative), jnp.asarray(self.times)
+
+        @jax.jit
+        def solve(rtol: float, atol: float) -> diffrax.Solution:
+            control = diffrax.PIDController(rtol, atol)
+            return diffrax.diffeqsolve(
+                term, diffrax.Dopri8(), times[0], times[-1], 2e-3, jnp.zeros((2, self.dofs, self.cells)),
+                saveat=diffrax.SaveAt(ts=times, fn=lambda t, y, args: y[1]), stepsize_controller=control,
+                adjoint=diffrax.ForwardMode(), max_steps=None,
+            )  # fmt: skip
+
+        return solve
+
+
+def main(output: str) -> None:
+    """Answer each line of the standard input."""
+    compiled: dict[str, tuple[Lattice, Callable[[float, float], diffrax.Solution]]] = {}
+    for line in sys.stdin:
+        path, rtol, atol = line.split()
+        text = "\n".join(words_of(path))
+        if text not in compiled:
+            lattice = Lattice(path)
+            compiled[text] = lattice, lattice.solver()
+            jax.block_until_ready(compiled[text][1](1e-3, 1e-4))
+        lattice, solve = compiled[text]
+        begin = time.process_time()
+        found = jax.block_until_ready(solve(float(rtol), float(atol)))
+        seconds = time.process_time() - begin
+        (np.asarray(found.ys) * lattice.scale * lattice.rate).tofile(output)
+        print(json.dumps({"cpu_seconds": seconds, "steps": int(found.stats["num_steps"])}), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
