@@ -64,6 +64,25 @@ def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
     comm.Barrier()
 
 
+@pytest.mark.parallel([1, 2])
+def test_samples_differ_and_neither_ranks_nor_order_change_a_bit(folder):
+    comm = MPI.COMM_WORLD
+    table = tomllib.loads(TABLE) | {"contacts": {"sites": [4, 9], "clearance": 2e-4}}
+    table |= {"disorder": {"clearance": {"relative": 0.05}}, "sweep": {"disorder": {"seed": {"count": 3}}}}
+    table["drive"] = table["drive"] | {"amplitude": 20.0}
+    run_sweep(Sweep.from_table(table), folder / "all", comm)
+    run_sweep(Sweep.from_table(table, ["sweep.disorder.seed=[2, 0, 1]"]), folder / "turned", comm)
+    comm.Barrier()
+    if comm.rank == 0:
+        run_sweep(Sweep.from_table(table), folder / "alone", MPI.COMM_SELF)
+        found, turned, alone = (datasets(folder / name / "ensemble.h5") for name in ("all", "turned", "alone"))
+        assert_same_bits(found, alone)
+        assert turned["ibtet"].tolist() == found["ibtet"][[2, 0, 1]].tolist() and len({*turned["ibtet"]}) == 3
+        assert found["statistics/samples"] == 3
+        assert (folder / "all" / "members.jsonl").read_bytes().count(b'"envelope"') == 1  # one linear run for all
+    comm.Barrier()
+
+
 @pytest.mark.parallel([2])
 @pytest.mark.parametrize(
     ("team", "phase", "kind"),

@@ -5,12 +5,13 @@ A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from vipetsc.case.reading import CaseFile, Problem, Table, Valid
+from vipetsc.case.disorder import SEED, DisorderTable, scatter
+from vipetsc.case.reading import CaseFile, Problem, Table, Valid, read_section
 from vipetsc.case.resolve import build_chain, check_cell, check_contacts, check_wave, resolved, wave_speed, with_preset
 from vipetsc.case.schema import (
     CONTACTS,
@@ -73,7 +74,8 @@ class Case(CaseFile):
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
         sections, problems = super().read(with_preset(table))
-        if problems:
+        disorder, wrong = read_section(DisorderTable, table.get("disorder", {}), "disorder")
+        if problems := problems + wrong:
             return sections, problems
         tables, samples = resolved(sections), sections["time"].samples
         count = tables["time"]["end"] / tables["time"]["sample_interval"]
@@ -83,6 +85,10 @@ class Case(CaseFile):
         if samples is not None:
             cell, interval = sections["lattice"].unit_cell(), tables["time"]["sample_interval"]
             problems = _too_coarse(cell, interval, "time.samples", samples)
+        if "disorder" in table and not problems:
+            nominal, (tables, problems) = tables, scatter(tables, disorder, sections["lattice"], sections["contacts"])
+            if tables is not nominal:
+                problems = [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in super().read(tables)[1]]
         return tables, problems
 
     @classmethod

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from vipetsc.case.case import Case
 from vipetsc.case.design import DesignCase
+from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.nnm import NnmCase
-from vipetsc.case.reading import CaseError, CaseFile, Problem, read_toml, with_overrides
+from vipetsc.case.reading import CaseError, CaseFile, Problem, Table, read_section, read_toml, with_overrides
 from vipetsc.case.sweep import MOST_TRIED, Sweep
 
 OF_SECTION: dict[str, type[CaseFile]] = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase}
@@ -18,10 +19,10 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     A file with ``[nnm]`` or ``[design]`` and no section of a run is not read as one. A sweep may give what a run
     lacks: then its first possible member stands for the run. Raises CaseError with the problems of all verbs.
     """
-    table, source = (read_toml(path), str(path)) if path else (Case.builtin_table, "built-in case")
+    table, source = _table(path)
     sections = with_overrides(table, overrides := list(overrides))[0].keys()
     kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in sections]
-    if not kinds or {"sweep", "drive", "time", "output"} & sections:
+    if not kinds or {"sweep", "disorder", "drive", "time", "output"} & sections:
         kinds.insert(0, Case)
     cases: list[CaseFile] = []
     problems: dict[str, Problem] = {}
@@ -37,3 +38,21 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     if problems:
         raise CaseError(problems.values(), source)
     return cases
+
+
+def disorder_of(path: str | Path | None, overrides: Iterable[str]) -> tuple[DisorderTable, Case, Case] | None:
+    """What scatters in a valid case file, the case without and with it; of a sweep, its first possible member's."""
+    table, _ = with_overrides(_table(path)[0], overrides)
+    if "sweep" in table:
+        plan = Sweep.from_table(table)
+        table, _ = plan.member_table(next(member.index for member in plan.members(MOST_TRIED) if member.case))
+    if "disorder" not in table:
+        return None
+    disorder, nominal = read_section(DisorderTable, table["disorder"], "disorder")[0], table.copy()
+    del nominal["disorder"]
+    return disorder, Case.from_table(nominal), Case.from_table(table)
+
+
+def _table(path: str | Path | None) -> tuple[Table, str]:
+    """The table of a case file and what it is called; the built-in one without a file."""
+    return (read_toml(path), str(path)) if path else (Case.builtin_table, "built-in case")

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 if TYPE_CHECKING:
     import xarray as xr
 
-SECTIONS = ("lattice", "contacts", "drive", "time", "output", "analysis", "sweep", "nnm", "design", "petsc")
+SECTIONS = ("lattice", "contacts", "disorder", "drive", "time", "output", "analysis", "sweep", "nnm", "design", "petsc")
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")

@@ -14,6 +14,7 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case
+from vipetsc.case.disorder import SEED
 from vipetsc.case.reading import LARGEST, CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.schema import number
 
@@ -63,7 +64,7 @@ class Sweep(CaseFile):
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
             table["time"] = {"engine": "auto"} | table.get("time", {})
-        sections = Case.model_fields.keys() - {"name", "analysis"}
+        sections = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
         values: Values = {}
@@ -115,13 +116,18 @@ class Sweep(CaseFile):
         texts = [[json.dumps(row, sort_keys=True, default=str) for row in axis] for axis in rows]
         return [name(chosen) for chosen in itertools.product(*texts)]
 
-    def member(self, number: int) -> SweepMember:
-        """The member ``number`` (from 0) in the order of the axes, the last varying fastest."""
-        index = tuple(map(int, np.unravel_index(number, self.shape)))
-        table, problems = copy.deepcopy(self.table), []
+    def member_table(self, index: Sequence[int]) -> tuple[Table, list[Problem]]:
+        """The table of the member with that ``index`` on every axis, and what could not be put into it."""
+        table, problems = copy.deepcopy(self.table), list[Problem]()
         for axis, i in zip(self.axes, index, strict=True):
             for key, values in axis.items():
                 problems += put(table, key, copy.deepcopy(values[i]))
+        return table, problems
+
+    def member(self, number: int) -> SweepMember:
+        """The member ``number`` (from 0) in the order of the axes, the last varying fastest."""
+        index = tuple(map(int, np.unravel_index(number, self.shape)))
+        table, problems = self.member_table(index)
         try:
             return SweepMember(index, None, problems) if problems else SweepMember(index, Case.from_table(table))
         except CaseError as error:
@@ -143,11 +149,17 @@ class Sweep(CaseFile):
         return member.case
 
     def members(self, most: int = MOST_MEMBERS) -> list[SweepMember]:
-        """All members in their order, or ``most`` of them drawn; raises CaseError if none of these is a valid case."""
+        """All members in their order, or ``most`` of them drawn.
+
+        Raises CaseError if none of these is a valid case, and if one is not because of what its disorder draws: the
+        samples that are left would be of another distribution.
+        """
         numbers = np.arange(self.count)
         if most < self.count:
             numbers = np.sort(np.random.default_rng(0).choice(self.count, most, replace=False))
         members = [self.member(number) for number in numbers]
+        if refused := {str(p): p for member in members for p in member.problems if p.key.startswith("disorder")}:
+            raise CaseError(refused.values(), self.name)
         if not any(member.case for member in members):
             raise CaseError(members[0].problems, self.name)
         return members
@@ -163,16 +175,18 @@ class Sweep(CaseFile):
 def _leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
     """Every key with its value, as "a.b.c"; a range is one value."""
     for key, value in tree.items():
-        if isinstance(value, dict) and not value.keys() & {"log", "linear"}:
+        if isinstance(value, dict) and not value.keys() & {"log", "linear"} and path + key != SEED:
             yield from _leaves(value, f"{path}{key}.")
         else:
             yield path + key, value
 
 
 def _values(value: Any) -> tuple[Any, ...]:
-    """The values of a list or a range; raises ValueError with the remedy."""
+    """The values of a list or a range, of seeds from 0 for a count alone; raises ValueError with the remedy."""
     if isinstance(value, list) and value:
         return tuple(value)
+    if isinstance(value, dict) and value.keys() == {"count"} and type(value["count"]) is int and value["count"] > 0:
+        return tuple(range(min(value["count"], MOST_MEMBERS + 1)))
     remedy = "give a list of values, { log = [first, last], count = n } or { linear = [first, last], count = n }"
     if not isinstance(value, dict) or len(value) != 2 or "count" not in value:
         raise ValueError(remedy)

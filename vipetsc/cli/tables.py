@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
+from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.io.folder import provenance
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
@@ -138,6 +139,22 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
         ("cost", f"about {steps:.3g} steps of engine ts, {duration} on {ranks} rank{'s' * (ranks > 1)}"
                  " before contacts"),
     ]  # fmt: skip
+
+
+def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> list[tuple[str, str]]:
+    """What scatters, how, and the first values drawn: ``drawn`` beside the case without scatter, ``nominal``."""
+    before, after = (values_of(case.lattice, case.contacts) for case in (nominal, drawn))
+    rows = []
+    for name, deviation in disorder.quantities().items():
+        new = after[name] if name == "sites" else np.divide(after[name], before[name])
+        beside = "cells " if name == "sites" else "times "
+        rows.append(
+            (
+                f"disorder of {name}",
+                f"{deviation}; seed {disorder.seed}: {beside}{_first_few([f'{x:.5g}' for x in new])}",
+            )
+        )
+    return rows
 
 
 def _first_few(items: Sequence[object]) -> str:

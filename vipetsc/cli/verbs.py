@@ -14,7 +14,7 @@ from typing import TextIO, TypeVar
 from mpi4py import MPI
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
-from vipetsc.case.every import load_every
+from vipetsc.case.every import disorder_of, load_every
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
 from vipetsc.cli.plot import draw_source, source_of
@@ -137,6 +137,7 @@ def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> 
         for case in cases:
             check_options(case)
         rows = [row for case in cases for row in tables.case_rows(case, comm.size)]
+        rows += tables.disorder_rows(*disorder) if (disorder := disorder_of(options.case, options.set)) else []
         return "\n".join(
             [tables.table(rows)] + [f"warning: {warning}" for case in cases for warning in case.warnings()]
         )

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import percentile_norm
+from vipetsc.figures.panels import band_of, percentile_norm
 from vipetsc.figures.study import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import select
@@ -27,12 +27,16 @@ MOST_COLUMNS = 3  # of histories
 
 
 class EntropyCurve(NamedTuple):
-    """Mean entropy over the amplitude (N), normalised to [.01, 1], its deviation over the cells, its power law."""
+    """Mean entropy over the amplitude (N), normalised to [.01, 1], its deviation over the cells, its power law.
+
+    ``band`` has the lowest and the highest quantile over the samples, on the same scale.
+    """
 
     amplitude: np.ndarray
     value: np.ndarray
     error: np.ndarray
     fit: dict[str, float]
+    band: Sequence[np.ndarray] | None
 
     @classmethod
     def of(cls, row: xr.Dataset, average: str) -> Self | None:
@@ -43,8 +47,10 @@ class EntropyCurve(NamedTuple):
             return None
         names = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
         fit = {name: float(row[f"fits/entropy/{average}/{name}"]) for name in names}
-        deviation = 0.99 * error[valid] / np.ptp(value[valid])
-        return cls(row[AMPLITUDE].values[valid], normalised(value[valid]), deviation, fit)
+        scale = 0.99 / np.ptp(value[valid])
+        ends = band_of(row, f"entropy/{average}")
+        band = ends and [0.01 + scale * (end[valid] - value[valid].min()) for end in ends]
+        return cls(row[AMPLITUDE].values[valid], normalised(value[valid]), scale * error[valid], fit, band)
 
 
 def entropy(sweeps: Sweeps) -> Iterator[style.Drawing]:
@@ -181,6 +187,9 @@ def _panels(rows: int, columns: int, height: float, heading: str) -> tuple[Figur
 
 
 def _points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
+    if curve.band:
+        shade = {"color": COLOURS[average], "alpha": 0.25, "lw": 0, "label": "5 to 95 % of samples"}
+        axes.fill_between(curve.amplitude, *curve.band, **shade)
     pale = tuple(0.5 + 0.5 * np.array(to_rgb(COLOURS[average])))
     axes.errorbar(curve.amplitude, curve.value, curve.error, fmt="o-", color=COLOURS[average], ecolor=pale, ms=size,
                   mew=0, lw=0.6, elinewidth=0.4, label=f"{AVERAGES[average]}, ± std over the cells")  # fmt: skip

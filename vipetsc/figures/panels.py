@@ -1,6 +1,6 @@
 """Panels that figures share: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,14 @@ ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
 KAPPA, OMEGA = "Wavenumber κ (π rad/cell)", "Frequency ω (krad/s)"
+
+
+def band_of(row: Mapping[Any, Any], name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Lowest and highest quantile (point) over the samples of the measure ``name``; None of a sweep without samples."""
+    if f"statistics/{name}/quantiles" not in row:
+        return None
+    quantiles = row[f"statistics/{name}/quantiles"].transpose("quantile", ...).values
+    return quantiles[0], quantiles[-1]
 
 
 def annotate_empty(axes: Axes, reason: str) -> None:

@@ -17,7 +17,7 @@ from vipetsc.figures import style
 from vipetsc.figures.panels import ROMAN, recorded_sites
 from vipetsc.figures.style import Drawing
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.io.read import axes, curves, field_time, open_run, whole_members
+from vipetsc.io.read import axes, curves, field_time, open_run, over_samples, whole_members
 from vipetsc.lattice import waves_at
 from vipetsc.lattice.chain import cells_between
 
@@ -41,10 +41,13 @@ class Files(ExitStack):
 
 
 class Sweeps(list[xr.Dataset]):
-    """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`; ``files`` are those of their members."""
+    """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`; ``files`` are those of their members.
+
+    Of a sweep over samples means stand for what was measured of each, and the first sample for their runs.
+    """
 
     def __init__(self, ensembles: Iterable[xr.Dataset], files: Files) -> None:
-        super().__init__(ensembles)
+        super().__init__(map(over_samples, ensembles))
         self.files = files
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import style
-from vipetsc.figures.panels import note, recorded_sites, shade_regions
+from vipetsc.figures.panels import band_of, note, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
 from vipetsc.figures.study import AMPLITUDE, Files, Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
 from vipetsc.io.netcdf import open_netcdf
@@ -79,6 +79,9 @@ def _page(reading: str, of_reading: Sequence[Curve]) -> Figure:
             line_style = {"color": f"C{number}", "marker": MARKERS[number % len(MARKERS)], "ms": 2.2, "lw": 0.7}
             for axes in (linear, logarithmic):
                 axes.plot(amplitudes, transfer, label=kinds[number], **line_style)
+                if band := band_of(curve.data, "ibtet"):
+                    label = "" if line else "5 to 95 % of samples"
+                    axes.fill_between(amplitudes, *band, color=f"C{number}", alpha=0.25, lw=0, label=label)
                 if np.isfinite(curve.data["floor"]):
                     axes.axhline(float(curve.data["floor"]), color=f"C{number}", lw=0.6, ls=style.DASHED, zorder=1)
             # A ring round the largest value of each, and what it is.

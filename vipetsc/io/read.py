@@ -73,6 +73,20 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
     return data.assign(number=(data["status"].dims, number, {"long_name": "number of the member, from 0"}))
 
 
+def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
+    """The ensemble without the axis of its samples, if it has one: means in place of what was measured of each.
+
+    What has no mean is that of the first sample; ``statistics/<name>/quantiles`` stay.
+    """
+    if "statistics/samples" not in ensemble:
+        return ensemble
+    (seed,) = (dim for dim in axes(ensemble) if ensemble[dim].attrs["long_name"] == "disorder.seed")
+    first = ensemble.isel({seed: 0}, drop=True)
+    means = {name: (f"statistics/{name}/mean", f"statistics/{name}") for name in map(str, ensemble.data_vars)}
+    replaced = {name: first[path] for name, paths in means.items() for path in paths if path in first}
+    return first.assign({name: item.assign_attrs(ensemble[name].attrs) for name, item in replaced.items()})
+
+
 def outdated(folder: Path) -> str:
     """Empty; of a sweep of an earlier version, which has a folder for every member, what is to be done about it."""
     remedy = "the verb sweep makes it again with --force, or elsewhere with --out"

@@ -11,11 +11,13 @@ import xarray as xr
 
 import vipetsc
 from vipetsc.case import Sweep
+from vipetsc.case.disorder import SEED
 from vipetsc.case.sweep import coordinate
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
 from vipetsc.io.records import Line, Record, merge_records, read_records
 from vipetsc.spectra import FEWEST, doubt, normalised, power_law
 from vipetsc.studies.linear import FITTED, MEASURES, RECORDS, LinearRun, record_files
+from vipetsc.studies.samples import over_samples
 
 FORMAT_VERSION = 2
 STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached before a stop
@@ -195,6 +197,11 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     about |= {name: sorted(values) for name, values in results.used.items()}
     about |= {"case": plan.to_toml(), "failed": failed, "warnings": json.dumps(warnings)}
     data |= _fits(data, names[AMPLITUDE]) if AMPLITUDE in names else {}
+    if any(axis.keys() == {SEED} for axis in plan.axes):
+        data |= over_samples(data, names[SEED], [name for name in STATISTICS | MEASURES if name in data])
+        means = {name: data[f"statistics/{name}/mean"] for name in FITTED if name in data}
+        along = {name: data[name] for key, name in names.items() if key == AMPLITUDE}
+        data |= {f"statistics/{name}": fit for key in along for name, fit in _fits(means | along, key).items()}
     write_netcdf(results.folder / "ensemble.h5", xr.Dataset(data, attrs=about))
 
 

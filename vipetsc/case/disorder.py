@@ -1,0 +1,136 @@
+"""Scatter of a case's numbers: the section ``[disorder]``, from which values are drawn that the resolved case holds.
+
+A resolved case has these values in place of the section: whatever is made of it does not know that they were drawn, and
+a run tells what was simulated. Each quantity has a generator of its own (Philox), keyed by the seed and its name: the
+same numbers on any number of ranks, in any order, beside any other quantity.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vipetsc.case.reading import Problem, Section, Table
+from vipetsc.case.schema import CONTACTS, ContactsTable, LatticeTable
+from vipetsc.lattice import UnitCell
+
+SEED = "disorder.seed"
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Deviation(Section):
+    """Standard deviation of values about those of the case: ``relative`` to each, or ``absolute`` in its unit.
+
+    Their mean is the case's value with every ``distribution``; ``uniform`` ends sqrt(3) deviations from it.
+    """
+
+    relative: NotNegative | None = None
+    absolute: NotNegative | None = None
+    distribution: Literal["normal", "uniform", "lognormal"] = "normal"
+
+    def draw(self, values: np.ndarray, seed: int, name: str) -> np.ndarray:
+        """Values (n) of the quantity ``name`` about ``values`` (n); a larger n begins with the same numbers."""
+        key = np.random.SeedSequence([seed, int.from_bytes(name.encode(), "little")])
+        generator = np.random.Generator(np.random.Philox(key))
+        deviation = np.full(len(values), self.absolute) if self.relative is None else self.relative * np.abs(values)
+        if self.distribution == "uniform":
+            return values + deviation * np.sqrt(3) * generator.uniform(-1, 1, len(values))
+        normal = generator.standard_normal(len(values))
+        if self.distribution == "normal":
+            return values + deviation * normal
+        spread = np.log1p((deviation / values) ** 2)  # variance of the logarithm
+        return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
+
+    def __str__(self) -> str:
+        size = f"{100 * self.relative:g} %" if self.relative is not None else f"{self.absolute:g}"
+        return f"{self.distribution}, deviation {size}"
+
+
+class DisorderTable(Section):
+    """What scatters about the values of the case, and the ``seed`` of what is drawn.
+
+    Of every site: ``clearance`` (m), ``sites`` (the cell, rounded). Of all sites together: ``restitution``,
+    ``stiffness`` (N/m^n) or ``modulus`` (Pa). Of the cell, the same in all cells: ``masses`` (kg), ``springs`` (N/m).
+    """
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    clearance: Deviation | None = None
+    sites: Deviation | None = None
+    restitution: Deviation | None = None
+    stiffness: Deviation | None = None
+    modulus: Deviation | None = None
+    masses: Deviation | None = None
+    springs: Deviation | None = None
+
+    def quantities(self) -> dict[str, Deviation]:
+        """What scatters, by name."""
+        return {name: getattr(self, name) for name in type(self).model_fields if name != "seed" and getattr(self, name)}
+
+
+def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Sequence[float]]:
+    """The quantities of a resolved case by name, those it has not empty; ``modulus`` is what is proportional to it."""
+    cell, sites, clearance = lattice.unit_cell(), contacts.sites, contacts.clearance
+    assert isinstance(sites, list) and isinstance(clearance, list)
+    stiffness = [contacts.stiffness] if contacts.stiffness else []
+    of_sites: dict[str, Sequence[float]] = {"clearance": clearance, "sites": sites}
+    of_law = {"restitution": [contacts.restitution], "stiffness": stiffness, "modulus": stiffness}
+    return of_sites | of_law | {"masses": cell.masses, "springs": [spring.stiffness for spring in cell.springs]}
+
+
+def scatter(
+    tables: dict[str, Table], disorder: DisorderTable, lattice: LatticeTable, contacts: ContactsTable
+) -> tuple[dict[str, Table], list[Problem]]:
+    """The resolved ``tables`` of a run with what ``disorder`` draws, and the problems of that.
+
+    ``lattice`` and ``contacts`` are the sections before they were resolved. A drive and times that follow from the
+    cell are those of the case without scatter.
+    """
+    law, problems, drawn = dict(tables["contacts"]), list[Problem](), dict[str, list[float]]()
+    known = values_of(lattice, ContactsTable(**law))
+    known["modulus"] = [contacts.modulus] if contacts.modulus and known["stiffness"] else []
+    for name, deviation in disorder.quantities().items():
+        key, values = f"disorder.{name}", np.asarray(known[name], float)
+        if (deviation.relative is None) == (deviation.absolute is None) or (name == "sites" and deviation.relative):
+            remedy = "give absolute, in cells" if name == "sites" else "give one of relative and absolute"
+            problems.append(Problem(key, deviation.model_dump(exclude_none=True), remedy))
+        elif not values.size:
+            problems.append(Problem(key, None, "the case has none that could scatter"))
+        elif deviation.relative or deviation.absolute:  # none leaves the case as it is, to the last bit
+            new = deviation.draw(values, disorder.seed, name)
+            if (wrong := ~(new * values > 0) & (new != values)).any():
+                numbers = [float(f"{x:.4g}") for x in new[wrong]]
+                remedy = (
+                    f"drawn with seed {disorder.seed}, but a sign cannot change: take a smaller deviation, or lognormal"
+                )
+                problems.append(Problem(key, numbers, remedy))
+            drawn[name] = new.tolist()
+    if problems or not drawn:
+        empty = Problem(
+            "disorder", disorder.seed, "names nothing that scatters, as in: clearance = { relative = 0.01 }"
+        )
+        return tables, problems if disorder.quantities() else [empty]
+    law |= {name: drawn[name] for name in ("clearance",) if name in drawn}
+    law |= {name: drawn[name][0] for name in ("restitution", "stiffness") if name in drawn}
+    if "sites" in drawn:
+        law["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
+    if "modulus" in drawn and contacts.modulus:
+        law["stiffness"] *= drawn["modulus"][0] / contacts.modulus
+    tables = tables | {"contacts": law}
+    if drawn.keys() & {"masses", "springs"}:
+        tables["lattice"] = _with_cell(tables["lattice"], lattice.unit_cell(), drawn)
+        if lattice.preset and "stiffness" in law:
+            law.setdefault("radius", CONTACTS["radius"])
+    return tables, []
+
+
+def _with_cell(lattice: Table, cell: UnitCell, drawn: dict[str, list[float]]) -> Table:
+    """The table ``lattice`` with a cell of its own, of the masses and springs ``drawn``."""
+    stiffness: list[float] = drawn.get("springs", [spring.stiffness for spring in cell.springs])
+    springs: list[dict[str, Any]] = [
+        {"start": s.start + 1, "end": s.end + 1, "stiffness": k, "next_cell": s.next_cell}
+        for s, k in zip(cell.springs, stiffness, strict=True)
+    ]
+    table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}
+    rest = {key: value for key, value in lattice.items() if key not in ("preset", "lambda", "eta")}
+    return rest | {"cell": table | {"contact": [cell.host + 1, cell.resonator + 1]}}
