@@ -4,3 +4,4 @@ from vipetsc.lattice.bands import Band, BlochPoint, bloch, gaps, max_group_veloc
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain, ToneBurst
 from vipetsc.lattice.contact import Contact, contact_stiffness
+from vipetsc.lattice.modes import Modes, modes_of

@@ -4,5 +4,6 @@ from vipetsc.spectra.bands import Parts, front_arrival, ibtet, part_energies, pa
 from vipetsc.spectra.entropies import Entropy, averages, entropy, local_entropy
 from vipetsc.spectra.fits import FEWEST, PowerLaw, doubt, normalised, power_law
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
+from vipetsc.spectra.modal import ModalParts, upper_share
 from vipetsc.spectra.pooling import block_means, block_sums, blocks
 from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform

@@ -1,0 +1,164 @@
+"""The linear modes of a finite lattice, or waves on a ring where modes are too many.
+
+Without contacts M u'' + K u = f. With x = M^(1/2) u and the orthonormal vectors of M^(-1/2) K M^(-1/2) v = Om^2 v the
+complex amplitudes z = v*.x' + i Om v*.x obey z' = i Om z + v*.M^(-1/2) f. The energy |z|^2/2 of a mode changes by
+forces alone, and the energies of all modes sum to the kinetic energy and that of the springs.
+
+The modes of a ring are Bloch waves, at 2 pi/cells times whole numbers. Beyond ``MOST_DOFS`` a lattice with ends is
+taken for a part of a ring: with one more cell, at rest, that is a wall on both sides, and energies sum up; free ends
+lack the spring that a ring has between them. A wave that meets an end is seen in other bands too until it has left.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import eigh, eigvals_banded, lapack
+from scipy.sparse import csc_matrix, diags
+
+from vipetsc.lattice.bands import bloch
+from vipetsc.lattice.chain import Chain, ToneBurst
+
+MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size
+CLOSE = 1e-3  # modes nearer than this share of the largest Om^2 are made orthogonal one by one
+ORTHONORMAL = 2e-13  # error of the norm of any field in all modes up to which they are taken
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Modes of ``chain``: ``frequency`` (mode) in rad/s, ``wavenumber`` (mode) in rad per cell, ``vectors``.
+
+    Of a lattice with ends ``vectors`` is (cell and dof, mode), and a wavenumber, in [0, pi], is that of the standing
+    wave, in a gap its real part. If it is ``exact`` no more, and of a ring, modes are waves on ``cells`` cells with
+    vectors (k, dof, band) for k >= 0; positive wavenumbers go to higher cells.
+    """
+
+    chain: Chain
+    frequency: np.ndarray
+    wavenumber: np.ndarray
+    vectors: np.ndarray
+    exact: bool
+    cells: int
+
+    def amplitudes(self, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Amplitudes z (t, mode) in sqrt(J) of fields (t, cell, dof) in m and m/s."""
+        root, nt = np.sqrt(self.chain.cell.masses), len(velocity)
+        fields = np.concatenate([velocity * root, displacement * root])
+        if self.vectors.ndim == 2:
+            parts = fields.reshape(2 * nt, -1) @ self.vectors
+            return np.asarray(parts[:nt] + 1j * self.frequency * parts[nt:])
+        spectrum = np.fft.rfft(fields, self.cells, axis=1, norm="ortho").swapaxes(0, 1)
+        waves = (spectrum @ self.vectors.conj()).swapaxes(0, 1)
+        rate, turned = waves[:nt], 1j * self.frequency[: waves[0].size].reshape(waves.shape[1:]) * waves[nt:]
+        back = self._backward(waves.shape[1])
+        pairs = rate + turned, (rate - turned)[:, back].conj()
+        return np.concatenate([z.reshape(nt, -1) for z in pairs], axis=1)
+
+    def _backward(self, count: int) -> slice:
+        """Of ``count`` wavenumbers k >= 0 those whose opposites are others."""
+        return slice(1, count - (self.cells % 2 == 0))
+
+    def force(self, cell: int, mass: int) -> np.ndarray:
+        """What 1 N on a ``mass`` of a ``cell`` (0-based) adds to z' (mode), in 1/sqrt(kg)."""
+        root = np.sqrt(self.chain.cell.masses[mass])
+        if self.vectors.ndim == 2:
+            return np.asarray(self.vectors[cell * self.chain.cell.dofs + mass] / root)
+        k = np.arange(len(self.vectors))
+        shift = np.exp(-2j * np.pi * k * cell / self.cells) / np.sqrt(self.cells)
+        waves = self.vectors[:, mass].conj() * shift[:, None]
+        return np.concatenate([waves.ravel(), waves[self._backward(len(k))].conj().ravel()]) / root
+
+    def later(self, amplitudes: np.ndarray, interval: float) -> np.ndarray:
+        """Free ``amplitudes`` (mode) after an ``interval`` in s."""
+        return np.asarray(amplitudes * np.exp(1j * self.frequency * interval))
+
+    def driven(self, drive: ToneBurst, start: float, stop: float) -> np.ndarray:
+        """What ``drive`` adds from ``start`` to ``stop`` (s) to the amplitudes (mode) at ``stop``, for ``force`` 1.
+
+        The integral of exp(i Om (stop - s)) F(s), whose F is a sum of three sines, in closed form.
+        """
+        end = min(max(stop, 0.0), drive.duration)
+        begin = min(max(start, 0.0), end)
+        middle, length, total = (begin + end) / 2, end - begin, np.zeros(len(self.frequency), complex)
+        for share, factor in ((1.0, 1.0), (-0.5, 1 + 1 / drive.cycles), (-0.5, 1 - 1 / drive.cycles)):
+            for sign in (1, -1):
+                detuning = sign * factor * drive.frequency - self.frequency
+                wave = np.exp(1j * (self.frequency * stop + detuning * middle))
+                total += sign * share / 2j * wave * np.sinc(detuning * length / (2 * np.pi))
+        return total * drive.window_amplitude * length
+
+
+def modes_of(chain: Chain) -> Modes:
+    """The modes of ``chain`` without its sites, computed once: 1200 DoFs take about a second and 12 MB."""
+    return _modes(replace(chain, sites=(), clearances=()))
+
+
+@lru_cache(maxsize=4)
+def _modes(chain: Chain) -> Modes:
+    ring = chain.ends == "periodic"
+    if ring or chain.cells * chain.cell.dofs > MOST_DOFS:
+        return _ring(chain, chain.cells + (chain.ends == "fixed"), ring)
+    root = diags(1 / np.sqrt(chain.masses()))
+    matrix = csc_matrix(root @ chain.stiffness_matrix() @ root)
+    squared, vectors = _near_diagonal(matrix)
+    x = np.random.default_rng(0).standard_normal((2, len(squared)))
+    if np.any(np.abs(np.sum((x @ vectors) ** 2, axis=1) / np.sum(x**2, axis=1) - 1) > ORTHONORMAL):
+        squared, vectors = eigh(matrix.toarray(), driver="evr")
+    squared[squared < 1e-13 * squared[-1]] = 0.0  # free ends
+    return Modes(chain, np.sqrt(squared), _wavenumbers(vectors, chain), vectors, True, chain.cells)
+
+
+def _ring(chain: Chain, cells: int, exact: bool) -> Modes:
+    kappa = 2 * np.pi * np.arange(cells // 2 + 1) / cells
+    waves = bloch(chain.cell, kappa)
+    vectors = waves.vectors * np.sqrt(chain.cell.masses)[:, None]
+    back = slice(1, len(kappa) - (cells % 2 == 0))
+    # exp(i (k x + Om t)) goes to lower cells.
+    number = np.concatenate([-kappa, kappa[back]])
+    frequency = np.concatenate([waves.frequency, waves.frequency[back]]).ravel()
+    return Modes(chain, frequency, np.repeat(number, chain.cell.dofs), vectors, exact, cells)
+
+
+def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues, lowest first, and vectors of a symmetric banded ``matrix``, by inverse iteration.
+
+    Vectors of eigenvalues closer than ``CLOSE`` are made orthogonal to one another; whether that made all so, the
+    caller finds out. It takes a fifth of the time of a dense solution.
+    """
+    n, width = matrix.shape[0], int(np.abs(np.subtract(*matrix.nonzero())).max())
+    band = np.zeros((3 * width + 1, n))
+    for k in range(-width, width + 1):
+        diagonal = matrix.diagonal(k)
+        band[2 * width - k, max(k, 0) : max(k, 0) + len(diagonal)] = diagonal
+    squared = eigvals_banded(band[2 * width :], lower=True)
+    vectors, noise = np.zeros((n, n), order="F"), np.random.default_rng(1).standard_normal((n, n))
+    first, shift = 0, -np.inf
+    for j, value in enumerate(squared):
+        first += int(np.searchsorted(squared[first:j], value - CLOSE * squared[-1]))
+        shift = max(value, shift + 4 * np.finfo(float).eps * squared[-1])
+        shifted = band.copy(order="F")
+        shifted[2 * width] -= shift
+        factor, pivots, _ = lapack.dgbtrf(shifted, width, width, overwrite_ab=True)
+        x, close = noise[j], vectors[:, first:j]
+        for _ in range(3):
+            x, _ = lapack.dgbtrs(factor, width, width, x, pivots)
+            x /= np.linalg.norm(x)
+            for _ in range(2):
+                x -= close @ (close.T @ x)
+                x /= np.linalg.norm(x)
+        vectors[:, j] = x
+    return squared, vectors
+
+
+def _wavenumbers(vectors: np.ndarray, chain: Chain) -> np.ndarray:
+    """Wavenumbers (mode): of a standing wave two neighbours of a cell sum to 2 cos(kappa) times itself."""
+    shapes = vectors.reshape(chain.cells, -1, vectors.shape[1])
+    inside = slice(1, -1) if chain.cells > 2 else slice(None)
+    sums = np.zeros_like(shapes)
+    sums[1:] += shapes[:-1]
+    sums[:-1] += shapes[1:]
+    products = np.einsum("xdn,xdn->n", shapes[inside], sums[inside])
+    norms = np.einsum("xdn,xdn->n", shapes[inside], shapes[inside])
+    # A mode may be at rest in the one cell between two others.
+    cosines = np.divide(products, 2 * norms, out=np.zeros_like(norms), where=norms > 1e-12)
+    return np.arccos(np.clip(cosines, -1, 1))
