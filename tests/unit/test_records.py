@@ -1,6 +1,7 @@
 """Records come back as they were written; a line that was cut off or damaged is named and costs no other."""
 
 import os
+import resource
 
 import pytest
 
@@ -66,3 +67,18 @@ def test_a_full_disk_names_the_file(tmp_path):
         put(tmp_path / "a.jsonl", ROWS)
     injector.disarm()
     assert read(tmp_path / "a.jsonl") == (ROWS[:1], [])
+
+
+def test_a_disk_that_takes_a_part_of_a_line_is_full(tmp_path):
+    path = tmp_path / "a.jsonl"
+    put(path, ROWS[:1])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"a\.jsonl could not be written: File too large"):
+            put(path, ROWS[1:2])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert read(path)[0] == ROWS[:1] and len(read(path)[1]) == 1
+    put(path, ROWS[1:])
+    assert read(path)[0] == ROWS

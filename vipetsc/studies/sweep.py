@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from mpi4py import MPI
 
@@ -96,8 +97,14 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     store = MemberStore(plan, folder, team, stop, comm.rank)
 
     # What there is and what comes first is decided on one rank: another may not see the files of the others yet.
-    survey = _Survey(plan)
-    linear, store.linear = on_root(comm, lambda: survey.look(folder))
+    survey: _Survey
+
+    def look() -> tuple[dict[str, tuple[Case, list[int]]], dict[str, LinearRun | str]]:
+        nonlocal survey
+        survey = _survey(plan, folder)
+        return survey.needed, dict(survey.results.linear if len(survey.missing) else {})
+
+    linear, store.linear = on_root(comm, look)
     pool.share(list(linear), lambda name: store.make_linear(*linear[name]))
     for name, run in (item for known in comm.allgather(store.linear) for item in known.items()):
         store.linear[name] = run if isinstance(run, str) else run.joined(store.linear.get(name))
@@ -119,45 +126,19 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     return SweepResult(status, made, seconds, busy, folder, warnings)
 
 
-class _Survey:
-    """What there is of a sweep and what is missing, on one rank.
+class _Survey(NamedTuple):
+    """What there is of a sweep, the numbers of the ``missing`` members, and sentences about what is ``lost``.
 
-    Of the missing members, if they are many, some are drawn that stand for the others: they tell which linear runs are
-    needed, and what a member costs.
+    Of the missing members, if they are many, some are ``drawn`` that stand for the others: number, case, name of the
+    linear run. They tell what a member costs, and the linear runs that are ``needed``: cases by name, with the first
+    sites to measure them for.
     """
 
     results: Results
-
-    def __init__(self, plan: Sweep) -> None:
-        self.plan, self.lost = plan, list[str]()
-
-    def look(self, folder: Path) -> tuple[dict[str, tuple[Case, list[int]]], dict[str, LinearRun | str]]:
-        """The cases of missing linear runs by name, with the first sites to measure them for; the runs that are there.
-
-        Members that have failed are missing, and those whose fields cannot be read.
-        """
-        results = self.results = Results(self.plan, folder)
-        missing = (results.status != COMPLETE) & (results.status != SCALED)
-        if self.plan.options.fields:
-            files = "run.h5", "analysis.h5"
-            missing |= [not all(is_whole(folder / name / file, self.lost) for file in files) for name in results.ids]
-        self.missing = np.unique(results.first[missing])
-        drawn = self.missing
-        if len(drawn) > MOST_SURVEYED:
-            drawn = np.sort(np.random.default_rng(0).choice(drawn, MOST_SURVEYED, replace=False))
-        members = [(number, self.plan.member(number).case) for number in drawn]
-        self.drawn = [(number, case, linear_name(case)) for number, case in members if case]
-        needed: dict[str, tuple[Case, list[int]]] = {}
-        for _, case, name in self.drawn:
-            _, sites = needed.setdefault(name, (case, []))
-            if not self.plan.options.fields and leading_cell(case) not in sites:
-                sites.append(leading_cell(case))
-        for name, (_, sites) in [*needed.items()]:
-            if name in results.linear:
-                sites[:] = [site for site in sites if site not in results.linear[name].measures]
-                if not sites:
-                    del needed[name]
-        return needed, dict(results.linear if len(drawn) else {})
+    missing: np.ndarray
+    drawn: list[tuple[int, Case, str]]
+    needed: dict[str, tuple[Case, list[int]]]
+    lost: list[str]
 
     def order(self, linear: dict[str, LinearRun | str]) -> list[int]:
         """The missing members, the longest first: contacts at every site that the linear wave would reach cost most."""
@@ -169,6 +150,28 @@ class _Survey:
         # One that is not known costs what the last one before it does that is.
         place = np.searchsorted(known, self.missing, "right") - 1
         return list(self.missing[np.argsort(-np.array(cost)[place], kind="stable")].tolist())
+
+
+def _survey(plan: Sweep, folder: Path) -> _Survey:
+    """Look through ``folder``: members that have failed are missing, and those whose fields cannot be read."""
+    results, lost = Results(plan, folder), list[str]()
+    absent = (results.status != COMPLETE) & (results.status != SCALED)
+    if plan.options.fields:
+        files = "run.h5", "analysis.h5"
+        absent |= [not all(is_whole(folder / name / file, lost) for file in files) for name in results.ids]
+    some = missing = np.unique(results.first[absent])
+    if len(missing) > MOST_SURVEYED:
+        some = np.sort(np.random.default_rng(0).choice(missing, MOST_SURVEYED, replace=False))
+    cases = [(number, plan.member(number).case) for number in some.tolist()]
+    drawn = [(number, case, linear_name(case)) for number, case in cases if case]
+    needed: dict[str, tuple[Case, list[int]]] = {}
+    for _, case, name in drawn:
+        _, sites = needed.setdefault(name, (case, []))
+        known = results.linear[name].measures if name in results.linear else ()
+        if not plan.options.fields and leading_cell(case) not in (*sites, *known):
+            sites.append(leading_cell(case))
+    needed = {name: run for name, run in needed.items() if run[1] or name not in results.linear}
+    return _Survey(results, missing, drawn, needed, lost)
 
 
 def is_whole(path: Path, lost: list[str]) -> bool:
@@ -196,7 +199,7 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__, "sweep": plan.name}
     index = about | {"members": count, "failed": failed}
     warned = Counter(text for first in results.first for text in results.warnings.get(int(first), ()))
-    warnings = [f"{count} members: {sentence}" for sentence, count in warned.items()]
+    warnings = [f"{n} member{'s' * (n > 1)}: {sentence}" for sentence, n in warned.items()]
     path, text = folder / "index.json", json.dumps(index, indent=1, default=int) + "\n"
     told = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
     # The index comes last: with it and nothing made since, the ensemble is that of these members.
