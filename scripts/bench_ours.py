@@ -40,12 +40,14 @@ class Flight:
         self.layout = layout = Layout(self.model, comm)
         self.engine = kind(self.model, layout)
         setup = Setup(case, self.model, layout, EnergyMeter(self.model, layout), self.engine, self.output)
-        self._run = Run(setup, (Guard.name, Ledger.name))
+        self._run = Run(setup, (Guard, Ledger))
 
     def advance(self, begin: int, end: int) -> None:
         """Go from a sample to a later one and record none; ``ts`` ends a step at each, the propagator anyhow."""
-        targets = range(begin + 1, end + 1) if self.engine.name == "ts" else [end]
-        for sample in targets:
+        if self.engine.name == "propagator":
+            self.engine.fill(self._run.recorder.room(end + 1, 0))
+            return
+        for sample in range(begin + 1, end + 1):
             self.engine.advance(sample * self.model.sample_interval)
 
     def velocities(self) -> tuple[np.ndarray, float]:

@@ -110,17 +110,17 @@ class Watch(Observer):
         return {"fastest": self.fastest, "watched": self.seen}
 
 
-def test_an_observer_is_taken_by_its_name_and_goes_on_with_the_run(folder):
+def test_an_observer_is_given_and_goes_on_with_the_run(folder):
     case = small_case(time={"end": 0.04})
-    straight = simulate(case, folder / "straight", observers=["test-watch"])
+    straight = simulate(case, folder / "straight", observers=[Watch])
     assert Watch.calls == ["begin", "finish"]
     run = datasets(folder / "straight" / "run.h5")
     assert straight.statistics["fastest"] == np.abs(run["velocity"]).max()
     assert straight.statistics["watched"] == list(enumerate(run["time"].tolist()))
 
-    stopped = simulate(case, folder / "stopped", stop=StopAt(150), observers=["test-watch"])
+    stopped = simulate(case, folder / "stopped", stop=StopAt(150), observers=[Watch])
     assert Watch.calls == ["begin", "flush", "checkpoint", "stopped"]
-    resumed = simulate(case, folder / "stopped", resume=True, observers=["test-watch"])
+    resumed = simulate(case, folder / "stopped", resume=True, observers=[Watch])
     assert Watch.calls == ["begin", "restore", "finish"]
     assert stopped.statistics["watched"] + resumed.statistics["watched"] == straight.statistics["watched"]
     for name in ("fastest", "ledger_error", "work", "dissipated", "episodes", "samples", "steps", "switches", "grazes"):
@@ -153,7 +153,7 @@ def test_what_an_observer_refuses_within_a_block_is_not_recorded(folder, engine)
     case = small_case(time={"end": 0.03, "engine": engine}, output={"stride": 3})
     whole = simulate(case, folder / "whole")
     assert whole.complete
-    result = simulate(case, folder / "run", observers=["test-halves"])
+    result = simulate(case, folder / "run", observers=[Halves])
     last = case.model().sample_interval * 99
     assert result.sentence.startswith("far enough, at t = 0.02 s")
     assert result.sentence.endswith(f"last good sample: t = {last:.6g} s")

@@ -169,7 +169,7 @@ def run_table(result: "Result") -> str:
         steps = f"{s['steps']} linear ({s['method']}, {s['bandwidth']} cells each way, exact to {s['truncation']:.1g})"
         steps += f", {s['substeps']} with forces"
     else:
-        steps = f"{s['steps']} accepted, {s['rejected']} rejected ({s['method']}, {s['right_hand_side']})"
+        steps = f"{s['steps']} accepted, {s['rejected']} rejected ({s['method']})"
     energy = ""
     if s.get("work"):
         share = f"dissipated {100 * s['dissipated'] / s['work']:.4g} %"
@@ -261,7 +261,7 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
         compile_callback()
         rows.append(("native right-hand side", "yes"))
     except (AttributeError, OSError) as error:
-        rows.append(("native right-hand side", f"no, the Python one is used ({error})"))
+        rows.append(("native right-hand side", f"no: runs need PETSc's symbols ({error})"))
     hosts = comm.allgather(MPI.Get_processor_name())
     rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
     healthy = all(value is not None for _, value, _ in checks)

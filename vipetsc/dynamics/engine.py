@@ -37,8 +37,8 @@ class Engine(ABC):
     time: float
 
     @abstractmethod
-    def __init__(self, model: Model, layout: Layout, native: bool = True, stop: StopRequest | None = None) -> None:
-        """An engine for ``model`` at rest at t = 0, on all ranks; ``native``: no Python in the right-hand side."""
+    def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
+        """An engine for ``model`` at rest at t = 0, on all ranks, which looks at requests to ``stop``."""
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:

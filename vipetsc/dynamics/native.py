@@ -1,21 +1,28 @@
 """Functions of PETSc for compiled code, which has no petsc4py; handles and pointers are int64."""
 
 import ctypes
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from petsc4py import PETSc
 
 from llvmlite import binding
-from numba import types
+from numba.core.types import ExternalFunction, int32, int64, voidptr
 from numba.extending import intrinsic
 
-external: Any = types.ExternalFunction
-get_read, restore_read, get_write, restore_write = (
-    external(f"Vec{verb}Array{access}", types.int32(types.int64, types.int64))
-    for access in ("Read", "Write")
-    for verb in ("Get", "Restore")
-)
+external: Any = ExternalFunction
+get_read, restore_read, get_write, restore_write, local_size = _vectors = [
+    external(f"Vec{name}", int32(int64, int64))
+    for name in ("GetArrayRead", "RestoreArrayRead", "GetArrayWrite", "RestoreArrayWrite", "GetLocalSize")
+]
+# Then the modes of insertion and of direction.
+ghosts_begin, ghosts_end = _ghosts = [
+    external(f"VecGhostUpdate{part}", int32(int64, int32, int32)) for part in ("Begin", "End")
+]
+scatter_begin, scatter_end = _scatters = [
+    external(f"VecScatter{part}", int32(int64, int64, int64, int32, int32)) for part in ("Begin", "End")
+]
 
 
 def petsc_library() -> ctypes.CDLL:
@@ -23,9 +30,13 @@ def petsc_library() -> ctypes.CDLL:
     return ctypes.CDLL(PETSc.__file__)
 
 
-def bind_symbols(functions: Iterable[Any]) -> None:
-    """Let compiled code call external ``functions`` of PETSc; raises AttributeError where it hides its symbols."""
-    for function in functions:
+@cache
+def bind_symbols() -> None:
+    """Let compiled code be linked to these functions, as it must even where it calls none of them.
+
+    Raises AttributeError where PETSc hides its symbols.
+    """
+    for function in (*_vectors, *_ghosts, *_scatters):
         address = ctypes.cast(getattr(petsc_library(), function.symbol), ctypes.c_void_p).value
         binding.add_symbol(function.symbol, address)
 
@@ -34,9 +45,9 @@ def _pointer_of(typing_context: Any, address: Any) -> tuple[Any, Callable]:
     """An int64 address as a void pointer."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
+        return builder.inttoptr(arguments[0], context.get_value_type(voidptr))
 
-    return types.voidptr(types.int64), generate
+    return voidptr(int64), generate
 
 
 pointer: Any = intrinsic(_pointer_of)

@@ -2,7 +2,7 @@
 
 ``guard`` ends a run whose state is no solution any more, ``ledger`` keeps the error of the energy balance, ``progress``
 tells how far it is, ``recorder`` (a module of its own) keeps what is written. A further observer is a subclass of
-``Observer`` with a name, which ``simulate`` is given.
+``Observer``, which ``simulate`` is given.
 """
 
 import sys
@@ -53,18 +53,13 @@ class Observer:
     samples; whenever some observer is ``due``, and when the run is stopped on request, ``flush`` of all and then
     ``checkpoint`` of all; at the end ``finish`` and ``statistics``.
 
-    A subclass has a ``name``, by which ``simulate`` finds it, and may want blocks of at most ``longest`` samples: with
+    A subclass has a ``name``, which a checkpoint knows it by, and may want blocks of at most ``longest`` samples: with
     1 it sees the state at every sample. It must not change the state, and what it raises it must raise on all ranks.
     """
 
     name: ClassVar[str]
     longest: ClassVar[int] = sys.maxsize
     saved: ClassVar[tuple[str, ...]] = ()  # numbers among its attributes that a checkpoint keeps
-    registry: ClassVar[dict[str, "type[Observer]"]] = {}
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        Observer.registry[cls.name] = cls
 
     def begin(self, setup: Setup) -> None:
         """Make ready for a run from t = 0 on."""
@@ -110,7 +105,6 @@ class Guard(Observer):
     most_work = 0.0
 
     def observe(self, block: Block) -> None:
-        """See ``Observer``."""
         energies, largest = block.energies, self.setup.meter.largest
         most_work = np.maximum.accumulate(np.append(self.most_work, np.abs(energies.work)))[1:]
         finite = np.isfinite(energies.work) & (energies.total < largest)
@@ -131,7 +125,6 @@ class Ledger(Observer):
     work = dissipated = float("nan")
 
     def observe(self, block: Block) -> None:
-        """See ``Observer``."""
         energies = block.energies
         self.work, self.dissipated = float(energies.work[-1]), float(energies.dissipated[-1])
         self.worst = max(self.worst, float(np.abs(energies.residual).max()))
@@ -158,18 +151,14 @@ class ProgressReport(Observer):
     name = "progress"
 
     def begin(self, setup: Setup) -> None:
-        """See ``Observer``."""
         super().begin(setup)
         self._progress = Progress(setup.layout.comm, setup.model.end, "s")
 
     def observe(self, block: Block) -> None:
-        """See ``Observer``."""
         self._progress.update(float(block.times[-1]))
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """See ``Observer``."""
         self._progress.start_at(self.setup.engine.time)
 
     def finish(self, stopped: bool) -> None:
-        """See ``Observer``."""
         self._progress.close()

@@ -52,7 +52,6 @@ class Recorder(Observer):
     end = np.inf  # time in s beyond which what engines come to in a block is no solution
 
     def begin(self, setup: Setup) -> None:
-        """See ``Observer``."""
         super().begin(setup)
         layout, output, chain = setup.layout, setup.case.output, setup.model.chain
         recorded = np.array(recorded_cells(output, chain.cells))
@@ -93,7 +92,6 @@ class Recorder(Observer):
         return Samples(number, *arrays, self._first, output.every, output.stride, meter.lattice, meter.unit)
 
     def observe(self, block: Block) -> None:
-        """See ``Observer``."""
         here = slice(self._held, self._held + len(block))
         self._kept["time"][here] = block.times
         for part, name in ENERGIES.items():
@@ -103,11 +101,11 @@ class Recorder(Observer):
 
     @property
     def due(self) -> bool:
-        """See ``Observer``: a chunk is full."""
+        """A chunk is full."""
         return self._held == self._length
 
     def flush(self, last: bool = False) -> None:
-        """See ``Observer``: the samples kept so far and this rank's closed episodes become a chunk.
+        """The samples kept so far and this rank's closed episodes become a chunk.
 
         Fields, losses and episodes are those of a rank's own cells and sites, or on rank 0 of all, as ``io.chunks``
         says; of episodes that are still open, in the ``last`` one. Rank 0's has times and energies besides.
@@ -137,7 +135,6 @@ class Recorder(Observer):
         self._begin_chunk()
 
     def finish(self, stopped: bool) -> None:
-        """See ``Observer``."""
         if not stopped:
             self.flush(last=True)
 

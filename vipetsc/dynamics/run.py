@@ -19,7 +19,7 @@ from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
-from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError, Setup
+from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
 from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
@@ -65,10 +65,9 @@ def simulate(
     *,
     force: bool = False,
     resume: bool = False,
-    native: bool = True,
     stop: StopRequest | None = None,
     progress: bool = False,
-    observers: Sequence[str] = (),
+    observers: Sequence[type[Observer]] = (),
 ) -> Result:
     """Simulate ``case`` on all ranks of ``comm`` and leave ``run.h5`` and ``summary.json`` in ``folder``.
 
@@ -82,14 +81,12 @@ def simulate(
         ``resume`` needs one to go on with. A ``RunMemory`` keeps the run in memory.
     comm
         The ranks that share the lattice; those of a ``RunMemory`` are its own.
-    native
-        Register the right-hand side natively (default) or through Python.
     stop
         A request that ends the run at one of the next samples.
     progress
         Report progress on stderr of rank 0.
     observers
-        Names of further observers (subclasses of ``dynamics.observers.Observer``), which see all good samples.
+        Further observers, which see all good samples.
 
     Raises
     ------
@@ -107,8 +104,8 @@ def simulate(
     model = case.model()
     kind, refusal = select_engine(case, model)
     check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
-    watching = [Guard.name, *observers, Ledger.name, *(["progress"] if progress else [])]
-    make = partial(_simulate, case, model, partial(kind, native=native, stop=stop), refusal, watching)
+    watching: list[type[Observer]] = [Guard, *observers, Ledger, *([ProgressReport] if progress else [])]
+    make = partial(_simulate, case, model, partial(kind, stop=stop), refusal, watching)
     if isinstance(folder, RunOutput):
         return make(folder)
     with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
@@ -131,7 +128,7 @@ def _simulate(
     model: Model,
     create: Callable[[Model, Layout], Engine],
     refusal: str | None,
-    watching: Sequence[str],
+    watching: Sequence[type[Observer]],
     output: RunOutput,
 ) -> Result:
     """Simulate ``case`` into ``output``, from its last checkpoint on if it has one."""
@@ -179,10 +176,10 @@ class Run:
     A sample that one of them refuses is not seen by those behind it, nor recorded.
     """
 
-    def __init__(self, setup: Setup, observers: Sequence[str]) -> None:
+    def __init__(self, setup: Setup, observers: Sequence[type[Observer]]) -> None:
         self.setup = setup
         self.recorder = Recorder()
-        self.observers = [*(Observer.registry[name]() for name in observers), self.recorder]
+        self.observers = [*(kind() for kind in observers), self.recorder]
         longest = max(BLOCK_CELLS // setup.layout.cells, 1)
         self.longest = min(longest, *(observer.longest for observer in self.observers))
         self.samples = 0

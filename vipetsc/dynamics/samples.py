@@ -7,10 +7,9 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.dynamics.energies import LARGEST, Energies, measure
-from vipetsc.dynamics.layout import LatticeRecord, Layout, create_record
+from vipetsc.dynamics.layout import LatticeRecord
 
 
 class Samples(NamedTuple):
@@ -55,13 +54,6 @@ def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
                 for c in range(out.size):
                     out[c] = y[first + c * samples.every]
     return samples.sums[k, :, 0].max() < LARGEST and abs(samples.work[k]) < np.inf
-
-
-def no_samples(model: Model, layout: Layout) -> Samples:
-    """Room for none."""
-    none, sums = np.zeros(0), np.zeros((0, 4, 2), np.int64)
-    fields = np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1
-    return Samples(0, sums, none, none.reshape(0, 0), *fields, create_record(model, layout), 1.0)
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.tracker import Tracks
-from vipetsc.dynamics.engine import Engine, StalledError, Stretch
+from vipetsc.dynamics.engine import Engine, Stretch
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.collocation import Cluster
 from vipetsc.dynamics.propagator.forces import Forces, follow_contacts, group_dofs
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
-from vipetsc.dynamics.samples import Samples, no_samples, take_sample
+from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.parallel import StopRequest
 
 # Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
@@ -123,7 +123,7 @@ class Propagator(Engine):
 
     name = "propagator"
 
-    def __init__(self, model: Model, layout: Layout, native: bool = True, stop: StopRequest | None = None) -> None:
+    def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         series = step_series(model)
         assert series is not None, "refused"
         self.series = series
@@ -138,7 +138,6 @@ class Propagator(Engine):
         self._progress = np.zeros(1, PROGRESS)
         parts = round(model.sample_interval / series.interval)
         self._record = States(self._components, layout.owned, len(ghosts), parts, model.sample_interval, self._progress)
-        self._nothing = no_samples(model, layout)
         self.state, self.time = self._states[0], 0.0
 
     @property
@@ -167,23 +166,11 @@ class Propagator(Engine):
         )
 
     def fill(self, samples: Samples) -> Stretch:
-        """See ``Engine``; a stop is at the last sample."""
+        """A stop is at the last sample. Without room it goes to the sample before."""
         sys.audit("vipetsc.step")
-        return self._go(samples.number + len(samples.work) - 1, samples)
-
-    def advance(self, target: float) -> bool:
-        """Go on to the sample at ``target`` in s and take none; False if a stop was requested, on all ranks.
-
-        Raises StalledError, on all ranks, where no step can be taken.
-        """
-        stretch = self._go(round(target / self._record.sample_interval), self._nothing)
-        if stretch.stalled is not None:
-            raise StalledError(stretch.stalled)
-        return not stretch.stopped
-
-    def _go(self, last: int, samples: Samples) -> Stretch:
         forces, comm, progress, parts = self._forces, self._layout.comm, self._progress[0], self._record.parts
-        progress["last"], progress["failed"], progress["cluster"] = last * parts, last * parts + 1, -1
+        last = (samples.number + len(samples.work) - 1) * parts
+        progress["last"], progress["failed"], progress["cluster"] = last, last + 1, -1
         arrays = forces.dofs, forces.clusters, forces.tracker.tracks, samples
         with PROPAGATOR:
             error, log = take_steps(self._record, self._stencil, self._halo, *arrays)
@@ -195,7 +182,7 @@ class Propagator(Engine):
         comm.Allreduce(MPI.IN_PLACE, status, MPI.MIN)
         failed, stop = status.tolist()
         self.state, self.time = self._states[self.steps % 2], self._time(min(failed, self.steps))
-        if failed > progress["last"]:
+        if failed > last:
             return Stretch(len(samples.work), bool(stop))
         sites, reason = forces.sites(int(progress["cluster"])), "the state is not finite"
         if sites:
@@ -209,14 +196,12 @@ class Propagator(Engine):
         return steps // record.parts * record.sample_interval + steps % record.parts * self.series.interval
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
-        """See ``Engine``."""
         return self._forces.take_episodes(unfinished)
 
     def statistics(self) -> dict[str, Any]:
         """Linear steps and what the clusters did, the step and its band."""
         return {"steps": self.steps} | self._forces.statistics() | {
             "method": f"P({self.series.interval:.6g} s)",
-            "right_hand_side": "none",
             "interval": self.series.interval,
             "bandwidth": self.series.reach,
             "terms": self.series.terms,
@@ -225,12 +210,10 @@ class Propagator(Engine):
         }  # fmt: skip
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """See ``Engine``."""
         state = self._layout.checkpoint(self._components[self.steps % 2])
         return state | {"steps": np.array(self.steps)} | self._forces.checkpoint()
 
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """See ``Engine``."""
         steps = int(shares[0]["steps"])
         self._layout.restore(shares, self._components[steps % 2])
         self._forces.restore(shares)
@@ -238,7 +221,6 @@ class Propagator(Engine):
         self.state, self.time = self._states[steps % 2], self._time(steps)
 
     def destroy(self) -> None:
-        """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
         self._regions.destroy()
         for state in self._states:
             state.destroy()

@@ -11,19 +11,13 @@ from typing import NamedTuple
 from petsc4py import PETSc
 
 import numpy as np
-from numba.core.types import int32, int64
 from numpy.typing import ArrayLike
 
 from vipetsc.compiled import njit
+from vipetsc.dynamics import native
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.native import bind_symbols, external
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.vectors import LANES, add_product, prefetch, store, zeros
-
-# Functions of PETSc; handles are int64, then come the modes of insertion and of direction.
-_scatter_begin, _scatter_end = (
-    external(f"VecScatter{part}", int32(int64, int64, int64, int32, int32)) for part in ("Begin", "End")
-)
 
 
 class HaloRegions:
@@ -58,7 +52,7 @@ class HaloRegions:
             self._scatter = PETSc.Scatter().create(states[0], wanted, self._vector, None)
             wanted.destroy()
             scatter, vector = self._scatter.handle, self._vector.handle
-        bind_symbols((_scatter_begin, _scatter_end))
+        native.bind_symbols()
         return Halo(columns, cells, scatter, vector, np.array([state.handle for state in states]))
 
     def destroy(self) -> None:
@@ -88,8 +82,8 @@ def exchange(halo: Halo, which: int, state: np.ndarray) -> int:
     Returns PETSc's error code.
     """
     if halo.scatter != 0:
-        error = _scatter_begin(halo.scatter, halo.states[which], halo.vector, 1, 0)
-        return error or _scatter_end(halo.scatter, halo.states[which], halo.vector, 1, 0)
+        error = native.scatter_begin(halo.scatter, halo.states[which], halo.vector, 1, 0)
+        return error or native.scatter_end(halo.scatter, halo.states[which], halo.vector, 1, 0)
     for row in range(state.shape[0]):
         for column in range(halo.cells.size):
             halo.columns[row, column] = state[row, halo.cells[column]]

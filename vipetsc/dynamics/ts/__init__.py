@@ -5,7 +5,7 @@ r"""Runge-Kutta time stepping of the lattice by PETSc's TSRK, with a landing on 
     m_a u''_a = sum_s k_s (u_b - u_a) +- F_i + f,    W' = f u'_d,    E_i' = P_i,
 
 so that the work W of the drive at mass d and the dissipated energies E_i are integrated with the trajectory, by the
-same method. ``right_hand_side`` evaluates this as a first-order system; ``native`` hands it to PETSc as a C function.
+same method. ``right_hand_side`` evaluates this as a first-order system; PETSc calls it as a C function.
 
 **Step length.** The embedded pair's error is controlled in the maximum norm with the tolerances rtol |u| + atol, whose
 atol differs for displacements and velocities. W and E_i carry an absolute tolerance so large that they never decide

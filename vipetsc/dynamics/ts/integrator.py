@@ -20,7 +20,7 @@ from vipetsc.dynamics import log
 from vipetsc.dynamics.engine import Engine, StalledError, Stretch
 from vipetsc.dynamics.layout import Layout, create_record, join
 from vipetsc.dynamics.samples import Samples, take_sample
-from vipetsc.dynamics.ts.right_hand_side import observe, register, right_hand_side
+from vipetsc.dynamics.ts.right_hand_side import observe, register
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.parallel import StopRequest
 
@@ -40,8 +40,6 @@ class Integrator(Engine):
     ----------
     model, layout
         The lattice and its distribution.
-    native
-        Register the compiled right-hand side directly (default), or through Python with the same bits.
     stop
         Looked at after every step; a request on any rank is told by ``advance`` on all, at the time it goes to.
 
@@ -51,17 +49,16 @@ class Integrator(Engine):
 
     name = "ts"
 
-    def __init__(self, model: Model, layout: Layout, native: bool = True, stop: StopRequest | None = None) -> None:
+    def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         self.comm, self.layout = layout.comm, layout
         self.lattice = create_record(model, layout)
         self.tracker = ImpactTracker(self.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
         self.time = 0.0
         self.state = layout.create_vector()
-        if native:
-            register_sums(self.state)
+        register_sums(self.state)
         self.saved = self.state.duplicate()
-        self.ts = self._create_ts(model, layout, native)
+        self.ts = self._create_ts(model, layout)
         self._first_step = 0.002 / model.drive.frequency
         options = PETSc.Options()
         self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
@@ -77,7 +74,7 @@ class Integrator(Engine):
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
         self.observe(self.tracker.start)
 
-    def _create_ts(self, model: Model, layout: Layout, native: bool) -> PETSc.TS:
+    def _create_ts(self, model: Model, layout: Layout) -> PETSc.TS:
         options = PETSc.Options()
         tolerances = self.state.duplicate()
         half = layout.dofs * layout.owned
@@ -94,11 +91,7 @@ class Integrator(Engine):
         ts.setMaxStepRejections(0)
         ts.setErrorIfStepFails(False)
         ts.setSolution(self.state)
-        self.right_hand_side = "native" if native else "python"
-        if native:
-            register(ts, self.lattice)
-        else:
-            ts.setRHSFunction(self._evaluate)
+        register(ts, self.lattice)
         # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.
         default = "ts_adapt_wnormtype"
         if options.hasName(default):
@@ -109,24 +102,15 @@ class Integrator(Engine):
             options.delValue(default)
         return ts
 
-    def _exchange(self, u: PETSc.Vec) -> None:
-        """Fetch the neighbouring cells' displacements into the ghosts of ``u``."""
-        if self.lattice.shape.exchange:
-            u.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-
-    def _evaluate(self, ts: PETSc.TS, t: float, u: PETSc.Vec, f: PETSc.Vec) -> None:
-        self._exchange(u)
-        with u.localForm() as local:
-            right_hand_side(t, local.array, f.array, self.lattice)
-
     def observe(self, motion: np.ndarray, time: float | None = None) -> None:
         """Fill ``motion`` (sites, 3) from the state; it is taken at ``time``, else at the present one."""
-        self._exchange(self.state)
+        if self.lattice.shape.exchange:
+            self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
         with self.state.localForm() as local:
             observe(self.time if time is None else time, local.array, self.lattice, motion)
 
     def fill(self, samples: Samples) -> Stretch:
-        """See ``Engine``; a sample at which it stops is not taken."""
+        """A sample at which it stops is not taken."""
         for k in range(len(samples.work)):
             sys.audit("vipetsc.step")
             try:
@@ -260,18 +244,17 @@ class Integrator(Engine):
         self.ts.restartStep()
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
-        """See ``Engine``: those of the owned sites."""
+        """Those of the owned sites."""
         return self.tracker.take_episodes(self.state.array_r[self.lattice.shape.dissipated :], unfinished)
 
     def statistics(self) -> dict[str, Any]:
-        """Steps, what landings and limits of the contact law there were, and how the right-hand side is called."""
+        """Steps, and what landings and limits of the contact law there were."""
         of_sites = np.array([self.counts["switches"], *(self.tracker.counts[name].sum() for name in LIMITS)])
         self.comm.Allreduce(MPI.IN_PLACE, of_sites, MPI.SUM)
         sums = dict(zip(("switches", *LIMITS), of_sites.tolist(), strict=True))
-        return self.counts | sums | {"method": self.ts.getRKType(), "right_hand_side": self.right_hand_side}
+        return self.counts | sums | {"method": self.ts.getRKType()}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """See ``Engine``."""
         return self.layout.checkpoint(self.state.array_r) | {
             "sites": self.tracker.checkpoint(),
             "time": np.array(self.time),
@@ -280,7 +263,6 @@ class Integrator(Engine):
         }
 
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """See ``Engine``."""
         tables, common = join(shares, {"sites": "number", "counts": None}), shares[0]
         self.layout.restore(shares, self.state.array)
         self.tracker.restore(tables["sites"])
@@ -294,6 +276,5 @@ class Integrator(Engine):
         self.observe(self.tracker.start)
 
     def destroy(self) -> None:
-        """See ``Engine``."""
         for petsc_object in (self.ts, self.state, self.saved):
             petsc_object.destroy()

@@ -10,22 +10,14 @@ from typing import Any, get_type_hints
 from petsc4py import PETSc
 
 import numpy as np
-from numba import carray, types
+from numba import carray
 from numba.core.ccallback import CFunc
 
 from vipetsc.compiled import cfunc, njit
 from vipetsc.contact.law import FREE, SITE, Contacts, ForceLaw, contact_force
+from vipetsc.dynamics import native
 from vipetsc.dynamics.layout import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape, drive_force
-from vipetsc.dynamics.native import (
-    bind_symbols,
-    external,
-    get_read,
-    get_write,
-    petsc_library,
-    pointer,
-    restore_read,
-    restore_write,
-)
+from vipetsc.dynamics.native import pointer
 
 # Cells in one pass: what a pass touches stays in the first-level cache.
 CHUNK = 512
@@ -162,20 +154,15 @@ CONTEXT = np.dtype(
 """A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables."""
 
 
-_ghosts_begin, _ghosts_end = (
-    external(f"VecGhostUpdate{part}", types.int32(types.int64, types.int32, types.int32)) for part in ("Begin", "End")
-)
-
-
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     context: Any = carray(pointer(address), (1,), CONTEXT)[0]
     shape = context.shape
-    error = (_ghosts_begin(u, 1, 0) or _ghosts_end(u, 1, 0)) if shape.exchange else 0
-    error = error or get_read(u, address)
+    error = (native.ghosts_begin(u, 1, 0) or native.ghosts_end(u, 1, 0)) if shape.exchange else 0
+    error = error or native.get_read(u, address)
     if error != 0:
         return error
     state = context.array
-    error = get_write(f, address)
+    error = native.get_write(f, address)
     if error != 0:
         return error
     at, size = context.address, context.length
@@ -190,11 +177,11 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     )
     rate = carray(pointer(context.array), (shape.owned,), np.float64)
     right_hand_side(t, carray(pointer(state), (shape.ghosted,), np.float64), rate, lattice)
-    error = restore_write(f, address)
+    error = native.restore_write(f, address)
     if error != 0:
         return error
     context.array = state
-    return restore_read(u, address)
+    return native.restore_read(u, address)
 
 
 def compile_callback() -> CFunc:
@@ -202,7 +189,7 @@ def compile_callback() -> CFunc:
 
     ``context`` is the address of a ``CONTEXT`` record. Raises AttributeError where PETSc hides its symbols.
     """
-    bind_symbols((_ghosts_begin, _ghosts_end, get_read, restore_read, get_write, restore_write))
+    native.bind_symbols()
     return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)
 
 
@@ -215,6 +202,6 @@ def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
     context["length"] = tuple(tables[name].size for name in _TABLES)
     ts.setAttr("callback", (callback, context, lattice))  # PETSc holds bare pointers: all must live as long as ts
     pointers = (ctypes.c_void_p(p) for p in (ts.handle, None, callback.address, context.ctypes.data))
-    error = petsc_library().TSSetRHSFunction(*pointers)
+    error = native.petsc_library().TSSetRHSFunction(*pointers)
     if error:
         raise RuntimeError(f"TSSetRHSFunction failed with PETSc error {error}")

@@ -10,28 +10,18 @@ from functools import cache
 from petsc4py import PETSc
 
 import numpy as np
-from numba import carray, types
+from numba import carray
 from numba.core.ccallback import CFunc
 
 from vipetsc.compiled import cfunc, njit
-from vipetsc.dynamics.native import (
-    bind_symbols,
-    external,
-    get_read,
-    get_write,
-    petsc_library,
-    pointer,
-    restore_read,
-    restore_write,
-)
+from vipetsc.dynamics import native
+from vipetsc.dynamics.native import pointer
 from vipetsc.dynamics.vectors import LANES, add, add_product, prefetch, store, zeros
 
 # PETSc's number of the operation, in the order of its _VecOps.
 MAXPY = 14
 # Components to fetch ahead: so many vectors at once are more than the processor foresees.
 AHEAD = 6 * LANES
-
-_local_size = external("VecGetLocalSize", types.int32(types.int64, types.int64))
 
 
 @njit(error_model="numpy")
@@ -65,22 +55,22 @@ def _callback(y: int, count: int, factors: int, vectors: int) -> int:
     # Of the vectors, then of y, then its size.
     addresses = np.zeros(count + 2, np.int64)
     at = addresses.ctypes.data
-    error = _local_size(y, at + 8 * (count + 1)) or get_write(y, at + 8 * count)
+    error = native.local_size(y, at + 8 * (count + 1)) or native.get_write(y, at + 8 * count)
     for j in range(count):
-        error = error or get_read(handles[j], at + 8 * j)
+        error = error or native.get_read(handles[j], at + 8 * j)
     if error != 0:
         return error
     target = carray(pointer(addresses[count]), (addresses[count + 1],), np.float64)
     add_products(target, carray(pointer(factors), (count,), np.float64), addresses)
     for j in range(count):
-        error = error or restore_read(handles[j], at + 8 * j)
-    return error or restore_write(y, at + 8 * count)
+        error = error or native.restore_read(handles[j], at + 8 * j)
+    return error or native.restore_write(y, at + 8 * count)
 
 
 @cache
 def _compile() -> CFunc:
     """``PetscErrorCode f(Vec y, PetscInt count, const PetscScalar *factors, Vec *vectors)``; it lives on."""
-    bind_symbols((_local_size, get_read, restore_read, get_write, restore_write))
+    native.bind_symbols()
     return cfunc(f"i4(i8, i{np.dtype(PETSc.IntType).itemsize}, i8, i8)")(_callback)
 
 
@@ -92,7 +82,7 @@ def register_sums(vector: PETSc.Vec) -> None:
 
 def _set_operation(vector: PETSc.Vec) -> None:
     arguments = ctypes.c_void_p(vector.handle), ctypes.c_int(MAXPY), ctypes.c_void_p(_compile().address)
-    if error := petsc_library().VecSetOperation(*arguments):
+    if error := native.petsc_library().VecSetOperation(*arguments):
         raise RuntimeError(f"VecSetOperation failed with PETSc error {error}")
 
 
