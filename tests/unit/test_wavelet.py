@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from vipetsc.spectra import (
@@ -70,24 +68,13 @@ def test_bank_is_transform_binning_and_inverse(cells, kc, odd):
     assert np.abs(parts[..., :cells] - bank.split(signal)).max() < 1e-12
 
 
-@settings(max_examples=25)
-@given(st.integers(2, 200), st.sampled_from([6.0, 12.0]), st.integers(0, 99), st.floats(-1e3, 1e3))
-def test_dual_parts_sum_to_any_signal(cells, kc, seed, mean):
-    signal = noise(cells, seed) + mean
-    bank = filter_bank(cells, kc, "dual")
-    assert np.abs(bank.split(signal).sum(axis=0) - signal).max() < 1e-12 * max(np.abs(signal).max(), 1)
-    assert np.all(bank.transfer >= 0)
-    assert np.all(bank.transfer <= 1)
-
-
 @pytest.mark.parametrize("kc", [6.0, 12.0])
 def test_analytic_bank_sums_to_one_where_the_nodes_reach(kc):
     bank = filter_bank(600, kc)
     eta, total = wavenumbers(bank.length), bank.transfer.sum(axis=0)
     assert np.abs(total[(eta > np.pi / 60 * 1.6)] - 1).max() < 0.01
     assert total[0] == 0
-    coarse = filter_bank(600, kc, voices=0.65 * kc).transfer.sum(axis=0)
-    assert np.abs(coarse[(eta > np.pi / 60 * 1.6)] - 1).max() < 0.01
+    assert np.all(bank.transfer >= 0)
 
 
 def test_constant_is_the_integral():
@@ -138,18 +125,16 @@ def test_a_packet_lands_in_bins_7_and_8():
 def test_analytic_parts_reconstruct_a_packet_within_one_percent():
     found = partition(moving_packet(), 0.01)
     assert found.error.max() < 0.01
-    assert partition(moving_packet(), 0.01, normalisation="dual").error.max() < 1e-12
 
 
-@pytest.mark.parametrize("normalisation", ["analytic", "dual"])
-def test_partition_accounts_for_its_energies(normalisation):
+def test_partition_accounts_for_its_energies():
     velocity, masses = noise((37, 80, 2)), np.array([0.01, 0.08])
     velocity[0] = 0
-    found = partition(velocity, masses, normalisation=normalisation, mean_over=1)
+    found = partition(velocity, masses, mean_over=1)
     assert found.field.shape == (12, 37, 80)
     assert np.allclose(found.field.sum(axis=2), found.energy, rtol=1e-12)
     assert np.allclose(found.kinetic, kinetic_energy(velocity, masses).sum(axis=1), rtol=1e-12)
-    parts = filter_bank(80, 6.0, normalisation).split(velocity[5].T)
+    parts = filter_bank(80).split(velocity[5].T)
     assert np.allclose(found.energy[:, 5], 0.5 * np.einsum("j,bjc->b", masses, parts**2), rtol=1e-10)
     assert found.reconstructed[5] == pytest.approx(0.5 * masses @ (parts.sum(axis=0) ** 2).sum(axis=1), rel=1e-12)
     assert found.error[0] == found.cross_share[0] == 0
@@ -159,7 +144,7 @@ def test_partition_accounts_for_its_energies(normalisation):
 
 def test_neighbouring_bins_share_much_of_a_packet():
     """The bins overlap at kc = 6: the energies of the parts leave out most of the whole."""
-    share = partition(moving_packet(), 1.0, normalisation="dual").cross_share
+    share = partition(moving_packet(), 1.0).cross_share
     assert np.all((share > 0.4) & (share < 0.8))
 
 
@@ -193,7 +178,5 @@ def test_bad_requests_are_named():
         transform(noise(10), [1.0], 2.0)
     with pytest.raises(ValueError, match="length"):
         transform(noise(10), [1.0], 6.0, 9)
-    with pytest.raises(ValueError, match="normalisation"):
-        filter_bank(10, 6.0, "other")
     with pytest.raises(ValueError, match="masses"):
         partition(noise((3, 10, 2)), [1.0])

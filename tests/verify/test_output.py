@@ -12,8 +12,7 @@ from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorder, simulate
 from vipetsc.io import chunks
 from vipetsc.io.atomic import load_arrays, save_arrays
-from vipetsc.io.chunks import Recording
-from vipetsc.io.contents import LOSSES, SAMPLED
+from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.store import RunMemory
 

@@ -13,8 +13,7 @@ from vipetsc.case.schema import OutputTable
 from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.samples import Block, Samples
-from vipetsc.io.chunks import Recording, ranges
-from vipetsc.io.contents import LOSSES
+from vipetsc.io.chunks import LOSSES, Recording, ranges
 from vipetsc.io.store import GATHER_LIMIT
 
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.

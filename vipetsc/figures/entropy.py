@@ -220,7 +220,8 @@ def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figu
     heading = _heading(configurations[0], ensemble, "entropy H(t) of every amplitude")
     figure = style.new_figure(width, 0.7 + 1.9 * rows, heading)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    shown = [(row, _start_of_averages(row)) for row in configurations]
+    # When the averages over time begin.
+    shown = [(row, float(np.nanmin(row["entropy/start"].values))) for row in configurations]
     norm = percentile_norm(row["entropy/history"].where(row["entropy/time"] >= start) for row, start in shown)
     for axes, (row, start) in zip(grid.flat, shown, strict=False):
         times, history, amplitude = (row[name].values for name in ("entropy/time", "entropy/history", AMPLITUDE))
@@ -240,8 +241,3 @@ def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figu
     figure.supylabel("Amplitude A (N)")
     panels.colour_bar(image, grid, "H(t) (bit)", extend="both")
     return figure
-
-
-def _start_of_averages(row: xr.Dataset) -> float:
-    """When the averages over time begin, in s."""
-    return float(np.nanmin(row["entropy/start"].values))

@@ -57,13 +57,7 @@ FIGURES = {
 
 
 def figure_names(source: str, names: Sequence[str] | None = None) -> list[str]:
-    """The ``names`` after a check, by default those of all figures of ``source``.
-
-    Raises
-    ------
-    KeyError
-        For a name that is no figure of ``source``; gives the nearest one and all.
-    """
+    """The ``names``, by default those of all figures of ``source``; raises KeyError for one that is not among them."""
     valid = [name for name, spec in FIGURES.items() if spec.source == source]
     for name in names or ():
         if name not in valid:
@@ -83,24 +77,11 @@ def draw(
 ) -> list[Path]:
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; returns the files, each complete.
 
-    Parameters
-    ----------
-    source
-        What is in the folders: "run" (one folder), "sweep" (with branches beside them), "branches" (of the same
-        names, side by side) or "design" (one folder).
-    names
-        Which figures; by default all that the data allow.
-    share
-        (rank, size): draw every ``size``-th picture from ``rank`` on, so that ranks can share the work.
-    newest
-        Keep pictures that are not older than this time.
-
-    Raises
-    ------
-    KeyError
-        For a name that is no figure of ``source``, with the nearest that is; for a file that lacks something.
-    OSError, ValueError
-        If a file cannot be read, or a picture not written.
+    The ``source``, what is in the folders, is "run" (one folder), "sweep" (with branches beside them), "branches" (of
+    the same names, side by side) or "design" (one folder); ``names`` are figures, by default all that the data allow.
+    With a ``share`` (rank, size) every ``size``-th picture from ``rank`` on is drawn; pictures that are not older than
+    the time ``newest`` stay. Raises KeyError for a name that is no figure of ``source`` and for a file that lacks
+    something, OSError or ValueError if a file cannot be read, or a picture not written.
     """
 
     def keep(path: Path) -> bool:

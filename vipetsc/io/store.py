@@ -25,8 +25,7 @@ import xarray as xr
 
 from vipetsc.io import chunks
 from vipetsc.io.atomic import Arrays, discard, load_arrays, save_arrays, unwritten, write_text
-from vipetsc.io.chunks import Recording
-from vipetsc.io.contents import LOSSES
+from vipetsc.io.chunks import LOSSES, Recording
 from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run

@@ -7,7 +7,7 @@ positive wavenumbers make; eta = pi belongs to both signs and counts half on eit
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,8 +21,6 @@ LOWEST = np.pi / 60
 BINS = 12  # wavenumber bins of equal width in [0, pi]
 VOICES = 256  # nodes an octave
 CHUNK = 16  # snapshots that are partitioned together
-
-Normalisation = Literal["analytic", "dual"]
 
 
 @dataclass(frozen=True)
@@ -131,12 +129,9 @@ def inverse(x: np.ndarray, nodes: Nodes, kc: float) -> np.ndarray:
 class Bank:
     """The FFT filters that transform, binning and inverse amount to: a mask of bins does not vary along x.
 
-    ``transfer`` (bin, k) over the wavenumbers of the padded ``length``. "analytic" is
-    T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2: the sum over b is 1
-    within 1 % from 1.3 pi/60 to pi, .56 at pi/60 and 0 at eta = 0 (kc = 6). "dual" divides by that sum, so that
-    the parts add up to the signal to rounding. Below pi/60, where the sum fades, the quotient would share out
-    the tails of far wavelets by their number; there, the mean included, the first bin has all. At pi/60 it has
-    all but 1e-10 already, so the filters have no step.
+    ``transfer`` (bin, k) over the wavenumbers of the padded ``length``:
+    T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2. The sum over b is 1
+    within 1 % from 1.3 pi/60 to pi, .56 at pi/60 and 0 at eta = 0 (kc = 6).
     """
 
     transfer: np.ndarray
@@ -149,19 +144,12 @@ class Bank:
 
 
 @lru_cache(maxsize=16)
-def filter_bank(cells: int, kc: float = 6.0, normalisation: Normalisation = "analytic", voices: float = VOICES) -> Bank:
+def filter_bank(cells: int, kc: float = 6.0) -> Bank:
     """The bank of filters of all bins for lattices of ``cells``."""
-    if normalisation not in ("analytic", "dual"):
-        raise ValueError(f"normalisation = {normalisation!r}: analytic or dual")
-    length = padded_length(cells, kc)
-    nodes, eta = Nodes.log(kc, voices), wavenumbers(length)
-    gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, eta) ** 2
+    length, nodes = padded_length(cells, kc), Nodes.log(kc)
+    gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, wavenumbers(length)) ** 2
     bin_of = nodes.bins
     transfer = np.stack([gain[bin_of == b].sum(axis=0) for b in range(BINS)])
-    if normalisation == "dual":
-        low = eta < LOWEST
-        transfer[:, ~low] /= transfer[:, ~low].sum(axis=0)
-        transfer[:, low] = np.arange(BINS)[:, None] == 0
     transfer.flags.writeable = False
     return Bank(transfer, length)
 
@@ -184,9 +172,7 @@ class Partition:
     cross_share: np.ndarray
 
 
-def partition(
-    velocity: np.ndarray, masses: ArrayLike, normalisation: Normalisation = "analytic", mean_over: int = 0
-) -> Partition:
+def partition(velocity: np.ndarray, masses: ArrayLike, mean_over: int = 0) -> Partition:
     """Partition the kinetic energy of ``velocity``, (t, cell) or (t, cell, dof) in m/s, by wavenumber bins.
 
     ``masses`` in kg, (dof) or a scalar. A few snapshots at a time are held, so ``velocity`` may be an HDF5
@@ -196,7 +182,7 @@ def partition(
     nt, cells = velocity.shape[:2]
     if mass_list.shape != (velocity.shape[2:] or (1,)):
         raise ValueError(f"masses: {len(mass_list)} given for velocities of shape {velocity.shape}")
-    bank = filter_bank(cells, normalisation=normalisation)
+    bank = filter_bank(cells)
     energy, kinetic, reconstructed = np.zeros((BINS, nt)), np.zeros(nt), np.zeros(nt)
     field = np.zeros((BINS, nt, -(-cells // mean_over))) if mean_over else None
     for first in range(0, nt, CHUNK):
