@@ -7,10 +7,12 @@ from vipetsc.case.case import Case
 from vipetsc.case.design import DesignCase
 from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.nnm import NnmCase
+from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Table, read_section, read_toml, with_overrides
 from vipetsc.case.sweep import MOST_TRIED, Sweep
 
-OF_SECTION: dict[str, type[CaseFile]] = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase}
+OF_SECTION: dict[str, type[CaseFile]]
+OF_SECTION = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase, "optimise": OptimiseCase}
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:
@@ -22,7 +24,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     table, source = _table(path)
     sections = with_overrides(table, overrides := list(overrides))[0].keys()
     kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in sections]
-    if not kinds or {"sweep", "disorder", "drive", "time", "output"} & sections:
+    if not kinds or {"sweep", "disorder", "drive", "time", "output", "optimise"} & sections:
         kinds.insert(0, Case)
     cases: list[CaseFile] = []
     problems: dict[str, Problem] = {}

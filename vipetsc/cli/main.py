@@ -16,13 +16,14 @@ from vipetsc.parallel import StoppedError, StopRequest
 
 Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 # Verbs that look at a request to stop, to save first; others end where they are.
-STOPPABLE = ("run", "sweep", "nnm", "paper")
+STOPPABLE = ("run", "sweep", "nnm", "optimise", "paper")
 WITH_PETSC_OPTIONS = ("run", "sweep", "validate")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
 ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "case": ("case", {"nargs": "?", "metavar": "CASE", "help": "case file (TOML); the built-in one if left out"}),
     "swept": ("case", {"metavar": "CASE", "help": "case file (TOML) with a section [sweep]"}),
+    "searched": ("case", {"metavar": "CASE", "help": "case file (TOML) with a section [optimise]"}),
     "modal": ("case", {"metavar": "CASE", "help": "case file (TOML) with a section [nnm]"}),
     "member": ("--member", {"metavar": "ID", "help": "make a member of a sweep (CASE is its file or folder) again,"
                             " whole: its name, or its number from 0"}),
@@ -52,6 +53,11 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
     "bands": (verbs.bands, "pass bands, gaps and group velocities of a cell", "case set out json"),
     "sweep": (verbs.sweep, "every combination in [sweep]; goes on where it was", "swept set out force resume"),
     "nnm": (verbs.nnm, "nonlinear normal modes: frequency-energy branches", "modal set out force resume"),
+    "optimise": (
+        verbs.optimise,
+        "the best design for an objective; goes on where it was",
+        "searched set out force resume",
+    ),
     "design": (verbs.design, "the (lambda, eta) search of the four-band cell", "case set out force resume"),
     "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs set"),
     "plot": (verbs.plot, "pictures of a finished run again, from its files", "path fig format"),

@@ -9,7 +9,11 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.read import outdated
 from vipetsc.parallel import on_every_rank, on_root
 
-_NOT_OURS = {"design": "design.h5: is not a search", "branches": "branch-*.h5: is not a branch"}
+_NOT_OURS = {
+    "design": "design.h5: is not a search",
+    "optimum": "optimum.h5: is not a search",
+    "branches": "branch-*.h5: is not a branch",
+}
 
 
 def source_of(paths: Sequence[Path]) -> tuple[str, Sequence[Path]]:
@@ -24,8 +28,8 @@ def source_of(paths: Sequence[Path]) -> tuple[str, Sequence[Path]]:
     if len(paths) > 1:
         raise FolderError(f"{' '.join(map(str, paths))}: only sweeps and folders of branches can share a page")
     (path,) = paths
-    folder = path.parent if path.name in ("run.h5", "design.h5") else path
-    return "design" if (folder / "design.h5").exists() else "run", [folder]
+    folder = path.parent if path.name in ("run.h5", "design.h5", "optimum.h5") else path
+    return next((kind for kind in ("design", "optimum") if (folder / f"{kind}.h5").exists()), "run"), [folder]
 
 
 def draw_source(

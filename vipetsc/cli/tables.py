@@ -15,6 +15,7 @@ import numpy as np
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
 from vipetsc.case.disorder import DisorderTable, values_of
+from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.io.folder import provenance
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
@@ -28,7 +29,19 @@ if TYPE_CHECKING:
 # Time of one step of the default method per mass and per step, measured on one 2020s core.
 _STEP_SECONDS, _STEP_SECONDS_PER_MASS = 2e-5, 7e-8
 
-MODULES = ("scipy", "matplotlib", "jinja2", "numba", "pydantic", "tqdm", "tomli_w", "xarray", "h5netcdf")
+MODULES = (
+    "scipy",
+    "matplotlib",
+    "jinja2",
+    "numba",
+    "pydantic",
+    "tqdm",
+    "tomli_w",
+    "xarray",
+    "h5netcdf",
+    "cma",
+    "pymoo",
+)
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
@@ -90,6 +103,10 @@ def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
         search = case.design
         cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
         return [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]
+    if isinstance(case, OptimiseCase):
+        options, searched = case.options, [variable.name for variable in case.variables()]
+        told = [("objective", objective.told()) for objective in options.objective]
+        return [("optimise", f"{options.budget} designs of {_first_few(searched)}"), *told]
     if isinstance(case, NnmCase):
         contact, (low, high) = case.contact(), case.nnm.energy
         return [

@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
 from vipetsc.case.every import disorder_of, load_every
+from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
 from vipetsc.cli.plot import draw_source, source_of
@@ -177,6 +178,22 @@ def design(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
     with locked(comm, folder):
         echo(comm, on_root(comm, lambda: search_design(case, folder, options.force, options.resume)))
         echo_paths(comm, draw_source("design", [folder], comm, afresh=False))
+    return DONE
+
+
+def optimise(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """The best clearances, sites, restitution or cell for an objective: ``optimum.h5``, ``best.toml``, pictures."""
+    from vipetsc.dynamics.options import check_options
+    from vipetsc.studies.optimise import run_search
+
+    plan = _load(OptimiseCase, options, comm)
+    on_root(comm, lambda: check_options(plan.base))
+    folder, flags = _output(options, plan.name), {"force": options.force, "resume": options.resume}
+    with locked(comm, folder):
+        echo(comm, run_search(plan, folder, comm, **flags, stop=stop, progress=True))
+        stop.check(comm)
+        if plan.base.output.figures:
+            echo_paths(comm, draw_source("optimum", [folder], comm, afresh=False))
     return DONE
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import xarray as xr
 from matplotlib.figure import Figure
 
-from vipetsc.figures import backbone, design, entropy, lattice, runs, scattering, transfer, transfer_curves
+from vipetsc.figures import backbone, design, entropy, lattice, optimise, runs, scattering, transfer, transfer_curves
 from vipetsc.figures.study import Files, Sweeps, table
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.io.netcdf import open_netcdf
@@ -20,14 +20,15 @@ from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 
 MOST_WARNINGS = 4  # below a picture
-RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
+RUN, SWEEP, BRANCHES, DESIGN, OPTIMUM = "run", "sweep", "branches", "design", "optimum"
+FILES = {DESIGN: ("design.h5", ("cost", "frequency")), OPTIMUM: ("optimum.h5", ("value", "comparison"))}
 
 
 class FigureSpec(NamedTuple):
     """A figure of what folders of a ``source`` hold; one of sweeps is drawn from those that take the ``measure``.
 
-    ``function`` is (run, analysis or None) -> Figure for a run, (search) -> Figure for a design, (paths) -> Figure
-    for branches; of sweeps it offers drawings: (ensembles) -> iterator of (suffix, () -> Figure).
+    ``function`` is (run, analysis or None) -> Figure for a run, (search) -> Figure for a design or an optimum,
+    (paths) -> Figure for branches; of sweeps it offers drawings: (ensembles) -> iterator of (suffix, () -> Figure).
     """
 
     function: Callable[..., Any]
@@ -51,6 +52,7 @@ FIGURES = {
     **_specs(SWEEP, transfer_curves.phase_regimes, measure="transfer"),
     "branch": FigureSpec(backbone.backbone, BRANCHES),
     **_specs(DESIGN, design.deflections, design.cost_maps),
+    **_specs(OPTIMUM, optimise.convergence, optimise.compared_designs, optimise.compared_curves),
     "dispersion_against_lambda": FigureSpec(partial(design.dispersions, along="lambda", other="eta"), DESIGN),
     "dispersion_against_eta": FigureSpec(partial(design.dispersions, along="eta", other="lambda"), DESIGN),
 }
@@ -78,7 +80,7 @@ def draw(
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; returns the files, each complete.
 
     The ``source``, what is in the folders, is "run" (one folder), "sweep" (with branches beside them), "branches" (of
-    the same names, side by side) or "design" (one folder); ``names`` are figures, by default all that the data allow.
+    the same names, side by side), "design" or "optimum" (one folder); ``names`` are figures, by default all there are.
     With a ``share`` (rank, size) every ``size``-th picture from ``rank`` on is drawn; pictures that are not older than
     the time ``newest`` stay. Raises KeyError for a name that is no figure of ``source`` and for a file that lacks
     something, OSError or ValueError if a file cannot be read, or a picture not written.
@@ -142,5 +144,6 @@ def drawings(
         of_run = [data for data in (run, analysis) if data is not None]
         yield from ((name, warned(partial(spec.function, run, analysis), *of_run)) for name, spec in specs.items())
     else:
-        search = files.get(folder / "design.h5", partial(open_netcdf, kind="search", needs=("cost", "frequency")))
+        file, needs = FILES[source]
+        search = files.get(folder / file, partial(open_netcdf, kind="search", needs=needs))
         yield from ((name, partial(spec.function, search)) for name, spec in specs.items())

@@ -1,0 +1,271 @@
+"""The case of the verb ``optimise``: what varies within which bounds, and what is to become large or small."""
+
+import copy
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import tomli_w
+from pydantic import Field
+
+from vipetsc.case.case import Case
+from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, read_section
+from vipetsc.case.resolve import with_preset
+from vipetsc.case.schema import Positive
+from vipetsc.lattice import pass_bands
+
+MOST_DESIGNS = 100_000
+Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class VariablesTable(Section):
+    """What varies, each as [low, high]; all but sites and restitution are searched by their logarithm.
+
+    ``clearance`` in m of each site by itself, or ``profile``, those of the first and of the last site with the others
+    log-spaced between; ``sites``: the cells (1-based), whole numbers that differ; ``restitution``; ``masses`` in kg and
+    ``springs`` in N/m of the cell by their number in it (from 1).
+    """
+
+    clearance: Pair | None = None
+    profile: Pair | None = None
+    sites: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    restitution: Annotated[list[Share], Field(min_length=2, max_length=2)] | None = None
+    masses: dict[str, Pair] = Field({})
+    springs: dict[str, Pair] = Field({})
+
+
+class ObjectiveTable(Section):
+    """What is to become large or small.
+
+    ``measure``: at the run's end over the drive's work, the energy in the pass bands above the driven one
+    (``upper_share_at_end``), in the pass band ``band`` or in ``part`` of it in rad/s (``band_share``), beyond the last
+    site (``transmitted``); or ``ibtet``, or the energy-weighted ``entropy`` in bit. Of the ``amplitudes`` in N, by
+    default the case's, the ``worst`` or the ``mean`` counts.
+    """
+
+    measure: Literal["upper_share_at_end", "ibtet", "band_share", "entropy", "transmitted"] = "upper_share_at_end"
+    goal: Literal["maximise", "minimise"] = "maximise"
+    band: int | None = Field(None, ge=1)
+    part: Pair | None = None
+    amplitudes: list[Positive] = Field([])
+    over: Literal["worst", "mean"] = "worst"
+
+    @property
+    def name(self) -> str:
+        """The measure, with its band and part."""
+        of = f" {self.band}" if self.band else ""
+        return self.measure + of + (f" {self.part[0]:g}-{self.part[1]:g}" if self.part else "")
+
+    def told(self) -> str:
+        """The objective in words."""
+        at = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
+        return f"{self.goal} {self.name}" + (f", the {self.over} at {at} N" if at else "")
+
+
+class OptimiseTable(Section):
+    """One objective is searched by CMA-ES, two by NSGA-II, for a Pareto front.
+
+    ``start``: the case, or clearances ``matched`` to its wave by the scattering law of a site; ``budget`` in designs,
+    the case among them; ``population``: designs a generation; ``step``: first standard deviation over the range between
+    the bounds; ``samples``: what ``[disorder]`` draws so often for every run, of which the mean counts; ``curve``: amplitudes in N at which the best designs are compared; ``ranks`` share a run.
+    """
+
+    variables: VariablesTable = Field(default_factory=lambda: VariablesTable.model_validate({}))
+    objective: list[ObjectiveTable] = Field([ObjectiveTable.model_validate({})], min_length=1, max_length=2)
+    start: Literal["case", "matched"] = "case"
+    budget: int = Field(100, ge=2, le=MOST_DESIGNS)
+    population: int | None = Field(None, ge=4)
+    step: Annotated[float, Field(gt=0, le=1)] = 0.2
+    seed: int = Field(1, ge=0)
+    samples: int = Field(1, ge=1, le=10_000)
+    curve: list[Positive] = Field([])
+    ranks: int = Field(1, ge=1)
+
+
+class Variable(NamedTuple):
+    """A number that varies between ``low`` and ``high``: searched by its logarithm, as it is, or a whole one."""
+
+    name: str
+    low: float
+    high: float
+    unit: str
+    kind: Literal["log", "linear", "whole"]
+
+
+class OptimiseCase(CaseFile):
+    """The case to begin with, resolved (``base``), and its ``table`` without ``[optimise]``."""
+
+    table: Table
+    options: OptimiseTable
+    base: Case
+
+    @classmethod
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The fields, and everything that is wrong with the section or with the case to begin with."""
+        table = dict(table)
+        section = table.pop("optimise", None)
+        if not isinstance(section, dict):
+            remedy = "missing; say what varies, as in: [optimise.variables] clearance = [1e-4, 1e-2]"
+            return {}, [Problem("optimise", section, remedy)]
+        # Many runs want the fastest engine that a case allows.
+        if isinstance(table.get("time", {}), dict):
+            table["time"] = {"engine": "auto"} | table.get("time", {})
+        options, problems = read_section(OptimiseTable, section, "optimise")
+        try:
+            base = _case(table)
+            _case(table, table.get("disorder"))
+        except CaseError as error:
+            return {}, problems + error.problems
+        wrong = _problems(options, base, "disorder" in table)
+        invalid = tuple(problem.key for problem in problems)
+        problems += [p for p in wrong if not invalid or not p.key.startswith(("optimise.variables", *invalid))]
+        return {"table": table, "options": options, "base": base}, problems
+
+    def to_toml(self) -> str:
+        """The case as TOML; reading it back gives the same search."""
+        section = self.options.model_dump(exclude_none=True)
+        return tomli_w.dumps({"name": self.name} | self.table | {"optimise": section})
+
+    @property
+    def sites(self) -> list[int]:
+        """Cells (1-based) of the sites of the case to begin with."""
+        return [site + 1 for site in self.base.model().chain.sites]
+
+    def variables(self) -> list[Variable]:
+        """What varies, in the order in which values are given."""
+        bounds, numbers = self.options.variables, range(1, len(self.sites) + 1)
+        rows: list[tuple[list[str], Any, str, Any]] = [
+            ([f"clearance {i}" for i in numbers], bounds.clearance, "m", "log"),
+            (["first clearance", "last clearance"], bounds.profile, "m", "log"),
+            ([f"site {i}" for i in numbers], bounds.sites, "1", "whole"),
+            (["restitution"], bounds.restitution, "1", "linear"),
+            *(([f"mass {number}"], pair, "kg", "log") for number, pair in bounds.masses.items()),
+            *(([f"spring {number}"], pair, "N/m", "log") for number, pair in bounds.springs.items()),
+        ]
+        return [Variable(n, float(p[0]), float(p[1]), *of) for names, p, *of in rows if p for n in names]
+
+    def begin(self, clearance: Sequence[float] = ()) -> np.ndarray:
+        """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
+        bounds, cell = self.options.variables, self.base.lattice.unit_cell()
+        gaps = list(clearance or self.base.model().chain.clearances)
+        values = [*(gaps if bounds.clearance else []), *((gaps[0], gaps[-1]) if bounds.profile else ())]
+        values += [*(self.sites if bounds.sites else [])]
+        values += [self.base.contacts.restitution] if bounds.restitution else []
+        values += [cell.masses[int(number) - 1] for number in bounds.masses]
+        values += [cell.springs[int(number) - 1].stiffness for number in bounds.springs]
+        return np.clip(values, *np.transpose([(v.low, v.high) for v in self.variables()]))
+
+    def to_unit(self, values: np.ndarray) -> np.ndarray:
+        """The point in the unit cube (variable) of ``values``."""
+        return np.array([
+            np.log(x / v.low) / np.log(v.high / v.low) if v.kind == "log" else (x - v.low) / (v.high - v.low)
+            for x, v in zip(values, self.variables(), strict=True)
+        ])  # fmt: skip
+
+    def from_unit(self, point: np.ndarray) -> np.ndarray:
+        """The values (variable) at a ``point`` of the unit cube; sites in rising order, no two in one cell."""
+        variables = self.variables()
+        values = np.array([
+            v.low * (v.high / v.low) ** x if v.kind == "log" else v.low + (v.high - v.low) * x
+            for x, v in zip(np.clip(point, 0.0, 1.0), variables, strict=True)
+        ])  # fmt: skip
+        if whole := [i for i, v in enumerate(variables) if v.kind == "whole"]:
+            order, last = np.arange(len(whole)), variables[whole[0]].high
+            cells = np.maximum.accumulate(np.sort(np.round(values[whole])) - order)
+            values[whole] = np.minimum(cells, last - order[-1]) + order
+        return values
+
+    def design(self, values: np.ndarray) -> Case:
+        """The case with ``values`` (variable); raises CaseError if it is impossible."""
+        bounds, left, count = self.options.variables, iter(map(float, values)), len(self.sites)
+        table = with_preset(copy.deepcopy(self.table))
+        contacts = table["contacts"] | {"sites": self.sites, "clearance": [*self.base.model().chain.clearances]}
+        if bounds.clearance:
+            contacts["clearance"] = [*islice(left, count)]
+        if bounds.profile:
+            contacts["clearance"] = np.geomspace(next(left), next(left), count).tolist()
+        if bounds.sites:
+            contacts["sites"] = [int(cell) for cell in islice(left, count)]
+        if bounds.restitution:
+            contacts["restitution"] = next(left)
+        if bounds.masses or bounds.springs:
+            cell = self.base.lattice.unit_cell()
+            masses, stiffness = list(cell.masses), [spring.stiffness for spring in cell.springs]
+            for values_of, numbers in ((masses, bounds.masses), (stiffness, bounds.springs)):
+                for number in numbers:
+                    values_of[int(number) - 1] = next(left)
+            springs = [
+                {"start": s.start + 1, "end": s.end + 1, "next_cell": s.next_cell, "stiffness": k}
+                for s, k in zip(cell.springs, stiffness, strict=True)
+            ]
+            own = {"masses": masses, "springs": springs, "contact": [cell.host + 1, cell.resonator + 1]}
+            kept = {k: v for k, v in table["lattice"].items() if k not in ("preset", "reading", "lambda", "eta")}
+            table["lattice"] = kept | {"cell": own}
+        return _case(table | {"contacts": contacts})
+
+    def run(self, design: Case, amplitude: float, lot: int | None = None) -> Case:
+        """A run of a ``design`` at ``amplitude`` in N, recorded whole, and with the scatter number ``lot``."""
+        table = design.model_dump(by_alias=True, exclude_none=True) | {"output": {}}
+        table["drive"] |= {"amplitude": float(amplitude)}
+        disorder = self.table.get("disorder")
+        scatter = None if lot is None or disorder is None else disorder | {"seed": disorder.get("seed", 0) + lot}
+        return _case(table, scatter)
+
+
+def _case(table: Table, disorder: Any = None) -> Case:
+    """The run in a ``table``, under one name, with ``disorder`` if that is given; raises CaseError."""
+    scatter = {} if disorder is None else {"disorder": disorder}
+    return Case.from_table({k: table[k] for k in table if k in Case.model_fields} | {"name": "design"} | scatter)
+
+
+def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Problem]:
+    """What is wrong between the keys of the section and the case to begin with."""
+    bounds, cell, sites = options.variables, base.lattice.unit_cell(), base.model().chain.sites
+    at, given = "optimise.variables", options.variables.model_dump(exclude_none=True)
+    if not sites:
+        yield Problem("contacts.sites", base.contacts.sites, "no sites: without contacts a design has nothing to do")
+    if not any(given.values()):
+        valid = ", ".join(VariablesTable.model_fields)
+        yield Problem(at, None, f"names nothing that varies; give [low, high] for any of {valid}")
+    if bounds.clearance and bounds.profile:
+        yield Problem(f"{at}.profile", bounds.profile, "give clearance or profile, not both")
+    pairs = {key: pair for key, pair in given.items() if isinstance(pair, list)}
+    for kind, count in (("masses", len(cell.masses)), ("springs", len(cell.springs))):
+        for number, pair in given[kind].items():
+            pairs[f"{kind}.{number}"] = pair
+            if not (number.isdecimal() and 1 <= int(number) <= count):
+                yield Problem(f"{at}.{kind}.{number}", pair, f"the cell's {kind} count from 1 to {count}")
+    for key, (low, high) in pairs.items():
+        if key != "sites" and not low < high:
+            yield Problem(f"{at}.{key}", [low, high], "must be [low, high] with low below high")
+    if bounds.sites:
+        low, high = bounds.sites
+        if not 1 <= low < high <= base.lattice.cells or high - low + 1 < len(sites):
+            remedy = f"must lie within cells 1 to {base.lattice.cells} and hold all {len(sites)} sites"
+            yield Problem(f"{at}.sites", bounds.sites, remedy)
+    if options.samples > 1 and not disorder:
+        yield Problem("optimise.samples", options.samples, "there is no [disorder] to draw them from")
+    if options.start == "matched" and not (bounds.clearance or bounds.profile):
+        yield Problem("optimise.start", options.start, "clearances are matched: let clearance or profile vary")
+    for number, objective in enumerate(options.objective, 1):
+        yield from _problems_of(objective, f"optimise.objective[{number}]", base, bool(bounds.masses or bounds.springs))
+
+
+def _problems_of(objective: ObjectiveTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
+    """What is wrong with an objective, of a cell that stays as it is unless ``varied``."""
+    bands, band, part = pass_bands(base.lattice.unit_cell()), objective.band, objective.part
+    if (objective.measure == "band_share") != (band is not None):
+        remedy = "only band_share has a band" if band else f"missing; band_share needs a band, 1 to {len(bands)}"
+        yield Problem(f"{at}.band", band, remedy)
+    elif band and band > len(bands):
+        yield Problem(f"{at}.band", band, f"the cell has {len(bands)} bands")
+    elif part and not band:
+        yield Problem(f"{at}.part", part, "only band_share has a part of a band")
+    elif part and band:
+        low, high = bands[band - 1].low, bands[band - 1].high
+        if not part[0] < part[1] or (not varied and (part[1] <= low or part[0] >= high)):
+            yield Problem(
+                f"{at}.part", part, f"must be [low, high] in rad/s and meet band {band}, {low:.5g}-{high:.5g}"
+            )

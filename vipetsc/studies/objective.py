@@ -1,0 +1,166 @@
+"""The runs that a design is judged by: made over teams of ranks, measured, recorded as they come."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import xarray as xr
+
+import vipetsc
+from vipetsc.case import Case, Model, case_id
+from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
+from vipetsc.dynamics import simulate
+from vipetsc.io.records import Record, RecordFile, read_records
+from vipetsc.io.store import RunMemory
+from vipetsc.lattice import Chain, pass_bands
+from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.studies.analysis import analyse
+from vipetsc.studies.pool import TaskPool
+
+RECORDS = "runs-*.jsonl"
+ANALYSED = {"ibtet": "bands", "entropy": "entropy"}  # what ``analyse`` calls them
+OF_ANALYSIS = {"ibtet": "ibtet", "entropy": "entropy/energy_weighted"}
+
+
+class Judge:
+    """Makes runs of designs in ``folder`` on the ranks of ``comm``, and tells what they came to.
+
+    ``known`` by the hash of its case has the record of every run made or read: its ``values``, or the ``reason`` why it
+    failed. ``damaged`` tells of records that could not be used. All ranks must make one.
+    """
+
+    def __init__(self, plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
+        self.plan, self.comm, self.stop = plan, comm, stop
+        self.team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
+        self.pool = TaskPool(comm, self.team, stop)
+        self.file = RecordFile(folder / RECORDS.replace("*", str(comm.rank)))
+        self.damaged: list[str] = []
+
+        def read() -> dict[str, Record]:
+            records = (r for path in sorted(folder.glob(RECORDS)) for r, _ in read_records(path, self.damaged.append))
+            return {r["id"]: r for r in records if r["vipetsc_version"] == vipetsc.__version__}
+
+        self.known = on_root(comm, read)
+
+    def close(self) -> None:
+        """Let go of the files and of the teams; all ranks must call it."""
+        self.file.close()
+        self.team.Free()
+
+    def make(self, runs: Iterable[Case]) -> None:
+        """Make those ``runs`` that are not known; all ranks must call it. Raises StoppedError on all."""
+        cases = {name: case for case in runs if (name := case_id(case)) not in self.known}
+        made: dict[str, Record] = {}
+
+        def work(name: str) -> None:
+            told = {"values": self._values(cases[name])}
+            on_root(self.team, lambda: keep(name, told))
+
+        def keep(name: str, told: Record) -> None:
+            record = {"id": name, "vipetsc_version": vipetsc.__version__} | told
+            self.file.append(record)
+            made[name] = record
+
+        self.pool.share(list(cases), work, fail=lambda name, reason: keep(name, {"reason": reason}))
+        for records in self.comm.allgather(made):
+            self.known |= records
+        if self.pool.stopped:
+            raise StoppedError(f"stopped on request with {len(self.known)} runs; the same command goes on")
+
+    def _values(self, case: Case) -> dict[str, Any]:
+        """What is measured of a run, on the first rank of its team."""
+        memory = RunMemory(self.team)
+        result = simulate(case, memory, self.team, stop=self.stop)
+        if result.resumable:
+            raise StoppedError(result.sentence)
+        if not result.complete:
+            raise RuntimeError(result.sentence)
+
+        def measure() -> dict[str, Any]:
+            assert memory.dataset is not None
+            return measured(memory.dataset, result.statistics, self.plan.options.objective)
+
+        return on_root(self.team, measure)
+
+    def losses(self, design: Case) -> tuple[list[float], str]:
+        """How far a ``design`` whose runs were made is from each goal, small is good; NaN if one failed, and why."""
+        options, records = self.plan.options, {key: self.known[case_id(run)] for key, run in self.runs(design).items()}
+        failed = [f"{key[0]:g} N: {record['reason']}" for key, record in records.items() if "reason" in record]
+        losses = []
+        for objective in options.objective:
+            sign, over = (-1 if objective.goal == "maximise" else 1), objective.amplitudes or [self.amplitude]
+            if failed:
+                losses.append(np.nan)
+                continue
+            of = [
+                [r["values"][objective.name] for (a, _), r in records.items() if a == amplitude] for amplitude in over
+            ]
+            means = [sign * float(np.mean(values)) for values in of]
+            losses.append(max(means) if objective.over == "worst" else float(np.mean(means)))
+        return losses, "; ".join(failed[:1])
+
+    def values(self, run: Case) -> dict[str, Any]:
+        """What was measured of a ``run`` that is known; nothing of one that failed."""
+        return dict(self.known[case_id(run)].get("values", {}))
+
+    @property
+    def amplitude(self) -> float:
+        """That of the case in N."""
+        return float(self.plan.base.drive.amplitude)
+
+    def runs(self, design: Case) -> dict[tuple[float, int], Case]:
+        """The runs of a ``design`` by their amplitude in N and the number of what scatters; raises CaseError."""
+        amplitudes = dict.fromkeys(a for o in self.plan.options.objective for a in o.amplitudes or [self.amplitude])
+        pairs = itertools.product(amplitudes, range(self.plan.options.samples))
+        return {(amplitude, lot): self.plan.run(design, amplitude, lot) for amplitude, lot in pairs}
+
+
+def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[ObjectiveTable]) -> dict[str, Any]:
+    """What the ``objectives`` ask of a ``run``, by their names, and what is always told.
+
+    ``upper_share_at_end``, ``bands`` (pass band): energy at the end over the work; ``transmitted``: that beyond the
+    last site; ``dissipated``, ``episodes``, ``ibtet`` and ``entropy`` where they are asked for.
+    """
+    model, work = Case.of(run).model(), float(run["energy/work"][-1])
+    chain, state = model.chain, [run[name].values[-1].ravel() for name in ("displacement", "velocity")]
+    values: dict[str, Any] = {"episodes": statistics["episodes"], "dissipated": statistics["dissipated"] / work}
+    frequency, modes = linear_modes(replace(chain, sites=(), clearances=()))
+    root = np.sqrt(chain.masses())
+    energy = 0.5 * ((frequency * (modes.T @ (root * state[0]))) ** 2 + (modes.T @ (root * state[1])) ** 2) / work
+    bands = [energy[(frequency >= b.low) & (frequency <= b.high)].sum() for b in pass_bands(chain.cell)]
+    above = [float(e) for e, b in zip(bands, pass_bands(chain.cell), strict=True) if b.low > model.drive.frequency]
+    values |= {"bands": list(map(float, bands)), "upper_share_at_end": sum(above)}
+    values["transmitted"] = _beyond(model, *state) / work
+    asked = {objective.measure for objective in objectives} & ANALYSED.keys()
+    analysis = analyse(run, {ANALYSED[name] for name in asked}) if asked else {}
+    values |= {name: float(analysis[OF_ANALYSIS[name]]) for name in asked}
+    for objective in objectives:
+        if objective.band:
+            band = pass_bands(chain.cell)[objective.band - 1]
+            low, high = objective.part or (band.low, band.high)
+            inside = (frequency >= max(low, band.low)) & (frequency <= min(high, band.high))
+            values[objective.name] = float(energy[inside].sum())
+    return values
+
+
+@lru_cache(maxsize=4)
+def linear_modes(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (mode) in rad/s and modes (masses, mode) of a chain."""
+    root = np.sqrt(chain.masses())
+    square, modes = np.linalg.eigh(chain.stiffness_matrix().toarray() / np.outer(root, root))
+    return np.sqrt(np.maximum(square, 0)), modes
+
+
+def _beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray) -> float:
+    """Energy in J of the cells beyond the site that is farthest from the drive; of springs at the border about half."""
+    chain, sites = model.chain, np.array(model.chain.sites)
+    far = sites[np.argmax(np.abs(sites - model.drive_cell))]
+    beyond = np.arange(chain.cells) > far if far >= model.drive_cell else np.arange(chain.cells) < far
+    energy = displacement * (chain.stiffness_matrix() @ displacement) + chain.masses() * velocity**2
+    return 0.5 * float(energy.reshape(chain.cells, -1)[beyond].sum())

@@ -1,0 +1,107 @@
+"""Which designs a search tries next: CMA-ES for one objective, NSGA-II for two; the same ones from the same seed.
+
+Points lie in the unit cube, losses are to become small. Neither draws from numpy's global state.
+"""
+
+from typing import Any, Protocol
+
+import numpy as np
+
+RESOLVED = 1e-4  # of the range between the bounds: what impacts make of a finer change is noise
+WHOLE = 0.3  # least standard deviation of a whole number
+
+
+class Sampler(Protocol):
+    """Asked for points (design, variable), and told the losses (design, objective) of all of them in that order."""
+
+    def ask(self) -> np.ndarray:
+        """The next points."""
+
+    def tell(self, losses: np.ndarray) -> None:
+        """What became of them."""
+
+
+class CmaEs:
+    """Covariance matrix adaptation (Hansen 2016, arXiv:1604.00772), by ``cma``.
+
+    A search that has contracted begins again at the best point, with twice the population. ``steps`` (variable) are
+    those of whole numbers in the unit cube, 0 for others.
+    """
+
+    def __init__(self, start: np.ndarray, steps: np.ndarray, step: float, seed: int, population: int | None) -> None:
+        self._random, self._step, self._steps = np.random.default_rng(seed), step, steps
+        self._best: tuple[float, np.ndarray] = np.inf, start
+        self._begin({"popsize": population} if population else {})
+
+    def _begin(self, options: dict[str, Any]) -> None:
+        from cma.evolution_strategy import CMAEvolutionStrategy
+
+        options |= {"bounds": [0, 1], "minstd": (WHOLE * self._steps).tolist(), "tolx": RESOLVED}
+        options |= {"randn": lambda *shape: self._random.standard_normal(shape), "seed": np.nan}
+        options |= {"verbose": -10}  # nor does it read options from a file cma_signals.in
+        self._search = CMAEvolutionStrategy(self._best[1].tolist(), self._step, options)
+
+    def ask(self) -> np.ndarray:
+        """The next generation."""
+        self._asked = self._search.ask()
+        return np.array(self._asked)
+
+    def tell(self, losses: np.ndarray) -> None:
+        """Its losses (design, 1)."""
+        least = int(np.argmin(losses[:, 0]))
+        if losses[least, 0] < self._best[0]:
+            self._best = float(losses[least, 0]), np.array(self._asked[least])
+        self._search.tell(self._asked, losses[:, 0].tolist())
+        if self._search.stop():
+            self._begin({"popsize": 2 * len(self._asked)})
+
+
+class Nsga2:
+    """Nondominated sorting genetic algorithm (Deb et al. 2002, IEEE Trans. Evol. Comput. 6, 182), by ``pymoo``.
+
+    The first generation is normal around the ``start``, with the standard deviation ``step``.
+    """
+
+    def __init__(self, start: np.ndarray, step: float, seed: int, population: int, objectives: int = 2) -> None:
+        from pymoo.algorithms.moo.nsga2 import NSGA2
+        from pymoo.core.problem import Problem
+        from pymoo.core.termination import NoTermination
+
+        first = start + step * np.random.default_rng(seed).standard_normal((population, len(start)))
+        first[0] = start
+        self._problem = Problem(n_var=len(start), n_obj=objectives, xl=0.0, xu=1.0)
+        self._search = NSGA2(pop_size=population, sampling=np.clip(first, 0.0, 1.0))
+        self._search.setup(self._problem, termination=NoTermination(), seed=seed)
+
+    def ask(self) -> np.ndarray:
+        """The next generation."""
+        self._asked = self._search.ask()
+        return np.array(self._asked.get("X"), float)
+
+    def tell(self, losses: np.ndarray) -> None:
+        """Its losses."""
+        from pymoo.core.evaluator import Evaluator
+        from pymoo.problems.static import StaticProblem
+
+        Evaluator().eval(StaticProblem(self._problem, F=losses), self._asked)
+        self._search.tell(infills=self._asked)
+
+
+def front(losses: np.ndarray) -> np.ndarray:
+    """Which of ``losses`` (design, objective) no other is better than: all finite, sorted by the first objective.
+
+    Of equal ones the first; for one objective the best.
+    """
+    finite = np.flatnonzero(np.isfinite(losses).all(axis=1))
+    order = finite[np.lexsort(losses[finite].T[::-1])]
+    kept: list[int] = []
+    for number in order:
+        if not any((losses[other] <= losses[number]).all() for other in kept):
+            kept.append(int(number))
+    return np.array(kept, int)
+
+
+def knee(losses: np.ndarray) -> int:
+    """Which of a front's ``losses`` (design, objective) is farthest below the line between its ends."""
+    span = np.ptp(losses, axis=0)
+    return int(np.argmin(((losses - losses.min(axis=0)) / np.where(span > 0, span, 1.0)).sum(axis=1)))
