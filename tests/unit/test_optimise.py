@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipetsc.case import CaseError, case_id
+from vipetsc.case.disorder import Deviation
 from vipetsc.case.every import load_every
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.studies.objective import Judge
 from vipetsc.studies.optimise import Search
 from vipetsc.studies.sampler import CmaEs, Nsga2, front, knee
 
@@ -40,7 +42,7 @@ def plan(*changes: str) -> OptimiseCase:
         (["contacts.sites=0", "contacts.clearance="], "no sites"),
         (["optimise.variables.clearance=[-1e-3, 1e-2]"], "clearance[1] = -0.001: must be greater than 0"),
         (["optimise.variables.clearance=[1e-2, 1e-3]"], "low below high"),
-        (["optimise.objective=[{measure='band_share'}]"], "optimise.objective[1].band: missing; band_share needs a band"),
+        (["optimise.objective=[{measure='band_share'}]"], "objective[1].band: missing; band_share needs a band"),
         (["optimise.objective=[{measure='band_share', band=5}]"], "the cell has 4 bands"),
         (["optimise.objective=[{measure='ibtet', band=2}]"], "only band_share has a band"),
         (["optimise.objective=[{measure='band_share', band=4, part=[100.0, 200.0]}]"], "meet band 4, 3214.9-3644.8"),
@@ -54,7 +56,7 @@ def plan(*changes: str) -> OptimiseCase:
         (["optimise.variables.sites=[10, 11]"], "within cells 1 to 40 and hold all 3 sites"),
         (["optimise.variables.sites=[0, 30]"], "within cells 1 to 40"),
         (["optimise.variables.restitution=[0.5, 1.5]"], "restitution[2] = 1.5"),
-        (["optimise.variables.clearance=", "optimise.variables.sites=[5, 30]", "optimise.start=matched"], "let clearance"),
+        (["optimise.variables={restitution=[0.5, 0.9]}", "optimise.start=matched"], "let clearance or profile vary"),
         (["optimise.samples=3"], "no [disorder]"),
         (["disorder.clearance.relative=-0.1"], "disorder.clearance.relative = -0.1"),
         (["contacts.sites=[50]"], "outside the lattice"),
@@ -78,7 +80,9 @@ def test_all_problems_come_at_once(tmp_path):
 
 
 def test_the_case_as_text_gives_the_same_search():
-    first = plan("optimise.variables.sites=[2, 39]", "optimise.samples=3", "disorder.clearance.relative=0.01", "time.rtol=1e-8")
+    first = plan(
+        "optimise.variables.sites=[2, 39]", "optimise.samples=3", "disorder.clearance.relative=0.01", "time.rtol=1e-8"
+    )
     again = OptimiseCase.from_toml(first.to_toml())
     assert again == first and again.options.samples == 3
 
@@ -141,11 +145,11 @@ def test_cma_es_finds_the_least_and_stays_in_the_cube():
 @pytest.mark.parametrize("make", [cma, lambda: Nsga2(np.full(4, 0.5), 0.2, 3, 8)])
 def test_a_search_depends_on_its_seed_alone(make):
     function = bowl if make is cma else lambda p: np.column_stack([bowl(p), bowl(1 - p)])
-    np.random.seed(1)
-    before = np.random.get_state()[1].copy()
+    np.random.seed(1)  # noqa: NPY002
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
     first, _ = searched(make(), function, 12)
-    assert np.array_equal(np.random.get_state()[1], before)
-    np.random.seed(2)
+    assert np.array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+    np.random.seed(2)  # noqa: NPY002
     again, _ = searched(make(), function, 12)
     assert first.tobytes() == again.tobytes()
 
@@ -166,9 +170,7 @@ def test_the_step_of_a_whole_number_does_not_vanish():
 def test_nsga_ii_finds_the_front_of_two_bowls():
     """The best of both lie on the straight line between their lowest points."""
     ends = np.array([[0.2, 0.2, 0.2], [0.8, 0.8, 0.2]])
-    points, losses = searched(
-        Nsga2(np.full(3, 0.5), 0.2, 3, 20), lambda p: ((p[:, None] - ends) ** 2).sum(axis=2), 50
-    )
+    points, losses = searched(Nsga2(np.full(3, 0.5), 0.2, 3, 20), lambda p: ((p[:, None] - ends) ** 2).sum(axis=2), 50)
     best = points[front(losses)]
     assert len(best) > 15 and np.ptp(best[:, 0]) > 0.4
     assert np.abs(best[:, 0] - best[:, 1]).max() < 0.1 and np.abs(best[:, 2] - 0.2).max() < 0.1
@@ -257,3 +259,37 @@ def test_a_start_that_is_not_the_case_is_a_design_too():
     search = Search(small, Bowl(), recorder(small), small.begin([1e-3, 1e-3, 1e-3]))
     assert [d.case.contacts.clearance for d in search.designs][1] == pytest.approx([1e-3] * 3)
     assert len(search.runs()) == 2
+
+
+def test_the_runs_of_a_design_are_its_amplitudes_times_what_scatters():
+    """A scatter is that of [disorder] with the next seeds; the design itself is without."""
+    objective = "optimise.objective=[{amplitudes=[2.0, 5.0]}, {measure='transmitted', amplitudes=[5.0, 9.0]}]"
+    small = plan(objective, "optimise.samples=2", "disorder={seed=7, clearance={relative=0.01}}")
+    runs = Judge.runs(Scarce(small), small.base)
+    assert [*runs] == [(a, lot) for a in (2.0, 5.0, 9.0) for lot in (0, 1)]
+    assert {run.drive.amplitude for run in runs.values()} == {2.0, 5.0, 9.0}
+    drawn = Deviation(relative=0.01).draw(np.array(small.base.contacts.clearance), 8, "clearance")
+    assert runs[5.0, 1].contacts.clearance == drawn.tolist() != small.base.contacts.clearance
+    assert runs[5.0, 1].contacts.clearance == runs[2.0, 1].contacts.clearance != runs[5.0, 0].contacts.clearance
+
+
+class Scarce(Judge):
+    """Without ranks and files: what is known is given."""
+
+    def __init__(self, plan, known=()):
+        self.plan, self.known = plan, dict(known)
+
+
+def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
+    objective = "optimise.objective=[{amplitudes=[2.0, 5.0]}, {measure='transmitted', goal='minimise', over='mean'}]"
+    small = plan(objective, "optimise.samples=2", "disorder.clearance.relative=0.01", "drive.amplitude=5.0")
+    share = {(2.0, 0): 0.1, (2.0, 1): 0.3, (5.0, 0): 0.5, (5.0, 1): 0.2}
+    runs = Judge.runs(Scarce(small), small.base)
+    known = {
+        case_id(run): {"values": {"upper_share_at_end": share[key], "transmitted": 0.4}} for key, run in runs.items()
+    }
+    losses, reason = Scarce(small, known).losses(small.base)
+    assert losses == pytest.approx([-0.2, 0.4]) and reason == ""
+    known[case_id(runs[5.0, 1])] = {"reason": "stalled"}
+    losses, reason = Scarce(small, known).losses(small.base)
+    assert np.isnan(losses).all() and reason == "5 N: stalled"

@@ -69,7 +69,8 @@ class OptimiseTable(Section):
 
     ``start``: the case, or clearances ``matched`` to its wave by the scattering law of a site; ``budget`` in designs,
     the case among them; ``population``: designs a generation; ``step``: first standard deviation over the range between
-    the bounds; ``samples``: what ``[disorder]`` draws so often for every run, of which the mean counts; ``curve``: amplitudes in N at which the best designs are compared; ``ranks`` share a run.
+    the bounds; ``samples`` of what ``[disorder]`` draws are run of every design, and their mean counts; ``curve``:
+    amplitudes in N at which the best designs are compared; ``ranks`` share a run.
     """
 
     variables: VariablesTable = Field(default_factory=lambda: VariablesTable.model_validate({}))

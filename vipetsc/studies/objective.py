@@ -2,8 +2,6 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +16,9 @@ from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.dynamics import simulate
 from vipetsc.io.records import Record, RecordFile, read_records
 from vipetsc.io.store import RunMemory
-from vipetsc.lattice import Chain, pass_bands
+from vipetsc.lattice import pass_bands
 from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.spectra.modal import ModalParts
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.pool import TaskPool
 
@@ -128,33 +127,24 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[O
     last site; ``dissipated``, ``episodes``, ``ibtet`` and ``entropy`` where they are asked for.
     """
     model, work = Case.of(run).model(), float(run["energy/work"][-1])
-    chain, state = model.chain, [run[name].values[-1].ravel() for name in ("displacement", "velocity")]
+    state = [run[name].values[-1:] for name in ("displacement", "velocity")]
+    modal, bands = ModalParts.of(model.chain), pass_bands(model.chain.cell)
+    energy, frequency = 0.5 * np.abs(modal.modes.amplitudes(*state)[0]) ** 2 / work, modal.modes.frequency
+    above, names = modal.parts.above(model.drive.frequency), [band.number for band in bands]
+    inside = {name: modal.part == [name in part for part in modal.parts.bands].index(True) for name in names}
     values: dict[str, Any] = {"episodes": statistics["episodes"], "dissipated": statistics["dissipated"] / work}
-    frequency, modes = linear_modes(replace(chain, sites=(), clearances=()))
-    root = np.sqrt(chain.masses())
-    energy = 0.5 * ((frequency * (modes.T @ (root * state[0]))) ** 2 + (modes.T @ (root * state[1])) ** 2) / work
-    bands = [energy[(frequency >= b.low) & (frequency <= b.high)].sum() for b in pass_bands(chain.cell)]
-    above = [float(e) for e, b in zip(bands, pass_bands(chain.cell), strict=True) if b.low > model.drive.frequency]
-    values |= {"bands": list(map(float, bands)), "upper_share_at_end": sum(above)}
+    values["bands"] = [float(energy[inside[name]].sum()) for name in names]
+    values["upper_share_at_end"] = float(energy[above[modal.part]].sum())
     values["transmitted"] = _beyond(model, *state) / work
     asked = {objective.measure for objective in objectives} & ANALYSED.keys()
     analysis = analyse(run, {ANALYSED[name] for name in asked}) if asked else {}
     values |= {name: float(analysis[OF_ANALYSIS[name]]) for name in asked}
     for objective in objectives:
         if objective.band:
-            band = pass_bands(chain.cell)[objective.band - 1]
-            low, high = objective.part or (band.low, band.high)
-            inside = (frequency >= max(low, band.low)) & (frequency <= min(high, band.high))
-            values[objective.name] = float(energy[inside].sum())
+            low, high = objective.part or (0.0, np.inf)
+            within = inside[objective.band] & (frequency >= low) & (frequency < high)
+            values[objective.name] = float(energy[within].sum())
     return values
-
-
-@lru_cache(maxsize=4)
-def linear_modes(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (mode) in rad/s and modes (masses, mode) of a chain."""
-    root = np.sqrt(chain.masses())
-    square, modes = np.linalg.eigh(chain.stiffness_matrix().toarray() / np.outer(root, root))
-    return np.sqrt(np.maximum(square, 0)), modes
 
 
 def _beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray) -> float:
@@ -162,5 +152,6 @@ def _beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray) -> flo
     chain, sites = model.chain, np.array(model.chain.sites)
     far = sites[np.argmax(np.abs(sites - model.drive_cell))]
     beyond = np.arange(chain.cells) > far if far >= model.drive_cell else np.arange(chain.cells) < far
-    energy = displacement * (chain.stiffness_matrix() @ displacement) + chain.masses() * velocity**2
+    u, v = displacement.ravel(), velocity.ravel()
+    energy = u * (chain.stiffness_matrix() @ u) + chain.masses() * v**2
     return 0.5 * float(energy.reshape(chain.cells, -1)[beyond].sum())

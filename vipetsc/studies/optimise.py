@@ -199,7 +199,9 @@ def _curves(search: Search) -> dict[str, list[Case]]:
     amplitudes = options.curve or np.geomspace(min(asked) / spread, max(asked) * spread, count).tolist()
     amplitudes = sorted({*amplitudes, search.judge.amplitude})
     cases = {name: search.designs[number].case for name, number in search.compared().items()}
-    return {name: [search.plan.run(case, amplitude) for amplitude in amplitudes] for name, case in cases.items() if case}
+    return {
+        name: [search.plan.run(case, amplitude) for amplitude in amplitudes] for name, case in cases.items() if case
+    }
 
 
 def _write(search: Search, folder: Path) -> None:

@@ -1,0 +1,81 @@
+"""The same optimum on any number of ranks, alone or in teams, and after any stop."""
+
+from __future__ import annotations
+
+import tomllib
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.conftest import StopAt, assert_same_bits, datasets
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.parallel import StoppedError, StopRequest
+from vipetsc.studies.optimise import run_search
+
+TABLE = """
+name = "small"
+[lattice]
+preset = "four-band"
+cells = 16
+[contacts]
+sites = [4, 9]
+clearance = 2e-4
+[drive]
+cycles = 3
+[time]
+end = 0.03
+rtol = 1e-7
+[optimise]
+budget = 14
+curve = [20.0]
+[optimise.variables]
+clearance = [1e-5, 1e-3]
+sites = [3, 12]
+"""
+TWO = "optimise.objective=[{measure='transmitted', amplitudes=[5.0]}, {measure='transmitted', goal='minimise'}]"
+
+
+def plan(*changes):
+    return OptimiseCase.from_table(tomllib.loads(TABLE), changes)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What one rank finds."""
+    folder = tmp_path_factory.mktemp("whole")
+    run_search(plan(), folder, MPI.COMM_SELF)
+    return datasets(folder / "optimum.h5")
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("team", [1, 2])
+def test_the_optimum_does_not_depend_on_the_ranks(folder, whole, team):
+    text = run_search(plan(f"optimise.ranks={team}"), folder, MPI.COMM_WORLD)
+    assert "14 designs" in text
+    assert_same_bits(datasets(folder / "optimum.h5"), whole)
+    MPI.COMM_WORLD.Barrier()
+
+
+@pytest.mark.parallel([2])
+def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
+    alone = tmp_path_factory.mktemp("alone")
+    case = plan(TWO, "optimise.population=6")
+    run_search(case, alone, MPI.COMM_SELF)
+    run_search(case, folder, MPI.COMM_WORLD)
+    assert_same_bits(datasets(folder / "optimum.h5"), datasets(alone / "optimum.h5"))
+    MPI.COMM_WORLD.Barrier()
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("looks", [1, 12])
+def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder, whole, looks):
+    comm = MPI.COMM_WORLD
+    stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
+    with pytest.raises(StoppedError, match="the same command goes on"):
+        run_search(plan(), folder, comm, stop=stop)
+    assert not (folder / "optimum.h5").exists()
+    comm.Barrier()
+    run_search(plan(), folder, comm, resume=True)
+    assert_same_bits(datasets(folder / "optimum.h5"), whole)
+    comm.Barrier()

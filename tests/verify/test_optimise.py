@@ -1,0 +1,101 @@
+"""What a design is judged by, against the ledger and against the run of the best case."""
+
+from __future__ import annotations
+
+import tomllib
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import datasets, small_case
+from vipetsc.case import Case
+from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
+from vipetsc.dynamics import simulate
+from vipetsc.io.store import RunMemory
+from vipetsc.lattice import gaps, pass_bands
+from vipetsc.studies.objective import measured
+from vipetsc.studies.optimise import run_search
+
+TABLE = """
+name = "small"
+[lattice]
+preset = "four-band"
+cells = 24
+[contacts]
+sites = [6, 12, 13]
+clearance = 2e-4
+[drive]
+amplitude = 24.33
+cycles = 6
+[time]
+end = 0.08
+rtol = 1e-8
+[optimise]
+budget = 30
+curve = [12.0]
+[optimise.variables]
+clearance = [3e-5, 3e-3]
+"""
+
+
+def objective(measure, **more):
+    return ObjectiveTable.model_validate({"measure": measure} | more)
+
+
+def judged(case, *objectives):
+    memory = RunMemory()
+    result = simulate(case, memory, MPI.COMM_SELF)
+    return measured(memory.dataset, result.statistics, objectives), memory.dataset
+
+
+def test_shares_of_the_work_sum_to_one():
+    """Bands, parts of bands and gaps; what is lost is the ledger's."""
+    case = small_case(time={"end": 0.08, "engine": "auto", "rtol": 1e-9})
+    bands = pass_bands(case.lattice.unit_cell())
+    middle = 0.5 * (bands[3].low + bands[3].high)
+    parts = [objective("band_share", band=4, part=part) for part in ([1.0, middle], [middle, 1e5])]
+    values, run = judged(case, objective("upper_share_at_end"), objective("band_share", band=4), *parts)
+    of_ends = 1 - sum(values["bands"]) - values["dissipated"]
+    held = float(run["energy/contact"][-1] / run["energy/work"][-1])
+    assert len(gaps(bands)) == 3 and 0 <= of_ends - held < 0.01
+    assert values["dissipated"] == pytest.approx(float(run["energy/dissipated"][-1] / run["energy/work"][-1]))
+    assert values["band_share 4"] == pytest.approx(values["bands"][3], rel=1e-12)
+    assert sum(values[part.name] for part in parts) == pytest.approx(values["bands"][3], rel=1e-12)
+    assert all(values[part.name] > 0 for part in parts)
+    assert (
+        values["upper_share_at_end"] == pytest.approx(sum(values["bands"][2:]), rel=1e-12) and values["episodes"] > 10
+    )
+
+
+@pytest.mark.parametrize("drive", [1, 24])
+def test_what_is_beyond_the_last_site_is_what_came_through(drive):
+    """Without contacts a wave passes the site whole, whichever end it comes from."""
+    contacts = {"sites": [11 if drive == 1 else 14], "clearance": 1.0}
+    case = small_case(contacts=contacts, drive={"cell": drive, "cycles": 2}, time={"end": 0.045, "engine": "auto"})
+    values, run = judged(case, objective("transmitted"))
+    energy = run["energy/kinetic"][-1] + run["energy/spring"][-1]
+    assert values["episodes"] == 0 and float(energy / run["energy/work"][-1]) == pytest.approx(1, rel=1e-6)
+    u, v = (run[name].values[-1] for name in ("displacement", "velocity"))
+    chain = case.model().chain
+    local = 0.5 * (u.ravel() * (chain.stiffness_matrix() @ u.ravel()) + chain.masses() * v.ravel() ** 2).reshape(24, 4)
+    side = slice(11, None) if drive == 1 else slice(None, 13)
+    assert values["transmitted"] == pytest.approx(local[side].sum() / float(run["energy/work"][-1]), rel=1e-9)
+    assert 0.3 < values["transmitted"] < 1
+
+
+def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
+    plan = OptimiseCase.from_table(tomllib.loads(TABLE))
+    run_search(plan, tmp_path)
+    found = datasets(tmp_path / "optimum.h5")
+    value, best = found["value"][:, 0], int(found["comparison/number"][1])
+    assert len(value) == 30 and np.isfinite(value).all() and best == np.argmax(value)
+    assert value[best] > 2 * value[0]
+    case = Case.load(tmp_path / "best.toml")
+    assert case.name == "small-best" and case.contacts.clearance == pytest.approx(found["parameter"][best], rel=1e-15)
+    values, _ = judged(case)
+    assert values["upper_share_at_end"] == pytest.approx(value[best], rel=1e-12)
+    at = list(found["amplitude"]).index(24.33)
+    assert found["curve/value"][1, at, 0] == value[best] and found["curve/value"][0, at, 0] == value[0]
+    assert found["upper_share_at_end"].tolist() == value.tolist()
