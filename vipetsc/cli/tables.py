@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 # Time of one step of the default method per mass and per step, measured on one 2020s core.
 _STEP_SECONDS, _STEP_SECONDS_PER_MASS = 2e-5, 7e-8
 
-MODULES = "scipy matplotlib jinja2 numba pydantic tqdm tomli_w xarray h5netcdf cma pymoo".split()
+MODULES = ("scipy", "matplotlib", "jinja2", "numba", "pydantic", "tqdm", "tomli_w", "xarray", "h5netcdf", "cma",
+           "pymoo")  # fmt: skip
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
