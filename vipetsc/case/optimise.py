@@ -201,9 +201,9 @@ class OptimiseCase(CaseFile):
                 {"start": s.start + 1, "end": s.end + 1, "next_cell": s.next_cell, "stiffness": k}
                 for s, k in zip(cell.springs, stiffness, strict=True)
             ]
-            own = {"masses": masses, "springs": springs, "contact": [cell.host + 1, cell.resonator + 1]}
-            kept = {k: v for k, v in table["lattice"].items() if k not in ("preset", "reading", "lambda", "eta")}
-            table["lattice"] = kept | {"cell": own}
+            changed = {"masses": masses, "springs": springs, "contact": [cell.host + 1, cell.resonator + 1]}
+            others = {k: v for k, v in table["lattice"].items() if k not in ("preset", "reading", "lambda", "eta")}
+            table["lattice"] = others | {"cell": changed}
         return _case(table | {"contacts": contacts})
 
     def run(self, design: Case, amplitude: float, lot: int | None = None) -> Case:

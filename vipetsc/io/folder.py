@@ -54,7 +54,7 @@ RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "fi
 BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
 SEARCH = FolderKind("search", ("design.h5",))
 SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
-OPTIMUM = FolderKind("search", ("optimum.h5", "runs-*.jsonl"), ("figures", "best*.toml"))
+OPTIMUM = FolderKind("optimum", ("optimum.h5", "runs-*.jsonl"), ("figures", "best*.toml"))
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, SWEEP, OPTIMUM, PAPER)
 

@@ -94,11 +94,11 @@ def front(losses: np.ndarray) -> np.ndarray:
     """
     finite = np.flatnonzero(np.isfinite(losses).all(axis=1))
     order = finite[np.lexsort(losses[finite].T[::-1])]
-    kept: list[int] = []
+    best: list[int] = []
     for number in order:
-        if not any((losses[other] <= losses[number]).all() for other in kept):
-            kept.append(int(number))
-    return np.array(kept, int)
+        if not any((losses[other] <= losses[number]).all() for other in best):
+            best.append(int(number))
+    return np.array(best, int)
 
 
 def knee(losses: np.ndarray) -> int:
