@@ -53,10 +53,11 @@ class FolderKind:
 RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "figures"), free="analysis")
 BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
 SEARCH = FolderKind("search", ("design.h5",))
+LAW = FolderKind("law", ("law.h5", "one-site-*.jsonl"))
 SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
 OPTIMUM = FolderKind("optimum", ("optimum.h5", "runs-*.jsonl"), ("figures", "best*.toml"))
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
-KINDS = (RUN, BRANCHES, SEARCH, SWEEP, OPTIMUM, PAPER)
+KINDS = (RUN, BRANCHES, SEARCH, LAW, SWEEP, OPTIMUM, PAPER)
 
 
 class Claim:

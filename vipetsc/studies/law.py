@@ -1,0 +1,125 @@
+"""The scattering law of one site: what becomes of a wave's energy, against how hard it meets the site."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.studies.linear import LinearRun
+
+FORWARD, BACKWARD = 0, 1
+LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency is judged
+BROAD = 0.05  # half the width in log z over which it is averaged: a design has to bear as much
+
+
+class Outcome(NamedTuple):
+    """What one site makes of a wave, arrays over z; shares of the energy that arrives in the drive's band.
+
+    ``share`` (..., band, direction) is what leaves by band, forward (0) and backward (1): in the drive's band these are
+    ``transmitted`` and ``reflected``; ``upper`` is all of the bands above. ``dissipated`` and ``contact``, held by a
+    closed contact at the end, make the sum 1. ``onset`` and ``separation`` are the times in s of the first and the
+    last contact, NaN without any; ``release`` is the linear envelope over the clearance at the latter.
+    """
+
+    share: np.ndarray
+    transmitted: np.ndarray
+    reflected: np.ndarray
+    upper: np.ndarray
+    dissipated: np.ndarray
+    contact: np.ndarray
+    onset: np.ndarray
+    separation: np.ndarray
+    release: np.ndarray
+
+
+@dataclass(frozen=True)
+class ScatteringLaw:
+    """The law at points ``z``: largest relative displacement of the linear wave at the site over the clearance.
+
+    ``mean`` and ``scatter`` (standard deviation of runs with amplitudes a little apart) hold arrays over the points.
+    ``drive_band`` counts from 0; ``clearance`` in m. ``peak`` is the largest |w| of the linear wave at the site in m
+    under 1 N, ``linear_envelope`` (time) its sqrt(w^2 + (w'/Om)^2) at ``linear_time`` in s.
+    """
+
+    z: np.ndarray
+    mean: Outcome
+    scatter: Outcome
+    drive_band: int
+    clearance: float
+    peak: float
+    linear_time: np.ndarray
+    linear_envelope: np.ndarray
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """The law in a file ``law.h5``; raises OSError or ValueError if it is none."""
+        with open_netcdf(path, "law", ("share", "drive_band")) as data:
+            return cls.of(data)
+
+    @classmethod
+    def of(cls, data: xr.Dataset) -> Self:
+        """The law in the content of ``law.h5``."""
+        mean, scatter = (
+            Outcome(*(data[f"{name}{end}"].values for name in Outcome._fields)) for end in ("", "_scatter")
+        )
+        about = int(data.attrs["drive_band"]) - 1, float(data.attrs["clearance"]), float(data.attrs["peak"])
+        return cls(data["z"].values, mean, scatter, *about, data["time"].values, data["envelope"].values)
+
+    def at(self, z: ArrayLike) -> Outcome:
+        """What becomes of a wave at ``z`` (any shape): linear in log z between the points, T = 1 below the first.
+
+        Above the last point the last one holds.
+        """
+        return self._interpolated(self.mean, z)
+
+    def deviation(self, z: ArrayLike) -> Outcome:
+        """The scatter at ``z``, as ``at``."""
+        return self._interpolated(self.scatter, z)
+
+    def _interpolated(self, values: Outcome, z: ArrayLike) -> Outcome:
+        x = np.log(np.clip(np.asarray(z, float), self.z[0], self.z[-1]))
+        grid = np.log(self.z)
+        right = np.clip(np.searchsorted(grid, x), 1, len(grid) - 1)
+        weight = (x - grid[right - 1]) / (grid[right] - grid[right - 1])
+
+        def between(array: np.ndarray) -> np.ndarray:
+            w = weight.reshape(weight.shape + (1,) * (array.ndim - 1))
+            # Exactly the point's value at a point, and no NaN of a neighbour beside it.
+            mixed = (1 - w) * array[right - 1] + w * array[right]
+            return np.where(w == 0, array[right - 1], np.where(w == 1, array[right], mixed))
+
+        return Outcome(*map(between, values))
+
+    def efficiency(self) -> np.ndarray:
+        """U/(1-T) (point), both averaged over 5 % of z either way; 0 where 1-T is below 2 % somewhere there."""
+        around = np.exp(np.linspace(-BROAD, BROAD, 41))[:, None] * self.z
+        outcome = self.at(around)
+        lost = 1 - outcome.transmitted
+        return np.where(lost.min(axis=0) > LEAST, outcome.upper.mean(axis=0) / lost.mean(axis=0).clip(LEAST), 0.0)
+
+    def matched(self) -> tuple[float, float]:
+        """Where upper bands get the most of what the drive's wave loses: z*, and T there.
+
+        Raises ValueError if no upper band gets anything.
+        """
+        efficiency = self.efficiency()
+        best = int(np.argmax(efficiency))
+        if not efficiency[best] > 0:
+            raise ValueError("no band above the drive's gets energy from it")
+        return float(self.z[best]), float(self.at(self.z[best]).transmitted)
+
+
+def matched_clearances(law: ScatteringLaw, linear: LinearRun, sites: Sequence[int], amplitude: float) -> np.ndarray:
+    """Clearances in m of ``sites`` (cells from 1, in the order in which the wave meets them) that each meet at z*.
+
+    D_k = A env(s_k) sqrt(T^k)/z*, with the envelope of the ``linear`` run under 1 N and the ``amplitude`` A in N: what
+    the sites before leave of the drive's wave.
+    """
+    z, transmitted = law.matched()
+    left = np.sqrt(transmitted ** np.arange(len(sites)))
+    return abs(amplitude) * linear.envelope[np.asarray(sites) - 1] * left / z
