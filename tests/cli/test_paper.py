@@ -61,7 +61,7 @@ def made(tmp_path_factory) -> Path:
 @pytest.mark.mpirun
 def test_one_rank_makes_the_same_claims_as_two(made, tmp_path):
     done = make_paper(drawing(tiny_plan()), tmp_path / "out", only=["C8", "C11"])
-    assert set(done.made) == {"scattering", "interband"}
+    assert set(done.made) == {"scattering", "interband", "interband-scatter"}
     claims = (made / "claims.json").read_bytes()
     assert (tmp_path / "out" / "claims.json").read_bytes() == claims
     assert {row["verdict"] for row in json.loads(claims)} == {"holds"}

@@ -552,6 +552,36 @@ def test_transfer_as_the_paper_has_it_holds(tmp_path):
     assert single.uncertainty["amplitudes, hertz"] == 17
 
 
+def test_scatter_stands_beside_the_maxima_and_decides_nothing(tmp_path):
+    put_transfer(tmp_path, 0.35)
+    before = {claim: measure(claim, tmp_path) for claim in ("C11", "C14")}
+    rows = [[law, sites] for sites in (5, 1) for law in LAWS]
+    table = {
+        "lattice": {"preset": "four-band", "reading": "calibrated"},
+        "disorder": {"clearance": {"relative": 0.02}},
+        "sweep": {
+            "measures": ["transfer"],
+            "zip": [["lattice.reading", "contacts.law", "contacts.sites", "drive.amplitude"]],
+            "lattice": {"reading": ["calibrated"] * 4},
+            "contacts": {"law": [law for law, _ in rows], "sites": [sites for _, sites in rows]},
+            "drive": {"amplitude": [20.0, 21.0, 22.0, 23.0]},
+            "disorder": {"seed": {"count": 4}},
+        },
+    }
+
+    def content(case):  # a deviation as that of the first clearance
+        nominal = Case.from_table({"contacts": {"sites": len(case.contacts.sites)}}).contacts.clearance[0]
+        return {"ibtet": case.drive.amplitude * case.contacts.clearance[0] / nominal}
+
+    put_sweep(tmp_path / "interband-scatter", table, content, lambda case: 1)
+    for claim, law, amplitude in (("C11", "bilinear", 21.0), ("C14", "hertz", 22.0)):
+        result, name = measure(claim, tmp_path), f"4 samples of 2 % clearance scatter at {amplitude:.4g} N, {law}"
+        mean, deviation = result.value[f"mean of {name}"], result.uncertainty[f"deviation of the {name}"]
+        assert 0 < abs(mean / amplitude - 1) < 0.05 and 0.002 < deviation / amplitude < 0.06
+        assert (result.verdict, result.threshold) == (before[claim].verdict, before[claim].threshold)
+        assert len(result.value) == len(before[claim].value) + 2
+
+
 def test_an_onset_ends_at_half_the_maximum(tmp_path):
     ratio = "ratio of amplitudes from the floor to half the maximum, hertz"
     for folder, slow, expected in (("a", 0.0, 10**0.25), ("b", 90.0, 10.0)):

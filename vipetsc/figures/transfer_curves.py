@@ -58,13 +58,23 @@ def columns_of_laws(shown: Sequence[Curve], ylabel: str, panel: Callable[[Axes, 
     return figure
 
 
+def sampled_points(sweeps: Sweeps) -> Iterator[Curve]:
+    """The configurations that were sampled at single amplitudes."""
+    for ensemble in sweeps:
+        if "statistics/ibtet/mean" in ensemble and AMPLITUDE not in ensemble.sizes:
+            for index in np.ndindex(*ensemble["number"].shape):
+                point = ensemble.isel(dict(zip(ensemble["number"].dims, index, strict=True)))
+                yield Curve(Sweep.of(ensemble).case(int(point["number"])), point)
+
+
 def ibtet(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """One page a reading, a column a law: about the peaks on linear scales, all amplitudes in logarithms."""
+    points = list(sampled_points(sweeps))
     for reading, of_reading in grouped(transfer_curves(sweeps), lambda curve: curve.case.lattice.reading).items():
-        yield reading, partial(_page, reading, of_reading)
+        yield reading, partial(_page, reading, of_reading, [p for p in points if p.case.lattice.reading == reading])
 
 
-def _page(reading: str, of_reading: Sequence[Curve]) -> Figure:
+def _page(reading: str, of_reading: Sequence[Curve], points: Sequence[Curve]) -> Figure:
     laws = sorted({c.case.contacts.law for c in of_reading}, reverse=True)
     kinds = list(dict.fromkeys(Labels.of(c.case).configuration for c in of_reading))
     figure = style.new_figure(style.PAGE if len(laws) > 1 else style.COLUMN, 4.6)
@@ -84,6 +94,11 @@ def _page(reading: str, of_reading: Sequence[Curve]) -> Figure:
                     axes.fill_between(amplitudes, *band, color=f"C{number}", alpha=0.25, lw=0, label=label)
                 if np.isfinite(curve.data["floor"]):
                     axes.axhline(float(curve.data["floor"]), color=f"C{number}", lw=0.6, ls=style.DASHED, zorder=1)
+            for case, point in points:
+                if case.contacts.law == law and Labels.of(case).configuration == kinds[number]:
+                    mean, deviation = (point[f"statistics/ibtet/{name}"].item() for name in ("mean", "deviation"))
+                    bar = {"color": f"C{number}", "mec": style.BLACK, "mew": 0.4, "ms": 3.5, "capsize": 2, "zorder": 5}
+                    linear.errorbar(case.drive.amplitude, mean, deviation, fmt="D", **bar)
             # A ring round the largest value of each, and what it is.
             amplitude, largest = amplitudes[curve.data["peak"]], transfer[curve.data["peak"]]
             linear.plot(amplitude, largest, "o", mfc="none", mec=f"C{number}", ms=6, mew=0.7)

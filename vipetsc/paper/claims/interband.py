@@ -1,11 +1,15 @@
 """C10-C14: energy that passes to higher bands of the four-band lattice (the paper's section III and supplement)."""
 
+import tomllib
+from contextlib import suppress
+
 import numpy as np
 
+from vipetsc.io.read import select
 from vipetsc.paper.claims.criteria import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MeasuredRun, Measurement, MissingEvidence
 
-STEP, AMPLITUDES, DESIGN = "interband", "interband-amplitudes", "design"
+STEP, AMPLITUDES, DESIGN, SCATTER = "interband", "interband-amplitudes", "design", "interband-scatter"
 
 
 def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -75,12 +79,25 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
         beside = np.sort(curve.value[max(curve.peak - 1, 0) : curve.peak + 2])[-2:][0]
         result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - beside
         result.uncertainty[f"amplitudes, {law}"] = len(curve.amplitude)
+        _add_scatter(evidence, reading, law, 5, result)
     result.uncertainty["spread of the maxima between the laws"] = np.ptp(maxima)
     text = "the floor is what the filters make of the record's end, not transfer: without the ends it is"
     result.reasons += [f"{text} {np.nanmax(inner):.1g}"] if np.isfinite(inner).any() else []
     lowest = next(c.interval[0] for c in CLAIMS["C11"].criteria if c.quantity.startswith("maximum"))
     if max(maxima) < lowest and reading == "printed":
         result.reasons.append("the resonator's spring lambda k of the printed equations gives less transfer")
+
+
+def _add_scatter(evidence: Evidence, reading: str, law: str, sites: int, result: Measurement) -> None:
+    """Mean and deviation near the maximum with clearances that scatter, where these samples were made; no criterion."""
+    with suppress(MissingEvidence, KeyError):
+        ensemble = evidence.ensemble(SCATTER)
+        member = select(ensemble, reading=reading, law=law, sites=sites)
+        share = tomllib.loads(ensemble.attrs["case"])["disorder"]["clearance"]["relative"]
+        samples = f"{member['statistics/samples'].item()} samples of {100 * share:g} % clearance scatter"
+        at = f"at {member['amplitude'].item():.4g} N, {law}"
+        result.value[f"mean of {samples} {at}"] = member["statistics/ibtet/mean"].item()
+        result.uncertainty[f"deviation of the {samples} {at}"] = member["statistics/ibtet/deviation"].item()
 
 
 def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -161,3 +178,4 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
             f"maximum with 15 cycles, {law}": short.value.max(),
         }
         result.uncertainty[f"amplitudes, {law}"] = len(shared)
+        _add_scatter(evidence, reading, law, 1, result)
