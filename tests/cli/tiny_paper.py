@@ -23,8 +23,8 @@ CHANGES = {
     "interband-amplitudes": (*FOUR_BAND, "output.window=[5, 15]", "output.every=10"),
     "interband-one-site": (*FOUR_BAND, "output.window=[10, 10]", "sweep.drive.amplitude=[2.0, 40.0]"),
     "interband-scatter": (
-        *SHORT[:3], "lattice.cells=30", 'sweep.lattice.reading=["calibrated", "calibrated"]',
-        'sweep.contacts.law=["hertz", "bilinear"]', "sweep.contacts.sites=[5, 1]", "sweep.drive.amplitude=[5.0, 5.0]"
+        *FOUR_BAND, 'sweep.contacts.law=["hertz", "bilinear"]', "sweep.contacts.sites=[5, 1]",
+        "sweep.drive.amplitude=[5.0, 5.0]"
     ),
     "design": ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11"),
     "nnm-hertz": BRANCH,

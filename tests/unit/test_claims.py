@@ -561,8 +561,8 @@ def test_scatter_stands_beside_the_maxima_and_decides_nothing(tmp_path):
         "disorder": {"clearance": {"relative": 0.02}},
         "sweep": {
             "measures": ["transfer"],
-            "zip": [["lattice.reading", "contacts.law", "contacts.sites", "drive.amplitude"]],
-            "lattice": {"reading": ["calibrated"] * 4},
+            "zip": [["contacts.law", "contacts.sites", "drive.amplitude"]],
+            "lattice": {"reading": ["calibrated"]},
             "contacts": {"law": [law for law, _ in rows], "sites": [sites for _, sites in rows]},
             "drive": {"amplitude": [20.0, 21.0, 22.0, 23.0]},
             "disorder": {"seed": {"count": 4}},
