@@ -1,6 +1,7 @@
 """The verdicts on the paper's claims follow from their numbers: files with known answers in, claims out."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,10 +15,12 @@ from hypothesis import strategies as st
 from tests.conftest import put_members
 from vipetsc.case import Case, Sweep
 from vipetsc.lattice import bloch, pass_bands
+from vipetsc.lattice.modes import modes_of
 from vipetsc.paper.claims import criteria as constants
-from vipetsc.paper.claims import measure_claims, write_claims
+from vipetsc.paper.claims import interband, measure_claims, write_claims
 from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvidence
+from vipetsc.paper.claims.interband import modal_error
 from vipetsc.paper.claims.measure import READINGS, measure_claim, rounded
 from vipetsc.paper.claims.scattering import BRANCHES
 from vipetsc.spectra import FEWEST, Parts, dispersion, part_energies, power_law
@@ -157,6 +160,7 @@ C13 | largest error of the mean over the record | <= | 0.01
 C13 | mean error over a period of the drive, largest of the runs | <= | 0.01
 C13 | largest share outside the paper's bands and gaps | <= | 0.01
 C13 | largest difference of a part's share from that in the space-time spectrum | <= | 0.01
+C13 | bound on the relative error of the modal energies' sum at any sample | <= | 1e-6
 C14 | maximum with one site* | within | 0.05 0.15
 C14 | maximum with one site over that with five* | <= | 1
 C14 | correlation of 15 and 30 cycles* | >= | 0.9
@@ -702,6 +706,22 @@ def test_bands_sum_where_the_split_is_right_alone(tmp_path, velocity, change, ex
     sums = measure("C13", tmp_path)
     assert sums.verdict == expected, sums
     assert missed in sums.reason and sums.figure.endswith("calibrated-5-sites-30-cycles-24N")
+
+
+def test_no_motion_misses_the_modal_energies_by_more_than_the_bound(monkeypatch):
+    """Of a lattice with its own modes, and where modes or frequencies are wrong by a known share."""
+    case = Case.from_table({"lattice": {"preset": "four-band", "cells": 12}})
+    chain, rng = case.model().chain, np.random.default_rng(5)
+    modes, root = modes_of(chain), np.sqrt(chain.masses())
+    assert modal_error(SimpleNamespace(case=case)) < 1e-11
+    for wrong in (replace(modes, vectors=1.01 * modes.vectors), replace(modes, frequency=1.02 * modes.frequency)):
+        monkeypatch.setattr(interband, "modes_of", lambda chain, wrong=wrong: wrong)
+        bound = modal_error(SimpleNamespace(case=case))
+        fields = rng.standard_normal((2, 30, 48)) / root * [[[1.0]], [[1000.0]]]
+        u, v = np.concatenate([fields, np.stack([modes.vectors.T[:30] / root, np.zeros((30, 48))])], axis=1)
+        total = 0.5 * np.sum(v**2 * root**2 + u * (chain.stiffness_matrix() @ u.T).T, axis=1)
+        parts = 0.5 * np.sum(np.abs(wrong.amplitudes(*(x.reshape(60, 12, 4) for x in (u, v)))) ** 2, axis=1)
+        assert 0.015 < np.max(np.abs(parts / total - 1)) <= bound < 1
 
 
 @pytest.mark.parametrize("law", LAWS)
