@@ -98,7 +98,10 @@ def _page(reading: str, of_reading: Sequence[Curve], points: Sequence[Curve]) ->
                 if case.contacts.law == law and Labels.of(case).configuration == kinds[number]:
                     mean, deviation = (point[f"statistics/ibtet/{name}"].item() for name in ("mean", "deviation"))
                     bar = {"color": f"C{number}", "mec": style.BLACK, "mew": 0.4, "ms": 3.5, "capsize": 2, "zorder": 5}
-                    linear.errorbar(case.drive.amplitude, mean, deviation, fmt="D", **bar)
+                    linear.errorbar(
+                        case.drive.amplitude, mean, deviation, fmt="D", label="mean ± std of samples", **bar
+                    )
+                    linear.legend(handles=linear.containers[:1], loc="center right")
             # A ring round the largest value of each, and what it is.
             amplitude, largest = amplitudes[curve.data["peak"]], transfer[curve.data["peak"]]
             linear.plot(amplitude, largest, "o", mfc="none", mec=f"C{number}", ms=6, mew=0.7)
