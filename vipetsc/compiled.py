@@ -83,3 +83,4 @@ def kernel_sources(package: Path) -> list[Path]:
 # (each array of a tuple, at each access). ``inlined`` ones are put in place of their calls, with the constants there.
 kernel = njit(error_model="numpy", _nrt=False)
 inlined = njit(error_model="numpy", _nrt=False, inline="always")
+allocating = njit(error_model="numpy", _nrt=True)  # makes arrays, also where it is called from those

@@ -78,7 +78,7 @@ def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
     w = side * (np.poly1d([D]) - 40.0 * np.poly1d([1, -2 * middle, middle**2 - width**2]))
     start, end = motions(w, h)
     contacts = create_contacts(Contact("hertz", KC, R), [D, D])
-    change = changes.first_change(contacts, start, end, h)
+    change = changes.first_change(contacts, start, end, h, np.empty((2, 6)))
     assert change.share * h == pytest.approx(middle - width)
     assert (change.site, change.function) == (1, 0 if side == 1 else 1)
     assert changes.switching(contacts, 1, change.function, end[1]).mode == side * CLOSED
@@ -86,7 +86,7 @@ def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
     begin = middle - width
     start = motions(np.poly1d(w.c)(np.poly1d([1, begin])), h)[0]  # at the onset
     contacts.sites[1] = (side * CLOSED, D, side * 8e-3)
-    change = changes.first_change(contacts, start, end, h - begin)
+    change = changes.first_change(contacts, start, end, h - begin, np.empty((2, 6)))
     assert begin + change.share * (h - begin) == pytest.approx(middle + width)
     assert (change.site, change.function) == (1, 0)
     separation = changes.switching(contacts, 1, 0, end[1])
@@ -105,7 +105,8 @@ def test_the_earliest_of_several_sites_changes_first(order):
     h, clearances = 1e-3, np.array([D, 3 * D, 5 * D])[::order]
     rate = 6 * D / h
     start, end = np.array([[0.0, rate, 0.0]] * 3), np.array([[6 * D, rate, 0.0]] * 3)
-    change = changes.first_change(create_contacts(Contact("hertz", KC, R), clearances), start, end, h)
+    contacts = create_contacts(Contact("hertz", KC, R), clearances)
+    change = changes.first_change(contacts, start, end, h, np.empty((2, 6)))
     assert change.site == (0 if order == 1 else 2)
     assert change.share == pytest.approx(1 / 6)
 
@@ -117,7 +118,7 @@ def test_clipping_begins_where_g_falls_through_zero():
     for adhesion in ("allow", "clip"):
         contacts = create_contacts(Contact("hertz", KC, R, adhesion), [D, D])
         contacts.sites[1] = (CLOSED, D, approach)
-        change = changes.first_change(contacts, start, end, h)
+        change = changes.first_change(contacts, start, end, h, np.empty((2, 6)))
         assert (change.share > 1) == (adhesion == "allow")
     damping = contacts.law.damping
     begin = change.share * h

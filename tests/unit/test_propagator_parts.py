@@ -27,6 +27,7 @@ from vipetsc.dynamics.propagator.collocation import (
     accumulate_moments,
     collocate,
     collocation,
+    create_trial,
     error_ratio,
     update_taylor,
 )
@@ -227,13 +228,13 @@ def oscillator(damping: float = 0.0) -> tuple[Cluster, float]:
     cluster = Cluster(
         contacts, burst, response, collocation(2), h, 1.0, 1e-10, 1e-12, 1.0,
         taylor=np.array([[1.0, speed * h]]), site_motion=np.zeros((1, 3)), moments=np.zeros((1, 2)),
-        energy=np.zeros(1), history=np.zeros(1, HISTORY), state=np.zeros(1, SUBSTEP_STATE),
+        energy=np.zeros(1), history=np.zeros(1, HISTORY), state=np.zeros(1, SUBSTEP_STATE), trial=create_trial(1, 1),
     )  # fmt: skip
     return cluster, rate
 
 
 def one_substep(cluster: Cluster, substep: Substep) -> Trial:
-    trial = Trial(np.array([0]), np.array([0]), *np.zeros((3, 1, NODES)), np.zeros((1, 2)), np.zeros((1, 3)))
+    trial = cluster.trial
     assert collocate(cluster, trial, substep)
     update_taylor(cluster, trial, substep)
     accumulate_moments(cluster, trial, substep)

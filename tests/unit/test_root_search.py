@@ -24,7 +24,7 @@ def test_bernstein_form_matches_the_hermite_data(data, h):
     b = quintic(*data, h)
     oracle = BPoly.from_derivatives([0, h], [[w0, v0, a0], [w1, v1, a1]])
     s = np.linspace(0, 1, 17)
-    np.testing.assert_allclose([evaluate(b, x) for x in s], oracle(s * h), atol=1e-12)
+    np.testing.assert_allclose([evaluate(b, x, np.empty(6)) for x in s], oracle(s * h), atol=1e-12)
 
 
 @given(st.lists(coefficient, min_size=6, max_size=6))
@@ -40,7 +40,7 @@ def test_first_rise_is_the_first_sign_change(b):
     before = values[s < root - 1e-9]
     assert np.all(before <= 1e-12)
     if b[0] < -1e-9:
-        assert abs(evaluate(b, root)) < 1e-9
+        assert abs(evaluate(b, root, np.empty(6))) < 1e-9
 
 
 def test_a_pair_of_crossings_inside_one_step_is_found():

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import allocating, kernel
 from vipetsc.contact.law import CLIPPED, CLOSED, FREE, Contacts, contact_force
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
@@ -50,7 +50,7 @@ class Extremes(NamedTuple):
     smallest_force: float
 
 
-@njit(error_model="numpy")
+@kernel
 def _affine_form(contacts: Contacts, i: int, function: int) -> tuple[int, float, float, float, int]:
     """Order k, factor, offset of a switching function ``factor`` d^k w/dt^k + ``offset``; its tolerance and mode.
 
@@ -72,49 +72,51 @@ def _affine_form(contacts: Contacts, i: int, function: int) -> tuple[int, float,
     return 1, factor, sign, LANDED_G, side * (CLOSED if clipped else CLIPPED)
 
 
-@njit(error_model="numpy")
+@kernel
 def switching(contacts: Contacts, i: int, function: int, motion: np.ndarray) -> Switching:
     """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
     order, factor, offset, tolerance, mode = _affine_form(contacts, i, function)
     return Switching(factor * motion[order] + offset, factor * motion[order + 1], tolerance, mode)
 
 
-@njit(error_model="numpy")
-def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: float) -> Change:
-    """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3)."""
-    first = Change(2.0, -1, 0)
-    b, c = np.empty(6), np.empty(6)
+@kernel
+def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray) -> Change:
+    """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
+
+    ``room`` (2, 6) is overwritten.
+    """
+    first, b, c = Change(2.0, -1, 0), room[0], room[1]
     for i in range(contacts.sites.size):
         bernstein(start[i], end[i], h, b)
         site = contacts.sites[i]
-        reach = site.clearance - LANDED_W * site.clearance
-        if site.mode == FREE and b.max() < reach and b.min() > -reach:
+        reach, within = site.clearance - LANDED_W * site.clearance, site.mode == FREE
+        for w in b:
+            within &= -reach < w < reach
+        if within:
             continue
         for function in range(2):
             order, factor, offset, tolerance, _ = _affine_form(contacts, i, function)
             if offset == -np.inf:
                 continue
-            if order == 0:
-                c[:] = factor * b + offset
-            else:
-                c[:5] = factor * 5.0 * (b[1:] - b[:5]) / h + offset
+            for k in range(6 - order):
+                c[k] = factor * b[k] + offset if order == 0 else factor * 5.0 * (b[k + 1] - b[k]) / h + offset
             share = first_upcrossing_after_start(c[: 6 - order], tolerance)
             if share < first.share:
                 first = Change(share, i, function)
     return first
 
 
-@njit(error_model="numpy")
-def _push(contacts: Contacts, i: int, b: np.ndarray, d: np.ndarray, s: float) -> float:
+@kernel
+def _push(contacts: Contacts, i: int, b: np.ndarray, d: np.ndarray, s: float, room: np.ndarray) -> float:
     """Contact force in N at share ``s`` of a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
-    force, _ = contact_force(contacts, i, evaluate(b, s), evaluate(d, s))
+    force, _ = contact_force(contacts, i, evaluate(b, s, room), evaluate(d, s, room))
     return force if contacts.sites[i].mode > 0 else -force
 
 
-@njit(error_model="numpy")
+@allocating
 def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
-    b = np.empty(6)
+    b, room = np.empty(6), np.empty(6)
     bernstein(start[i], end[i], h, b)
     d = 5.0 * (b[1:] - b[:5]) / h
     site = contacts.sites[i]
@@ -124,11 +126,11 @@ def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: 
     if recoil[0] < 0.0:
         turn = first_upcrossing(recoil)
         if turn <= 1.0:
-            deepest = max(deepest, side * evaluate(b, turn))
-    largest = smallest = _push(contacts, i, b, d, 0.0)
+            deepest = max(deepest, side * evaluate(b, turn, room))
+    largest = smallest = _push(contacts, i, b, d, 0.0, room)
     best = 0.0
     for k in range(1, _INTERVALS + 1):
-        force = _push(contacts, i, b, d, k / _INTERVALS)
+        force = _push(contacts, i, b, d, k / _INTERVALS, room)
         smallest = min(smallest, force)
         if force > largest:
             largest, best = force, k / _INTERVALS
@@ -136,9 +138,9 @@ def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: 
     low, high = max(best - 1.0 / _INTERVALS, 0.0), min(best + 1.0 / _INTERVALS, 1.0)
     for _ in range(24):
         left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        if _push(contacts, i, b, d, left) > _push(contacts, i, b, d, right):
+        if _push(contacts, i, b, d, left, room) > _push(contacts, i, b, d, right, room):
             high = right
         else:
             low = left
-    largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high)))
+    largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high), room))
     return Extremes(deepest - site.clearance, largest, smallest)

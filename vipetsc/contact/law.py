@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel
 from vipetsc.lattice import Contact
 
 # Modes of a site; the sign is the side.
@@ -49,7 +49,7 @@ def create_contacts(contact: Contact, clearances: Sequence[float]) -> Contacts:
     return Contacts(law, sites)
 
 
-@njit(error_model="numpy")
+@kernel
 def elastic_force_and_slope(law: ForceLaw, x: float) -> tuple[float, float]:
     """kc x^n in N and its derivative in N/m at the indentation x in m, continued as an odd function to x < 0."""
     if law.exponent == 1.0:
@@ -58,7 +58,7 @@ def elastic_force_and_slope(law: ForceLaw, x: float) -> tuple[float, float]:
     return slope * x / law.exponent, slope
 
 
-@njit(error_model="numpy")
+@kernel
 def elastic_force(law: ForceLaw, x: float) -> float:
     """The force of ``elastic_force_and_slope``; Hertz's by a square root, which is five times as fast as a power."""
     if law.exponent == 1.5:
@@ -66,7 +66,7 @@ def elastic_force(law: ForceLaw, x: float) -> float:
     return elastic_force_and_slope(law, x)[0]
 
 
-@njit(error_model="numpy")
+@kernel
 def elastic_energy(law: ForceLaw, x: float) -> float:
     """kc x^(n+1)/(n+1) in J for the indentation x in m; zero for x <= 0."""
     if x <= 0.0:
@@ -78,7 +78,7 @@ def elastic_energy(law: ForceLaw, x: float) -> float:
     return law.stiffness * x ** (law.exponent + 1.0) / (law.exponent + 1.0)
 
 
-@njit(error_model="numpy")
+@kernel
 def contact_force(contacts: Contacts, i: int, w: float, rate: float) -> tuple[float, float]:
     """Force on the host in N and dissipated power in W of site ``i`` in its present mode, at w in m and w' in m/s."""
     site = contacts.sites[i]

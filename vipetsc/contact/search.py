@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import allocating, kernel
 
 # Halvings of [0, 1] are at most 2^-44 = 6e-14 wide; each leaves one half to be searched later.
 _DEPTH = 64
@@ -22,7 +22,7 @@ MOST_ATTEMPTS = 16
 LANDED, RETRY, SEARCH, MISSED = range(4)
 
 
-@njit(error_model="numpy")
+@kernel
 def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> None:
     """Coefficients ``b`` (6,) on [0, 1] of the quintic with (w, w', w'') given at both ends of a step h.
 
@@ -36,32 +36,35 @@ def bernstein(start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> No
     b[5] = end[0]
 
 
-@njit(error_model="numpy")
-def evaluate(b: np.ndarray, s: float) -> float:
-    """Value at s in [0, 1] by de Casteljau's scheme, for up to six coefficients."""
-    c = b.copy()
+@kernel
+def evaluate(b: np.ndarray, s: float, room: np.ndarray) -> float:
+    """Value at s in [0, 1] of the polynomial ``b`` (n <= 6,) by de Casteljau's scheme in ``room`` (6,)."""
+    for i in range(b.size):
+        room[i] = b[i]
     for k in range(1, b.size):
         for i in range(b.size - k):
-            c[i] = (1.0 - s) * c[i] + s * c[i + 1]
-    return c[0]
+            room[i] = (1.0 - s) * room[i] + s * room[i + 1]
+    return room[0]
 
 
-@njit(error_model="numpy")
-def _bisect(c: np.ndarray) -> float:
+@kernel
+def _bisect(c: np.ndarray, room: np.ndarray) -> float:
     """Root in [0, 1] of a polynomial that turns from negative to positive once."""
     a, b = 0.0, 1.0
     for _ in range(53):
         s = 0.5 * (a + b)
-        if evaluate(c, s) > 0.0:
+        if evaluate(c, s, room) > 0.0:
             b = s
         else:
             a = s
     return b
 
 
-@njit(error_model="numpy")
+@allocating
 def first_upcrossing(b: np.ndarray) -> float:
     """Smallest s in [0, 1] at which the polynomial ``b`` (n <= 6,) turns positive; 2 if it never does."""
+    if b[0] > 0.0 or b.max() <= 0.0:
+        return 0.0 if b[0] > 0.0 else 2.0
     n = b.size
     stack = np.empty((_DEPTH + 2, 6))
     low = np.empty(_DEPTH + 2)
@@ -69,7 +72,7 @@ def first_upcrossing(b: np.ndarray) -> float:
     top = 0
     stack[0, :n] = b
     low[0], width[0] = 0.0, 1.0
-    left = np.empty(6)
+    left, room = np.empty(6), np.empty(6)
     while top >= 0:
         c = stack[top, :n].copy()
         begin, size = low[top], width[top]
@@ -80,7 +83,7 @@ def first_upcrossing(b: np.ndarray) -> float:
             continue
         changes = np.sum((c[:-1] <= 0.0) != (c[1:] <= 0.0))
         if changes == 1 and c[n - 1] > 0.0:
-            return begin + size * _bisect(c)
+            return begin + size * _bisect(c, room)
         if size < 1e-13:
             return begin
         for k in range(1, n):
@@ -98,7 +101,7 @@ def first_upcrossing(b: np.ndarray) -> float:
     return 2.0
 
 
-@njit(error_model="numpy")
+@allocating
 def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
     """``first_upcrossing``, where a start within ``tolerance`` of zero has just landed and is itself no crossing."""
     if abs(b[0]) > tolerance:
@@ -119,7 +122,7 @@ class Landing(NamedTuple):
     attempts: int
 
 
-@njit(error_model="numpy")
+@kernel
 def correct(landing: Landing, value: float, rate: float, tolerance: float, goal: float) -> tuple[Landing, int]:
     """Judge an attempt that ended at the ``value`` and ``rate`` (per unit of length) of the switching function.
 
@@ -142,7 +145,7 @@ def correct(landing: Landing, value: float, rate: float, tolerance: float, goal:
     return Landing(landing.length, landing.longest, landing.residual, attempts), SEARCH
 
 
-@njit(error_model="numpy")
+@kernel
 def shorten(landing: Landing, share: float) -> Landing:
     """The attempt at a ``share`` of the last one's length."""
     return Landing(landing.length * share, landing.longest, landing.residual, landing.attempts)

@@ -5,7 +5,7 @@ Sec. 2 to 4 of the derivation in the package's docstring.
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.law import CLOSED, FREE, contact_force
 from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
@@ -23,7 +23,7 @@ from vipetsc.dynamics.propagator.collocation import (
     evaluate_site_motion,
     update_taylor,
 )
-from vipetsc.dynamics.propagator.series import ROUNDING, first_onset, shift
+from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, or without progress.
 DONE, CHANGED, FAILED = range(3)
@@ -44,7 +44,7 @@ LEAST_GROWTH, MOST_GROWTH = 0.2, 2.0
 CUT = 0.4
 
 
-@njit(error_model="numpy")
+@kernel
 def _advance_freely(cluster: Cluster) -> int:
     """Go to the first onset, or to the end of the step, while no force acts."""
     state = cluster.state[0]
@@ -61,7 +61,7 @@ def _advance_freely(cluster: Cluster) -> int:
     return CHANGED
 
 
-@njit(error_model="numpy", inline="always")
+@inlined
 def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     """The next substep: as long as its error allows, not beyond the drive's end, short while a contact is young."""
     state, sites = cluster.state[0], cluster.contacts.sites
@@ -82,7 +82,7 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     return Substep(PLAIN, length)
 
 
-@njit(error_model="numpy", inline="always")
+@inlined
 def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     """Leave the end of a substep in ``trial``; whether it could be collocated."""
     if not collocate(cluster, trial, substep):
@@ -95,7 +95,7 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     return True
 
 
-@njit(error_model="numpy")
+@kernel
 def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> tuple[float, bool]:
     """Repeat a substep to end on a ``change``; the length taken, negative if it could not be, whether it was met."""
     contacts, site, h = cluster.contacts, change.site, cluster.interval
@@ -110,7 +110,8 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> t
         # Landings come to the rounding of w where Newton's steps still help.
         landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, 1e-4 * end.tolerance)
         if outcome == SEARCH:
-            share = first_change(contacts, cluster.site_motion, trial.site_motion, h * landing.length).share
+            motion = cluster.site_motion, trial.site_motion
+            share = first_change(contacts, *motion, h * landing.length, trial.sums.bernstein).share
             if share > 1.0:
                 return landing.length, False
             landing = shorten(landing, share)
@@ -118,14 +119,15 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> t
             return landing.length, outcome == LANDED
 
 
-@njit(error_model="numpy", inline="always")
+@inlined
 def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[Substep, bool]:
     """Search a substep just tried and land on its first change: the substep taken, whether the change was met.
 
     A substep of negative length was rejected; ``state.length`` has the next one to try.
     """
     state = cluster.state[0]
-    change = first_change(cluster.contacts, cluster.site_motion, trial.site_motion, cluster.interval * substep.length)
+    motion, h = (cluster.site_motion, trial.site_motion), cluster.interval
+    change = first_change(cluster.contacts, *motion, h * substep.length, trial.sums.bernstein)
     if change.share > 1.0:
         return substep, False
     mode = cluster.contacts.sites[change.site].mode
@@ -143,7 +145,7 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     return Substep(kind, taken), landed
 
 
-@njit(error_model="numpy", inline="always")
+@inlined
 def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) -> bool:
     """Set the next substep's length by the error of the one ``taken``; whether that is small enough."""
     state = cluster.state[0]
@@ -158,7 +160,7 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
     return True
 
 
-@njit(error_model="numpy")
+@kernel
 def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> None:
     """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
     start, end, history = cluster.site_motion[i], trial.site_motion[i], cluster.history[i]
@@ -166,9 +168,11 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
     depth = max(side * start[0], side * end[0]) - cluster.contacts.sites[i].clearance
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]
-    inside = -side * trial.force[i]
-    force, smallest = max(first, last), min(first, last, inside.min())
-    if inside.max() > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
+    force, smallest, largest = max(first, last), min(first, last), max(first, last)
+    for node in range(NODES):
+        inside = -side * trial.force[i, node]
+        smallest, largest = min(smallest, inside), max(largest, inside)
+    if largest > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
         # A turn lies inside.
         depth, force, smallest = extremes(cluster.contacts, i, cluster.site_motion, trial.site_motion, seconds)
     history.indentation = max(history.indentation, depth)
@@ -176,25 +180,35 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
     history.smallest_force = min(history.smallest_force, smallest)
 
 
-@njit(error_model="numpy")
+@kernel
+def _select_active(cluster: Cluster) -> Trial:
+    """The room for a substep of a cluster, of those DoFs on which forces act."""
+    state, sites, room, closed = cluster.state[0], cluster.contacts.sites, cluster.trial, 0
+    for i in range(sites.size):
+        if sites[i].mode != FREE:
+            room.active[closed] = room.closed[closed] = i
+            closed += 1
+    room.active[closed:] = sites.size
+    is_driven = cluster.taylor.shape[0] > sites.size and state.position < state.drive_end
+    values = room.force, room.w, room.v, room.taylor, room.site_motion, room.sums
+    return Trial(room.active[: closed + is_driven], room.closed[:closed], *values)
+
+
+@kernel
 def advance_cluster(cluster: Cluster) -> int:
     """Advance a cluster to the first change of modes or to the step's end.
 
     Returns ``DONE``, ``CHANGED`` (``cluster`` stands behind it) or ``FAILED``.
     """
-    state, blind, sites, dofs = cluster.state[0], False, cluster.contacts.sites, cluster.taylor.shape[0]
-    force, w, v = np.zeros((dofs, NODES)), np.zeros((dofs, NODES)), np.zeros((dofs, NODES))
-    taylor, site_motion = np.empty_like(cluster.taylor), np.empty_like(cluster.site_motion)
+    state, blind, room = cluster.state[0], False, cluster.trial
+    room.force[:] = room.w[:] = room.v[:] = 0.0
     for _ in range(MOST_SUBSTEPS):
         if 1.0 - state.position <= ROUNDING:
             state.position = 1.0
             return DONE
-        closed = np.flatnonzero(sites["mode"] != FREE)
-        is_driven = dofs > sites.size and state.position < state.drive_end
-        active = np.append(closed, sites.size) if is_driven else closed
-        if active.size == 0:
+        trial = _select_active(cluster)
+        if trial.active.size == 0:
             return _advance_freely(cluster)
-        trial = Trial(active, closed, force, w, v, taylor, site_motion)
         evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
         substep = _choose_substep(cluster, trial)
         if blind:
@@ -221,8 +235,8 @@ def advance_cluster(cluster: Cluster) -> int:
             for i in trial.closed:
                 _update_extremes(cluster, trial, i, cluster.interval * substep.length)
             state.position += substep.length
-            cluster.taylor[:] = taylor
-            cluster.site_motion[:] = site_motion
+            copy(trial.taylor, cluster.taylor)
+            copy(trial.site_motion, cluster.site_motion)
         if landed:
             return CHANGED
     return FAILED

@@ -5,6 +5,7 @@ time. Nodes laid out evenly in the root of the time since the onset, or before t
 ``ONSET`` and ``EXIT`` beside ``PLAIN``.
 """
 
+from collections import namedtuple
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legval
 from scipy.special import binom
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.law import Contacts, contact_force
 from vipetsc.dynamics.layout import Burst, drive_force
 from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
@@ -60,11 +61,9 @@ def _lay_out(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache
 def collocation(powers: int) -> Collocation:
     """Tables for the powers 0 to ``powers`` - 1."""
-    x, w = leggauss(NODES)
-    x, w = (1 + x) / 2, w / 2
-    # Exact for all products: degree 2 powers + NODES + 1.
-    fine, fine_weight = leggauss(powers + NODES)
-    fine, fine_weight = (1 + fine) / 2, fine_weight / 2
+    # The finer ones are exact for all products: degree 2 powers + NODES + 1.
+    rules = leggauss(NODES), leggauss(powers + NODES)
+    (x, w), (fine, fine_weight) = (((1 + at) / 2, weight / 2) for at, weight in rules)
     at = x[:, None] * fine  # (node j, fine)
     (share, slope), (share_at, slope_at) = _lay_out(x), _lay_out(at)
     lagrange = np.stack([np.prod([(at - a) / (b - a) for a in x if a != b], axis=0) for b in x])  # (node k, j, fine)
@@ -87,7 +86,7 @@ class Cluster(NamedTuple):
     ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``site_motion`` (dof, 3) w,
     w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
     ``energy`` (dof,) in J what sites dissipated and the work of the drive; ``history`` (dof,) is of dtype ``HISTORY``,
-    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``.
+    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``. ``trial`` is room for a substep of the largest cluster.
     """
 
     contacts: Contacts
@@ -105,6 +104,7 @@ class Cluster(NamedTuple):
     energy: np.ndarray
     history: np.ndarray
     state: np.ndarray
+    trial: "Trial"
 
 
 class Substep(NamedTuple):
@@ -128,13 +128,26 @@ class Trial(NamedTuple):
     v: np.ndarray
     taylor: np.ndarray
     site_motion: np.ndarray
+    sums: "Sums"
 
 
-@njit(error_model="numpy")
+Sums = namedtuple("Sums", "free_w free_v to_w to_v reaches w v forces moments series bernstein")
+"""Room for what a substep adds up: compiled code that makes no arrays need not count references to them."""
+
+
+def create_trial(dofs: int, terms: int) -> Trial:
+    """Room for a substep of ``dofs`` DoFs, all of which are active."""
+    numbers, taylor, (force, w, v) = np.arange(dofs), np.zeros((dofs, 2 * terms)), np.zeros((3, dofs, NODES))
+    pairs = *np.zeros((2, dofs, NODES)), *np.zeros((2, dofs, dofs, NODES, NODES)), np.zeros((dofs, dofs), bool)
+    rest = *np.zeros((2, NODES)), np.zeros(dofs), np.zeros(2 * terms), np.zeros((terms, 2 * terms)), np.zeros((2, 6))
+    return Trial(numbers, numbers.copy(), force, w, v, taylor, np.zeros((dofs, 3)), Sums(*pairs, *rest))
+
+
+@kernel
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
     """``out`` (site, 3) = w, w', w'' of every site at the present position, where the series is ``taylor``."""
     state, sites, h = cluster.state[0], cluster.contacts.sites.size, cluster.interval
-    forces = np.zeros(taylor.shape[0])
+    forces = cluster.trial.sums.forces[: cluster.taylor.shape[0]]
     for i in range(sites):
         out[i, 0], out[i, 1] = taylor[i, 0], taylor[i, 1] / h
         forces[i] = -contact_force(cluster.contacts, i, out[i, 0], out[i, 1])[0]
@@ -147,11 +160,11 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
         out[i, 2] = acceleration / (h * h)
 
 
-@njit(error_model="numpy")
+@kernel
 def _node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
     """Fill (node k, node) with what DoF ``j``'s force at node k adds to w, w' of DoF ``i``; whether it reaches it."""
-    reaches = False
-    power, size = substep.length, 1.0
+    to_w[:] = to_v[:] = 0.0
+    power, size, reaches = substep.length, 1.0, False
     for m in range(cluster.response.shape[2]):
         g = cluster.response[i, j, m]
         if g != 0.0:
@@ -168,15 +181,15 @@ def _node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np
     return reaches
 
 
-@njit(error_model="numpy")
+@kernel
 def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     """Solve for the force and motion of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
 
     Picard's iteration, which begins with the forces that ``trial`` holds.
     """
-    state, contacts, h = cluster.state[0], cluster.contacts, cluster.interval
+    state, contacts, h, last = cluster.state[0], cluster.contacts, cluster.interval, np.inf
     active, n = trial.active, trial.active.size
-    free_w, free_v = np.empty((n, NODES)), np.empty((n, NODES))
+    free_w, free_v, to_w, to_v, reaches, w, v, _, _, _, _ = trial.sums
     for a in range(n):
         for node in range(NODES):
             at = substep.length * cluster.nodes.share[substep.kind, node]
@@ -184,17 +197,14 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
             free_v[a, node] = slope / h
             if active[a] == contacts.sites.size:
                 trial.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
-    to_w, to_v = np.zeros((n, n, NODES, NODES)), np.zeros((n, n, NODES, NODES))
-    reaches = np.zeros((n, n), np.bool_)
     for a in range(n):
         for b in range(n):
             reaches[a, b] = _node_responses(cluster, substep, active[a], active[b], to_w[a, b], to_v[a, b])
-    w, v, last = np.empty(NODES), np.empty(NODES), np.inf
     for _ in range(MOST_SWEEPS):
         change = 0.0
         for a in range(n):
-            w[:] = free_w[a]
-            v[:] = free_v[a]
+            for node in range(NODES):
+                w[node], v[node] = free_w[a, node], free_v[a, node]
             for b in range(n):
                 if reaches[a, b]:
                     for k in range(NODES):
@@ -215,7 +225,7 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     return False
 
 
-@njit(error_model="numpy")
+@kernel
 def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
     """Put the motion of DoF ``i`` at the nodes into ``trial``; largest change of a site's, inf if it is not finite."""
     change = 0.0
@@ -230,12 +240,11 @@ def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, trial: Tr
     return change
 
 
-@njit(error_model="numpy")
+@kernel
 def update_taylor(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """The series of all DoFs' free motion after a substep in which the forces of ``trial`` acted, into ``trial``."""
     shift(cluster.taylor, substep.length, trial.taylor)
-    dofs, _, terms = cluster.response.shape
-    moments, series = np.empty(2 * terms), np.empty((terms, 2 * terms))
+    (dofs, _, terms), moments, series = cluster.response.shape, trial.sums.moments, trial.sums.series
     for source in trial.active:
         moments[:] = 0.0
         for node in range(NODES):
@@ -255,7 +264,7 @@ def update_taylor(cluster: Cluster, trial: Trial, substep: Substep) -> None:
                         trial.taylor[i, k] += g * series[m, k]
 
 
-@njit(error_model="numpy")
+@kernel
 def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
     """Estimated error of a substep over the allowed one, by the forces' last two Legendre coefficients."""
     worst = 0.0
@@ -272,7 +281,7 @@ def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
     return worst
 
 
-@njit(error_model="numpy")
+@kernel
 def accumulate_moments(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """Add a substep's forces to the moments about the step's end, and their work to the energies."""
     h, position = cluster.interval, cluster.state[0].position

@@ -18,7 +18,7 @@ from vipetsc.contact.law import FREE, Contacts, create_contacts
 from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, impact_time, switch_sites, update_episode, with_room
 from vipetsc.dynamics.layout import Layout, create_burst, join
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
-from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation
+from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation, create_trial
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
 
@@ -97,6 +97,7 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
         clusters.energy[first:stop],
         clusters.history[first:stop],
         clusters.state[c : c + 1],
+        clusters.trial,
     )
 
 
@@ -178,6 +179,7 @@ class Forces:
             energy=np.zeros(count),
             history=np.zeros(count, HISTORY),
             state=np.zeros(len(groups.first) - 1, SUBSTEP_STATE),
+            trial=create_trial(int(np.diff(groups.first).max(initial=0)), terms),
         )
         self.clusters.state["length"] = 1.0
         leaders = dofs["cell"][groups.first[:-1]]

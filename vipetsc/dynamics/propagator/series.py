@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.contact.changes import LANDED_W
 from vipetsc.lattice.chain import Chain
 
@@ -226,20 +226,26 @@ def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.nda
                 out[masses + j, c] += v * dofs.inverse_masses[j]
 
 
-@njit(error_model="numpy")
+@kernel
+def copy(source: np.ndarray, target: np.ndarray) -> None:
+    """Fill all rows of ``target`` (row, column) with the first ones of ``source``."""
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@kernel
 def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
     """Series ``taylor`` (dof, coefficient) expanded about ``s`` instead of 0 into ``out``, which may be ``taylor``."""
-    # Coefficient by coefficient, so that the innermost loop runs over contiguous DoFs.
-    series = np.ascontiguousarray(taylor.T)
-    last, dofs = series.shape[0] - 1, series.shape[1]
-    for k in range(last):
-        for i in range(last - 1, k - 1, -1):
-            for j in range(dofs):
-                series[i, j] += s * series[i + 1, j]
-    out[:] = series.T
+    dofs, coefficients = taylor.shape
+    copy(taylor, out[:dofs])
+    for j in range(dofs):
+        for k in range(coefficients - 1):
+            for i in range(coefficients - 2, k - 1, -1):
+                out[j, i] += s * out[j, i + 1]
 
 
-@njit(error_model="numpy")
+@kernel
 def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
     """Value and slope of a ``series`` at ``s``, by Horner's scheme."""
     value = slope = 0.0
@@ -249,7 +255,7 @@ def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
     return value, slope
 
 
-@njit(error_model="numpy")
+@kernel
 def first_onset(series: np.ndarray, clearance: float, length: float) -> float:
     """First s in [0, length] at which |w| comes within rounding of the clearance and grows; 2 if none does.
 

@@ -164,7 +164,7 @@ class Integrator(Engine):
         end = target if count == 1 else self.time + h
         self.observe(self.tracker.end, end)
         with log.SEARCH:
-            change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h)
+            change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h, np.empty((2, 6)))
         earliest = np.array([change.share, -float(self._stop.requested)])
         self.comm.Allreduce(MPI.IN_PLACE, earliest, MPI.MIN)
         share, stop = earliest.tolist()
@@ -224,7 +224,7 @@ class Integrator(Engine):
         if outcome != SEARCH:
             return attempt, outcome
         # A graze: short of it, go on from here; beyond it, search again on the shorter step.
-        share = first_change(tracker.contacts, tracker.start, tracker.end, attempt.length).share
+        share = first_change(tracker.contacts, tracker.start, tracker.end, attempt.length, np.empty((2, 6))).share
         return (shorten(attempt, share), RETRY) if share <= 1.0 else (attempt, MISSED)
 
     def _switch(self) -> None:
