@@ -16,7 +16,7 @@ from vipetsc.parallel import StoppedError, StopRequest
 
 Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 # Verbs that look at a request to stop, to save first; others end where they are.
-STOPPABLE = ("run", "sweep", "nnm", "optimise", "paper")
+STOPPABLE = ("run", "sweep", "nnm", "law", "optimise", "paper")
 WITH_PETSC_OPTIONS = ("run", "sweep", "validate")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
@@ -36,8 +36,8 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "runs": ("path", {"type": Path, "nargs": "+", "metavar": "PATH",
                       "help": "folder of a run or of a sweep, or a run.h5"}),
     "path": ("path", {"type": Path, "nargs": "+", "metavar": "PATH",
-                      "help": "folder of a run or a search, or its run.h5, design.h5; or folders of branches, whose"
-                              " branches of one name share a page"}),
+                      "help": "folder of a run, a search or a law, or its run.h5, design.h5, law.h5; or folders of"
+                              " branches, whose branches of one name share a page"}),
     "fig": ("--fig", {"action": "append", "metavar": "NAME", "help": "only this figure; may be repeated"}),
     "format": ("--format", {"action": "append", "choices": ("png", "pdf"),
                             "help": "png if left out; may be repeated"}),
@@ -53,6 +53,7 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
     "bands": (verbs.bands, "pass bands, gaps and group velocities of a cell", "case set out json"),
     "sweep": (verbs.sweep, "every combination in [sweep]; goes on where it was", "swept set out force resume"),
     "nnm": (verbs.nnm, "nonlinear normal modes: frequency-energy branches", "modal set out force resume"),
+    "law": (verbs.law, "the scattering law of one site, refined; goes on where it was", "case set out force resume"),
     "optimise": (
         verbs.optimise,
         "the best design for an objective; goes on where it was",

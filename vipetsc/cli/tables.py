@@ -13,7 +13,7 @@ from mpi4py import MPI
 import h5py
 import numpy as np
 
-from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
+from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
 from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
@@ -92,6 +92,10 @@ def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
         search = case.design
         cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
         return [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]
+    if isinstance(case, LawCase):
+        site = case.one_site()
+        where = f"a clearance of {site.clearance:.5g} m {site.distance} cells from the drive"
+        return [("law", f"z to {case.law.largest:g}, {where}; ring of {site.cells} cells, {site.samples} samples")]
     if isinstance(case, OptimiseCase):
         options, searched = case.options, [variable.name for variable in case.variables()]
         told = [("objective", objective.told()) for objective in options.objective]

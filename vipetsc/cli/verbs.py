@@ -13,7 +13,7 @@ from typing import TextIO, TypeVar
 
 from mpi4py import MPI
 
-from vipetsc.case import Case, CaseFile, DesignCase, NnmCase, Sweep
+from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
 from vipetsc.case.every import disorder_of, load_every
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
@@ -178,6 +178,22 @@ def design(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
     with locked(comm, folder):
         echo(comm, on_root(comm, lambda: search_design(case, folder, options.force, options.resume)))
         echo_paths(comm, draw_source("design", [folder], comm, afresh=False))
+    return DONE
+
+
+def law(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """The scattering law of one site: ``law.h5``, its picture, a table."""
+    from vipetsc.dynamics.options import check_options
+    from vipetsc.studies.one_site import make_law
+
+    case = _load(LawCase, options, comm)
+    on_root(comm, lambda: check_options(case))
+    folder, flags = _output(options, f"{case.name}-law"), {"force": options.force, "resume": options.resume}
+    with locked(comm, folder):
+        found = make_law(case, folder, comm, **flags, stop=stop, progress=True)
+        echo(comm, tables.table(found.summary()))
+        if case.output.figures:
+            echo_paths(comm, draw_source("law", [folder], comm, afresh=False))
     return DONE
 
 

@@ -12,7 +12,18 @@ from typing import Any, NamedTuple
 import xarray as xr
 from matplotlib.figure import Figure
 
-from vipetsc.figures import backbone, design, entropy, lattice, optimise, runs, scattering, transfer, transfer_curves
+from vipetsc.figures import (
+    backbone,
+    design,
+    entropy,
+    lattice,
+    law,
+    optimise,
+    runs,
+    scattering,
+    transfer,
+    transfer_curves,
+)
 from vipetsc.figures.study import Files, Sweeps, table
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.io.netcdf import open_netcdf
@@ -20,8 +31,9 @@ from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 
 MOST_WARNINGS = 4  # below a picture
-RUN, SWEEP, BRANCHES, DESIGN, OPTIMUM = "run", "sweep", "branches", "design", "optimum"
-FILES = {DESIGN: ("design.h5", ("cost", "frequency")), OPTIMUM: ("optimum.h5", ("value", "comparison"))}
+RUN, SWEEP, BRANCHES, DESIGN, OPTIMUM, LAW = "run", "sweep", "branches", "design", "optimum", "law"
+FILES = {DESIGN: ("design.h5", ("cost", "frequency")), OPTIMUM: ("optimum.h5", ("value", "comparison")),
+         LAW: ("law.h5", ("share", "efficiency"))}  # fmt: skip
 
 
 class FigureSpec(NamedTuple):
@@ -52,6 +64,7 @@ FIGURES = {
     **_specs(SWEEP, transfer_curves.phase_regimes, measure="transfer"),
     "branch": FigureSpec(backbone.backbone, BRANCHES),
     **_specs(DESIGN, design.deflections, design.cost_maps),
+    **_specs(LAW, law.law),
     **_specs(OPTIMUM, optimise.convergence, optimise.compared_designs, optimise.compared_curves),
     "dispersion_against_lambda": FigureSpec(partial(design.dispersions, along="lambda", other="eta"), DESIGN),
     "dispersion_against_eta": FigureSpec(partial(design.dispersions, along="eta", other="lambda"), DESIGN),
@@ -80,7 +93,7 @@ def draw(
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; returns the files, each complete.
 
     The ``source``, what is in the folders, is "run" (one folder), "sweep" (with branches beside them), "branches" (of
-    the same names, side by side), "design" or "optimum" (one folder); ``names`` are figures, by default all there are.
+    the same names, side by side), "design", "optimum" or "law" (one folder); ``names`` are figures, all by default.
     With a ``share`` (rank, size) every ``size``-th picture from ``rank`` on is drawn; pictures that are not older than
     the time ``newest`` stay. Raises KeyError for a name that is no figure of ``source`` and for a file that lacks
     something, OSError or ValueError if a file cannot be read, or a picture not written.

@@ -1,9 +1,9 @@
 """The scattering law of one site: what becomes of a wave's energy, against how hard it meets the site."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -14,7 +14,34 @@ from vipetsc.studies.linear import LinearRun
 
 FORWARD, BACKWARD = 0, 1
 LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency is judged
+NEAR = 5  # cells from the site within which energy counts as near it
 BROAD = 0.05  # half the width in log z over which it is averaged: a design has to bear as much
+
+OF_POINT = {
+    "transmitted": ("z", "1", "share that goes on in the drive's band"),
+    "reflected": ("z", "1", "share that goes back in the drive's band"),
+    "upper": ("z", "1", "share that bands above the drive's get"),
+    "share": ("z band direction", "1", "share that leaves by band and direction"),
+    "dissipated": ("z", "1", "share that is dissipated"),
+    "contact": ("z", "1", "share that a closed contact holds at the end"),
+    "onset": ("z", "s", "time of the first contact"),
+    "separation": ("z", "s", "time at which the last contact ends"),
+    "release": ("z", "1", "linear envelope over the clearance when the last contact ends"),
+}
+LAYOUT = {
+    "z": ("z", "1", "largest relative displacement of the linear wave at the site over the clearance"),
+    "band": ("band", "1", "band, from 1"),
+    "direction": ("direction", "1", "forward: from the drive to the site and on; backward"),
+    "time": ("time", "s", "time"),
+    "envelope": ("time", "m/N", "sqrt(w^2 + (w'/Om)^2) of the linear wave at the site under 1 N"),
+    "amplitude": ("z", "N", "amplitude of the drive"),
+    "episodes": ("z", "1", "contact episodes"),
+    "near": ("z", "1", f"twice the kinetic energy within {NEAR} cells of the site at the end, contained in the shares"),
+    "interpolation_error": ("z", "1", "largest distance of a share from the line between the neighbours before it"),
+    "efficiency": ("z", "1", "U/(1-T), both averaged over 5 % of z either way; 0 where little leaves the drive's wave"),
+    **OF_POINT,
+    **{f"{name}_scatter": (dims, unit, f"deviation: {text}") for name, (dims, unit, text) in OF_POINT.items()},
+}
 
 
 class Outcome(NamedTuple):
@@ -43,7 +70,8 @@ class ScatteringLaw:
 
     ``mean`` and ``scatter`` (standard deviation of runs with amplitudes a little apart) hold arrays over the points.
     ``drive_band`` counts from 0; ``clearance`` in m. ``peak`` is the largest |w| of the linear wave at the site in m
-    under 1 N, ``linear_envelope`` (time) its sqrt(w^2 + (w'/Om)^2) at ``linear_time`` in s.
+    under 1 N, ``linear_envelope`` (time) its sqrt(w^2 + (w'/Om)^2) at ``linear_time`` in s; ``about``: the attributes
+    of ``law.h5``.
     """
 
     z: np.ndarray
@@ -54,6 +82,7 @@ class ScatteringLaw:
     peak: float
     linear_time: np.ndarray
     linear_envelope: np.ndarray
+    about: Mapping[str, Any]
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -68,7 +97,7 @@ class ScatteringLaw:
             Outcome(*(data[f"{name}{end}"].values for name in Outcome._fields)) for end in ("", "_scatter")
         )
         about = int(data.attrs["drive_band"]) - 1, float(data.attrs["clearance"]), float(data.attrs["peak"])
-        return cls(data["z"].values, mean, scatter, *about, data["time"].values, data["envelope"].values)
+        return cls(data["z"].values, mean, scatter, *about, data["time"].values, data["envelope"].values, data.attrs)
 
     def at(self, z: ArrayLike) -> Outcome:
         """What becomes of a wave at ``z`` (any shape): linear in log z between the points, T = 1 below the first.
@@ -112,6 +141,29 @@ class ScatteringLaw:
         if not efficiency[best] > 0:
             raise ValueError("no band above the drive's gets energy from it")
         return float(self.z[best]), float(self.at(self.z[best]).transmitted)
+
+    def summary(self) -> list[tuple[str, str]]:
+        """What there is to tell of the law, as rows of a table."""
+        about, mean = self.about, self.mean
+        sums = mean.share.sum(axis=(1, 2)) + mean.dissipated + mean.contact
+        arrives = f"at {about['arrival']:.4g} s, {about['spread']:.4g} times as long as the burst"
+        rows = [
+            ("ring", f"{about['cells']} cells, site at {about['distance']}, clearance {self.clearance:.5g} m"),
+            ("packet", f"{arrives}; {about['under_way']:.1e} of its energy had not passed at the end"),
+            ("points", f"{len(self.z)} from z = 1 to {self.z[-1]:g}; shares sum to 1 within {abs(sums - 1).max():.0e}"),
+        ]
+        for z in (1.01, 1.1, 1.5, 3.0, 10.0, 30.0, 100.0):
+            o, d = self.at(z), self.deviation(z)
+            shares = (
+                (o.transmitted, d.transmitted),
+                (o.reflected, d.reflected),
+                (o.upper, d.upper),
+                (o.dissipated, d.dissipated),
+            )
+            told = (f"{name} {m:.3f}+-{s:.3f}" for name, (m, s) in zip("TRUL", shares, strict=True))
+            rows += [(f"z = {z:g}", ", ".join(told))] if z < self.z[-1] else []
+        best = f"z* = {about['matched_z']:.4g}, T = {about['matched_transmitted']:.3g}"
+        return [*rows, ("matched", best if self.efficiency().any() else "no band above the drive's gets energy")]
 
 
 def matched_clearances(law: ScatteringLaw, linear: LinearRun, sites: Sequence[int], amplitude: float) -> np.ndarray:

@@ -20,9 +20,9 @@ given z, shares do not depend on the clearance. Hertz's does through its stiffne
 clearance, by default the geometric mean of the sites'.
 
 **Refinement.** z = 1, then two points an octave; the point in the middle (in log z) of two is made, and if T, R, U or
-the dissipated share lies further from the line between them than the tolerance and than its scatter, both halves are
-treated likewise, until they are finer than asked for. Mean and deviation at z are those of runs spread evenly over
-z (1 +- min(jitter, (z - 1)/4)).
+the dissipated share lies further from the line between them than the tolerance and than its scatter, or T falls from 1
+between them, both halves are treated likewise, until they are finer than asked for. Mean and deviation at z are those
+of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
 """
 
 import itertools
@@ -36,6 +36,7 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicHermiteSpline
 
+import vipetsc
 from vipetsc.case import Case
 from vipetsc.case.law import LawCase
 from vipetsc.dynamics import simulate
@@ -45,39 +46,13 @@ from vipetsc.io.records import Record, RecordFile, read_records
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
 from vipetsc.spectra.directions import by_direction, wave_energies
-from vipetsc.studies.law import FORWARD, Outcome, ScatteringLaw
+from vipetsc.studies.law import FORWARD, LAYOUT, NEAR, OF_POINT, ScatteringLaw
 from vipetsc.studies.pool import TaskPool
 
 LINEAR = 0.0  # the z of the run without a site
 STEP = np.sqrt(2.0)  # between neighbouring points to begin with
-NEAR = 5  # cells from the site within which energy counts as near it
 RECORDS = "one-site-*.jsonl"
 JUDGED = "transmitted", "reflected", "upper", "dissipated"
-
-OF_POINT = {
-    "transmitted": ("z", "1", "share that goes on in the drive's band"),
-    "reflected": ("z", "1", "share that goes back in the drive's band"),
-    "upper": ("z", "1", "share that bands above the drive's get"),
-    "share": ("z band direction", "1", "share that leaves by band and direction"),
-    "dissipated": ("z", "1", "share that is dissipated"),
-    "contact": ("z", "1", "share that a closed contact holds at the end"),
-    "onset": ("z", "s", "time of the first contact"),
-    "separation": ("z", "s", "time at which the last contact ends"),
-    "release": ("z", "1", "linear envelope over the clearance when the last contact ends"),
-}
-LAYOUT = {
-    "z": ("z", "1", "largest relative displacement of the linear wave at the site over the clearance"),
-    "band": ("band", "1", "band, from 1"),
-    "direction": ("direction", "1", "forward: from the drive to the site and on; backward"),
-    "time": ("time", "s", "time"),
-    "envelope": ("time", "m/N", "sqrt(w^2 + (w'/Om)^2) of the linear wave at the site under 1 N"),
-    "amplitude": ("z", "N", "amplitude of the drive"),
-    "episodes": ("z", "1", "contact episodes"),
-    "near": ("z", "1", f"twice the kinetic energy within {NEAR} cells of the site at the end, contained in the shares"),
-    "interpolation_error": ("z", "1", "largest distance of a share from the line between the neighbours before it"),
-    **OF_POINT,
-    **{f"{name}_scatter": (dims, unit, f"deviation: {text}") for name, (dims, unit, text) in OF_POINT.items()},
-}
 
 
 def make_law(
@@ -104,7 +79,7 @@ def make_law(
         if not on_root(comm, path.exists):
             runs = Runs(case, claim.folder, comm, stop)
             grid = refine(runs, progress)
-            on_root(comm, lambda: write_netcdf(path, runs.dataset(grid).assign_attrs(provenance(comm) | runs.about())))
+            on_root(comm, lambda: write_netcdf(path, runs.dataset(grid)))
         claim.publish()
         return on_root(comm, lambda: ScatteringLaw.read(claim.path / "law.h5"))
 
@@ -131,7 +106,10 @@ class Runs:
         def work(z: float) -> None:
             begin = time.process_time()
             made[z] = self._linear(team) if z == LINEAR else self._scattered(z, team)
-            self.file.append({"z": z, "cpu_seconds": round(time.process_time() - begin, 4)} | made[z])
+            self.file.append(
+                {"z": z, "vipetsc_version": vipetsc.__version__, "cpu_seconds": round(time.process_time() - begin, 4)}
+                | made[z]
+            )
 
         bar = Progress(self.comm, len(missing), "runs", show=progress and bool(missing))
         pool.share(missing, work, bar, lambda z, reason: failed.append(f"z = {z:.6g}: {reason}"))
@@ -207,7 +185,7 @@ class Runs:
     def jittered(self, z: float) -> list[float]:
         """The runs that stand for the point ``z``; none for z = 1, which nothing touches."""
         options = self.case.law
-        width = min(options.jitter, (z - 1) / 4)
+        width = min(options.jitter, (z - 1) / 10)
         spread = np.linspace(-1, 1, options.samples) if options.samples > 1 else np.zeros(1)
         return [*dict.fromkeys((z * (1 + width * spread)).tolist())] if z > 1 else []
 
@@ -236,11 +214,15 @@ class Runs:
         values |= {"direction": ["forward", "backward"], "time": linear["time"], "envelope": linear["envelope"]}
         values |= {"amplitude": [self.amplitude(z) for z in points], "interpolation_error": [*map(grid.get, points)]}
         values |= {name: np.array([mean[name] for mean in means]) for name in (*OF_POINT, "near", "episodes")}
-        values |= {f"{name}_scatter": np.array([row[name] for row in deviations]) for name in Outcome._fields}
-        return xr.Dataset(tabulated(LAYOUT, values))
+        values |= {f"{name}_scatter": np.array([row[name] for row in deviations]) for name in OF_POINT}
+        data = xr.Dataset(tabulated(LAYOUT, values), attrs=provenance(self.comm) | self._about())
+        law = ScatteringLaw.of(data)
+        best = law.matched() if law.efficiency().any() else (np.nan, np.nan)
+        data.attrs |= dict(zip(("matched_z", "matched_transmitted"), best, strict=True))
+        return data.assign(tabulated(LAYOUT, {"efficiency": law.efficiency()}))
 
-    def about(self) -> dict[str, Any]:
-        """The attributes of ``law.h5``."""
+    def _about(self) -> dict[str, Any]:
+        """The attributes of ``law.h5`` that tell of the runs without a site."""
         setting, linear, case = self.setting, self.records[LINEAR], self.case
         time, energy = np.array(linear["time"]), np.square(linear["envelope"])
         burst = np.linspace(0, 1, 1001)
@@ -271,6 +253,7 @@ def refine(runs: Runs, progress: bool = False) -> dict[float, float]:
             off = {name: float(np.abs(mean[name] - (left[name] + right[name]) / 2)) for name in JUDGED}
             grid[z] = max(off.values())
             bent = any(off[name] > max(options.tolerance, float(deviation[name])) for name in JUDGED)
+            bent |= bool(left["transmitted"] > 1 - options.tolerance >= right["transmitted"])  # the onset
             if bent and z / low > 1 + options.finest:
                 halves += [(low, z), (z, high)]
     return grid
@@ -296,4 +279,5 @@ def _last(run: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
 def _read(folder: Path) -> dict[float, Record]:
     """The records of runs in ``folder`` by z."""
     paths = sorted(folder.glob(RECORDS))
-    return {record["z"]: record for path in paths for record, _ in read_records(path, lambda text: None)}
+    records = (record for path in paths for record, _ in read_records(path, lambda text: None))
+    return {record["z"]: record for record in records if record["vipetsc_version"] == vipetsc.__version__}
