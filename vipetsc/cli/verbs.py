@@ -190,8 +190,8 @@ def law(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     on_root(comm, lambda: check_options(case))
     folder, flags = _output(options, f"{case.name}-law"), {"force": options.force, "resume": options.resume}
     with locked(comm, folder):
-        found = make_law(case, folder, comm, **flags, stop=stop, progress=True)
-        echo(comm, tables.table(found.summary()))
+        result = make_law(case, folder, comm, **flags, stop=stop, progress=True)
+        echo(comm, tables.table(result.summary()))
         if case.output.figures:
             echo_paths(comm, draw_source("law", [folder], comm, afresh=False))
     return DONE

@@ -4,6 +4,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.figures import style
 
@@ -32,7 +33,7 @@ def law(data: xr.Dataset) -> Figure:
             share, scatter = (
                 data[name].values[:, of["band"]][:, 0][:, of["direction"]][:, 0] for name in ("share", "share_scatter")
             )
-            _curve(middle, z, np.maximum(share, FLOOR), scatter, colour, line, f"band {number}, {way}")
+            _curve(middle, z, np.where(share > FLOOR, share, np.nan), scatter, colour, line, f"band {number}, {way}")
     over = z - 1
     for name in ("transmitted", "upper"):
         label, colour = SHARES[name]
@@ -41,8 +42,11 @@ def law(data: xr.Dataset) -> Figure:
     right.plot(over, efficiency, color=style.BLACK, lw=1.2, label="U/(1 - T)")
     for axes in (left, middle):
         axes.set(xscale="log", xlabel="z = linear displacement / clearance", xlim=(0.9, z[-1]))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if z[-1] > 20 else (1.0, 2.0, 5.0)))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     left.set(ylim=(0, 1.02), ylabel="share of the energy that arrives")
-    middle.set(yscale="log", ylim=(FLOOR, 1.5))
+    middle.set(yscale="log", ylim=(FLOOR / 50, 1.5))
     right.set(xscale="log", xlabel="z - 1", xlim=(max(over[1] / 2, 1e-4), 3), ylim=(0, 1.02))
     if np.isfinite(best):
         for axes, at in ((left, best), (middle, best), (right, best - 1)):
@@ -50,8 +54,9 @@ def law(data: xr.Dataset) -> Figure:
         right.set_title(f"z* = {best:.3g}, T = {float(data.attrs['matched_transmitted']):.3g}", fontsize=8)
     left.set_title("T + R + U + L + other bands = 1", fontsize=8)
     middle.set_title("by band and direction", fontsize=8)
-    for axes in (left, middle, right):
-        axes.legend(fontsize=6)
+    left.legend(fontsize=6, loc="center right")
+    right.legend(fontsize=6, loc="upper right", bbox_to_anchor=(1.0, 0.75))
+    middle.legend(fontsize=6, loc="lower left", ncols=2)
     return figure
 
 
