@@ -108,9 +108,11 @@ def _page(reading: str, of_reading: Sequence[Curve], points: Sequence[Curve]) ->
             linear.text(0.97, 0.94 - 0.09 * line, f"largest: {largest:.3f} at {amplitude:.3g} N", ha="right", va="top",
                         color=f"C{number}", transform=linear.transAxes)  # fmt: skip
         reach = max(6 * c.data[AMPLITUDE][c.data["peak"]] for c in of_law)
-        linear.set(title=f"({tag}.1) {law.capitalize()}, {reading}", xlim=(0, float(reach)), ylim=(0, None))
-        logarithmic.set(title=f"({tag}.2) {law.capitalize()}, {reading}", xscale="log", yscale="log", ylim=(None, 6.0))
+        linear.set(title=f"({tag}.1) {law.capitalize()}, {reading}", xlim=(0, float(reach)))
+        logarithmic.set(title=f"({tag}.2) {law.capitalize()}, {reading}", xscale="log", yscale="log")
         logarithmic.legend(loc="upper right")
+    for row, low, high in ((grid[0], 0, None), (grid[1], None, 6.0)):  # the limits of all columns, once all is drawn
+        row[0].set_ylim(low, high)
     return figure
 
 
