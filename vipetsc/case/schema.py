@@ -217,13 +217,15 @@ class AnalysisTable(Section):
     """How finely a run is measured; the strides at 1 leave nothing out, what others change stands in ``analysis.h5``.
 
     ``band_stride``: samples between those at which energies above the pass bands are taken; ``snapshot_stride`` and
-    ``cell_stride``: of the snapshots (500 at most) and of the cells whose entropy is taken. ``pixels``: most rows and
-    columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most that.
+    ``cell_stride``: of the snapshots (500 at most) and of the cells whose entropy is taken. ``modal_stride``: samples
+    between those, besides the ones around contacts, at which the energies of the linear modes are taken. ``pixels``:
+    most rows and columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most that.
     """
 
     band_stride: int = Field(10, ge=1)
     snapshot_stride: int = Field(2, ge=1)
     cell_stride: int = Field(2, ge=1)
+    modal_stride: int = Field(50, ge=1)
     pixels: int = Field(600, ge=2)
     memory: Positive = 1.0
 

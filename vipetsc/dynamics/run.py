@@ -261,6 +261,9 @@ class Run:
         statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
         about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
         attributes = comm.bcast(provenance(comm) | about)  # what rank 0 tells counts
+        if ending == COMPLETE and isinstance(output, RunMemory):
+            shares = comm.gather(self.setup.layout.checkpoint(engine.state.array_r)["cells"])
+            output.end = np.concatenate(shares) if shares else None
         if ending != STOPPED:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
         return result_of(attributes, ending == STOPPED, output.folder)

@@ -32,6 +32,8 @@ LOSSES = "energy/dissipated_by_site"
 LARGE = {
     "displacement": ("field_time cell dof", "m", "displacement of each mass"),
     "velocity": ("field_time cell dof", "m/s", "velocity of each mass"),
+    "end/displacement": ("cell dof", "m", "displacement of each mass at the last sample"),
+    "end/velocity": ("cell dof", "m/s", "velocity of each mass at the last sample"),
     LOSSES: ("time site", "J", "energy dissipated at each site"),
     "episode": ("episode", "1", "contact episode, by onset"),
     "impacts/site": ("episode", "1", "site, counted from 1"),

@@ -191,7 +191,8 @@ class RunMemory:
     """Keeps a run in memory: ``dataset`` on rank 0 of ``comm``, None on the others and before its end.
 
     It is used as a ``RunFolder``. Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
-    They lie in memory as (t, dof, cell): on one rank the engine writes them where they stay.
+    They lie in memory as (t, dof, cell): on one rank the engine writes them where they stay. ``end`` are the
+    displacements and velocities (cell, 2 dof) at the last sample of a run that is complete; see ``end/displacement``.
     """
 
     folder = None
@@ -200,6 +201,7 @@ class RunMemory:
     def __init__(self, comm: MPI.Comm = MPI.COMM_SELF) -> None:
         self.comm, self.count = comm, 0
         self.dataset: xr.Dataset | None = None
+        self.end: np.ndarray | None = None
 
     def begin(self, case: str) -> None:
         """Make ready."""
@@ -247,6 +249,9 @@ class RunMemory:
             self.dataset = chunks.small_dataset(self, attributes)
             log, *_ = spread(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
             fields = dict(zip(self.recording.fields, self._fields[:, : self._rows].swapaxes(2, 3), strict=True))
+            if self.end is not None:
+                last = np.split(self.end[self.recording.given["cell"] - 1], 2, axis=1)
+                fields |= dict(zip(("end/displacement", "end/velocity"), last, strict=True))
             for name, values in {**chunks.joined(self, [LOSSES]), **chunks.log_columns(log), **fields}.items():
                 dims, about = chunks.described(name, self.dataset)
                 self.dataset[name] = dims, values, about

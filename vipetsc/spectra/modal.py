@@ -12,6 +12,7 @@ from vipetsc.spectra.bands import Parts
 from vipetsc.spectra.pooling import blocks
 from vipetsc.spectra.wavelet import BINS
 
+Rows = Sequence[int] | np.ndarray
 EDGE = 1e-9  # modes nearer to a pass band than this share of the top one's edge are in it
 
 
@@ -45,7 +46,9 @@ class ModalParts:
         rows = [np.bincount(index, row, shape[0] * BINS).reshape(shape) for row in energies]
         return np.stack(rows, axis=-1) if rows else np.zeros((*shape, 0))
 
-    def energies(self, displacement: Any, velocity: Any, rows: Sequence[int], memory: float = np.inf) -> np.ndarray:
+    def energies(
+        self, displacement: Any, velocity: Any, rows: Sequence[int] | np.ndarray, memory: float = np.inf
+    ) -> np.ndarray:
         """Energies (part, bin, row) in J at the samples ``rows`` of fields (t, cell, dof) in m and m/s.
 
         Fields may be stored; no more than ``memory`` bytes of both are read at once.
@@ -55,6 +58,35 @@ class ModalParts:
             u, v = (np.asarray(field[rows[some]]) for field in (displacement, velocity))
             parts.append(self.sums(0.5 * np.abs(self.modes.amplitudes(u, v)) ** 2))
         return np.concatenate(parts, axis=-1)
+
+    def driven_change(self, state: np.ndarray, drive: ToneBurst, force: np.ndarray, span: np.ndarray) -> np.ndarray:
+        """What ``drive`` changes in the energies (part) in J of a lattice without contacts within a ``span`` in s.
+
+        ``state`` are the amplitudes (mode) at its begin, ``force`` is ``Modes.force`` of the driven mass. Exact.
+        """
+        begin, end = span
+        later = self.modes.later(state, end - begin) + force * self.modes.driven(drive, begin, end)
+        return np.asarray(self.sums(0.5 * (np.abs(later) ** 2 - np.abs(state) ** 2)[None]).sum(axis=(1, 2)))
+
+
+def cluster_samples(
+    onset: np.ndarray, separation: np.ndarray, time: np.ndarray, stride: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Contact episodes put together that touch between the same samples, by the times in s of all.
+
+    Returns the numbers (cluster, 2) of the samples, of those that ``stride`` divides and the last one, between which
+    each cluster lies, and the cluster (episode) of every episode, from 0. Episodes without an end (NaN) last.
+    """
+    first = np.maximum(np.searchsorted(time, onset, side="right") - 1, 0) // stride * stride
+    stop = -(-np.searchsorted(time, separation) // stride) * stride
+    stop = np.minimum(np.maximum(stop, first + stride), len(time) - 1)
+    order = np.argsort(first, kind="stable")
+    reach = np.maximum.accumulate(stop[order])
+    begins = np.flatnonzero(np.append(True, first[order][1:] >= reach[:-1])[: len(order)])
+    ends = np.append(begins[1:], len(order))[: len(begins)] - 1
+    cluster = np.zeros(len(order), np.int64)
+    cluster[order] = np.repeat(np.arange(len(begins)), ends - begins + 1)
+    return np.column_stack([first[order][begins], reach[ends]]), cluster
 
 
 def _index(edges: np.ndarray, frequency: np.ndarray) -> np.ndarray:

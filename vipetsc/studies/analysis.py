@@ -2,7 +2,8 @@
 
 Kinetic energy in space and time, wavenumber content, dispersion (of the whole record, and of the cells before and
 after the first site), wavenumber partition and entropy (wavelets over the cells), energies of the pass bands and
-gaps, and the inter-band targeted energy transfer. The measures themselves stand in ``vipetsc.spectra``.
+gaps, the inter-band targeted energy transfer, and the energies of the linear modes. The measures themselves stand in
+``vipetsc.spectra``.
 """
 
 import json
@@ -20,66 +21,59 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import cells_between
+from vipetsc.studies.bands import BANDS, band_energies
+from vipetsc.studies.modal import MODAL, modal_energies
 from vipetsc.studies.velocity import VelocityRecord, options_of
 
 FORMAT_VERSION = 3
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
 SNAPSHOTS = 500  # at most this many samples are transformed by wavelets
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those who window the record
-ENDS = 0.02  # share of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 
 # What is measured of a run whose fields are kept; "maps" are the space-time maps of the other measures.
-FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "maps")
+FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "modal", "transfers", "maps")
 # Of a member of a sweep whose fields are kept, by the sweep's ``measures``: what its pictures show.
 WHOLE = {
     "entropy": ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "maps"),
-    "transfer": ("kinetic", "dispersion", "bands", "maps"),
+    "transfer": ("kinetic", "dispersion", "bands", "modal", "maps"),
 }
 
 # Dimensions, units and description of every variable; dimensions of a group are named without it, so none may be
 # called as one outside that the group uses.
-LAYOUT = {
-    "time": ("time", "s", "time"),
-    "cell": ("cell", "1", "cell"),
-    "kinetic_energy": ("time cell", "J", "kinetic energy of a cell"),
-    "wavenumber": ("wavenumber", "rad/cell", "wavenumber"),
-    "wavenumber_content": ("time wavenumber", "J", "kinetic energy per wavenumber bin"),
-    "frequency": ("frequency", "rad/s", "angular frequency"),
-    "dispersion": ("wavenumber frequency", "J", "mean kinetic energy per bin"),
-    "dispersion_before": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells before the first site"),
-    "dispersion_after": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells after the first site"),
-    "ibtet": ("", "1", "inter-band energy transfer"),
-    "ibtet_whole": ("", "1", "inter-band energy transfer as the paper's: the record's last samples are in the mean"),
-    "bands/edge": ("bands/edge", "1", "edge of a part"),
-    "bands/part": ("bands/part", "1", "part of the frequency axis"),
-    "bands/edges": ("bands/edge", "rad/s", "edges of the pass bands and gaps"),
-    "bands/sample": ("bands/sample", "s", "time of a sample"),
-    "bands/energy": ("bands/part bands/sample", "J", "kinetic energy of a part"),
-    "bands/band": ("bands/band", "1", "part that holds pass bands"),
-    "bands/kinetic_energy": ("bands/band time cell", "J", "kinetic energy of a part in a cell"),
-    "bands/above": ("bands/part", "1", "1 for a pass band above the driven one"),
-    "bands/total": ("bands/sample", "J", "kinetic energy"),
-    "bands/share": ("bands/part", "1", "mean share of a part after the wave's arrival"),
-    "entropy/snapshot": ("entropy/snapshot", "s", "time of a snapshot"),
-    "entropy/history": ("entropy/snapshot", "bit", "energy-weighted mean entropy of a snapshot"),
-    "entropy/energy_weighted": ("", "bit", "mean over time of the energy-weighted entropy"),
-    "entropy/masked": ("", "bit", "mean entropy where the wave is louder than 1 % of its loudest"),
-    "entropy/joint": ("", "bit", "mean over time of the entropy over cells and wavenumbers together"),
-    "entropy/error": ("", "bit", "deviation over the cells of the masked time mean"),
-    "entropy/cell": ("entropy/cell", "1", "cell"),
-    "entropy/local": ("entropy/snapshot entropy/cell", "bit", "entropy over wavenumbers at a cell"),
-    "entropy/weight": ("entropy/snapshot entropy/cell", "m2/s2", "wavelet energy at a cell"),
-    "partition/snapshot": ("partition/snapshot", "s", "time of a snapshot"),
-    "partition/bin": ("partition/bin", "1", "wavenumber bin"),
-    "partition/bound": ("partition/bound", "1", "bound of a bin"),
-    "partition/bounds": ("partition/bound", "rad/cell", "bounds of the bins"),
-    "partition/energy": ("partition/bin partition/snapshot", "J", "kinetic energy of a bin"),
-    "partition/kinetic": ("partition/snapshot", "J", "kinetic energy"),
-    "partition/reconstructed": ("partition/snapshot", "J", "kinetic energy of the bins' sum"),
-    "partition/error": ("partition/snapshot", "1", "relative error of the reconstructed kinetic energy"),
-    "partition/cross_share": ("partition/snapshot", "1", "share of the energy between bins"),
-    "partition/kinetic_energy": ("partition/bin partition/snapshot cell", "J", "kinetic energy of a bin in a cell"),
-}
+LAYOUT = (
+    {
+        "time": ("time", "s", "time"),
+        "cell": ("cell", "1", "cell"),
+        "kinetic_energy": ("time cell", "J", "kinetic energy of a cell"),
+        "wavenumber": ("wavenumber", "rad/cell", "wavenumber"),
+        "wavenumber_content": ("time wavenumber", "J", "kinetic energy per wavenumber bin"),
+        "frequency": ("frequency", "rad/s", "angular frequency"),
+        "dispersion": ("wavenumber frequency", "J", "mean kinetic energy per bin"),
+        "dispersion_before": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells before the first site"),
+        "dispersion_after": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells after the first site"),
+        "entropy/snapshot": ("entropy/snapshot", "s", "time of a snapshot"),
+        "entropy/history": ("entropy/snapshot", "bit", "energy-weighted mean entropy of a snapshot"),
+        "entropy/energy_weighted": ("", "bit", "mean over time of the energy-weighted entropy"),
+        "entropy/masked": ("", "bit", "mean entropy where the wave is louder than 1 % of its loudest"),
+        "entropy/joint": ("", "bit", "mean over time of the entropy over cells and wavenumbers together"),
+        "entropy/error": ("", "bit", "deviation over the cells of the masked time mean"),
+        "entropy/cell": ("entropy/cell", "1", "cell"),
+        "entropy/local": ("entropy/snapshot entropy/cell", "bit", "entropy over wavenumbers at a cell"),
+        "entropy/weight": ("entropy/snapshot entropy/cell", "m2/s2", "wavelet energy at a cell"),
+        "partition/snapshot": ("partition/snapshot", "s", "time of a snapshot"),
+        "partition/bin": ("partition/bin", "1", "wavenumber bin"),
+        "partition/bound": ("partition/bound", "1", "bound of a bin"),
+        "partition/bounds": ("partition/bound", "rad/cell", "bounds of the bins"),
+        "partition/energy": ("partition/bin partition/snapshot", "J", "kinetic energy of a bin"),
+        "partition/kinetic": ("partition/snapshot", "J", "kinetic energy"),
+        "partition/reconstructed": ("partition/snapshot", "J", "kinetic energy of the bins' sum"),
+        "partition/error": ("partition/snapshot", "1", "relative error of the reconstructed kinetic energy"),
+        "partition/cross_share": ("partition/snapshot", "1", "share of the energy between bins"),
+        "partition/kinetic_energy": ("partition/bin partition/snapshot cell", "J", "kinetic energy of a bin in a cell"),
+    }
+    | BANDS
+    | MODAL
+)
 
 
 def analyse(
@@ -111,8 +105,9 @@ def analyse(
         record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
     else:
         values |= _dispersions(record) if "dispersion" in measures else {}
-        values |= _bands(record, measures) if "bands" in measures else {}
+        values |= band_energies(record, measures) if "bands" in measures else {}
         values |= _wavelets(record, measures, arrival) if cells > 1 else {}
+    values |= modal_energies(run, record, measures) if {"modal", "transfers"} & measures else {}
     if cells == 1:
         record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
     left_out = "; ".join(record.left_out + record.warnings)
@@ -189,52 +184,6 @@ def _dispersions(record: VelocityRecord) -> dict[str, Any]:
         frequency = np.concatenate([part.frequency for part in pieces])
         values |= {"wavenumber": pieces[0].wavenumber, "frequency": frequency, name: energy}
     return values
-
-
-def _bands(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
-    """Energies of the pass bands and gaps, and the inter-band transfer from the wave's arrival on."""
-    parts, stride = spectra.Parts.of(pass_bands(record.model.chain.cell)), record.options.band_stride
-    measured = record.velocity, record.masses, record.interval, parts.edges
-    energy = spectra.part_energies(*measured, stride, record.memory)
-    above = parts.above(record.model.drive.frequency)
-    if record.site is None:
-        after = int(np.searchsorted(record.time, record.model.drive.duration))
-        first, reason = min(after, len(record.time) - 1), "the drive ends (the lattice has no sites)"
-    else:
-        at = int(np.argmin(np.abs(record.cells - record.site)))
-        first = spectra.front_arrival(spectra.kinetic_energy(record.velocity[:, at], record.masses))
-        reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
-    # The filters see less than the waves' length at the record's ends.
-    nt, ends = len(record.time), int(np.ceil(ENDS * len(record.time)))
-    first = min(max(first, ends), nt - 1)
-    last = max(nt - ends, first + 1)
-    total = energy[:, first:last].sum(axis=0)
-    moving = total > 0
-    about = {"start": record.time[first], "starts_when": f"{reason}, or after the first {ENDS:.0%} of the record"}
-    about |= {"end": record.time[last - 1], "ends_when": f"before the last {ENDS:.0%} of the record"}
-    names = {"parts": list(parts.names)}
-    record.attributes |= {"bands/energy": names, "bands/share": about | names}
-    coarse, some = energy.copy(), np.arange(0, nt, 2 * stride)
-    coarse[-1] = np.interp(np.arange(nt), some, energy[-1, some])
-    values: dict[str, Any] = {}
-    whole = {"start": about["start"], "end": record.time[-1]}
-    for name, stop, times in (("ibtet", last, about), ("ibtet_whole", nt, whole)):
-        values[name], doubled = (spectra.ibtet(e[:, :stop], above, first) for e in (energy, coarse))
-        error = abs(doubled - values[name]) if stride > 1 else 0.0
-        record.attributes[name] = times | {"band_stride": stride, "sampling_error": error}
-    if "maps" in measures:
-        bands = np.flatnonzero([bool(inside) for inside in parts.bands])
-        values["bands/band"] = bands + 1
-        ranges = np.column_stack([parts.edges[bands], parts.edges[bands + 1]])
-        values["bands/kinetic_energy"] = spectra.part_maps(*measured[:3], ranges, record.sizes, record.memory)
-    return values | {
-        "bands/edge": np.arange(len(parts.edges)),
-        "bands/part": np.arange(1, len(parts.names) + 1),
-        "bands/edges": parts.edges,
-        "bands/energy": energy,
-        "bands/above": above.astype(np.int8),
-        "bands/share": (energy[:, first:last][:, moving] / total[moving]).mean(axis=1),
-    }
 
 
 def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float | None) -> dict[str, Any]:

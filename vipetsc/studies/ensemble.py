@@ -145,7 +145,11 @@ class Results:
                 members.setdefault(source, []).append(number)
         for (name, site), numbers in members.items():
             if name in self.linear and site in self.linear[name].measures:
-                self._put(numbers, self.linear[name].measures[site])
+                run = self.linear[name]
+                self._put(numbers, run.measures[site])
+                if "bands/modal_energy" in run.measures[site]:
+                    table = self.tables["bands/modal_energy"]
+                    table[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
             else:
                 self.status[numbers] = MISSING
 
@@ -186,9 +190,9 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
         number = np.arange(data["entropy/history"].shape[-1])
         data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
         data["entropy/time"] = data.pop("entropy/snapshot")
-    if "bands/share" in data:
-        data["bands/share"].attrs["parts"] = list(*results.parts)
-        number = np.arange(1, data["bands/share"].shape[-1] + 1)
+    for name in data.keys() & {"bands/share", "bands/modal_energy"}:
+        data[name].attrs["parts"] = list(*results.parts)
+        number = np.arange(1, data[name].shape[-1] + 1)
         data["part"] = variable("part", number, "1", "part of the frequency axis")
     places = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
     numbers = results.first[results.status == FAILED]

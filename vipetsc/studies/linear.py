@@ -30,6 +30,8 @@ MEASURES = {name: LAYOUT[name] for name in (*FITTED, "ibtet_whole", "entropy/err
     "entropy/start": ("", "s", "time at which averages of the entropy begin"),
     "entropy/history": ("snapshot", "bit", "entropy of a snapshot"),
     "entropy/snapshot": ("snapshot", "s", "time of a snapshot"),
+    "upper_share_at_end": LAYOUT["upper_share_at_end"],
+    "bands/modal_energy": ("part", "J", "energy of the linear modes in a part at the end"),
     "bands/share": ("part", "1", "mean share of a pass band or gap after the wave's arrival"),
 }
 
@@ -95,7 +97,10 @@ def measured(analysis: xr.Dataset) -> Record:
     errors = {name: analysis[name].attrs.get("sampling_error") for name in row}
     row |= {"errors": {name: float(error) for name, error in errors.items() if error is not None}}
     row |= {"analysis": analysis.attrs["analysis"]} if "analysis" in analysis.attrs else {}
-    row |= {"parts": list(analysis["bands/share"].attrs["parts"])} if "bands/share" in row else {}
+    for name in row.keys() & {"bands/share", "bands/modal_energy"}:
+        row["parts"] = list(analysis[name].attrs["parts"])
+    if "bands/modal_energy" in row:
+        row["bands/modal_energy"] = analysis["bands/modal_energy"].values[:, -1].tolist()
     return row | ({"entropy/start": float(analysis.attrs["entropy/start"])} if "entropy/history" in row else {})
 
 

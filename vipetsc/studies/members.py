@@ -26,7 +26,10 @@ from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
 from vipetsc.studies.linear import MARGIN, PARTS, LinearRun, leading_cell, linear_case, linear_name, measured
 
 FIELDS = "displacement", "velocity"
-ANALYSED = {"entropy": ("entropy",), "transfer": ("bands",)}  # what ``analyse`` calls those of ``[sweep] measures``
+ANALYSED = {
+    "entropy": ("entropy",),
+    "transfer": ("bands", "modal"),
+}  # what ``analyse`` calls those of ``[sweep] measures``
 
 
 class MemberStore:
@@ -99,7 +102,7 @@ class MemberStore:
 
     def _run(self, case: Case, folder: Path, arrival: float | None) -> Record:
         """Simulate and measure a member with all its samples and cells; what is kept of them comes after that."""
-        whole, all_kept = self.plan.options.fields, keeps_all(case)
+        whole, all_kept = self.plan.options.fields, keeps_all(case) and "displacement" in case.output.fields
 
         def begin() -> None:
             """A run with its fields that was cut off goes on, if it is of the same case."""
@@ -110,7 +113,7 @@ class MemberStore:
                 write_text(marker, text)
 
         on_root(self.team, begin)
-        fields = [name for name in FIELDS if name == "velocity" or (whole and name in case.output.fields)]
+        fields = [*FIELDS[not whole :]]
         memory = RunMemory(self.team)
         output = {"fields": fields, "window": None, "every": 1, "stride": 1, "writer": "gather"}
         everything = case.model_copy(update={"output": case.output.model_copy(update=output)})
@@ -156,6 +159,8 @@ def keeps_all(case: Case) -> bool:
 def thinned(run: xr.Dataset, case: Case) -> xr.Dataset:
     """``run`` with what the section ``[output]`` of ``case`` keeps of its fields."""
     output = case.output
+    if "displacement" not in output.fields:
+        run = run.assign({"end/displacement": run["displacement"].variable[-1]})
     run = run.drop_vars([name for name in FIELDS if name in run and name not in output.fields])
     run = run.isel(cell=list(recorded_cells(output, case.lattice.cells)))
     fields = {name: run[name].isel(time=slice(None, None, output.stride)) for name in output.fields}

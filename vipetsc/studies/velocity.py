@@ -37,7 +37,7 @@ class VelocityRecord:
         self.options, self.memory = options, options.memory * 2**30
         self.model = Case.of(run).model()
         self.masses = np.asarray(self.model.chain.cell.masses)
-        self.velocity: Any = _StoredField(field) if field.nbytes > self.memory else field.values
+        self.velocity: Any = self.field(field)
         self.time, self.interval, self.cells = field_time(run), field_interval(run), run["cell"].values
         self.site = None if leading is None else int(run["sites/cell"].values[leading])
         self.sizes = -(-len(self.time) // options.pixels), -(-len(self.cells) // options.pixels)
@@ -46,6 +46,10 @@ class VelocityRecord:
         self.attributes: dict[str, dict[str, Any]] = {}
         self.left_out: list[str] = []
         self.warnings: list[str] = []
+
+    def field(self, field: xr.DataArray) -> Any:
+        """A recorded ``field``, read as a whole if it fits into the memory."""
+        return _StoredField(field) if field.nbytes > self.memory else field.values
 
     def unresolved(self) -> set[str]:
         """Measures that would take waves for longer or slower ones in what was kept; warns of them."""
