@@ -48,7 +48,7 @@ def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, in_process, case, 
     files = {p.name for p in (tmp_path / "out").iterdir()}
     assert files == {"run.h5", "summary.json", "case.toml", "analysis.h5", "figures"}
     pictures = {p.name: p.stat().st_size for p in (tmp_path / "out" / "figures").glob("*.png")}
-    wanted = {"spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
+    wanted = {"modal_energies", "spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
     assert {f"{name}.png" for name in wanted} <= pictures.keys()
     assert min(pictures.values()) > 5000
     if not ranks:

@@ -18,6 +18,7 @@ from vipetsc.figures import (
     entropy,
     lattice,
     law,
+    modal,
     optimise,
     runs,
     scattering,
@@ -54,6 +55,7 @@ def _specs(source: str, *functions: Callable[..., Any], measure: str = "") -> di
 
 # The dearest of a run first, so that ranks which share the work finish together.
 FIGURES = {
+    **_specs(RUN, modal.modal_energies),
     **_specs(RUN, runs.spacetime, runs.dispersion, runs.phase, lattice.unit_cell, runs.impacts, runs.ledger),
     **_specs(SWEEP, scattering.amplitudes, scattering.wavelets, scattering.partition, measure="entropy"),
     **_specs(SWEEP, scattering.partition_explained, scattering.reconstruction, measure="entropy"),

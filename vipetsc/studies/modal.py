@@ -34,9 +34,13 @@ MODAL = {
 
 def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     """The variables of ``MODAL``: at the last sample alone, or with "transfers" among the ``measures`` over time."""
-    chain, time, kept = record.model.chain, record.time, [n for n in ("displacement", "end/displacement") if n in run]
-    if len(record.cells) < chain.cells or not kept:
-        missing = f"{chain.cells - len(record.cells)} cells were" if kept else "the displacement was"
+    chain, time, recorded = (
+        record.model.chain,
+        record.time,
+        [n for n in ("displacement", "end/displacement") if n in run],
+    )
+    if len(record.cells) < chain.cells or not recorded:
+        missing = f"{chain.cells - len(record.cells)} cells were" if recorded else "the displacement was"
         record.left_out.append(f"upper_share_at_end, bands/modal_energy: {missing} not recorded")
         return {}
     parts = ModalParts.of(chain)
@@ -44,10 +48,10 @@ def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection
     kind = "of the lattice" if parts.modes.exact else f"of a ring of {parts.modes.cells} cells"
     record.attributes["bands/modal_energy"] = {"parts": list(names), "modes": kind}
     values: dict[str, Any] = {"bands/part": np.arange(1, len(names) + 1)}
-    if kept[0] == "displacement" and "transfers" in measures:
+    if recorded[0] == "displacement" and "transfers" in measures:
         values |= _history(run, record, parts)
     else:
-        last = run[kept[0]][-1:] if kept[0] == "displacement" else run[kept[0]].expand_dims("time")
+        last = run[recorded[0]][-1:] if recorded[0] == "displacement" else run[recorded[0]].expand_dims("time")
         energy = parts.energies(last.values, np.asarray(record.velocity[-1:]), np.zeros(1, int))
         values |= {"bands/instant": time[-1:], "bands/modal_energy": energy.sum(axis=1)}
     work = float(run["energy/work"].values[np.searchsorted(run["time"].values, time[-1])])
