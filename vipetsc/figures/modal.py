@@ -34,7 +34,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         share = float(energy[p, -1] / energy[:, -1].sum())
         steps.plot(time, energy[p], color=colour, lw=0.9, label=f"{names[p]}: {share:.1%}")
     steps.set(ylabel="Energy of the linear modes (J)", xlim=run["time"][[0, -1]], ylim=(0, None))
-    steps.legend(loc="upper right", title="share at the end", title_fontsize=7)
+    steps.legend(loc="best", title="share at the end", title_fontsize=7)
     if not rows:
         steps.set(xlabel="Time (s)")
         return figure
