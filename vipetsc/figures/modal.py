@@ -22,7 +22,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     largest = float(energy.sum("bands/part").max())
     if largest == 0:
         return panels.empty_figure("Modal energies: the drive has done no work")
-    weight = np.maximum(energy[:, -1], np.abs(analysis["bands/transfer"]).sum("bands/cluster")).values
+    weight = np.maximum(energy.values[:, -1], np.abs(analysis["bands/transfer"].values).sum(axis=0))
     shown = [p for p, name in enumerate(names) if "band" in name or weight[p] > LEAST * largest]
     rows, moved = _moved(run, analysis, shown)
     figure = style.new_figure(style.PAGE if rows else style.COLUMN, 3.3 if rows else 2.4)
