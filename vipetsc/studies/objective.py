@@ -23,8 +23,7 @@ from vipetsc.studies.analysis import analyse
 from vipetsc.studies.pool import TaskPool
 
 RECORDS = "runs-*.jsonl"
-ANALYSED = {"ibtet": "bands", "entropy": "entropy"}  # what ``analyse`` calls them
-OF_ANALYSIS = {"ibtet": "ibtet", "entropy": "entropy/energy_weighted"}
+ANALYSED = {"ibtet": ("bands", "ibtet"), "entropy": ("entropy", "entropy/energy_weighted")}  # of ``analyse``
 
 
 class Judge:
@@ -136,9 +135,9 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[O
     values["bands"] = [float(energy[inside[name]].sum()) for name in names]
     values["upper_share_at_end"] = float(energy[above[modal.part]].sum())
     values["transmitted"] = _beyond(model, *state) / work
-    asked = {objective.measure for objective in objectives} & ANALYSED.keys()
-    analysis = analyse(run, {ANALYSED[name] for name in asked}) if asked else {}
-    values |= {name: float(analysis[OF_ANALYSIS[name]]) for name in asked}
+    asked = {o.measure: ANALYSED[o.measure] for o in objectives if o.measure in ANALYSED}
+    analysis = analyse(run, {measure for measure, _ in asked.values()}) if asked else {}
+    values |= {name: float(analysis[variable]) for name, (_, variable) in asked.items()}
     for objective in objectives:
         if objective.band:
             low, high = objective.part or (0.0, np.inf)

@@ -1,24 +1,15 @@
 """Which designs a search tries next: CMA-ES for one objective, NSGA-II for two; the same ones from the same seed.
 
-Points lie in the unit cube, losses are to become small. Neither draws from numpy's global state.
+Either is asked for points (design, variable) of the unit cube and told the losses (design, objective), which are to
+become small, of all of them in that order. Neither draws from numpy's global state.
 """
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 RESOLVED = 1e-4  # of the range between the bounds: what impacts make of a finer change is noise
 WHOLE = 0.3  # least standard deviation of a whole number
-
-
-class Sampler(Protocol):
-    """Asked for points (design, variable), and told the losses (design, objective) of all of them in that order."""
-
-    def ask(self) -> np.ndarray:
-        """The next points."""
-
-    def tell(self, losses: np.ndarray) -> None:
-        """What became of them."""
 
 
 class CmaEs:
@@ -85,6 +76,9 @@ class Nsga2:
 
         Evaluator().eval(StaticProblem(self._problem, F=losses), self._asked)
         self._search.tell(infills=self._asked)
+
+
+Sampler = CmaEs | Nsga2
 
 
 def front(losses: np.ndarray) -> np.ndarray:
