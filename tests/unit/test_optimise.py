@@ -160,6 +160,11 @@ def test_a_search_that_has_contracted_begins_again_with_more():
     assert sizes[0] == 8 and 16 in sizes
 
 
+def test_where_nothing_differs_generations_stay_within_bounds():
+    sizes = {len(searched(sampler, lambda p: np.ones((len(p), 1)), 1)[0]) for sampler in [cma()] for _ in range(40)}
+    assert 8 < max(sizes) <= 64
+
+
 def test_the_step_of_a_whole_number_does_not_vanish():
     """Where the others contract, neighbouring cells are still tried."""
     sampler = CmaEs(np.full(2, 0.52), np.array([0.0, 0.02]), 0.2, 5, None)

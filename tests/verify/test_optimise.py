@@ -15,8 +15,9 @@ from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import gaps, pass_bands
+from vipetsc.studies import optimise
+from vipetsc.studies.linear import LinearRun, linear_case
 from vipetsc.studies.objective import measured
-from vipetsc.studies.optimise import run_search
 
 TABLE = """
 name = "small"
@@ -87,7 +88,7 @@ def test_what_is_beyond_the_last_site_is_what_came_through(drive):
 
 def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
     plan = OptimiseCase.from_table(tomllib.loads(TABLE))
-    run_search(plan, tmp_path)
+    optimise.run_search(plan, tmp_path)
     found = datasets(tmp_path / "optimum.h5")
     value, best = found["value"][:, 0], int(found["comparison/number"][1])
     assert len(value) == 30 and np.isfinite(value).all() and best == np.argmax(value)
@@ -99,3 +100,27 @@ def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
     at = list(found["amplitude"]).index(24.33)
     assert found["curve/value"][1, at, 0] == value[best] and found["curve/value"][0, at, 0] == value[0]
     assert found["upper_share_at_end"].tolist() == value.tolist()
+
+
+def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, monkeypatch):
+    """Each meets the same relative displacement over clearance, less what the sites before it take."""
+
+    class Law:
+        def matched(self):
+            return 1.25, 0.64
+
+    asked = []
+    monkeypatch.setattr(optimise, "make_law", lambda *given, **options: asked.append(given) or Law())
+    table = tomllib.loads(TABLE)
+    table["optimise"] |= {"start": "matched", "budget": 2}
+    table["contacts"]["sites"] = [12, 6, 13]
+    optimise.run_search(OptimiseCase.from_table(table), tmp_path)
+    ((law, folder, _),) = asked
+    assert law.drive.amplitude == 24.33 and folder == tmp_path / "law"
+    memory = RunMemory()
+    result = simulate(linear_case(small_case()), memory, MPI.COMM_SELF)
+    envelope = LinearRun.of(memory.dataset, result.statistics, (), ()).envelope
+    met = 24.33 * envelope[np.array([6, 12, 13]) - 1] / 1.25 * [1, 0.8, 0.64]
+    found = datasets(tmp_path / "optimum.h5")["parameter"]
+    assert found.shape == (2, 3) and found[0] == pytest.approx(2e-4)
+    assert found[1][[1, 0, 2]] == pytest.approx(met, rel=1e-3)

@@ -55,7 +55,7 @@ BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
 SEARCH = FolderKind("search", ("design.h5",))
 LAW = FolderKind("law", ("law.h5", "one-site-*.jsonl"))
 SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
-OPTIMUM = FolderKind("optimum", ("optimum.h5", "runs-*.jsonl"), ("figures", "best*.toml"))
+OPTIMUM = FolderKind("optimum", ("optimum.h5", "runs-*.jsonl"), ("figures", "law", "best*.toml"))
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, LAW, SWEEP, OPTIMUM, PAPER)
 

@@ -15,13 +15,19 @@ from mpi4py import MPI
 import numpy as np
 import xarray as xr
 
-from vipetsc.case import Case, CaseError, case_id
+from vipetsc.case import Case, CaseError, LawCase, case_id
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.dynamics import simulate
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import OPTIMUM, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
-from vipetsc.parallel import Progress, StopRequest, on_root
+from vipetsc.io.store import RunMemory
+from vipetsc.lattice.chain import cells_between
+from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
+from vipetsc.studies.law import matched_clearances
+from vipetsc.studies.linear import LinearRun, linear_case
 from vipetsc.studies.objective import Judge
+from vipetsc.studies.one_site import make_law
 from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, front, knee
 from vipetsc.studies.sweep import is_whole
 
@@ -164,12 +170,9 @@ def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest,
 
     searches: list[Search] = []  # on rank 0
 
-    def begin() -> None:
-        start = plan.begin()
-        searches.append(Search(plan, judge, _sampler(plan, start), start))
-
     try:
-        on_root(comm, begin)
+        start = _start(plan, folder, comm, stop)
+        on_root(comm, lambda: searches.append(Search(plan, judge, _sampler(plan, start), start)))
         more = True
         while more:
             judge.make(on_root(comm, lambda: searches[0].runs()))
@@ -180,6 +183,29 @@ def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest,
     finally:
         bar.close()
         judge.close()
+
+
+def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> np.ndarray:
+    """The values (variable) at which the search begins; all ranks must call it. Raises StoppedError."""
+    if plan.options.start == "case":
+        return plan.begin()
+    table = {key: value for key, value in plan.table.items() if key != "disorder"}
+    law = make_law(LawCase.from_table(table | {"name": "law"}), folder / "law", comm, stop=stop)
+    lattice, drive = plan.base.lattice, plan.base.drive
+
+    def matched() -> np.ndarray:
+        memory = RunMemory(MPI.COMM_SELF)
+        result = simulate(linear_case(plan.base), memory, MPI.COMM_SELF, stop=stop)
+        if memory.dataset is None or not result.complete:
+            raise StoppedError(f"{result.sentence}; the same command goes on")
+        linear = LinearRun.of(memory.dataset, result.statistics, (), ())
+        sites = np.array(plan.sites)  # the law's are in the order in which the wave meets them
+        order = np.argsort(cells_between(sites, drive.cell, lattice.cells, lattice.ends), kind="stable")
+        clearance = np.empty(len(sites))
+        clearance[order] = matched_clearances(law, linear, sites[order].tolist(), drive.amplitude)
+        return plan.begin(clearance.tolist())
+
+    return on_root(comm, matched)
 
 
 def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:

@@ -9,20 +9,22 @@ from typing import Any
 import numpy as np
 
 RESOLVED = 1e-4  # of the range between the bounds: what impacts make of a finer change is noise
+LARGEST = 8  # times the first population
 WHOLE = 0.3  # least standard deviation of a whole number
 
 
 class CmaEs:
     """Covariance matrix adaptation (Hansen 2016, arXiv:1604.00772), by ``cma``.
 
-    A search that has contracted begins again at the best point, with twice the population. ``steps`` (variable) are
-    those of whole numbers in the unit cube, 0 for others.
+    A search that has contracted begins again at the best point, with twice the population, up to ``LARGEST`` times the
+    first. ``steps`` (variable) are those of whole numbers in the unit cube, 0 for others.
     """
 
     def __init__(self, start: np.ndarray, steps: np.ndarray, step: float, seed: int, population: int | None) -> None:
         self._random, self._step, self._steps = np.random.default_rng(seed), step, steps
         self._best: tuple[float, np.ndarray] = np.inf, start
         self._begin({"popsize": population} if population else {})
+        self._first = int(self._search.popsize)
 
     def _begin(self, options: dict[str, Any]) -> None:
         from cma.evolution_strategy import CMAEvolutionStrategy
@@ -44,7 +46,7 @@ class CmaEs:
             self._best = float(losses[least, 0]), np.array(self._asked[least])
         self._search.tell(self._asked, losses[:, 0].tolist())
         if self._search.stop():
-            self._begin({"popsize": 2 * len(self._asked)})
+            self._begin({"popsize": min(2 * len(self._asked), LARGEST * self._first)})
 
 
 class Nsga2:
