@@ -21,7 +21,8 @@ class LawTable(Section):
     """How the scattering law of one site is taken.
 
     ``clearance`` in m (by default the geometric mean of the sites'), ``distance`` in cells from the driven cell to the
-    site (that of the leading site; without sites, the burst's length). The law reaches up to ``largest`` relative
+    site (that of the leading site, without sites the burst's length, but so many that the burst is over before a wave
+    is back from the site). The law reaches up to ``largest`` relative
     displacement over clearance; between neighbouring points it is refined until no share is further than ``tolerance``
     from a straight line over log z, or than the scatter, or the points are closer than ``finest``. At each,
     ``samples`` runs with amplitudes up to ``jitter`` apart from it give mean and scatter. A run ends ``settle``
@@ -81,6 +82,11 @@ class LawCase(Case):
             problems.append(Problem("contacts.stiffness", None, remedy))
         return fields, problems or _place(fields)
 
+    def fastest(self) -> float:
+        """The largest group velocity of all bands in cells/s."""
+        cell = self.lattice.unit_cell()
+        return max(max_group_velocity(cell, number + 1)[2] for number in range(cell.dofs))
+
     def one_site(self) -> OneSite:
         """The lattice and the times of the law's runs (see ``studies.law``)."""
         distance, clearance, model = self.law.distance, self.law.clearance, self.model()
@@ -88,8 +94,7 @@ class LawCase(Case):
         cell, interval = model.chain.cell, model.sample_interval
         band, slow, _ = packet_speeds(cell, model.drive, model.drive_mass)
         samples = int(np.ceil((distance / max(slow, 1e-9) + self.law.settle * model.drive.duration) / interval))
-        fastest = max(max_group_velocity(cell, number + 1)[2] for number in range(cell.dofs))
-        cells = max(int(np.ceil(distance + fastest * samples * interval)) + 1, SHORTEST)
+        cells = max(int(np.ceil(distance + self.fastest() * samples * interval)) + 1, SHORTEST)
         towards = _way(self.contacts.sites, self.drive.cell, self.lattice.cells, self.lattice.ends)[1]
         site = towards * distance % cells
         return OneSite(cells, site, distance, clearance, towards, band, slow, samples * interval, samples)
@@ -120,10 +125,14 @@ def _place(fields: dict[str, Any]) -> list[Problem]:
     if not waves_at(cell, frequency):
         return [Problem("drive.frequency", frequency, "lies in no pass band, so that nothing arrives at a site")]
     model = case.model()
+    least = int(np.ceil(case.fastest() * model.drive.duration / 2))
+    if case.law.distance is not None and case.law.distance < least:
+        remedy = f"the burst must be over before a wave from the site is back at the drive; at least {least} cells"
+        return [Problem("law.distance", case.law.distance, remedy)]
     if case.law.distance is None:
         length = model.drive.duration * packet_speeds(cell, model.drive, model.drive_mass)[1]
         way = _way(case.contacts.sites, drive.cell, case.lattice.cells, case.lattice.ends)[0]
-        fields["law"]["distance"] = way or max(int(min(length, LARGEST)), 1)
+        fields["law"]["distance"] = max(way or int(min(length, LARGEST)), least)
         case = LawCase(name="law", **fields)
     setting = case.one_site()
     if setting.cells * setting.samples > LARGEST:

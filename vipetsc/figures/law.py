@@ -33,7 +33,15 @@ def law(data: xr.Dataset) -> Figure:
             share, scatter = (
                 data[name].values[:, of["band"]][:, 0][:, of["direction"]][:, 0] for name in ("share", "share_scatter")
             )
-            _curve(middle, z, np.where(share > FLOOR, share, np.nan), scatter, colour, line, f"band {number}, {way}")
+            _curve(
+                middle,
+                z,
+                np.where(share > FLOOR, share, np.nan),
+                scatter,
+                colour,
+                line,
+                f"band {number}" if way == "forward" else "",
+            )
     over = z - 1
     for name in ("transmitted", "upper"):
         label, colour = SHARES[name]
@@ -46,21 +54,20 @@ def law(data: xr.Dataset) -> Figure:
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     left.set(ylim=(0, 1.02), ylabel="share of the energy that arrives")
-    middle.set(yscale="log", ylim=(FLOOR / 50, 1.5))
+    middle.set(yscale="log", ylim=(FLOOR / 10, 1.5))
     right.set(xscale="log", xlabel="z - 1", xlim=(max(over[1] / 2, 1e-4), 3), ylim=(0, 1.02))
     if np.isfinite(best):
         for axes, at in ((left, best), (middle, best), (right, best - 1)):
             axes.axvline(at, color=style.GREY, lw=0.8, ls=style.DOTTED)
         right.set_title(f"z* = {best:.3g}, T = {float(data.attrs['matched_transmitted']):.3g}", fontsize=8)
     left.set_title("T + R + U + L + other bands = 1", fontsize=8)
-    middle.set_title("by band and direction", fontsize=8)
+    middle.set_title("by band; dashed: backward", fontsize=8)
     left.legend(fontsize=6, loc="center right")
-    right.legend(fontsize=6, loc="upper right", bbox_to_anchor=(1.0, 0.75))
     middle.legend(fontsize=6, loc="lower left", ncols=2)
-    return figure
+    right.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45))
 
 
 def _curve(axes: Axes, x: np.ndarray, y: np.ndarray, scatter: np.ndarray, colour: str, line: str, label: str) -> None:
     """A curve with its scatter, one deviation either way."""
-    axes.plot(x, y, color=colour, ls=line, lw=1.0, label=label)
+    axes.plot(x, y, color=colour, ls=line, lw=1.0, label=label or None)
     axes.fill_between(x, y - scatter, y + scatter, color=colour, alpha=0.25, lw=0)

@@ -15,6 +15,7 @@ from vipetsc.studies.linear import LinearRun
 FORWARD, BACKWARD = 0, 1
 LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency is judged
 NEAR = 5  # cells from the site within which energy counts as near it
+FLAT = 0.1  # of the efficiency, which its scatter does not tell apart
 BROAD = 0.05  # half the width in log z over which it is averaged: a design has to bear as much
 
 OF_POINT = {
@@ -134,12 +135,13 @@ class ScatteringLaw:
     def matched(self) -> tuple[float, float]:
         """Where upper bands get the most of what the drive's wave loses: z*, and T there.
 
-        Raises ValueError if no upper band gets anything.
+        The efficiency U/(1-T) is flat: of the points within 10 % of its best the one with the largest T, which leaves
+        most for further sites. Raises ValueError if no upper band gets anything.
         """
         efficiency = self.efficiency()
-        best = int(np.argmax(efficiency))
-        if not efficiency[best] > 0:
+        if not efficiency.any():
             raise ValueError("no band above the drive's gets energy from it")
+        best = int(np.argmax(np.where(efficiency >= (1 - FLAT) * efficiency.max(), self.mean.transmitted, -np.inf)))
         return float(self.z[best]), float(self.at(self.z[best]).transmitted)
 
     def summary(self) -> list[tuple[str, str]]:

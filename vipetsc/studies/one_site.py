@@ -11,9 +11,9 @@ Waves need not have separated in space: Bloch amplitudes tell band and direction
 **Shares.** E0 (band, direction) are the energies of the run without a site under 1 N, E those of a run under the
 amplitude A, over A^2; E_in is what of E0, in the drive's band and forward (the way from the drive to the site), is fast
 enough to have arrived. The share of a band and direction is (E - E0)/E_in, plus 1 in the drive's band forward: T. It is
-R backward, and U in the bands above. The drive works as without a site, for no wave is back, so with the dissipated
-energy and what a closed contact holds, over A^2 E_in, they sum to 1, to the ledger's accuracy, and T = 1 where nothing
-is touched. What differs from the law of a finite lattice: the drive is in its midst, not at a wall.
+R backward, and U in the bands above. The drive works as without a site, for the burst is over before a wave is back
+(d >= V T_b/2). So with the dissipated energy and what a closed contact holds, over A^2 E_in, they sum to 1, to the
+ledger's accuracy, and T = 1 where nothing is touched. The drive is in the midst of the lattice, not at a wall.
 
 **z** is the largest |w| of the linear wave at the site over the clearance. The bilinear law scales exactly: with a
 given z, shares do not depend on the clearance. Hertz's does through its stiffness kc D^(1/2): the law is that of one
