@@ -8,6 +8,7 @@ from scipy.linalg import expm
 
 from vipetsc.lattice import Chain, Spring, ToneBurst, UnitCell, diatomic, four_band, modes, modes_of, pass_bands
 from vipetsc.spectra import ModalParts, upper_share
+from vipetsc.spectra.modal import cluster_samples
 
 CELLS = {
     "four-band": four_band("calibrated"),
@@ -131,3 +132,18 @@ def test_upper_share_is_of_the_bands_above_the_drive():
     bands = parts.energies(u, v, [0]).sum(axis=(1, 2))
     assert upper_share(chain, drive, u[0], v[0], 4.0) == pytest.approx((bands[4] + bands[6]) / 4.0)
     assert np.isnan(upper_share(chain, replace(drive, frequency=3500.0), u[0], v[0], 4.0))
+
+
+def test_episodes_that_touch_between_the_same_samples_are_one_cluster():
+    time = np.arange(11) * 1.0
+    onset = np.array([1.2, 1.4, 4.5, 2.1, 6.0, 8.5, 9.2])
+    separation = np.array([2.7, 1.6, 4.8, 3.0, 7.0, np.nan, 9.9])
+    bounds, cluster = cluster_samples(onset, separation, time)
+    assert bounds.tolist() == [[1, 3], [4, 5], [6, 7], [8, 10]]
+    assert cluster.tolist() == [0, 0, 1, 0, 2, 3, 3]
+    # 2.1 to 3.0 begins after the sample at which another has ended: apart.
+    assert cluster_samples(onset[[1, 3]], separation[[1, 3]], time)[0].tolist() == [[1, 2], [2, 3]]
+    bounds, cluster = cluster_samples(onset, separation, time, 4)
+    assert bounds.tolist() == [[0, 4], [4, 8], [8, 10]] and cluster.tolist() == [0, 0, 1, 0, 1, 2, 2]
+    bounds, cluster = cluster_samples(np.zeros(0), np.zeros(0), time)
+    assert bounds.shape == (0, 2) and cluster.shape == (0,)

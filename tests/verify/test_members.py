@@ -129,3 +129,14 @@ def test_a_linear_run_that_was_not_foreseen_is_made_where_it_is_needed(sweep, tm
     found = open_ensemble(tmp_path / "out")["entropy/masked"].values
     assert (found[:, 0] == found[:, 1]).all() and found[0, 0] != found[1, 0]
     assert found[0, 0] == ensemble["entropy/masked"].values[0]
+
+
+def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
+    shares, ensemble, _ = sweep
+    energy, work = ensemble["bands/modal_energy"], ensemble["work"].values
+    assert energy.attrs["parts"] == ensemble["bands/share"].attrs["parts"] and energy.sizes["part"] == 8
+    left = work * (1 - ensemble["dissipated_fraction"].values)
+    apart = shares < 1.2  # at the largest amplitude a site may be in contact at the end
+    assert energy.values.sum(axis=1)[apart] == pytest.approx(left[apart], rel=1e-6)
+    upper = energy.values[:, [4, 6]].sum(axis=1) / work
+    assert ensemble["upper_share_at_end"].values == pytest.approx(upper, rel=1e-12)
