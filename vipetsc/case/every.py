@@ -9,11 +9,13 @@ from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.law import LawCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.predict import PredictCase
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Table, read_section, read_toml, with_overrides
 from vipetsc.case.sweep import MOST_TRIED, Sweep
 
 OF_SECTION: dict[str, type[CaseFile]]
-OF_SECTION = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase, "law": LawCase, "optimise": OptimiseCase}
+OF_SECTION = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase, "law": LawCase, "optimise": OptimiseCase,
+              "predict": PredictCase}  # fmt: skip
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:

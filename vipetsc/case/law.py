@@ -120,7 +120,8 @@ def _way(sites: Any, drive: int, cells: int, ends: str) -> tuple[int, int]:
 
 def _place(fields: dict[str, Any]) -> list[Problem]:
     """Fill in the distance of a resolved case; what is wrong with its waves."""
-    case = LawCase(name="law", **fields)
+    sections = {name: section for name, section in fields.items() if name in LawCase.model_fields}
+    case = LawCase(name="law", **sections)
     cell, frequency, drive = case.lattice.unit_cell(), case.drive.frequency or 0.0, case.drive
     if not waves_at(cell, frequency):
         return [Problem("drive.frequency", frequency, "lies in no pass band, so that nothing arrives at a site")]
@@ -133,7 +134,7 @@ def _place(fields: dict[str, Any]) -> list[Problem]:
         length = model.drive.duration * packet_speeds(cell, model.drive, model.drive_mass)[1]
         way = _way(case.contacts.sites, drive.cell, case.lattice.cells, case.lattice.ends)[0]
         fields["law"]["distance"] = max(way or int(min(length, LARGEST)), least)
-        case = LawCase(name="law", **fields)
+        case = LawCase(name="law", **sections)
     setting = case.one_site()
     if setting.cells * setting.samples > LARGEST:
         remedy = (

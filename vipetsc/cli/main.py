@@ -16,7 +16,7 @@ from vipetsc.parallel import StoppedError, StopRequest
 
 Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 # Verbs that look at a request to stop, to save first; others end where they are.
-STOPPABLE = ("run", "sweep", "nnm", "law", "optimise", "paper")
+STOPPABLE = ("run", "sweep", "nnm", "law", "optimise", "predict", "paper")
 WITH_PETSC_OPTIONS = ("run", "sweep", "validate")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
@@ -59,6 +59,7 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
         "the best design for an objective; goes on where it was",
         "searched set out force resume",
     ),
+    "predict": (verbs.predict, "several sites from the answer of one, beside simulations", "case set out force resume"),
     "design": (verbs.design, "the (lambda, eta) search of the four-band cell", "case set out force resume"),
     "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs set"),
     "plot": (verbs.plot, "pictures of a finished run again, from its files", "path fig format"),

@@ -13,6 +13,7 @@ _NOT_OURS = {
     "design": "design.h5: is not a search",
     "optimum": "optimum.h5: is not a search",
     "law": "law.h5: is not a law",
+    "prediction": "prediction.h5: is not a prediction",
     "branches": "branch-*.h5: is not a branch",
 }
 
@@ -29,8 +30,9 @@ def source_of(paths: Sequence[Path]) -> tuple[str, Sequence[Path]]:
     if len(paths) > 1:
         raise FolderError(f"{' '.join(map(str, paths))}: only sweeps and folders of branches can share a page")
     (path,) = paths
-    folder = path.parent if path.name in ("run.h5", "design.h5", "optimum.h5", "law.h5") else path
-    return next((kind for kind in ("design", "optimum", "law") if (folder / f"{kind}.h5").exists()), "run"), [folder]
+    kinds = "design", "optimum", "law", "prediction"
+    folder = path.parent if path.name in ("run.h5", *(f"{kind}.h5" for kind in kinds)) else path
+    return next((kind for kind in kinds if (folder / f"{kind}.h5").exists()), "run"), [folder]
 
 
 def draw_source(

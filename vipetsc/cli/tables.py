@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 import h5py
 import numpy as np
+import xarray as xr
 
 from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
 from vipetsc.case.disorder import DisorderTable, values_of
@@ -277,3 +278,21 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     healthy = all(value is not None for _, value, _ in checks)
     verdict = "all is well" if healthy else "something is missing, see above"
     return f"{table(rows)}\n{verdict}", healthy
+
+
+def prediction_table(data: xr.Dataset) -> str:
+    """Predicted and simulated shares at every amplitude, and how far apart they are."""
+    kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
+    names = "upper", "other", "dissipated"
+    lines = ["   amplitude (N)  " + "  ".join(f"{kind} {name}" for name in names for kind in kinds)]
+    for row, amplitude in enumerate(data["amplitude"].values):
+        shares = (f"{float(data[f'{k}/{n}'][row]):{len(k) + len(n) + 1}.4f}" for n in names for k in kinds)
+        lines.append(f"{amplitude:16.5g}  " + "  ".join(shares))
+    told = {
+        "onset_amplitude": "first contact (N)",
+        "rms_upper": "rms of the upper bands (decades)",
+        "rms_other": "rms of all bands but the driven one (decades)",
+        "worst_dissipated": "largest difference of what is dissipated",
+        "cpu_seconds": "CPU time without the simulations (s)",
+    }
+    return "\n".join(lines + [f"{text}: {data.attrs[key]:.4g}" for key, text in told.items() if key in data.attrs])

@@ -16,6 +16,7 @@ from mpi4py import MPI
 from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
 from vipetsc.case.every import disorder_of, load_every
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
 from vipetsc.cli.plot import draw_source, source_of
@@ -210,6 +211,22 @@ def optimise(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> 
         stop.check(comm)
         if plan.base.output.figures:
             echo_paths(comm, draw_source("optimum", [folder], comm, afresh=False))
+    return DONE
+
+
+def predict(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """The case's transfer composed from the answer of one site, beside simulations: ``prediction.h5``, a picture."""
+    from vipetsc.dynamics.options import check_options
+    from vipetsc.studies.prediction import predict as predict_case
+
+    case = _load(PredictCase, options, comm)
+    on_root(comm, lambda: check_options(case))
+    folder, flags = _output(options, case.name), {"force": options.force, "resume": options.resume}
+    with locked(comm, folder):
+        data = predict_case(case, folder, comm, **flags, stop=stop, progress=True)
+        echo(comm, tables.prediction_table(data))
+        if case.output.figures:
+            echo_paths(comm, draw_source("prediction", [folder], comm, afresh=False))
     return DONE
 
 

@@ -20,6 +20,7 @@ from vipetsc.figures import (
     law,
     modal,
     optimise,
+    prediction,
     runs,
     scattering,
     transfer,
@@ -32,9 +33,11 @@ from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 
 MOST_WARNINGS = 4  # below a picture
-RUN, SWEEP, BRANCHES, DESIGN, OPTIMUM, LAW = "run", "sweep", "branches", "design", "optimum", "law"
+RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
+OPTIMUM, LAW, PREDICTION = "optimum", "law", "prediction"
 FILES = {DESIGN: ("design.h5", ("cost", "frequency")), OPTIMUM: ("optimum.h5", ("value", "comparison")),
-         LAW: ("law.h5", ("share", "efficiency"))}  # fmt: skip
+         LAW: ("law.h5", ("share", "efficiency")),
+         PREDICTION: ("prediction.h5", ("predicted", "onset_amplitude"))}  # fmt: skip
 
 
 class FigureSpec(NamedTuple):
@@ -67,6 +70,7 @@ FIGURES = {
     "branch": FigureSpec(backbone.backbone, BRANCHES),
     **_specs(DESIGN, design.deflections, design.cost_maps),
     **_specs(LAW, law.law),
+    **_specs(PREDICTION, prediction.prediction),
     **_specs(OPTIMUM, optimise.convergence, optimise.compared_designs, optimise.compared_curves),
     "dispersion_against_lambda": FigureSpec(partial(design.dispersions, along="lambda", other="eta"), DESIGN),
     "dispersion_against_eta": FigureSpec(partial(design.dispersions, along="eta", other="lambda"), DESIGN),

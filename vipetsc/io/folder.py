@@ -55,9 +55,10 @@ BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
 SEARCH = FolderKind("search", ("design.h5",))
 LAW = FolderKind("law", ("law.h5", "one-site-*.jsonl"))
 SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
+PREDICTION = FolderKind("prediction", ("prediction.h5", "prediction*.jsonl"))
 OPTIMUM = FolderKind("optimum", ("optimum.h5", "runs-*.jsonl"), ("figures", "law", "best*.toml"))
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
-KINDS = (RUN, BRANCHES, SEARCH, LAW, SWEEP, OPTIMUM, PAPER)
+KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, PAPER)
 
 
 class Claim:

@@ -1,0 +1,47 @@
+"""The case of the verb ``predict``: a lattice run with its sites, and the amplitudes at which it is predicted."""
+
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from vipetsc.case.law import LawCase
+from vipetsc.case.reading import Problem, Section, Table, Valid
+from vipetsc.case.schema import Positive
+
+MOST = 10_000  # amplitudes
+
+
+class PredictTable(Section):
+    """``amplitudes`` in N; by default ``count``, log-spaced from that of the first contact to ``span`` times it.
+
+    ``points``: runs of the one site whose answer is composed. ``simulate``: run the same amplitudes, to compare.
+    """
+
+    amplitudes: list[Positive] = Field([], max_length=MOST)
+    count: int = Field(19, ge=1, le=MOST)
+    span: Annotated[float, Field(gt=1, le=1e6)] = 100.0
+    points: int = Field(24, ge=16, le=1000)
+    simulate: bool = True
+
+
+class PredictCase(LawCase):
+    """A case of the verb ``predict``: that of a law, with its sites, and ``[predict]``."""
+
+    predict: PredictTable
+
+    @classmethod
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The resolved sections, and everything that is wrong with them."""
+        fields, problems = super().read(table)
+        contacts = fields.get("contacts")
+        if isinstance(contacts, dict) and not contacts["sites"]:
+            problems = [Problem("contacts.sites", [], "there is no site to predict; list cells or give a count")]
+        return fields, problems
+
+    @classmethod
+    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
+        """What is wrong between keys."""
+        yield from super().check(sections, valid)
+        if valid("lattice.ends") and sections["lattice"].ends == "periodic":
+            yield Problem("lattice.ends", "periodic", "waves around a ring are not composed; fixed or free")
