@@ -89,11 +89,11 @@ def _set_operation(vector: PETSc.Vec) -> None:
 @cache
 def _is_maxpy() -> bool:
     """Whether the operation set is the one that VecMAXPY calls: ours alone leaves out NaN times zero."""
-    y, x = (PETSc.Vec().createSeq(1) for _ in range(2))
+    y, x, zero = (PETSc.Vec().createSeq(1) for _ in range(3))
     _set_operation(y)
     x.set(np.nan)
-    y.maxpy([0.0], [x])
+    y.maxpy([0.0, 1.0], [x, zero])  # with a factor that is not zero, or PETSc calls nothing
     ours = bool(np.isfinite(y.array_r[0]))
-    x.destroy()
-    y.destroy()
+    for vector in (y, x, zero):
+        vector.destroy()
     return ours
