@@ -159,13 +159,15 @@ def test_a_scaled_member_has_the_measures_of_its_linear_run(tmp_path):
     run.measures[5]["entropy/snapshot"] = [0.0]
     file, statistics = RecordFile(tmp_path / "members-0.jsonl"), {"episodes": 0, "dissipated": 0.0, "engine": "ts"}
     for name, site, work in zip(sweep.ids()[:2], (5, 9), (1.0, 4.0), strict=True):
-        about = {"id": name, "vipetsc_version": vipetsc.__version__, "status": "scaled", "warnings": ["seen"]}
+        about = {"id": name, "vipetsc_version": vipetsc.__version__, "status": "scaled"}
+        about["warnings"] = ["seen"] if site == 5 else ["seen", "alone"]
         known = {"statistics": statistics | {"work": work, "ledger_error": 0.0}, "cpu_seconds": 0.0, "rtol": 1e-9}
         file.append(about | known | {"linear": "wave", "site": site})
     assert (Results(sweep, tmp_path).status == MISSING).all()
     file.append(run.record("wave"))
     _, warnings = conclude(Results(sweep, tmp_path))
     ensemble = open_ensemble(tmp_path)
-    assert warnings == ["3 members: seen"] and ensemble["status"].values.tolist() == [SCALED] * 3
+    assert warnings == ["3 members: seen", "1 member: alone"]
+    assert ensemble["status"].values.tolist() == [SCALED] * 3
     assert ensemble["work"].values.tolist() == [1, 4, 1] and ensemble["ibtet"].values.tolist() == [0.2, 0.1, 0.2]
     assert np.isnan(ensemble["entropy/history"].values[1]).all()

@@ -20,9 +20,9 @@ from vipetsc.paper.claims import write_claims
 from vipetsc.paper.draw import draw_paper
 from vipetsc.paper.figures import RELATED, TRANSFER
 from vipetsc.paper.made import FORMATS, is_whole, read_made, write_made
-from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, Step, fingerprint, read_json
+from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, fingerprint, read_json
 from vipetsc.paper.report import write_report
-from vipetsc.paper.steps import duration, make_steps, noted, progress_of
+from vipetsc.paper.steps import duration, make_steps, noted
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
 
@@ -83,12 +83,8 @@ def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRe
     stop.check(comm)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell, inputs["claims"]))
 
-    def is_complete(step: Step) -> bool:
-        state, _, failures = progress_of(step, root)
-        return state == DONE and not failures
-
-    complete = on_root(comm, lambda: all(map(is_complete, part.steps)))
-    return PaperResult(made, drawn, claims, complete and not any(note.startswith("failed") for note in notes), notes)
+    complete = not on_root(comm, lambda: part.left(root)) and not any(note.startswith("failed") for note in notes)
+    return PaperResult(made, drawn, claims, complete, notes)
 
 
 def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:

@@ -208,6 +208,10 @@ class Plan:
         needed = needed.union(*(FURTHER_STEPS.get(claim, ()) for claim in shown))
         return replace(self, steps=tuple(s for s in self.steps if s.name in needed), figures=figures)
 
+    def left(self, root: Path) -> dict[str, float]:
+        """The steps that are not done or had failures, by name, with the CPU time in s that they still need."""
+        return {s.name: s.left(root) for s in self.steps if s.state(root) != DONE or s.failures(root)}
+
     def folders(self, root: Path) -> Mapping[str, Path]:
         """The folders of the steps that are done, by name."""
         return {step.name: step.folder(root) for step in self.steps if step.state(root) == DONE}

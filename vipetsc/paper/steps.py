@@ -10,7 +10,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from vipetsc.paper.made import read_made, write_made
-from vipetsc.paper.plan import DONE, STALE, Plan, Step
+from vipetsc.paper.plan import STALE, Plan, Step
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.pool import FULL, TaskPool
 
@@ -29,12 +29,6 @@ def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
         notes.append(f"failed: {name}: {error or type(error).__name__}")
 
 
-def progress_of(step: Step, root: Path) -> tuple[str, float, int]:
-    """State of a step, CPU time in s that is left, and how many of its members or branches failed."""
-    state = step.state(root)
-    return state, step.left(root), step.failures(root) if state == DONE else 0
-
-
 def make_steps(
     plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Callable[[str], None], notes: list[str]
 ) -> tuple[str, ...]:
@@ -42,9 +36,7 @@ def make_steps(
 
     First the parts that single ranks make, of all steps together, then the sweeps one by one.
     """
-    progress = on_root(comm, lambda: {step.name: progress_of(step, root) for step in plan.steps})
-    left = {name: seconds for name, (state, seconds, failures) in progress.items() if state != DONE or failures}
-    stale = {name for name, (state, *_) in progress.items() if state == STALE}
+    left, stale = on_root(comm, lambda: (plan.left(root), {s.name for s in plan.steps if s.state(root) == STALE}))
     missing = [step for step in plan.steps if step.name in left]
 
     def say(*names: str) -> None:
