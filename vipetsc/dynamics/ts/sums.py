@@ -45,7 +45,8 @@ def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> N
         for stop in range((count - 1) % 4 + 1, count + 1, 4):
             term = 0.0
             for j in range(first, stop):
-                term += factors[j] * carray(pointer(addresses[j]), (n,), np.float64)[i]
+                if factors[j] != 0.0:
+                    term += factors[j] * carray(pointer(addresses[j]), (n,), np.float64)[i]
             y[i] += term
             first = stop
 
