@@ -13,6 +13,7 @@ from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.every import load_every
 from vipetsc.dynamics import simulate
+from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.records import read_records
 from vipetsc.io.store import RunMemory
@@ -167,6 +168,7 @@ def test_refined_to_the_onset_and_gone_on_with(tmp_path):
     with open_netcdf(tmp_path / "law" / "law.h5", "law") as data:
         assert LawCase.of(data).to_toml() == of.to_toml()
         assert np.nanmax(data["interpolation_error"]) < 1
+    assert [path.name for path in draw("law", [tmp_path / "law"])] == ["law.png"]
     # A law that was cut off, with a line that is not whole, goes on to the same bits.
     first = tmp_path / "law" / "law.h5"
     again = tmp_path / "again"

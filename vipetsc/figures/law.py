@@ -65,6 +65,7 @@ def law(data: xr.Dataset) -> Figure:
     left.legend(fontsize=6, loc="center right")
     middle.legend(fontsize=6, loc="lower left", ncols=2)
     right.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45))
+    return figure
 
 
 def _curve(axes: Axes, x: np.ndarray, y: np.ndarray, scatter: np.ndarray, colour: str, line: str, label: str) -> None:
