@@ -42,12 +42,13 @@ def convergence(optimum: xr.Dataset) -> Figure:
         left.plot(number, value[:, 0], ".", color=style.SKY, ms=3, label="designs")
         left.step(number, best.accumulate(value[:, 0]), where="post", color=style.BLACK, lw=0.8, label="best so far")
         places = {name: (at, value[at, 0]) for name, at in compared.items()}
-        left.plot(number[failed], np.zeros(failed.sum()), "x", color=style.RED, ms=3, clip_on=False,
-                  transform=left.get_xaxis_transform(), label="failed" if failed.any() else None)  # fmt: skip
+        if failed.any():
+            look = {"color": style.RED, "ms": 3, "clip_on": False, "label": "failed"}
+            left.plot(number[failed], np.zeros(failed.sum()), "x", transform=left.get_xaxis_transform(), **look)
         left.set(xlabel="Design", ylabel=_label(objectives[0]), title="Objective")
     else:
         left.scatter(*value.T, c=number, cmap="Blues", s=6, vmin=-0.5 * len(number), label="designs (later: darker)")
-        left.step(*value[optimum["front"].values].T, where="mid", color=style.BLACK, lw=0.8, label="front")
+        left.plot(*value[optimum["front"].values].T, color=style.BLACK, lw=0.8, label="front")
         places = {name: tuple(value[at]) for name, at in compared.items()}
         left.set(xlabel=f"{objectives[0].goal} {_label(objectives[0])}", title="Both objectives")
         left.set_ylabel(f"{objectives[1].goal} {_label(objectives[1])}")
