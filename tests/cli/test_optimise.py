@@ -10,6 +10,7 @@ import time
 import pytest
 
 from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
+from vipetsc.io.records import read_records
 
 CASE = """
 [lattice]
@@ -49,17 +50,20 @@ def test_a_search_leaves_its_files_and_goes_on_after_a_kill(in_process, case, tm
     done = in_process("optimise", case, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "14 designs, 14 runs; 0 designs failed" in done.stdout and "maximise upper_share_at_end" in done.stdout
-    files = {"case.toml", "best.toml", "optimum.h5", "runs-0.jsonl"}
+    files = {"case.toml", "best.toml", "optimum.h5", "optimum-runs.jsonl"}
     assert names(out) == files | {f"figures/{name}.png" for name in FIGURES}
     # A kill leaves the records of the runs, the last one cut off.
     again.mkdir()
-    records = (out / "runs-0.jsonl").read_bytes()
+    records = (out / "optimum-runs.jsonl").read_bytes()
     (again / "case.toml").write_bytes((out / "case.toml").read_bytes())
-    (again / "runs-0.jsonl").write_bytes(records[: len(records) // 2])
+    (again / "optimum-runs-0.jsonl").write_bytes(records[: len(records) // 2])
     assert in_process("optimise", case, "--out", again, "--resume").returncode == 0
     assert_same_bits(datasets(out / "optimum.h5"), datasets(again / "optimum.h5"))
-    made = sorted((again / "runs-0.jsonl").read_bytes().splitlines()[:-1])
-    assert set(records.splitlines()) <= set((again / "runs-0.jsonl").read_bytes().splitlines()) and len(made) < 20
+    assert {"optimum-runs.jsonl"} == {path.name for path in again.glob("optimum-runs*")}
+    first, second = (
+        [r for r, _ in read_records(folder / "optimum-runs.jsonl", pytest.fail)] for folder in (out, again)
+    )
+    assert {r["key"]: r["values"] for r in first} == {r["key"]: r["values"] for r in second}
     assert (out / "best.toml").read_text() == (again / "best.toml").read_text()
     # Complete: nothing is made again; another search is refused, and replaced by force.
     written = modified(out)
@@ -94,12 +98,12 @@ def test_a_request_to_stop_ends_with_75_and_the_same_command_goes_on(vipetsc, in
     longer = ("--set", "optimise.budget=60", "--set", "output.figures=false")
     command = [sys.executable, "-m", "vipetsc", "optimise", str(case), "--out", str(out), *longer]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=clean_environment())
-    while process.poll() is None and not (out / "runs-0.jsonl").exists():
+    while process.poll() is None and not (out / "optimum-runs-0.jsonl").exists():
         time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
     _, told = process.communicate(timeout=120)
     assert process.returncode == 75 and "the same command goes on" in told, told
-    assert not (out / "optimum.h5").exists() and (out / "runs-0.jsonl").exists()
+    assert not (out / "optimum.h5").exists() and (out / "optimum-runs-0.jsonl").exists()
     for folder in (out, whole):
         assert in_process("optimise", case, "--out", folder, *longer).returncode == 0
     assert_same_bits(datasets(out / "optimum.h5"), datasets(whole / "optimum.h5"))

@@ -174,12 +174,12 @@ def test_refined_to_the_onset_and_gone_on_with(tmp_path):
     again = tmp_path / "again"
     again.mkdir()
     (again / "case.toml").write_text((tmp_path / "law" / "case.toml").read_text())
-    lines = (tmp_path / "law" / "one-site-0.jsonl").read_bytes().splitlines(keepends=True)
-    (again / "one-site-0.jsonl").write_bytes(b"".join(lines[:-3]) + lines[-3][:40])
-    before = sum(1 for _ in read_records(again / "one-site-0.jsonl", lambda text: None))
+    lines = (tmp_path / "law" / "law-runs.jsonl").read_bytes().splitlines(keepends=True)
+    (again / "law-runs.jsonl").write_bytes(b"".join(lines[:-3]) + lines[-3][:40])
+    before = sum(1 for _ in read_records(again / "law-runs.jsonl", lambda text: None))
     make_law(of, again, MPI.COMM_SELF)
     assert_same_bits(datasets(first), datasets(again / "law.h5"))
-    after = sum(1 for _ in read_records(again / "one-site-0.jsonl", lambda text: None))
+    after = sum(1 for _ in read_records(again / "law-runs.jsonl", lambda text: None))
     assert before == len(lines) - 3 and after == len(lines)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -282,7 +283,7 @@ class Scarce(Judge):
     """Without ranks and files: what is known is given."""
 
     def __init__(self, plan, known=()):
-        self.plan, self.known = plan, dict(known)
+        self.plan, self.recorded = plan, SimpleNamespace(known=dict(known))
 
 
 def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():

@@ -41,7 +41,7 @@ def made(tmp_path_factory):
 def response(made, **sections):
     """The linear record and the answer of one site of the small case, with other sections for a network."""
     folder = made[0]
-    records = [record for record, _ in read_records(folder / "prediction.jsonl", pytest.fail)]
+    records = [record for record, _ in read_records(folder / "prediction-runs.jsonl", pytest.fail)]
     linear = next(record for record in records if record["kind"] == LINEAR)
     answers = [record for record in records if record["kind"] == SITE]
     return linear, answers, small(**sections)
@@ -131,7 +131,7 @@ def test_contact_goes_on_until_release():
 
 def test_runs_that_are_there_are_not_made_again(made, tmp_path, monkeypatch):
     folder, case, data = made
-    (tmp_path / "prediction.jsonl").write_bytes((folder / "prediction.jsonl").read_bytes())
+    (tmp_path / "prediction-runs.jsonl").write_bytes((folder / "prediction-runs.jsonl").read_bytes())
     (tmp_path / "case.toml").write_text(case.to_toml())
     monkeypatch.setattr(Study, "_run", lambda *_: pytest.fail("a run was made"))
     again = predict(case, tmp_path)

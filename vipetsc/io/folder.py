@@ -53,10 +53,10 @@ class FolderKind:
 RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "figures"), free="analysis")
 BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
 SEARCH = FolderKind("search", ("design.h5",))
-LAW = FolderKind("law", ("law.h5", "one-site-*.jsonl"))
+LAW = FolderKind("law", ("law.h5", "law-runs*.jsonl"))
 SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
-PREDICTION = FolderKind("prediction", ("prediction.h5", "prediction*.jsonl"))
-OPTIMUM = FolderKind("optimum", ("optimum.h5", "runs-*.jsonl"), ("figures", "law", "best*.toml"))
+PREDICTION = FolderKind("prediction", ("prediction.h5", "prediction-runs*.jsonl"))
+OPTIMUM = FolderKind("optimum", ("optimum.h5", "optimum-runs*.jsonl"), ("figures", "law", "best*.toml"))
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, PAPER)
 

@@ -20,10 +20,11 @@ from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import Record, RecordFile
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
-from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
 from vipetsc.studies.linear import MARGIN, PARTS, LinearRun, leading_cell, linear_case, linear_name, measured
+from vipetsc.studies.recorded import whole
 
 FIELDS = "displacement", "velocity"
 ANALYSED = {
@@ -136,12 +137,7 @@ class MemberStore:
         return on_root(self.team, measure)
 
     def _simulate(self, case: Case, output: RunOutput) -> Result:
-        result = simulate(case, output, self.team, stop=self.stop)
-        if result.resumable:
-            raise StoppedError(result.sentence)
-        if not result.complete:
-            raise RuntimeError(result.sentence)
-        return result
+        return whole(simulate(case, output, self.team, stop=self.stop))
 
 
 def measures_of(plan: Sweep) -> set[str]:

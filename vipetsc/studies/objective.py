@@ -10,85 +10,43 @@ from mpi4py import MPI
 import numpy as np
 import xarray as xr
 
-import vipetsc
 from vipetsc.case import Case, Model, case_id
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
-from vipetsc.dynamics import simulate
-from vipetsc.io.records import Record, RecordFile, read_records
-from vipetsc.io.store import RunMemory
 from vipetsc.lattice import pass_bands
-from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.modal import ModalParts
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.pool import TaskPool
+from vipetsc.studies.recorded import Key, RecordedRuns, run_in_memory
 
-RECORDS = "runs-*.jsonl"
 ANALYSED = {"ibtet": ("bands", "ibtet"), "entropy": ("entropy", "entropy/energy_weighted")}  # of ``analyse``
 
 
 class Judge:
-    """Makes runs of designs in ``folder`` on the ranks of ``comm``, and tells what they came to.
+    """Makes ``recorded`` runs of designs in ``folder`` on the ranks of ``comm``, and tells what they came to.
 
-    ``known`` by the hash of its case has the record of every run made or read: its ``values``, or the ``reason`` why it
-    failed. ``damaged`` tells of records that could not be used. All ranks must make one.
+    The record of a run by the hash of its case: its ``values``, or why it failed (``reason``).
+    All ranks must make one.
     """
 
     def __init__(self, plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
-        self.plan, self.comm, self.stop = plan, comm, stop
-        self.team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
-        self.pool = TaskPool(comm, self.team, stop)
-        self.file = RecordFile(folder / RECORDS.replace("*", str(comm.rank)))
-        self.damaged: list[str] = []
-
-        def read() -> dict[str, Record]:
-            records = (r for path in sorted(folder.glob(RECORDS)) for r, _ in read_records(path, self.damaged.append))
-            return {r["id"]: r for r in records if r["vipetsc_version"] == vipetsc.__version__}
-
-        self.known = on_root(comm, read)
-
-    def close(self) -> None:
-        """Let go of the files and of the teams; all ranks must call it."""
-        self.file.close()
-        self.team.Free()
+        self.plan = plan
+        self.recorded = RecordedRuns("optimum", folder, comm, stop, plan.options.ranks)
 
     def make(self, runs: Iterable[Case]) -> None:
         """Make those ``runs`` that are not known; all ranks must call it. Raises StoppedError on all."""
-        cases = {name: case for case in runs if (name := case_id(case)) not in self.known}
-        made: dict[str, Record] = {}
-
-        def work(name: str) -> None:
-            told = {"values": self._values(cases[name])}
-            on_root(self.team, lambda: keep(name, told))
-
-        def keep(name: str, told: Record) -> None:
-            record = {"id": name, "vipetsc_version": vipetsc.__version__} | told
-            self.file.append(record)
-            made[name] = record
-
-        self.pool.share(list(cases), work, fail=lambda name, reason: keep(name, {"reason": reason}))
-        for records in self.comm.allgather(made):
-            self.known |= records
-        if self.pool.stopped:
-            raise StoppedError(f"stopped on request with {len(self.known)} runs; the same command goes on")
+        cases: dict[Key, Case] = {case_id(case): case for case in runs}
+        self.recorded.make(cases, lambda name: {"values": self._values(cases[name])}, failures=True)
 
     def _values(self, case: Case) -> dict[str, Any]:
-        """What is measured of a run, on the first rank of its team."""
-        memory = RunMemory(self.team)
-        result = simulate(case, memory, self.team, stop=self.stop)
-        if result.resumable:
-            raise StoppedError(result.sentence)
-        if not result.complete:
-            raise RuntimeError(result.sentence)
-
-        def measure() -> dict[str, Any]:
-            assert memory.dataset is not None
-            return measured(memory.dataset, result.statistics, self.plan.options.objective)
-
-        return on_root(self.team, measure)
+        """What is measured of a run, by its whole team."""
+        data, result = run_in_memory(case, self.recorded.team, self.recorded.stop)
+        objectives = self.plan.options.objective
+        return on_root(self.recorded.team, lambda: measured(data, result.statistics, objectives))
 
     def losses(self, design: Case) -> tuple[list[float], str]:
         """How far a ``design`` whose runs were made is from each goal, small is good; NaN if one failed, and why."""
-        options, records = self.plan.options, {key: self.known[case_id(run)] for key, run in self.runs(design).items()}
+        options, known = self.plan.options, self.recorded.known
+        records = {key: known[case_id(run)] for key, run in self.runs(design).items()}
         failed = [f"{key[0]:g} N: {record['reason']}" for key, record in records.items() if "reason" in record]
         losses = []
         for objective in options.objective:
@@ -105,7 +63,7 @@ class Judge:
 
     def values(self, run: Case) -> dict[str, Any]:
         """What was measured of a ``run`` that is known; nothing of one that failed."""
-        return dict(self.known[case_id(run)].get("values", {}))
+        return dict(self.recorded.known[case_id(run)].get("values", {}))
 
     @property
     def amplitude(self) -> float:

@@ -26,7 +26,7 @@ of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
 """
 
 import itertools
-import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,22 +36,18 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicHermiteSpline
 
-import vipetsc
 from vipetsc.case import Case
 from vipetsc.case.law import LawCase
-from vipetsc.dynamics import simulate
 from vipetsc.io.folder import LAW, claimed, provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
-from vipetsc.io.records import Record, RecordFile, read_records
-from vipetsc.io.store import RunMemory
-from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
+from vipetsc.io.records import Record
+from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.directions import by_direction, wave_energies
 from vipetsc.studies.law import FORWARD, LAYOUT, NEAR, OF_POINT, ScatteringLaw
-from vipetsc.studies.pool import TaskPool
+from vipetsc.studies.recorded import RecordedRuns, run_in_memory
 
 LINEAR = 0.0  # the z of the run without a site
 STEP = np.sqrt(2.0)  # between neighbouring points to begin with
-RECORDS = "one-site-*.jsonl"
 JUDGED = "transmitted", "reflected", "upper", "dissipated"
 
 
@@ -80,48 +76,28 @@ def make_law(
             runs = Runs(case, claim.folder, comm, stop)
             grid = refine(runs, progress)
             on_root(comm, lambda: write_netcdf(path, runs.dataset(grid)))
+            runs.recorded.finish()
         claim.publish()
         return on_root(comm, lambda: ScatteringLaw.read(claim.path / "law.h5"))
 
 
 class Runs:
-    """The runs of a law: their records by z, those in ``folder`` to begin with; all ranks hold all of them."""
+    """The runs of a law, made by its ``recorded`` by z."""
 
     def __init__(self, case: LawCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
-        self.case, self.comm, self.stop, self.setting = case, comm, stop, case.one_site()
-        self.cell = case.lattice.unit_cell()
-        self.file = RecordFile(folder / RECORDS.replace("*", str(comm.rank)))
-        self.records: dict[float, Record] = on_root(comm, lambda: _read(folder))
-        self.make([LINEAR])
+        self.case, self.setting, self.cell = case, case.one_site(), case.lattice.unit_cell()
+        self.recorded = RecordedRuns("law", folder, comm, stop)
+        self.records = self.recorded.known
+        self.recorded.make([LINEAR], lambda z: self._linear())
         linear = self.records[LINEAR]
         self.peak, self.reference = linear["peak"], np.array(linear["energy"])
         self.arrived = float(self.reference[self.setting.band, FORWARD] - linear["under_way"])
 
-    def make(self, points: list[float], progress: bool = False) -> None:
-        """Make the runs at ``points`` that are missing; raises RuntimeError if one fails. Collective."""
-        missing = [z for z in points if z not in self.records]
-        team = self.comm.Split(self.comm.rank)
-        pool, made, failed = TaskPool(self.comm, team, self.stop), dict[float, Record](), list[str]()
+    def make(self, points: Iterable[float], progress: bool = False) -> None:
+        """Make the runs with a site at ``points`` that are missing; raises RuntimeError if one fails. Collective."""
+        self.recorded.make(points, self._scattered, what="runs of the law", progress=progress)
 
-        def work(z: float) -> None:
-            begin = time.process_time()
-            made[z] = self._linear(team) if z == LINEAR else self._scattered(z, team)
-            self.file.append(
-                {"z": z, "vipetsc_version": vipetsc.__version__, "cpu_seconds": round(time.process_time() - begin, 4)}
-                | made[z]
-            )
-
-        bar = Progress(self.comm, len(missing), "runs", show=progress and bool(missing))
-        pool.share(missing, work, bar, lambda z, reason: failed.append(f"z = {z:.6g}: {reason}"))
-        self.file.close()
-        team.Free()
-        for more in self.comm.allgather(made):
-            self.records |= more
-        self.stop.check(self.comm)
-        for reason in (reason for reasons in self.comm.allgather(failed) for reason in reasons):
-            raise RuntimeError(f"a run of the law did not come out, {reason}")
-
-    def _run(self, team: MPI.Comm, z: float, **output: Any) -> xr.Dataset:
+    def _run(self, z: float, **output: Any) -> xr.Dataset:
         """A run in memory, without a site for z = 0."""
         setting, table = self.setting, self.case.model_dump(by_alias=True, exclude_none=True)
         del table["law"]
@@ -132,24 +108,18 @@ class Runs:
             table["contacts"] |= {"sites": [setting.site + 1], "clearance": [setting.clearance]}
         table["time"]["end"] = setting.end
         table["output"] = {"stride": setting.samples} | output
-        memory = RunMemory(team)
-        result = simulate(Case.from_table(table), memory, team, stop=self.stop)
-        if result.resumable:
-            raise StoppedError(result.sentence)
-        if not result.complete or memory.dataset is None:
-            raise RuntimeError(result.sentence)
-        return memory.dataset
+        return run_in_memory(Case.from_table(table), self.recorded.team, self.recorded.stop)[0]
 
     def amplitude(self, z: float) -> float:
         """Of the drive in N, for a largest linear relative displacement of ``z`` clearances."""
         return z * self.setting.clearance / self.peak
 
-    def _linear(self, team: MPI.Comm) -> Record:
+    def _linear(self) -> Record:
         """The run without a site: the wave at the site over time, and its energies at the end."""
         setting, drive, cell = self.setting, self.case.model().drive, self.cell
-        energy, speed = wave_energies(cell, *_last(self._run(team, LINEAR)))
+        energy, speed = wave_energies(cell, *_last(self._run(LINEAR)))
         late = (speed * setting.towards > 0) & (np.abs(speed) * (setting.end - drive.duration) < setting.distance)
-        at_site = self._run(team, LINEAR, stride=1, window=[setting.site + 1] * 2)
+        at_site = self._run(LINEAR, stride=1, window=[setting.site + 1] * 2)
         moved = (at_site[name].values[:, 0] for name in ("displacement", "velocity"))
         w, rate = (field[:, cell.resonator] - field[:, cell.host] for field in moved)
         times = at_site["time"].values
@@ -161,9 +131,9 @@ class Runs:
             "under_way": float(energy[late[:, setting.band], setting.band].sum()),
         }
 
-    def _scattered(self, z: float, team: MPI.Comm) -> Record:
+    def _scattered(self, z: Any) -> Record:
         """A run with the site; energies over the amplitude's square."""
-        setting, run, square, cell = self.setting, self._run(team, z), self.amplitude(z) ** 2, self.cell
+        setting, run, square, cell = self.setting, self._run(z), self.amplitude(z) ** 2, self.cell
         u, v = _last(run)
         energy, speed = wave_energies(cell, u, v)
         near = (np.arange(-NEAR, NEAR + 1) + setting.site) % setting.cells
@@ -215,7 +185,7 @@ class Runs:
         values |= {"amplitude": [self.amplitude(z) for z in points], "interpolation_error": [*map(grid.get, points)]}
         values |= {name: np.array([mean[name] for mean in means]) for name in (*OF_POINT, "near", "episodes")}
         values |= {f"{name}_scatter": np.array([row[name] for row in deviations]) for name in OF_POINT}
-        data = xr.Dataset(tabulated(LAYOUT, values), attrs=provenance(self.comm) | self._about())
+        data = xr.Dataset(tabulated(LAYOUT, values), attrs=provenance(self.recorded.comm) | self._about())
         law = ScatteringLaw.of(data)
         best = law.matched() if law.efficiency().any() else (np.nan, np.nan)
         data.attrs |= dict(zip(("matched_z", "matched_transmitted"), best, strict=True))
@@ -274,10 +244,3 @@ def _deviation(x: np.ndarray, weight: np.ndarray) -> float:
 
 def _last(run: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     return run["displacement"].values[-1], run["velocity"].values[-1]
-
-
-def _read(folder: Path) -> dict[float, Record]:
-    """The records of runs in ``folder`` by z."""
-    paths = sorted(folder.glob(RECORDS))
-    records = (record for path in paths for record, _ in read_records(path, lambda text: None))
-    return {record["z"]: record for record in records if record["vipetsc_version"] == vipetsc.__version__}

@@ -17,17 +17,16 @@ import xarray as xr
 
 from vipetsc.case import Case, CaseError, LawCase, case_id
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.dynamics import simulate
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import OPTIMUM, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
-from vipetsc.io.store import RunMemory
 from vipetsc.lattice.chain import cells_between
-from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
+from vipetsc.parallel import Progress, StopRequest, on_root
 from vipetsc.studies.law import matched_clearances
 from vipetsc.studies.linear import LinearRun, linear_case
 from vipetsc.studies.objective import Judge
 from vipetsc.studies.one_site import make_law
+from vipetsc.studies.recorded import run_in_memory
 from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, front, knee
 from vipetsc.studies.sweep import is_whole
 
@@ -180,9 +179,9 @@ def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest,
             bar.update(sum(len(search.designs) for search in searches))
         judge.make(on_root(comm, lambda: [run for row in _curves(searches[0]).values() for run in row]))
         on_root(comm, lambda: _write(searches[0], folder))
+        judge.recorded.finish()
     finally:
         bar.close()
-        judge.close()
 
 
 def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> np.ndarray:
@@ -194,11 +193,8 @@ def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) 
     lattice, drive = plan.base.lattice, plan.base.drive
 
     def matched() -> np.ndarray:
-        memory = RunMemory(MPI.COMM_SELF)
-        result = simulate(linear_case(plan.base), memory, MPI.COMM_SELF, stop=stop)
-        if memory.dataset is None or not result.complete:
-            raise StoppedError(f"{result.sentence}; the same command goes on")
-        linear = LinearRun.of(memory.dataset, result.statistics, (), ())
+        data, result = run_in_memory(linear_case(plan.base), MPI.COMM_SELF, stop)
+        linear = LinearRun.of(data, result.statistics, (), ())
         sites = np.array(plan.sites)  # the law's are in the order in which the wave meets them
         order = np.argsort(cells_between(sites, drive.cell, lattice.cells, lattice.ends), kind="stable")
         clearance = np.empty(len(sites))
@@ -265,7 +261,9 @@ def _write(search: Search, folder: Path) -> None:
             best = case.model_copy(update={"name": f"{plan.name}-{name}"})
             write_text(folder / f"{name}.toml", best.to_toml())
     runs = len({case_id(run) for design in designs for run in design.runs})
-    data = xr.Dataset(tabulated(LAYOUT, values), attrs=provenance(judge.comm) | {"case": plan.to_toml(), "runs": runs})
+    data = xr.Dataset(
+        tabulated(LAYOUT, values), attrs=provenance(judge.recorded.comm) | {"case": plan.to_toml(), "runs": runs}
+    )
     write_netcdf(folder / "optimum.h5", data.assign_attrs(summary=_summary(data, plan)))
 
 

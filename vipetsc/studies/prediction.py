@@ -19,17 +19,15 @@ import xarray as xr
 
 from vipetsc.case import Case
 from vipetsc.case.predict import PredictCase
-from vipetsc.dynamics import simulate
 from vipetsc.io.folder import PREDICTION, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
-from vipetsc.io.records import Record, RecordFile, merge_records, read_records
-from vipetsc.io.store import RunMemory
+from vipetsc.io.records import Record
 from vipetsc.lattice import pass_bands
-from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
+from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra import ModalParts
 from vipetsc.studies.composition import Network
 from vipetsc.studies.one_site import largest_between
-from vipetsc.studies.pool import TaskPool
+from vipetsc.studies.recorded import RecordedRuns, run_in_memory
 from vipetsc.studies.response import Burst, SiteResponse
 
 RECORDS, PARTS = "prediction.jsonl", "prediction-*.jsonl"
@@ -78,14 +76,17 @@ def predict(
             linear = study.make([(LINEAR, 1.0)])[0]
             amplitudes = amplitudes_of(case, linear)
             largest = max(float(amplitudes[-1] * max(linear["reached"])), HIGH) * 1.01
-            answers = study.make([(SITE, z) for z in site_points(case, largest)], largest)
+            study.largest = largest
+            answers = study.make([(SITE, z) for z in site_points(case, largest)])
             members = study.make([(MEMBER, a) for a in amplitudes.tolist()]) if case.predict.simulate else []
 
+            about = provenance(comm)
+
             def write() -> None:
-                write_netcdf(path, composed(case, linear, answers, members, largest).assign_attrs(provenance(comm)))
-                study.merge()
+                write_netcdf(path, composed(case, linear, answers, members, largest).assign_attrs(about))
 
             on_root(comm, write)
+            study.recorded.finish()
         claim.publish()
         return on_root(comm, lambda: read_prediction(claim.path))
 
@@ -111,52 +112,24 @@ def site_points(case: PredictCase, largest: float) -> list[float]:
 
 
 class Study:
-    """The runs of a prediction over the ranks of ``comm``, one rank a run, and their records in ``folder``."""
+    """The runs of a prediction over the ranks of ``comm``, one rank a run, and their records in ``folder``.
+
+    The one site's have ``largest`` as the largest z.
+    """
 
     def __init__(self, case: PredictCase, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> None:
-        self.case, self.folder, self.comm, self.stop, self.progress = case, folder, comm, stop, progress
+        self.case, self.recorded, self.progress = case, RecordedRuns("prediction", folder, comm, stop), progress
         self.setting, self.model, self.largest = case.one_site(), case.model(), 0.0
 
-    def make(self, jobs: Sequence[Job], largest: float = 0.0) -> list[Record]:
+    def make(self, jobs: Sequence[Job]) -> list[Record]:
         """The records of ``jobs``, the missing ones made now. Collective; raises RuntimeError if one fails."""
-        self.largest = largest
-        known = on_root(self.comm, self._read)
-        missing = [job for job in jobs if job not in known]
-        team = self.comm.Split(self.comm.rank)
-        pool, made, failed = TaskPool(self.comm, team, self.stop), dict[Job, Record](), list[str]()
-        file = RecordFile(self.folder / PARTS.replace("*", str(self.comm.rank)))
+        kinds = {LINEAR: self._linear, SITE: self._site, MEMBER: self._member}
 
-        def work(job: Job) -> None:
-            begin = time.process_time()
-            told = {LINEAR: self._linear, SITE: self._site, MEMBER: self._member}[job[0]](job[1])
-            cpu = round(time.process_time() - begin, 4)
-            made[job] = {"kind": job[0], "at": job[1], "largest": self.largest, "cpu_seconds": cpu} | told
-            file.append(made[job])
+        def work(job: Any) -> Record:
+            return {"kind": job[0], "at": job[1]} | kinds[job[0]](job[1])
 
-        bar = Progress(self.comm, len(missing), f"{jobs[0][0]} runs", show=self.progress and bool(missing))
-        pool.share(missing, work, bar, lambda job, reason: failed.append(f"{job[0]} {job[1]:.6g}: {reason}"))
-        file.close()
-        team.Free()
-        for more in self.comm.allgather(made):
-            known |= more
-        self.stop.check(self.comm)
-        for reason in (reason for reasons in self.comm.allgather(failed) for reason in reasons):
-            raise RuntimeError(f"a run of the prediction did not come out, {reason}")
-        return [known[job] for job in jobs]
-
-    def _read(self) -> dict[Job, Record]:
-        self.lines = {}
-        known = {}
-        for path in [self.folder / RECORDS, *sorted(self.folder.glob(PARTS))]:
-            for record, line in read_records(path, lambda text: None) if path.exists() else ():
-                job = record["kind"], record["at"]
-                known[job], self.lines[job] = record, line
-        return {job: record for job, record in known.items() if job[0] != SITE or record["largest"] == self.largest}
-
-    def merge(self) -> None:
-        """Put the records of all ranks into one file."""
-        self._read()
-        merge_records(self.folder / RECORDS, self.lines.values(), [*self.folder.glob(PARTS)])
+        self.recorded.make(jobs, work, what=f"{jobs[0][0]} runs", progress=self.progress)
+        return [self.recorded.known[job] for job in jobs]
 
     def _run(self, changes: dict[str, dict[str, Any]]) -> tuple[xr.Dataset, dict[str, Any]]:
         """A run in memory of the case with ``changes`` to its sections, and its statistics."""
@@ -165,13 +138,8 @@ class Study:
         table["output"] = {}
         for section, keys in changes.items():
             table[section] |= keys
-        memory = RunMemory(MPI.COMM_SELF)
-        result = simulate(Case.from_table(table), memory, MPI.COMM_SELF, stop=self.stop)
-        if result.resumable:
-            raise StoppedError(result.sentence)
-        if not result.complete or memory.dataset is None:
-            raise RuntimeError(result.sentence)
-        return memory.dataset, result.statistics
+        data, result = run_in_memory(Case.from_table(table), self.recorded.team, self.recorded.stop)
+        return data, result.statistics
 
     def _moved(self, run: xr.Dataset, places: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """w (time, place) and its rate at ``places`` of a run's cells."""
@@ -226,7 +194,8 @@ class Study:
         amplitude = z * clearance / peak
         run, w, _ = self._one(amplitude, [clearance])
         lost = run["energy/dissipated"].values
-        return {"z": z, "amplitude": amplitude} | burst.sums(amplitude, clearance, self.largest, w, lost)
+        sums = burst.sums(amplitude, clearance, self.largest, w, lost)
+        return {"z": z, "amplitude": amplitude, "largest": self.largest} | sums
 
     def _member(self, amplitude: float) -> Record:
         """The case under ``amplitude``: what is compared."""
