@@ -34,15 +34,17 @@ def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     result = simulate(case, folder / "run")
     memory = RunMemory()
     assert simulate(case, memory).folder is None
+    assert memory.dataset is not None
+    held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])  # of all cells, whatever is recorded
     with open_netcdf(folder / "run" / "run.h5", "run") as run:
-        assert memory.dataset.variables.keys() == run.variables.keys()
+        assert held.variables.keys() == run.variables.keys()
         for name, item in run.variables.items():
             assert memory.dataset[name].dims == item.dims, name
             assert memory.dataset[name].attrs == item.attrs, name
             assert memory.dataset[name].values.tobytes() == item.values.tobytes(), name
         assert memory.dataset.attrs.keys() == run.attrs.keys()
         assert json.loads(run.attrs["statistics"]) == result.statistics
-    write_netcdf(folder / "saved.h5", memory.dataset)
+    write_netcdf(folder / "saved.h5", held)
     assert_same_bits(datasets(folder / "run" / "run.h5"), datasets(folder / "saved.h5"))
 
 
