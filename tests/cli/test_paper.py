@@ -136,7 +136,7 @@ def test_bad_ids_and_foreign_folders_are_refused(vipetsc, in_process, tmp_path):
     wrong = vipetsc(2, "paper", "--only", "fig99", "C7", "--out", tmp_path / "out")
     assert wrong.returncode == 2
     assert wrong.stderr.count("--only fig99: figures are fig01, fig02") == 1
-    assert "claims are C1 to C17" in wrong.stderr
+    assert "claims are C1 to C18" in wrong.stderr
     assert not (tmp_path / "out").exists()
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "letter.txt").write_text("mine")

@@ -18,6 +18,7 @@ DIATOMIC = (*SHORT, "lattice.cells=40")
 FOUR_BAND = (*SHORT, "lattice.cells=30")
 AMPLITUDES = "sweep.drive.amplitude={ log = [0.2, 50.0], count = 6 }"
 BRANCH = ("nnm.energy=[0.0, 30.0]",)
+PREDICTED = (*FOUR_BAND[:3], "lattice.cells=30", "contacts.sites=2", "predict.amplitudes=[2.0]")
 CHANGES = {
     "scattering-amplitudes": (*DIATOMIC, "contacts.sites=2"),
     "interband-amplitudes": (*FOUR_BAND, "output.window=[5, 15]", "output.every=10"),
@@ -26,6 +27,8 @@ CHANGES = {
         *FOUR_BAND, 'sweep.contacts.law=["hertz", "bilinear"]', "sweep.contacts.sites=[5, 1]",
         "sweep.drive.amplitude=[5.0, 5.0]"
     ),
+    "prediction-hertz": PREDICTED,
+    "prediction-bilinear": PREDICTED,
     "design": ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11"),
     "nnm-hertz": BRANCH,
     "nnm-bilinear": BRANCH,

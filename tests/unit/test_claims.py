@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from tests.conftest import put_members
 from vipetsc.case import Case, Sweep
+from vipetsc.io.netcdf import write_netcdf
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.lattice.modes import modes_of
 from vipetsc.paper.claims import criteria as constants
@@ -21,12 +22,13 @@ from vipetsc.paper.claims import interband, measure_claims, write_claims
 from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvidence
 from vipetsc.paper.claims.interband import modal_error
-from vipetsc.paper.claims.measure import READINGS, measure_claim, rounded
+from vipetsc.paper.claims.measure import measure_claim, rounded
 from vipetsc.paper.claims.scattering import BRANCHES
+from vipetsc.paper.figures import READINGS
 from vipetsc.spectra import FEWEST, Parts, dispersion, part_energies, power_law
 from vipetsc.studies.linear import MEASURES
 
-IDS = [f"C{i}" for i in range(1, 18)]
+IDS = [f"C{i}" for i in range(1, 19)]
 SITES = [1, 2, 3, 5, 10, 20]
 ONSET = 0.7  # N
 SPREAD_FIT = "share of configurations of spread sites with adjusted R^2 >= 0.95 over 4 points or more"
@@ -180,6 +182,9 @@ C17 | II: correlation with the motion without contact* | >= | 0.9
 C17 | III: largest share of energy above the driven band* | >= | 0.1
 C17 | IV: correlation of host and resonator* | >= | 0.99
 C17 | IV: share of energy above the driven band* | <= | 0.01
+C18 | rms of the upper bands' energy at the end, in decades* | <= | 0.06
+C18 | largest error of the dissipated share* | <= | 0.04
+C18 | amplitudes with contact on one side alone* | <= | 0
 """
 
 
@@ -239,7 +244,7 @@ def _meeting(criterion):
 
 def test_without_files_nothing_is_measured_and_thresholds_stand(tmp_path):
     claims = [SimpleNamespace(**row) for row in measure_claims(tmp_path)]
-    assert [(c.id, c.reading) for c in claims] == [(i, r) for i in IDS for r in READINGS]
+    assert [(c.id, c.reading) for c in claims] == [(i, r) for i in IDS for r in CLAIMS[i].readings]
     assert list(CLAIMS) == IDS
     for c in claims:
         assert c.verdict == UNMEASURED and "missing" in c.reason and not c.files and not c.value
@@ -584,6 +589,24 @@ def test_scatter_stands_beside_the_maxima_and_decides_nothing(tmp_path):
         assert 0 < abs(mean / amplitude - 1) < 0.05 and 0.002 < deviation / amplitude < 0.06
         assert (result.verdict, result.threshold) == (before[claim].verdict, before[claim].threshold)
         assert len(result.value) == len(before[claim].value) + 2
+
+
+@pytest.mark.parametrize(
+    ("rms", "loss", "onset", "expected"),
+    [(0.05, 0.03, 16.0, HOLDS), (0.07, 0.03, 16.0, IN_PART), (0.05, 0.05, 16.0, IN_PART), (0.05, 0.03, 25.0, IN_PART)],
+)
+def test_a_prediction_holds_by_its_errors_and_its_onset(tmp_path, rms, loss, onset, expected):
+    amplitude = [12.0, 20.0, 30.0]
+    dims = {"amplitude": amplitude}
+    data = {"predicted/upper": ("amplitude", [0.0, 0.1, 0.2]), "simulated/contact_episodes": ("amplitude", [0.0, 3, 9])}
+    attributes = {"rms_upper": 0.01, "worst_upper": 0.2, "worst_dissipated": 0.01, "onset_amplitude": 16.0}
+    other = attributes | {"rms_upper": rms, "worst_dissipated": loss, "onset_amplitude": onset}
+    for law, about in (("hertz", attributes), ("bilinear", other)):
+        (tmp_path / f"prediction-{law}").mkdir()
+        write_netcdf(tmp_path / f"prediction-{law}" / "prediction.h5", xr.Dataset(data, dims, about))
+    row = measure("C18", tmp_path)
+    assert row.verdict == expected and len(row.files) == 2
+    assert row.value["amplitudes with contact on one side alone, bilinear"] == (onset > 20)
 
 
 def test_an_onset_ends_at_half_the_maximum(tmp_path):

@@ -21,6 +21,7 @@ import numpy as np
 
 import vipetsc
 from vipetsc.case import DesignCase, NnmCase, Sweep
+from vipetsc.case.predict import PredictCase
 from vipetsc.io.folder import NEW, FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, outdated
@@ -33,6 +34,7 @@ from vipetsc.parallel import StopRequest
 from vipetsc.studies.design import search_design
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, Results
+from vipetsc.studies.prediction import predict
 from vipetsc.studies.sweep import run_sweep
 
 FULL, QUICK = "full", "quick"
@@ -46,8 +48,10 @@ RELATION = "backbone.h5"  # beside a sweep that is laid over branches
 # Steps that a claim is measured from, and figures that bear on it are drawn from, besides those that these show.
 FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
 
-StepCase = Sweep | NnmCase | DesignCase
-KINDS: dict[str, type[StepCase]] = {"sweep": Sweep, "branches": NnmCase, "search": DesignCase}
+StepCase = Sweep | NnmCase | DesignCase | PredictCase
+KINDS: dict[str, type[StepCase]] = {
+    "sweep": Sweep, "branches": NnmCase, "search": DesignCase, "prediction": PredictCase
+}  # fmt: skip
 
 
 class Claimed(NamedTuple):
@@ -91,7 +95,7 @@ class Step:
 
     def results(self, root: Path) -> list[Path]:
         """The files that pictures and claims are made from."""
-        names = ["ensemble.h5" if isinstance(self.case, Sweep) else "design.h5"]
+        names = [{Sweep: "ensemble.h5", PredictCase: "prediction.h5"}.get(self.kind, "design.h5")]
         if isinstance(self.case, NnmCase):
             system = System.from_case(self.case)
             names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
@@ -99,10 +103,10 @@ class Step:
 
     @property
     def parts(self) -> dict[int, float]:
-        """What single ranks make, by number with CPU times in s: branches by mode, the search; nothing of a sweep."""
+        """What single ranks make, by number with CPU times in s: branches by mode, the search; nothing of other steps."""
         if isinstance(self.case, NnmCase):
             return {mode: self.cost * (IN_PHASE if mode == 1 else 1) for mode in self.case.nnm.modes}
-        return {} if isinstance(self.case, Sweep) else {1: self.cost}
+        return {} if isinstance(self.case, Sweep | PredictCase) else {1: self.cost}
 
     @contextmanager
     def claimed(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> Iterator[Claimed]:
@@ -117,10 +121,13 @@ class Step:
             yield Claimed(lambda part: search_design(case, folder, afresh))
 
     def sweep(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
-        """Make what is missing of a sweep on all ranks, everything if ``afresh``; may leave early on ``stop``.
+        """Make what is missing of a sweep or prediction on all ranks, all if ``afresh``; may leave early on ``stop``.
 
         Returns warnings about what was made.
         """
+        if isinstance(self.case, PredictCase):
+            predict(self.case, self.folder(root), comm, force=afresh, stop=stop)
+            return []
         assert isinstance(self.case, Sweep)
         return run_sweep(self.case, self.folder(root), comm, force=afresh, stop=stop, progress=True).warnings
 
@@ -159,7 +166,7 @@ class Step:
         if state == DONE:
             return 0.0
         if not isinstance(self.case, Sweep):
-            return sum(self.parts.values())
+            return sum(self.parts.values()) or self.cost
         times = [*Results(self.case, self.folder(root)).cpu_seconds.values()] if state == BEGUN else []
         rate = max(float(np.mean(times)), self.cost) if times else self.cost  # measuring a run takes time as well
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)

@@ -81,7 +81,8 @@ class ClaimSpec:
     """A claim before it is measured: a sentence, where the ``paper`` makes it, and what decides on it.
 
     ``figure`` is the stem of the picture that shows it, and may hold ``{reading}``. ``measure`` names a function
-    "module.name" (evidence, reading, measurement) that fills the measurement, or raises MissingEvidence.
+    "module.name" (evidence, reading, measurement) that fills the measurement, or raises MissingEvidence. It is measured
+    in those ``readings``.
     """
 
     claim: str
@@ -89,6 +90,7 @@ class ClaimSpec:
     figure: str
     measure: str
     criteria: tuple[Criterion, ...]
+    readings: Sequence[str] = ("printed", "calibrated")
 
 
 def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | None]) -> tuple[str, list[str]]:

@@ -200,3 +200,20 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
         }
         result.uncertainty[f"amplitudes, {law}"] = len(shared)
         _add_scatter(evidence, reading, law, 1, result)
+
+
+def prediction(evidence: Evidence, reading: str, result: Measurement) -> None:
+    """C18: what five sites transfer, composed from the answer of one site, beside simulations."""
+    for law in LAWS:
+        data = evidence.open(f"prediction-{law}", "prediction.h5", needs=("predicted", "simulated"))
+        touched = (
+            data["simulated/contact_episodes"].values > 0,
+            data["amplitude"].values > data.attrs["onset_amplitude"],
+        )
+        result.value |= {
+            f"rms of the upper bands' energy at the end, in decades, {law}": data.attrs["rms_upper"],
+            f"largest error of the dissipated share, {law}": data.attrs["worst_dissipated"],
+            f"amplitudes with contact on one side alone, {law}": int(np.sum(touched[0] != touched[1])),
+            f"largest error of the upper bands' energy, in decades, {law}": data.attrs["worst_upper"],
+        }
+        result.uncertainty[f"amplitudes, {law}"] = data.sizes["amplitude"]

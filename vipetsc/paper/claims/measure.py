@@ -11,12 +11,11 @@ from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import CLAIMS, UNMEASURED, verdict
 from vipetsc.paper.claims.evidence import Evidence, Measurement, MissingEvidence, Numbers
 
-READINGS = "printed", "calibrated"
 DIGITS = 6  # significant ones of the numbers in claims.json
 
 
 def measure_claims(root: str | Path) -> list[dict[str, Any]]:
-    """C1-C17 in both readings, from the steps in ``root`` (scattering/, interband/, nnm-hertz/, ...).
+    """C1-C17 in both readings and C18 in one, from the steps in ``root`` (scattering/, interband/, nnm-hertz/, ...).
 
     A row of ``claims.json`` is a claim in one ``reading`` of the paper's parameters. ``value`` holds named numbers,
     None where one could not be had, the deciding ones among them under the names that stand in ``threshold``;
@@ -24,7 +23,7 @@ def measure_claims(root: str | Path) -> list[dict[str, Any]]:
     the claim, ``files`` are what it was measured from, relative to ``root``. What cannot be measured because its files
     are missing has the verdict "not measured", and ``reason`` says what is missing.
     """
-    return [measure_claim(claim, reading, Path(root)) for claim in CLAIMS for reading in READINGS]
+    return [measure_claim(claim, reading, Path(root)) for claim, spec in CLAIMS.items() for reading in spec.readings]
 
 
 def measure_claim(claim: str, reading: str, root: Path) -> dict[str, Any]:
