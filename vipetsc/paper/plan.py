@@ -103,7 +103,7 @@ class Step:
 
     @property
     def parts(self) -> dict[int, float]:
-        """What single ranks make, by number with CPU times in s: branches by mode, the search; nothing of other steps."""
+        """What single ranks make, by number with CPU times in s: branches by mode, the search; else nothing."""
         if isinstance(self.case, NnmCase):
             return {mode: self.cost * (IN_PHASE if mode == 1 else 1) for mode in self.case.nnm.modes}
         return {} if isinstance(self.case, Sweep | PredictCase) else {1: self.cost}
