@@ -261,7 +261,7 @@ def test_json_is_strict_and_the_same_every_time(tmp_path):
     assert text == (tmp_path / "b.json").read_text()
     rows = json.loads(text)
     fields = {"id", "reading", "claim", "value", "uncertainty", "threshold", "verdict", "reason", "figure", "files"}
-    assert len(rows) == 34 and all(row.keys() == fields for row in rows)
+    assert len(rows) == 35 and all(row.keys() == fields for row in rows)
     assert not list(tmp_path.glob(".*.part"))
 
 

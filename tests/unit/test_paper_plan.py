@@ -142,8 +142,8 @@ def test_fingerprints_tell_parts_apart():
 
 
 def test_the_plan_names_what_it_does_not_know():
-    with pytest.raises(FolderError, match=r"--only fig99 C18: figures are fig01"):
-        paper_plan(FULL).only(["fig99", "C18", "C1"])
+    with pytest.raises(FolderError, match=r"--only fig99 C99: figures are fig01"):
+        paper_plan(FULL).only(["fig99", "C99", "C1"])
     assert paper_plan(FULL).only(["c1"]).figures
 
 
