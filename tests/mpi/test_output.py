@@ -48,7 +48,8 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
         assert memory.dataset is None
         return
     run = datasets(folder / "run" / "run.h5")
-    assert_same_bits(run, {str(name): item.values for name, item in memory.dataset.variables.items()})
+    held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])  # of all cells, whatever is recorded
+    assert_same_bits(run, {str(name): item.values for name, item in held.variables.items()})
 
 
 @pytest.mark.parallel([2, 3])
