@@ -24,13 +24,11 @@ from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
 from vipetsc.studies.linear import MARGIN, PARTS, LinearRun, leading_cell, linear_case, linear_name, measured
-from vipetsc.studies.recorded import whole
+from vipetsc.studies.recorded import completed
 
 FIELDS = "displacement", "velocity"
-ANALYSED = {
-    "entropy": ("entropy",),
-    "transfer": ("bands", "modal"),
-}  # what ``analyse`` calls those of ``[sweep] measures``
+# What ``analyse`` calls those of ``[sweep] measures``.
+ANALYSED = {"entropy": ("entropy",), "transfer": ("bands", "modal")}
 
 
 class MemberStore:
@@ -137,7 +135,7 @@ class MemberStore:
         return on_root(self.team, measure)
 
     def _simulate(self, case: Case, output: RunOutput) -> Result:
-        return whole(simulate(case, output, self.team, stop=self.stop))
+        return completed(simulate(case, output, self.team, stop=self.stop))
 
 
 def measures_of(plan: Sweep) -> set[str]:

@@ -34,11 +34,8 @@ MODAL = {
 
 def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     """The variables of ``MODAL``: at the last sample alone, or with "transfers" among the ``measures`` over time."""
-    chain, time, recorded = (
-        record.model.chain,
-        record.time,
-        [n for n in ("displacement", "end/displacement") if n in run],
-    )
+    chain, time = record.model.chain, record.time
+    recorded = [name for name in ("displacement", "end/displacement") if name in run]
     if len(record.cells) < chain.cells or not recorded:
         missing = f"{chain.cells - len(record.cells)} cells were" if recorded else "the displacement was"
         record.left_out.append(f"upper_share_at_end, bands/modal_energy: {missing} not recorded")

@@ -102,14 +102,14 @@ class RecordedRuns:
 def run_in_memory(case: Case, team: MPI.Comm, stop: StopRequest) -> tuple[xr.Dataset, Result]:
     """A run of ``case`` on all ranks of ``team``: its content, empty on all but the first, and how it ended.
 
-    Raises as ``whole``.
+    Raises as ``completed``.
     """
     memory = RunMemory(team)
-    result = whole(simulate(case, memory, team, stop=stop))
+    result = completed(simulate(case, memory, team, stop=stop))
     return xr.Dataset() if memory.dataset is None else memory.dataset, result
 
 
-def whole(result: Result) -> Result:
+def completed(result: Result) -> Result:
     """The ``result`` of a run that is complete; raises StoppedError if it was stopped, RuntimeError if it failed."""
     if result.resumable:
         raise StoppedError(result.sentence)
