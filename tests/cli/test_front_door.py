@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+from mpi4py import MPI
+
 import pytest
 
 from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
+from vipetsc.cli.doctor import doctor_table
 
 SMALL = """
 [lattice]
@@ -216,6 +220,15 @@ def test_doctor(vipetsc):
     ended = vipetsc(2, "doctor")
     assert ended.returncode == 0, ended.stdout
     assert "all is well" in ended.stdout
+
+
+def test_doctor_without_slepc_names_the_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "slepc4py", None)
+    text, healthy = doctor_table(MPI.COMM_SELF)
+    assert healthy
+    assert "python3-slepc4py" in text
+    monkeypatch.undo()
+    assert re.search(r"slepc +3\.", doctor_table(MPI.COMM_SELF)[0])
 
 
 def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):

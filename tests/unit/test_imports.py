@@ -30,7 +30,7 @@ FLOORS = (
     "__init__",
 )
 SERIAL = ("lattice", "spectra", "figures")
-FORBIDDEN = {"petsc4py", "mpi4py"}
+FORBIDDEN = {"petsc4py", "slepc4py", "mpi4py"}
 
 
 def module_of(path):
@@ -96,7 +96,7 @@ def test_importing_them_loads_neither_petsc_nor_mpi():
     modules = [f"vipetsc.{module}" for module in MODULES if module.split(".")[0] in SERIAL]
     assert len(modules) > 15
     code = f"import sys, importlib\nfor m in {modules!r}: importlib.import_module(m)\n"
-    code += "print(*sorted({'petsc4py', 'mpi4py'} & sys.modules.keys()))"
+    code += "print(*sorted({'petsc4py', 'slepc4py', 'mpi4py'} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT.parent)
     assert done.stdout.strip() == ""
 

@@ -1,16 +1,11 @@
-"""What the verbs print: tables of a case, its bands, an installation, and how runs, sweeps and branches ended."""
+"""What the verbs print: tables of a case, its bands, and how runs, sweeps and branches ended."""
 
-import importlib
 import json
 import math
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
-from mpi4py import MPI
-
-import h5py
 import numpy as np
 import xarray as xr
 
@@ -18,7 +13,6 @@ from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
 from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
-from vipetsc.io.folder import provenance
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
 if TYPE_CHECKING:
@@ -29,9 +23,6 @@ if TYPE_CHECKING:
 
 # Time of one step of the default method per mass and per step, measured on one 2020s core.
 _STEP_SECONDS, _STEP_SECONDS_PER_MASS = 2e-5, 7e-8
-
-MODULES = ("scipy", "matplotlib", "jinja2", "numba", "pydantic", "tqdm", "tomli_w", "xarray", "h5netcdf", "cma",
-           "pymoo")  # fmt: skip
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
@@ -242,42 +233,6 @@ def branch_table(branch: "Branch") -> str:
             f" ({law['points']} points)"
         )
     return "\n".join(lines)
-
-
-def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
-    """The checks as a table, and whether all is well; all ranks must call it."""
-    from petsc4py import PETSc
-
-    from vipetsc.dynamics.ts.right_hand_side import compile_callback
-
-    scalar = np.dtype(PETSc.ScalarType)
-    parallel = "yes" if comm.size > 1 else "under mpirun"
-    # Name, value (None if it is missing), remedy.
-    checks = [
-        ("petsc scalars", str(scalar) if scalar == np.float64 else None, "a real double PETSc (Debian: petsc-dev)"),
-        ("parallel HDF5", parallel if comm.size == 1 or h5py.get_config().mpi else None,
-         "the MPI build of h5py (Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*)"),
-        ("mpirun", shutil.which("mpirun"), "apt install openmpi-bin"),
-    ]  # fmt: skip
-    for module in MODULES:
-        try:
-            version = str(getattr(importlib.import_module(module), "__version__", "yes"))
-        except ImportError:
-            version = None
-        remedy = f"pip install --constraint scripts/constraints.txt {module.replace('_', '-')}"
-        checks.append((module, version, remedy))
-    rows = [(name.replace("_version", ""), str(value)) for name, value in provenance(comm).items()]
-    rows += [(name, f"MISSING: {remedy}" if value is None else value) for name, value, remedy in checks]
-    try:
-        compile_callback()
-        rows.append(("native right-hand side", "yes"))
-    except (AttributeError, OSError) as error:
-        rows.append(("native right-hand side", f"no: runs need PETSc's symbols ({error})"))
-    hosts = comm.allgather(MPI.Get_processor_name())
-    rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
-    healthy = all(value is not None for _, value, _ in checks)
-    verdict = "all is well" if healthy else "something is missing, see above"
-    return f"{table(rows)}\n{verdict}", healthy
 
 
 def prediction_table(data: xr.Dataset) -> str:

@@ -268,6 +268,8 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
 def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Versions, MPI, HDF5 and ranks; what is missing and how to get it."""
-    text, healthy = tables.doctor_table(comm)
+    from vipetsc.cli.doctor import doctor_table
+
+    text, healthy = doctor_table(comm)
     echo(comm, text)
     return DONE if healthy else FAILED
