@@ -3,5 +3,6 @@
 from vipetsc.lattice.bands import Band, BlochPoint, bloch, gaps, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain, ToneBurst
+from vipetsc.lattice.compliance import Compliance, DenseCompliance, IncidentWave
 from vipetsc.lattice.contact import Contact, contact_stiffness
 from vipetsc.lattice.modes import Modes, modes_of
