@@ -3,6 +3,9 @@
 import logging
 import os
 import sys
+from importlib.util import find_spec
+
+BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"  # which no wheel brings
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -12,6 +15,12 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault(name, "1")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("vipetsc").setLevel(logging.INFO)
+    if missing := [name for name in BUILT_FOR_MPI if find_spec(name) is None]:
+        remedy = (
+            "on Debian: apt install python3-petsc4py python3-h5py-mpi, and an environment with --system-site-packages"
+        )
+        logging.getLogger("vipetsc").critical("vipetsc: %s not installed; %s", " and ".join(missing), remedy)
+        return 1
     arguments = sys.argv[1:] if arguments is None else arguments
     end = arguments.index("--") if "--" in arguments else len(arguments)
 

@@ -101,9 +101,9 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
 
 def _parser() -> Parser:
     parser = Parser(
-        prog="python -m vipetsc",
+        prog="vipetsc",
         description="Waves in phononic lattices with vibro-impacts. Without a verb: the built-in four-band case.",
-        epilog="PETSc options go after --, as in: python -m vipetsc run CASE -- -ts_rk_type 5dp -log_view",
+        epilog="PETSc options go after --, as in: vipetsc run CASE -- -ts_rk_type 5dp -log_view",
     )
     parser.add_argument("--version", action="version", version=f"vipetsc {vipetsc.__version__}")
     subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")

@@ -1,0 +1,143 @@
+"""The package as a user installs it: an sdist, a wheel from it, and its programs away from the source tree."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import vipetsc as package
+from tests.conftest import clean_environment
+from vipetsc.compiled import kernel_cache
+
+ROOT = Path(package.__file__).parents[1]
+BUILD = "import sys; from setuptools.build_meta import build_sdist; print(build_sdist(sys.argv[1]))"
+PIP = sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-cache-dir"
+TOP = {
+    "pyproject.toml", "vipetsc", "tests", "runs", "scripts", "README.md",
+    "LICENSE", "CITATION.cff", "CHANGELOG.md", "MANIFEST.in", ".gitignore", ".ci",
+}  # fmt: skip
+# As scripts/setup runs it, so that its kernels are compiled.
+TINY = ("--set", "lattice.cells=40", "--set", "contacts.sites=[6,12]", "--set", "contacts.clearance=1e-4",
+        "--set", "time.end=0.08", "--set", "time.engine=propagator", "--set", "output.figures=false")  # fmt: skip
+
+
+def tracked() -> list[str]:
+    """What belongs to the source tree, by git."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
+    return [name for name in listed.stdout.splitlines() if (ROOT / name).exists()]
+
+
+def call(*command: object, cwd: Path, site: Path | None = None) -> subprocess.CompletedProcess:
+    """A command that ends well; with the installed package, if that is in ``site``, and never with the source."""
+    environment = clean_environment() | ({"PYTHONPATH": str(site)} if site else {})
+    words = list(map(str, command))
+    ended = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert ended.returncode == 0, f"{words}\n{ended.stdout}\n{ended.stderr}"
+    return ended
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> tuple[Path, Path]:
+    """An sdist of what git tracks, and a wheel made from that sdist."""
+    folder = tmp_path_factory.mktemp("built")
+    for name in tracked():
+        (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, folder / "source" / name)
+    call(sys.executable, "-c", BUILD, folder, cwd=folder / "source")
+    (sdist,) = folder.glob("*.tar.gz")
+    call(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, sdist, cwd=folder)
+    (wheel,) = folder.glob("*.whl")
+    return sdist, wheel
+
+
+@pytest.fixture(scope="module")
+def site(built, tmp_path_factory) -> Path:
+    """The wheel installed into a folder of its own, beside the libraries of this environment."""
+    folder = tmp_path_factory.mktemp("site")
+    call(*PIP, "install", "--no-deps", "--no-compile", "--target", folder, built[1], cwd=folder)
+    bring_kernels(folder)
+    return folder
+
+
+def bring_kernels(site: Path) -> None:
+    """Put kernels compiled for the source, if there are any, where numba looks for those of the installed package.
+
+    The sources are the same; to compile them again takes minutes and tests nothing.
+    """
+    ours, theirs = kernel_cache(ROOT / "vipetsc"), kernel_cache(site / "vipetsc")
+    assert ours.name == theirs.name
+    for folder in {Path(name).parent for name in tracked() if name.startswith("vipetsc/")}:
+        here, there = (cache_name(root / folder) for root in (ROOT, site))
+        if (ours / here).is_dir():
+            shutil.copytree(ours / here, theirs / there)
+
+
+def cache_name(folder: Path) -> str:
+    """What numba calls the cache of the modules in a folder."""
+    return f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
+
+
+def test_the_sdist_is_the_source_and_the_wheel_is_the_package(built):
+    sdist, wheel = built
+    with tarfile.open(sdist) as file:
+        packed = {name.partition("/")[2] for name in file.getnames()}
+    assert {name for name in tracked() if not name.startswith(".")} <= packed
+    with zipfile.ZipFile(wheel) as file:
+        assert {name for name in tracked() if name.startswith("vipetsc/")} <= set(file.namelist())
+    assert wheel.name == f"vipetsc-{package.__version__}-py3-none-any.whl"
+
+
+def test_the_top_level_holds_what_it_may():
+    assert {name.partition("/")[0] for name in tracked()} <= TOP
+
+
+@pytest.mark.mpirun
+def test_the_wheel_runs_away_from_the_source(site, tmp_path):
+    """The console script alone and under mpirun, and a part of the tiny paper."""
+    program, rank = site / "bin" / "vipetsc", ["mpirun", "--oversubscribe", "-n", "2"]
+    told = call(sys.executable, "-c", "import vipetsc; print(vipetsc.__file__)", cwd=tmp_path, site=site)
+    assert Path(told.stdout.strip()).is_relative_to(site)
+    assert call(program, "--version", cwd=tmp_path, site=site).stdout == f"vipetsc {package.__version__}\n"
+    ended = call(*rank, program, "run", *TINY, cwd=tmp_path, site=site)
+    assert ended.stdout.count("complete: ") == 1
+    call(program, "plot", "runs/four-band", "--fig", "ledger", cwd=tmp_path, site=site)
+    assert (tmp_path / "runs/four-band/figures/ledger.png").stat().st_size > 5000
+    assert "scattering" in call(program, "paper", "--list", cwd=tmp_path, site=site).stdout
+    shutil.copy2(ROOT / "tests/cli/tiny_paper.py", tmp_path)
+    call(sys.executable, "tiny_paper.py", "paper", "fig01", "C8", "C10", cwd=tmp_path, site=site)
+    for made in ("design/design.h5", "scattering/ensemble.h5", "report.html"):
+        assert (tmp_path / "paper" / made).exists()
+
+
+def test_what_pip_cannot_bring_is_named(site, tmp_path):
+    """Without the libraries that are built for MPI: a sentence, no traceback."""
+    hidden = (
+        f"import sys; sys.path = [p for p in sys.path if 'dist-packages' not in p]; sys.path.insert(0, {str(site)!r})"
+    )
+    code = f"{hidden}; from vipetsc.__main__ import main; sys.exit(main(['doctor']))"
+    ended = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert "petsc4py" in ended.stderr and "apt install" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_recipes_and_citation_say_what_the_package_says():
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    recipe = (ROOT / "scripts/recipes/recipe.yaml").read_text(encoding="utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    for text in (citation, recipe):
+        assert re.findall(r"^ *version: (\d\S*)$", text, flags=re.M) == [package.__version__]
+    assert re.search(r"^## (\S+)", changes, flags=re.M)[1] == package.__version__
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = {re.match(r"[\w-]+", line)[0] for line in [*project["dependencies"], "h5py"]}
+    run = recipe.split("\n  run:\n")[1].split("\n\n")[0]
+    assert {name.removesuffix("-base") for name in re.findall(r"^ +- ([\w-]+)", run, flags=re.M)} - {"python"} == needed
