@@ -5,18 +5,14 @@ is made around a point of the branch; xi is of order one there, so that arclengt
 (x, period) as xi, decodes it, and gives d(x, period)/d xi (n + 1, n + 1).
 """
 
-from dataclasses import dataclass
-
-from petsc4py import PETSc
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from vipetsc.modes.flow import Arc, Flow, FlowError
+from vipetsc.modes.newton import Attempt, BorderedNewton
 from vipetsc.modes.system import System
-
-# A Newton step below this, in unknowns of order one, is rounding.
-STEP_TOLERANCE = 1e-14
 
 
 class Relative:
@@ -144,22 +140,6 @@ MAPS = {
 }
 
 
-@dataclass(eq=False)
-class Attempt:
-    """What Newton's method did: ``history`` of residual norms, ``reason`` why it stopped, last ``xi`` and ``arc``."""
-
-    converged: bool
-    reason: str
-    history: list[float]
-    xi: np.ndarray
-    arc: Arc | None = None
-
-    @property
-    def residuals(self) -> str:
-        """The history as text."""
-        return " ".join(f"{r:.1e}" for r in self.history)
-
-
 class Shooting:
     """Periodic orbits of ``flow.system``: initial values x (n,) and period, by Newton's method (PETSc SNES).
 
@@ -180,26 +160,9 @@ class Shooting:
         # the half of the state that is free at the arc's start, and the half that should vanish at its end
         self._free = slice(0, n) if shooting_map.start == "rest" else slice(n, 2 * n)
         self._zero = slice(n, 2 * n) if shooting_map.end == "rest" else slice(0, n)
-        self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
-        self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
-        matrix = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
-        matrix.setUp()
-        snes.setOptionsPrefix("nnm_")
-        snes.setFunction(self._function, self._xi.duplicate())
-        snes.setJacobian(self._jacobian, matrix)
-        snes.setTolerances(max_it=max_newton)
-        snes.setConvergenceTest(self._test)
-        snes.getKSP().setType("preonly")
-        snes.getKSP().getPC().setType("lu")
-        options = PETSc.Options("nnm_")
-        if not options.hasName("snes_linesearch_type"):
-            options["snes_linesearch_type"] = "basic"  # step control is the continuation's business
-        snes.setFromOptions()
-        # the current equations: shooting in a chart, over its size, and row . xi = value
+        self._newton = BorderedNewton(self._function, self.matrix, size, tolerance, max_newton)
         self._chart: Chart
-        self._row: tuple[np.ndarray, float]
         self._last: tuple[np.ndarray, Arc] | None = None
-        self._history: list[float] = []
 
     def arc(self, x: np.ndarray, period: float) -> Arc:
         """The arc from initial values ``x``; raises FlowError where the flow fails."""
@@ -228,15 +191,9 @@ class Shooting:
 
     def solve(self, chart: Chart, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Solve shooting(xi) = 0 and row . xi = value, starting from ``guess`` (n + 1,)."""
-        self._chart, self._row, self._last, self._history = chart, (row, value), None, []
-        self._xi.setArray(guess)
-        try:
-            self._snes.solve(None, self._xi)
-        except FlowError as error:
-            return Attempt(False, str(error), self._history, guess)
-        reason = self._snes.getConvergedReason()
-        xi = self._xi.getArray().copy()
-        return Attempt(reason > 0, _REASONS.get(reason, str(reason)), self._history, xi, self._arc(xi))
+        self._chart, self._last, self._newton.tolerance = chart, None, self.tolerance
+        attempt = self._newton.solve(guess, row, value)
+        return attempt if attempt.left_domain else replace(attempt, arc=self._arc(attempt.xi))
 
     def matrix(self, xi: np.ndarray) -> np.ndarray:
         """The scaled Jacobian (n, n + 1) of the shooting equations at ``xi``, in the chart of the last attempt."""
@@ -252,34 +209,7 @@ class Shooting:
             self._last = xi.copy(), self.arc(*self._chart.decode(xi))
         return self._last[1]
 
-    def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        xi, (row, value) = x.getArray(readonly=True), self._row
+    def _function(self, xi: np.ndarray) -> np.ndarray:
         if not np.all(np.isfinite(xi)) or self._chart.decode(xi)[1] <= 0:
             raise FlowError("Newton left the domain: the period is not positive")
-        residual = self.residual(self._arc(xi)) / self._chart.size
-        f.setArray(np.append(residual, row @ xi - value))
-
-    def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
-        matrix.getDenseArray()[:] = np.vstack([self.matrix(x.getArray(readonly=True)), self._row[0]])
-        matrix.assemble()
-
-    def _test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | bool:
-        _, step, residual = norms
-        self._history.append(residual)
-        reasons = PETSc.SNES.ConvergedReason
-        if not np.isfinite(residual):
-            return reasons.DIVERGED_FNORM_NAN
-        if residual <= self.tolerance:
-            return reasons.CONVERGED_FNORM_ABS
-        if iteration and step <= STEP_TOLERANCE:
-            return reasons.CONVERGED_SNORM_RELATIVE
-        if residual > 1e3 * max(self._history[0], 1e-3):
-            return reasons.DIVERGED_DTOL
-        return reasons.ITERATING
-
-
-_REASONS = {
-    value: name.lower().replace("_", " ")
-    for name, value in vars(PETSc.SNES.ConvergedReason).items()
-    if name.startswith(("CONVERGED", "DIVERGED"))
-}
+        return self.residual(self._arc(xi)) / self._chart.size
