@@ -35,6 +35,7 @@ from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.series import StepSeries, apply_impulses, evaluate, expand_free_motion, shift
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.propagator.tape import create_tape
 from vipetsc.dynamics.samples import Samples
 from vipetsc.dynamics.vectors import LANES
 
@@ -229,6 +230,7 @@ def oscillator(damping: float = 0.0) -> tuple[Cluster, float]:
         contacts, burst, response, collocation(2), h, 1.0, 1e-10, 1e-12, 1.0,
         taylor=np.array([[1.0, speed * h]]), site_motion=np.zeros((1, 3)), moments=np.zeros((1, 2)),
         energy=np.zeros(1), history=np.zeros(1, HISTORY), state=np.zeros(1, SUBSTEP_STATE), trial=create_trial(1, 1),
+        tape=create_tape(0, 0),
     )  # fmt: skip
     return cluster, rate
 

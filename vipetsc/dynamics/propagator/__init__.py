@@ -51,6 +51,8 @@ so that one exchange of ``HaloRegions`` a step is all that ranks must say to eac
 against the size of its clusters. Its loop over a block of samples is compiled as a whole: ranks agree on requests and
 failures at a block's end, to which a rank that cannot follow its contacts goes on without them.
 
+**7. Variations** of the state beside an orbit move by P and by one small matrix a step in contact: ``variations``.
+
 References
 ----------
 H. Brunner, Collocation Methods for Volterra Integral and Related Functional Differential Equations, Cambridge 2004.

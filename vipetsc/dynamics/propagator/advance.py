@@ -161,6 +161,25 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
 
 
 @kernel
+def _take_down(cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """Write a substep that is taken onto the cluster's tape, for each closed site; on a full tape they are counted."""
+    tape, state = cluster.tape, cluster.state[0]
+    if tape.rows.shape[1] == 0:
+        return
+    for i in trial.closed:
+        k, site, motion = tape.used[0], cluster.contacts.sites[i], cluster.site_motion[i]
+        tape.used[0] += 1
+        if k < tape.rows.shape[1]:
+            row = tape.rows[0, k]
+            row.begin, row.position, row.length, row.kind = state.begin, state.position, substep.length, substep.kind
+            row.site, row.mode, row.approach = i, site.mode, site.approach
+            row.rate, row.acceleration = motion[1], motion[2]
+            row.onset = state.begin + state.position * cluster.interval == cluster.history[i].onset
+            for node in range(NODES):
+                tape.motion[0, k, 0, node], tape.motion[0, k, 1, node] = trial.w[i, node], trial.v[i, node]
+
+
+@kernel
 def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> None:
     """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
     start, end, history = cluster.site_motion[i], trial.site_motion[i], cluster.history[i]
@@ -232,6 +251,7 @@ def advance_cluster(cluster: Cluster) -> int:
             if not _control_length(cluster, trial, substep.length, landed):
                 continue
             accumulate_moments(cluster, trial, substep)
+            _take_down(cluster, trial, substep)
             for i in trial.closed:
                 _update_extremes(cluster, trial, i, cluster.interval * substep.length)
             state.position += substep.length

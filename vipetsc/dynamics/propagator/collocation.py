@@ -17,10 +17,10 @@ from vipetsc.compiled import kernel
 from vipetsc.contact.law import Contacts, contact_force
 from vipetsc.dynamics.layout import Burst, drive_force
 from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
+from vipetsc.dynamics.propagator.tape import Tape
 
 NODES = 8
 PLAIN, ONSET, EXIT = range(3)
-
 MOST_SWEEPS = 60
 # Responses smaller than this, beside the first one, are left out.
 SMALLEST_RESPONSE = 1e-18
@@ -86,7 +86,7 @@ class Cluster(NamedTuple):
     ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``site_motion`` (dof, 3) w,
     w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
     ``energy`` (dof,) in J what sites dissipated and the work of the drive; ``history`` (dof,) is of dtype ``HISTORY``,
-    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``. ``trial`` is room for a substep of the largest cluster.
+    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is room for a substep of the largest, ``tape`` a log.
     """
 
     contacts: Contacts
@@ -105,6 +105,7 @@ class Cluster(NamedTuple):
     history: np.ndarray
     state: np.ndarray
     trial: "Trial"
+    tape: Tape
 
 
 class Substep(NamedTuple):
@@ -161,7 +162,7 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
 
 
 @kernel
-def _node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
+def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
     """Fill (node k, node) with what DoF ``j``'s force at node k adds to w, w' of DoF ``i``; whether it reaches it."""
     to_w[:] = to_v[:] = 0.0
     power, size, reaches = substep.length, 1.0, False
@@ -199,7 +200,7 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
                 trial.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
     for a in range(n):
         for b in range(n):
-            reaches[a, b] = _node_responses(cluster, substep, active[a], active[b], to_w[a, b], to_v[a, b])
+            reaches[a, b] = node_responses(cluster, substep, active[a], active[b], to_w[a, b], to_v[a, b])
     for _ in range(MOST_SWEEPS):
         change = 0.0
         for a in range(n):

@@ -21,6 +21,7 @@ from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cl
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation, create_trial
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
+from vipetsc.dynamics.propagator.tape import create_tape, select_tape
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
 FIRST_SUBSTEP = 0.1
@@ -98,6 +99,7 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
         clusters.history[first:stop],
         clusters.state[c : c + 1],
         clusters.trial,
+        select_tape(clusters.tape, c),
     )
 
 
@@ -180,11 +182,12 @@ class Forces:
             history=np.zeros(count, HISTORY),
             state=np.zeros(len(groups.first) - 1, SUBSTEP_STATE),
             trial=create_trial(int(np.diff(groups.first).max(initial=0)), terms),
+            tape=create_tape(0, 0),
         )
         self.clusters.state["length"] = 1.0
         leaders = dofs["cell"][groups.first[:-1]]
-        self._logs = (leaders >= layout.start) & (leaders < layout.stop)
-        self._mine = np.repeat(self._logs, np.diff(groups.first))  # DoFs
+        self.logs = (leaders >= layout.start) & (leaders < layout.stop)
+        self._mine = np.repeat(self.logs, np.diff(groups.first))  # DoFs
         self._numbers, self._logged = groups.numbers, np.zeros(len(all_dofs), bool)
         self._logged[groups.numbers[self._mine]] = True
         self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist(), model.chain.cell.reduced_mass)
@@ -204,7 +207,7 @@ class Forces:
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
         sites = self.tracker.counts[self._mine]
-        total = np.array([*(self.clusters.state[name][self._logs].sum() for name in COUNTS),
+        total = np.array([*(self.clusters.state[name][self.logs].sum() for name in COUNTS),
                           *(sites[name].sum() for name in LIMITS)])  # fmt: skip
         self._comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         return dict(zip((*COUNTS, *LIMITS), total.tolist(), strict=True))

@@ -1,0 +1,177 @@
+r"""Compiled motion of variations beside an orbit, by the same exact steps: sec. 7 of the derivation.
+
+**7. Variations.** A step takes the lattice's state y to P y plus what the forces leave, their moments mu (sec. 5), and
+mu depends on y through the few coefficients a of the free motion of a cluster alone. A variation therefore moves by
+
+    dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2),
+
+with one small matrix J for each step and cluster in contact, made once for an orbit; q are the approach velocities
+w'_minus of the cluster's sites. J comes from the substeps on the orbit's ``tape``: in each the collocation of sec. 3 is
+linearised at its nodes, dF = F_w dw + F_v dv + F_q dq with dw, dv affine in dF, a linear system for the dF. Forces are
+continuous and a substep ends exactly on each change of a mode, so that the saltation matrix of the state is the
+identity (Leine and Nijmeijer 2004, ch. 7); at an onset the instant moves by -dw/w', and dq = dv - w'' dw/w'.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vipetsc.compiled import kernel, njit
+from vipetsc.contact.law import CLIPPED, ForceLaw, elastic_force_and_slope
+from vipetsc.dynamics.propagator.collocation import (
+    NODES,
+    Cluster,
+    Substep,
+    Trial,
+    accumulate_moments,
+    node_responses,
+    update_taylor,
+)
+from vipetsc.dynamics.propagator.forces import select_cluster
+from vipetsc.dynamics.propagator.series import DofTables, apply_impulses, copy, expand_free_motion, shift
+from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
+
+
+@kernel
+def _slopes(law: ForceLaw, clearance: float, row: Any, w: float, v: float) -> tuple[float, float, float]:
+    """Derivatives to w, w' and w'_minus of the force on a closed site's relative displacement."""
+    if abs(row.mode) == CLIPPED:
+        return 0.0, 0.0, 0.0
+    side = 1.0 if row.mode > 0 else -1.0
+    elastic, slope = elastic_force_and_slope(law, side * w - clearance)
+    g = 1.0 + law.damping * v / row.approach
+    by_rate = -side * elastic * law.damping / row.approach
+    return -slope * g, by_rate, -by_rate * v / row.approach
+
+
+@kernel
+def _begin_contact(cluster: Cluster, row: Any, x: np.ndarray, first: int) -> None:
+    """Set the variations of w'_minus of a site whose contact begins, in the columns ``x`` (column, number)."""
+    at = row.site * cluster.taylor.shape[1]
+    floored = abs(row.rate) < cluster.contacts.law.approach_floor
+    for j in range(x.shape[0]):
+        change = x[j, at + 1] / cluster.interval - row.acceleration * x[j, at] / row.rate
+        x[j, first + row.site] = 0.0 if floored else change
+
+
+@njit(error_model="numpy")
+def _force_variations(
+    cluster: Cluster, rows: np.ndarray, motion: np.ndarray, substep: Substep, x: np.ndarray
+) -> np.ndarray:
+    """Variations (site and node, column) of the forces of the closed sites ``rows`` in a substep."""
+    sites, columns, (dofs, terms) = rows.size, x.shape[0], cluster.taylor.shape
+    system, right = np.eye(sites * NODES), np.zeros((sites * NODES, columns))
+    slopes, (to_w, to_v) = np.zeros((NODES, 3)), np.zeros((2, NODES, NODES))
+    for a in range(sites):
+        i, row = rows[a].site, rows[a]
+        for node in range(NODES):
+            clearance = cluster.contacts.sites[i].clearance
+            slopes[node] = _slopes(cluster.contacts.law, clearance, row, motion[a, 0, node], motion[a, 1, node])
+            at = substep.length * cluster.nodes.share[substep.kind, node]
+            for j in range(columns):
+                w = v = 0.0
+                for k in range(terms - 1, -1, -1):  # Horner's scheme
+                    v = v * at + w
+                    w = w * at + x[j, i * terms + k]
+                change = slopes[node, 0] * w + slopes[node, 1] * v / cluster.interval
+                right[a * NODES + node, j] = change + slopes[node, 2] * x[j, dofs * terms + i]
+        for b in range(sites):
+            if node_responses(cluster, substep, i, rows[b].site, to_w, to_v):
+                for node in range(NODES):
+                    for k in range(NODES):
+                        by_force = slopes[node, 0] * to_w[k, node] + slopes[node, 1] * to_v[k, node]
+                        system[a * NODES + node, b * NODES + k] -= by_force
+    return np.linalg.solve(system, right)
+
+
+@njit(error_model="numpy")
+def linearise(
+    clusters: Cluster, dofs: DofTables, c: int, rows: np.ndarray, motion: np.ndarray, out: np.ndarray
+) -> None:
+    """The matrix J of cluster ``c`` in a step whose part of the tape is ``rows`` and ``motion``, into ``out``.
+
+    It takes the series of the free motion (dof, 2 term), then the variations of w'_minus (site,), to the moments of the
+    forces and the latter at the step's end. Taylor coefficients, moments and energies of the cluster are overwritten.
+    """
+    cluster = select_cluster(clusters, dofs, c)
+    room, (count, terms) = cluster.trial, cluster.taylor.shape
+    size, begin, position = count * terms, 0, 0.0
+    columns = size + cluster.contacts.sites.size
+    x, moments = np.eye(columns), np.zeros((columns, count, terms))
+    while begin < rows.size:
+        row, stop = rows[begin], begin
+        while stop < rows.size and rows[stop].position == row.position:
+            stop += 1
+        active, substep = rows[begin:stop]["site"].copy(), Substep(row.kind, row.length)
+        trial = Trial(active, active, room.force, room.w, room.v, room.taylor, room.site_motion, room.sums)
+        for j in range(columns if row.position > position else 0):
+            series = x[j, :size].reshape(count, terms)
+            shift(series, row.position - position, series)
+        for a in range(begin, stop):
+            if rows[a].onset:
+                _begin_contact(cluster, rows[a], x, size)
+        forces = _force_variations(cluster, rows[begin:stop], motion[begin:stop], substep, x)
+        cluster.state[0].position = row.position
+        for j in range(columns):
+            series = x[j, :size].reshape(count, terms)
+            copy(series, cluster.taylor)
+            copy(moments[j], cluster.moments)
+            for a in range(active.size):
+                for node in range(NODES):
+                    trial.force[active[a], node] = forces[a * NODES + node, j]
+            update_taylor(cluster, trial, substep)
+            accumulate_moments(cluster, trial, substep)
+            copy(trial.taylor, series)
+            copy(cluster.moments, moments[j])
+        begin, position = stop, row.position + row.length
+    for j in range(columns):
+        out[:size, j] = moments[j].reshape(size)
+        out[size:columns, j] = x[j, size:]
+
+
+class Variations(NamedTuple):
+    """Variations that are moved together.
+
+    ``components`` (variation, 2, component) are states as ``Layout`` orders them, read and written in turn;
+    ``approach`` (variation, dof) are those of w'_minus. ``places`` (step, cluster) numbers the
+    ``matrices`` (number, row, column), -1 without contact; ``taylor`` (dof, 2 term) is room.
+    """
+
+    components: np.ndarray
+    approach: np.ndarray
+    places: np.ndarray
+    matrices: np.ndarray
+    taylor: np.ndarray
+
+
+@njit(error_model="numpy")
+def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, number: int, cells: np.ndarray) -> None:
+    """Add to ``cells`` (2 dof, cell) what the forces' variation ``j`` of a cluster leaves there; its series is made."""
+    first, stop, terms = dofs.first[c], dofs.first[c + 1], variations.taylor.shape[1]
+    sites = stop - 1 - first if stop - 1 == dofs.driven else stop - first
+    size = (stop - first) * terms
+    before = np.concatenate((variations.taylor[first:stop].flatten(), variations.approach[j, first : first + sites]))
+    after, matrix = np.zeros(before.size), variations.matrices[number]
+    for row in range(before.size):
+        for k in range(before.size):
+            after[row] += matrix[row, k] * before[k]
+    apply_impulses(dofs, first, after[:size].reshape(stop - first, terms), cells)
+    variations.approach[j, first : first + sites] = after[size:]
+
+
+@njit(error_model="numpy")
+def move_variations(variations: Variations, stencil: Stencil, halo: Halo, dofs: DofTables, owned: int) -> int:
+    """Move all variations through the orbit's steps; returns PETSc's error code. Collective."""
+    rows, error = halo.columns.shape[0], 0
+    for step in range(variations.places.shape[0]):
+        for j in range(variations.components.shape[0]):
+            state, out = variations.components[j, step % 2], variations.components[j, 1 - step % 2]
+            cells, next_cells = state[: rows * owned].reshape(rows, owned), out[: rows * owned].reshape(rows, owned)
+            error = error or exchange(halo, 2 * j + step % 2, cells)
+            apply_propagator(stencil, cells, halo.columns, next_cells)
+            for c in range(variations.places.shape[1]):
+                number = variations.places[step, c]
+                if number >= 0:
+                    expand_free_motion(dofs, c, halo.columns, variations.taylor)
+                    _contact_step(dofs, c, variations, j, number, next_cells)
+    return error

@@ -1,0 +1,97 @@
+"""The flow of a lattice with contacts and its linearisation, shared over ranks: no matrix of the lattice's size.
+
+It is the engine of exact steps, ``dynamics.propagator``, and not Runge-Kutta stepping: between contacts a variation of
+the state moves as the state does, by P(H), and in contact a step is linearised through the few numbers by which a
+cluster of sites feels the lattice (``dynamics.propagator.tangent``). The orbit is integrated once, with its contacts
+located on all ranks from the same numbers; any number of variations then moves beside it without another search,
+in compiled code. Displacements, contacts and variations have the same bits on any number of ranks.
+
+States are blocks (2 dof, owned cell), displacements in m before velocities in m/s, mass by mass as in
+``dynamics.layout``; ``share`` and ``whole`` go from and to the order of ``modes.system``, cell by cell.
+"""
+
+from dataclasses import dataclass
+
+from mpi4py import MPI
+
+import numpy as np
+
+from vipetsc.case import Model
+from vipetsc.dynamics.engine import StalledError
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.engine import LARGEST_OMEGA_H
+from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.tangent import TangentPropagator
+from vipetsc.lattice import Chain, Contact, ToneBurst
+from vipetsc.modes.flow import FlowError
+
+# Errors allowed in a contact's substep, relative to its speed.
+RTOL = 1e-13
+
+
+@dataclass(eq=False)
+class LatticeArc:
+    """A piece of an orbit of ``duration`` seconds between the blocks ``start`` and ``end``.
+
+    ``episodes`` counts contacts that are closed at the start or begin; ``closed`` is the time in s with one closed.
+    """
+
+    duration: float
+    start: np.ndarray
+    end: np.ndarray
+    episodes: int
+    closed: float
+    engine: TangentPropagator
+
+    def move(self, variations: np.ndarray) -> np.ndarray:
+        """Variations (variation, 2 dof, owned cell) of the end, given those of the start; all ranks must call it."""
+        return self.engine.move(variations)
+
+
+class LatticeFlow:
+    """The flow of ``chain``, whose contacts follow the law ``contact``, without drive, on the ranks of ``comm``."""
+
+    def __init__(self, chain: Chain, contact: Contact, comm: MPI.Comm) -> None:
+        self.chain, self.contact, self.comm = chain, contact, comm
+        self.layout = Layout(self._model(1.0, 1), comm)
+        self._omega = StepSeries(chain, 1.0, RTOL).omega_max_h
+
+    def _model(self, duration: float, samples: int) -> Model:
+        """The lattice at rest, undriven, for so many samples."""
+        still, interval = ToneBurst(0.0, 1e-3 / duration, 1), duration / samples
+        return Model(self.chain, self.contact, still, 0, 0, duration, interval, "8vr", RTOL, (0.0, 0.0), 1.0, 1.0)
+
+    def arc(self, start: np.ndarray, duration: float) -> LatticeArc:
+        """The orbit from the block ``start`` over ``duration`` seconds; raises FlowError on all ranks."""
+        samples = max(int(np.ceil(self._omega * duration / LARGEST_OMEGA_H)), 1)
+        model = self._model(duration, samples)
+        if why := TangentPropagator.refusal(model):
+            raise FlowError(why)
+        engine = TangentPropagator(model, self.layout)
+        largest = np.abs(start).max(axis=1, initial=0.0) if start.size else np.zeros(len(start))
+        self.comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
+        u, v = np.split(largest, 2)
+        try:
+            engine.place(start, max(float(v.max()), 0.1 * self._omega * float(u.max())))
+            end = engine.run(samples)
+        except (StalledError, ValueError) as error:
+            engine.destroy()
+            raise FlowError(f"the orbit of {duration:.6g} s stops: {error}") from error
+        closed, episodes = engine.contacts()
+        spans = np.concatenate(self.comm.allgather(closed))
+        times = np.sort(spans, axis=0)  # of intervals that overlap the union has this length
+        gaps = np.maximum(times[1:, 0] - times[:-1, 1], 0.0).sum()
+        union = float(times[-1, 1] - times[0, 0] - gaps) if len(times) else 0.0
+        return LatticeArc(duration, start, end, self.comm.allreduce(episodes), union, engine)
+
+    def share(self, state: np.ndarray) -> np.ndarray:
+        """The rank's block of a ``state`` (..., 2n) of the whole lattice."""
+        layout = self.layout
+        cells = state.reshape(*state.shape[:-1], 2, layout.cells, layout.dofs)[..., layout.start : layout.stop, :]
+        return np.moveaxis(cells, -1, -2).reshape(*state.shape[:-1], 2 * layout.dofs, layout.owned).copy()
+
+    def whole(self, block: np.ndarray) -> np.ndarray:
+        """The state (..., 2n) of the whole lattice from the ``block`` of every rank, on all of them."""
+        cells = np.concatenate(self.comm.allgather(block), axis=-1)
+        halves = cells.reshape(*block.shape[:-2], 2, self.layout.dofs, self.layout.cells)
+        return np.moveaxis(halves, -1, -2).reshape(*block.shape[:-2], -1).copy()
