@@ -11,8 +11,18 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
+from vipetsc.case.initial import InitialTable, beginning_of, check_initial
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid, read_section
-from vipetsc.case.resolve import build_chain, check_cell, check_contacts, check_wave, resolved, wave_speed, with_preset
+from vipetsc.case.resolve import (
+    build_chain,
+    check_cell,
+    check_contacts,
+    check_wave,
+    driven_wave,
+    resolved,
+    wave_speed,
+    with_preset,
+)
 from vipetsc.case.schema import (
     CONTACTS,
     AnalysisTable,
@@ -35,7 +45,7 @@ class Model:
     """A case in the terms of ``vipetsc.lattice``: 0-based indices, seconds, newtons, everything decided.
 
     ``atol`` is the pair (displacement m, velocity m/s); ``scale`` the displacement in m of the drive's
-    linear wave, ``speed`` the group velocity in cells/s that ``traverse`` uses.
+    linear wave or of the ``initial`` state, ``speed`` the group velocity in cells/s that ``traverse`` uses.
     """
 
     chain: Chain
@@ -50,6 +60,7 @@ class Model:
     atol: tuple[float, float]
     scale: float
     speed: float
+    initial: InitialTable | None = None
 
     @property
     def samples(self) -> int:
@@ -65,6 +76,7 @@ class Case(CaseFile):
     drive: DriveTable
     time: TimeTable
     output: OutputTable
+    initial: InitialTable | None = None
     analysis: AnalysisTable | None = None
     petsc: PetscTable | None = None
 
@@ -77,7 +89,13 @@ class Case(CaseFile):
         disorder, wrong = read_section(DisorderTable, table.get("disorder", {}), "disorder")
         if problems := problems + wrong:
             return sections, problems
-        tables, samples = resolved(sections), sections["time"].samples
+        beginning, drive = None, sections["drive"]
+        if (initial := sections.get("initial")) and initial.moves:
+            frequency = driven_wave(sections["lattice"].unit_cell(), drive)[0] if _ways(drive) else None
+            beginning, problems = beginning_of(initial, sections["lattice"], frequency)
+            if problems:
+                return sections, problems
+        tables, samples = resolved(sections, beginning), sections["time"].samples
         count = tables["time"]["end"] / tables["time"]["sample_interval"]
         if count > MOST_SAMPLES:
             remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} can be taken, and the bands need so many"
@@ -100,9 +118,18 @@ class Case(CaseFile):
         if valid("lattice.cells", "contacts.sites"):
             yield from check_contacts(lattice, contacts, valid)
         length = lattice.cells if valid("lattice.cells") else None
+        initial, undriven = sections.get("initial", InitialTable.model_validate({})), sections["drive"].amplitude == 0
+        if valid("initial.kind"):
+            yield from check_initial(initial, lattice, cell, valid)
+        if initial.moves and cls is not Case:
+            yield Problem("initial.kind", initial.kind, "this verb is about a wave in a lattice at rest; leave it out")
+        if undriven and not initial.moves and valid("initial"):
+            yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
+        if undriven and sections["time"].atol == "paper":
+            yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
         of_drive = list(_check_drive(sections["drive"], length, cell, valid))
         yield from of_drive
-        if cell and not of_drive and valid("lattice", "drive", "time.end"):
+        if cell and not of_drive and _ways(sections["drive"]) and valid("lattice", "drive", "time.end"):
             yield from check_wave(cell, sections["drive"], sections["time"])
         yield from _check_sampling(sections["time"], cell, valid)
         window = sections["output"].window
@@ -115,7 +142,9 @@ class Case(CaseFile):
         assert drive.frequency is not None and time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
         burst = ToneBurst(drive.amplitude, drive.frequency, drive.cycles, drive.envelope)
-        scale = chain.wave_scale(burst, drive.cell - 1, drive.mass - 1)
+        scale = chain.wave_scale(burst, drive.cell - 1, drive.mass - 1) if drive.amplitude else 0.0
+        if self.initial:
+            scale = max(scale, self.initial.amplitude or 0.0)
         if time.atol == "scaled":
             small = WEAKEST * time.rtol * scale
             atol = small, small * drive.frequency
@@ -136,6 +165,7 @@ class Case(CaseFile):
             atol=atol,
             scale=scale,
             speed=wave_speed(chain.cell, drive.frequency),
+            initial=self.initial,
         )
 
     @property
@@ -152,7 +182,7 @@ class Case(CaseFile):
         coarse = f"fields kept every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
         sparse = f"fields of one cell in {output.every} do not resolve waves shorter than {2 * output.every} cells"
         checks = [
-            (not waves_at(model.chain.cell, drive.frequency),
+            (drive.amplitude and not waves_at(model.chain.cell, drive.frequency),
              f"{outside}, so the wave is evanescent; see the verb `bands`"),
             (model.end <= drive.duration, f"time.end = {model.end:.6g} s comes before the burst is over"),
             # In the words of the analysis, so that each is said once.
@@ -169,9 +199,9 @@ def _check_drive(drive: DriveTable, length: int | None, cell: UnitCell | None, v
     """The frequency is given in one way, and the driven mass exists."""
     if valid("drive"):
         by_band = drive.wavenumber is not None or drive.at is not None
-        ways = [way for way in (drive.frequency, drive.wavenumber, drive.at) if way is not None]
+        ways = _ways(drive)
         remedy = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
-        if len(ways) != 1:
+        if len(ways) != 1 and (ways or drive.amplitude != 0):
             yield Problem("drive.frequency", drive.frequency, remedy)
         elif by_band != (drive.band is not None):
             yield Problem("drive.band", drive.band, remedy)
@@ -181,6 +211,11 @@ def _check_drive(drive: DriveTable, length: int | None, cell: UnitCell | None, v
         yield Problem("drive.cell", drive.cell, f"outside the lattice; cells count from 1 to {length}")
     if cell and drive.mass > cell.dofs:
         yield Problem("drive.mass", drive.mass, f"the cell has {cell.dofs} masses")
+
+
+def _ways(drive: DriveTable) -> list[Any]:
+    """The frequency as it is given, in how many ways it is."""
+    return [way for way in (drive.frequency, drive.wavenumber, drive.at) if way is not None]
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

@@ -27,7 +27,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     table, source = _table(path)
     sections = with_overrides(table, overrides := list(overrides))[0].keys()
     kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in sections]
-    if not kinds or {"sweep", "disorder", "drive", "time", "output", "optimise"} & sections:
+    if not kinds or {"sweep", "disorder", "drive", "initial", "time", "output", "optimise"} & sections:
         kinds.insert(0, Case)
     cases: list[CaseFile] = []
     problems: dict[str, Problem] = {}

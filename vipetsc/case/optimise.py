@@ -119,7 +119,9 @@ class OptimiseCase(CaseFile):
             _case(table, table.get("disorder"))
         except CaseError as error:
             return {}, problems + error.problems
-        wrong = _problems(options, base, "disorder" in table)
+        wrong = list(_problems(options, base, "disorder" in table))
+        if base.initial:
+            wrong.append(Problem("initial.kind", base.initial.kind, "designs are compared in a lattice at rest"))
         invalid = tuple(problem.key for problem in problems)
         problems += [p for p in wrong if not invalid or not p.key.startswith(("optimise.variables", *invalid))]
         return {"table": table, "options": options, "base": base}, problems

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 if TYPE_CHECKING:
     import xarray as xr
 
-SECTIONS = ("lattice", "contacts", "disorder", "drive", "time", "output", "analysis", "petsc",
+SECTIONS = ("lattice", "contacts", "disorder", "drive", "initial", "time", "output", "analysis", "petsc",
             "sweep", "nnm", "design", "law", "optimise", "predict")  # fmt: skip
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 

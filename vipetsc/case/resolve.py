@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vipetsc.case.initial import Beginning
 from vipetsc.case.reading import Problem, Table, Valid
 from vipetsc.case.schema import CONTACTS, PRESETS, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
 from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
@@ -32,8 +33,13 @@ def with_default_preset(table: Table) -> Table:
 
 
 def with_preset(table: Table) -> Table:
-    """``table`` with the preset's length, contacts and drive where it does not give them itself."""
-    table = with_default_preset(table)
+    """``table`` with the preset's length, contacts and drive where it does not give them itself.
+
+    With an initial state, and no section for a drive, there is none.
+    """
+    table, initial = with_default_preset(table), table.get("initial", {})
+    if isinstance(initial, dict) and initial.get("kind", "zero") != "zero" and "drive" not in table:
+        table = table | {"drive": {"amplitude": 0.0}}
     lattice = table.get("lattice", {})
     if not isinstance(lattice, dict) or "cell" in lattice or str(lattice["preset"]) not in PRESETS:
         return table
@@ -42,6 +48,8 @@ def with_preset(table: Table) -> Table:
     for name, defaults in (("contacts", preset.contacts), ("drive", preset.drive)):
         given = table.get(name, {})
         if isinstance(given, dict):
+            if given.get("amplitude") == 0:
+                defaults = {}  # of an initial state alone
             replaced = {key for choice in given.keys() & REPLACES.keys() for key in REPLACES[choice]}
             table[name] = {k: v for k, v in defaults.items() if k not in replaced} | given
     return table
@@ -147,8 +155,8 @@ def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> I
         yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
 
 
-def resolved(sections: dict[str, Any]) -> dict[str, Table]:
-    """The sections of a valid lattice run as tables in which every choice is made."""
+def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str, Table]:
+    """The sections of a valid lattice run as tables in which every choice is made, and how it begins."""
     tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()}
     lattice, contacts, drive, time = (sections[name] for name in ("lattice", "contacts", "drive", "time"))
     cell, sites, law = lattice.unit_cell(), site_cells(lattice, contacts), tables["contacts"]
@@ -159,15 +167,22 @@ def resolved(sections: dict[str, Any]) -> dict[str, Table]:
         law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law["radius"], law.pop("poisson")))
         if lattice.preset and law["radius"] == CONTACTS["radius"]:
             del law["radius"]  # it goes without saying
-    frequency, end, interval = driven_wave(cell, drive)[0], time.end, time.sample_interval
+    told = beginning if beginning and drive.amplitude == 0 else None
+    frequency = told.frequency if told else driven_wave(cell, drive)[0]
+    end, interval = time.end, time.sample_interval
     if end == "traverse":
-        end = 2 * np.pi * drive.cycles / frequency + lattice.cells / wave_speed(cell, frequency)
+        burst = 0.0 if told else 2 * np.pi * drive.cycles / frequency
+        end = burst + lattice.cells / wave_speed(cell, frequency)
     if time.samples is not None:
         interval = end / (time.samples - 1)
     elif interval == "auto":
         interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
     tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in REPLACES["frequency"]}
     tables["drive"]["frequency"] = frequency
+    tables.pop("initial", None)
+    tables |= {"initial": beginning.table} if beginning else {}
+    if told and "cell" not in drive.model_fields_set:
+        tables["drive"]["cell"] = told.cell
     tables["time"] |= {"sample_interval": float(interval), "end": float(end)}
     tables["time"].pop("samples", None)
     return tables

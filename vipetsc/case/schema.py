@@ -23,12 +23,6 @@ def number(value: Any) -> Any:
     return float(match[1] or 1) * np.pi / float(match[2] or 1)
 
 
-def _not_zero(value: float) -> float:
-    if value == 0:
-        raise ValueError("must not be zero")
-    return value
-
-
 def once(values: list[Any]) -> list[Any]:
     """``values`` if none of them comes twice; raises ValueError."""
     if twice := [value for value in dict.fromkeys(values) if values.count(value) > 1]:
@@ -163,9 +157,12 @@ class ContactsTable(Section):
 
 
 class DriveTable(Section):
-    """A tone burst: ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``."""
+    """A tone burst: ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``.
 
-    amplitude: Annotated[Finite, AfterValidator(_not_zero)] = 1.0
+    With an initial state ``amplitude`` may be 0; then ``frequency`` and ``cell`` are by default those of its motion.
+    """
+
+    amplitude: Finite = 1.0
     cycles: int = Field(30, ge=1)
     envelope: Literal["paper", "hann"] = "paper"
     frequency: Positive | None = None

@@ -130,6 +130,7 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
                     f"restitution {contact.restitution:g}, effective {contact.effective_restitution:.3f}"),
         ("sites", _first_few([c + 1 for c in chain.sites])),
         ("clearance", _first_few([f"{1e3 * c:.4g}" for c in chain.clearances]) + " mm" if chain.sites else "none"),
+        ("begins with", initial_text(case)),
         ("drive", f"{model.drive.amplitude:g} N, {model.drive.cycles} cycles, Om = {model.drive.frequency:.4f} rad/s"),
         ("waves at Om", "; ".join(f"band {b}, kappa = {k / np.pi:.4f} pi, v_g = {v:.2f} cells/s" for b, k, v in waves)
                         or "none: in a gap"),
@@ -141,6 +142,23 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
         ("cost", f"about {steps:.3g} steps of engine ts, {duration} on {ranks} rank{'s' * (ranks > 1)}"
                  " before contacts"),
     ]  # fmt: skip
+
+
+def initial_text(case: Case) -> str:
+    """What a run begins with, in words; empty for a lattice at rest."""
+    initial = case.initial
+    if initial is None:
+        return ""
+    if initial.kind == "file":
+        which = f" at {initial.time:g} s" if initial.time is not None else f", orbit {initial.orbit}"
+        return f"{initial.path}{'' if initial.time is initial.orbit is None else which}"
+    size = f"{initial.amplitude:.4g} m" if initial.amplitude else f"{initial.energy:.4g} J"
+    if initial.kind == "mode":
+        return f"mode {initial.number or f'near {initial.near:g} rad/s'}, {size}"
+    return (
+        f"a packet of band {initial.band} about kappa = {(initial.wavenumber or 0) / np.pi:.4f} pi,"
+        f" {initial.width:g} cells wide in cell {initial.cell}, {size}"
+    )
 
 
 def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> list[tuple[str, str]]:

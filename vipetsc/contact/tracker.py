@@ -8,7 +8,7 @@ from scipy.special import gamma
 
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
-from vipetsc.contact.law import CLIPPED, FREE, SITE, Contacts, elastic_force
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, SITE, Contacts, elastic_force
 
 # Limits of the contact law, of which it is counted how often they acted.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
@@ -143,6 +143,28 @@ class ImpactTracker:
         integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
         time = ImpactTime((n + 1) / 2 * reduced_mass, 2.0, kc, 1 / (n + 1), 2 * float(integral))
         self.tracks = Tracks(sites, np.zeros(2 * len(sites), EPISODE), np.zeros(1, np.int64), time)
+
+    def begin(self, motion: np.ndarray) -> np.ndarray:
+        """Close the sites that begin beyond their clearance at t = 0; returns their indices.
+
+        ``motion`` (site, 2) has w and w' of all numbered sites. When these contacts began is not known: w'_minus is the
+        speed with which two masses alone come to w at w' without loss, mu (w'_minus^2 - w'^2)/2 = kc x^(n+1)/(n+1).
+        """
+        sites, law, mine = self.contacts.sites, self.contacts.law, np.flatnonzero(self.tracks.sites["number"] >= 0)
+        (w, rate), D = motion[self.tracks.sites["number"][mine]].T, sites["clearance"][mine]
+        side, deep = np.where(w < 0, -1, 1), np.abs(w) - D
+        closed = (deep > LANDED_W * D) | ((deep >= -LANDED_W * D) & (side * rate > 0))
+        some, side, deep, rate = mine[closed], side[closed], np.maximum(deep[closed], 0.0), rate[closed]
+        # kc x^(n+1)/(n+1) over mu/2, of which the impact's time knows (n+1)/2 times mu.
+        speed = np.sqrt(rate**2 + law.stiffness * deep ** (law.exponent + 1) / self.tracks.time.inertia)
+        sites["approach"][some] = side * np.maximum(speed, law.approach_floor)
+        sites["mode"][some] = side * CLOSED
+        if law.clip:
+            sites["mode"][some[1 + law.damping * rate / sites["approach"][some] < 0]] *= CLIPPED
+        episodes = self.tracks.sites["episode"]
+        episodes["site"][some], episodes["side"][some] = self.tracks.sites["number"][some], side
+        episodes["approach_velocity"][some], episodes["separation"][some] = side * speed, np.nan
+        return some
 
     @property
     def counts(self) -> np.ndarray:

@@ -91,7 +91,10 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drive, dissipated."""
+    """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drive, dissipated.
+
+    The work begins with the energy of the initial state.
+    """
 
     kinetic: np.ndarray
     spring: np.ndarray
@@ -121,7 +124,8 @@ class EnergyMeter:
         self.comm = layout.comm
         self.lattice = create_record(model, layout)
         speed = model.scale * model.drive.frequency
-        burst = model.drive.duration * model.speed  # cells that the packet covers
+        # Cells that the packet covers; of an initial state, perhaps all.
+        burst = model.chain.cells if model.initial else model.drive.duration * model.speed
         scale = sum(model.chain.cell.masses) * speed**2 * max(burst, 1.0)
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
         self.largest = self.unit * LARGEST  # energy in J from which on the sums saturate

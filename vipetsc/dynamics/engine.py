@@ -46,6 +46,13 @@ class Engine(ABC):
         return None
 
     @abstractmethod
+    def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
+        """Begin in motion, on all ranks: own ``cells`` (cell, 2 dof), displacements in m before velocities in m/s.
+
+        ``motion`` (site, 2) has w and w' of all sites. The work done begins with the ``energy`` in J of that state.
+        """
+
+    @abstractmethod
     def fill(self, samples: Samples) -> Stretch:
         """Go on through ``samples`` and take them with ``take_sample``; all ranks come equally far.
 

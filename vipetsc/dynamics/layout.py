@@ -71,6 +71,11 @@ class Layout:
         array = np.zeros(self.size + indices.size) if array is None else array
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
+    def place(self, cells: np.ndarray, work: float, y: np.ndarray) -> None:
+        """Fill this rank's part ``y`` of the state with its ``cells`` (cell, 2 dofs) and the ``work`` in J."""
+        y[: 2 * self.dofs * self.owned] = cells.T.ravel()
+        y[2 * self.dofs * self.owned : self.dissipated] = work
+
     def checkpoint(self, y: np.ndarray) -> dict[str, np.ndarray]:
         """The part ``y`` of the state in natural order: ``cells`` (cell, 2 dofs), and the ledger."""
         motion, ledger = y[: 2 * self.dofs * self.owned], y[2 * self.dofs * self.owned : self.size]

@@ -17,6 +17,7 @@ from vipetsc.case import Case, Model
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine
+from vipetsc.dynamics.initial import set_in_motion
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
@@ -143,6 +144,8 @@ def _simulate(
         shares = output.last_state()
         if shares is not None:
             run.restore(shares)
+        elif model.initial is not None:
+            set_in_motion(run.setup)
         with log.SAMPLES:
             ending, sentence = run.advance()
         with log.ENDING:

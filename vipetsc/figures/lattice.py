@@ -39,7 +39,8 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     draw_unit_cell(upper, model.chain.cell)
     draw_lattice(lower, model.chain, model.drive_cell)
     upper.set_title("(a) Unit cell")
-    lower.set_title(f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends; sites: {LEGEND}")
+    legend = LEGEND if model.drive.amplitude else LEGEND.replace("driven", "begins")
+    lower.set_title(f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends; sites: {legend}")
     return figure
 
 

@@ -73,7 +73,15 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     panels.colour_bar(image, [*maps, side], "Mean kinetic energy per bin (J)")
     drive = model.drive.frequency / 1e3
     side.axhline(drive, color=style.BLACK, lw=0.6, ls=":")
-    panels.note(side, "drive", (1, drive), (-2, 2), xycoords=("axes fraction", "data"), ha="right", va="bottom")
+    panels.note(
+        side,
+        "drive" if model.drive.amplitude else "motion",
+        (1, drive),
+        (-2, 2),
+        xycoords=("axes fraction", "data"),
+        ha="right",
+        va="bottom",
+    )
     side.set(xscale="log", xlim=(largest * 1e-7, largest * 3), xlabel="Energy (J)")
     side.set_title(f"({'abc'[len(spectra)]}) Sum over κ")
     side.legend(loc="lower right")
@@ -129,7 +137,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     means = run[["energy/kinetic", "energy/spring"]].rolling(time=window, center=True, min_periods=1).mean()
     stored = kinetic + spring + contact
     curves = (
-        ("work of the drive", work, style.BLACK, "-"),
+        ("initial energy and work" if Case.of(run).initial else "work of the drive", work, style.BLACK, "-"),
         ("kinetic + potential", stored, style.BLUE, "-"),
         ("dissipated", dissipated, style.VERMILION, "-"),
         ("kinetic, mean", means["energy/kinetic"], style.SKY, "-"),

@@ -31,8 +31,8 @@ class ToneBurst:
 
     @property
     def duration(self) -> float:
-        """Length of the burst in s."""
-        return 2 * np.pi * self.cycles / self.frequency
+        """Length of the burst in s; 0 of none."""
+        return 2 * np.pi * self.cycles / self.frequency if self.amplitude else 0.0
 
     @property
     def window_amplitude(self) -> float:

@@ -119,17 +119,63 @@ def _ring(chain: Chain, cells: int, exact: bool) -> Modes:
     return Modes(chain, frequency, np.repeat(number, chain.cell.dofs), vectors, exact, cells)
 
 
+@lru_cache(maxsize=4)
+def frequencies(chain: Chain) -> np.ndarray:
+    """Frequencies (mode) in rad/s of all modes of ``chain``, lowest first, up to ``MOST_DOFS`` or of any ring."""
+    if chain.ends == "periodic":
+        every = np.sort(_ring(chain, chain.cells, True).frequency)
+    else:
+        root = diags(1 / np.sqrt(chain.masses()))
+        band = _band(csc_matrix(root @ chain.stiffness_matrix() @ root))
+        every = np.sqrt(np.maximum(eigvals_banded(band[2 * (len(band) // 3) :], lower=True), 0.0))
+    return np.where(every < 1e-6 * every[-1], 0.0, every)  # free ends
+
+
+@lru_cache(maxsize=4)
+def mode_shape(chain: Chain, number: int) -> np.ndarray:
+    """Displacement (cell, dof) in m of mode ``number`` (from 1, as in ``frequencies``), the largest 1 m.
+
+    Of a wave that a ring carries both ways, the standing one that is largest at cell 1 has the lower number.
+    """
+    if chain.ends == "periodic":
+        ring = _ring(chain, chain.cells, True)
+        place = np.argsort(ring.frequency, kind="stable")[number - 1]
+        kappa, dofs = ring.wavenumber[place], chain.cell.dofs
+        wave = bloch(chain.cell, kappa).vectors[:, place % dofs]
+        turned = wave / wave[np.argmax(np.abs(wave))] * np.exp(1j * kappa * np.arange(chain.cells))[:, None]
+        shape = turned.imag if kappa > 0 else turned.real
+    else:
+        root = 1 / np.sqrt(chain.masses())
+        band = _band(csc_matrix(diags(root) @ chain.stiffness_matrix() @ diags(root)))
+        width, every = len(band) // 3, frequencies(chain)
+        band[2 * width] -= every[number - 1] ** 2 + 4 * np.finfo(float).eps * every[-1] ** 2
+        factor, pivots, _ = lapack.dgbtrf(band, width, width)
+        x = np.random.default_rng(number).standard_normal(len(root))
+        for _ in range(3):
+            x, _ = lapack.dgbtrs(factor, width, width, x, pivots)
+            x /= np.linalg.norm(x)
+        shape = (x * root).reshape(chain.cells, -1)
+    return np.asarray(shape / shape.flat[np.argmax(np.abs(shape))])
+
+
+def _band(matrix: csc_matrix) -> np.ndarray:
+    """The band of ``matrix`` (3 width + 1, n) as LAPACK's factors want it, with room above."""
+    width = int(np.abs(np.subtract(*matrix.nonzero())).max())
+    band = np.zeros((3 * width + 1, matrix.shape[0]))
+    for k in range(-width, width + 1):
+        diagonal = matrix.diagonal(k)
+        band[2 * width - k, max(k, 0) : max(k, 0) + len(diagonal)] = diagonal
+    return band
+
+
 def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues, lowest first, and vectors of a symmetric banded ``matrix``, by inverse iteration.
 
     Vectors of eigenvalues closer than ``CLOSE`` are made orthogonal to one another; whether that made all so, the
     caller finds out. It takes a fifth of the time of a dense solution.
     """
-    n, width = matrix.shape[0], int(np.abs(np.subtract(*matrix.nonzero())).max())
-    band = np.zeros((3 * width + 1, n))
-    for k in range(-width, width + 1):
-        diagonal = matrix.diagonal(k)
-        band[2 * width - k, max(k, 0) : max(k, 0) + len(diagonal)] = diagonal
+    n, band = matrix.shape[0], _band(matrix)
+    width = len(band) // 3
     squared = eigvals_banded(band[2 * width :], lower=True)
     vectors, noise = np.zeros((n, n), order="F"), np.random.default_rng(1).standard_normal((n, n))
     first, shift = 0, -np.inf

@@ -1,12 +1,13 @@
-"""The wave packet that a tone burst makes in an infinite lattice: its band and how fast its parts travel."""
+"""Wave packets: that of a tone burst in an infinite lattice, its band and speeds; a Gaussian one, cell by cell."""
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.cell import UnitCell
-from vipetsc.lattice.chain import ToneBurst
+from vipetsc.lattice.chain import Chain, ToneBurst
 
 WAVENUMBERS = np.linspace(0, np.pi, 8001)[1:-1]
 
@@ -26,3 +27,51 @@ def packet_speeds(cell: UnitCell, burst: ToneBurst, mass: int, beyond: float = 1
     order = np.argsort(speed)
     slow, fast = np.interp([beyond, 1 - beyond], np.cumsum(weight[order]) / weight.sum(), speed[order])
     return band, float(slow), float(fast)
+
+
+class Packet(NamedTuple):
+    """A packet of 1 m at its ``centre`` cell (0-based): fields (cell, dof) in m and m/s from ``centre - len/2`` on.
+
+    ``energy`` in J is that of all waves together.
+    """
+
+    centre: int
+    displacement: np.ndarray
+    velocity: np.ndarray
+    energy: float
+
+    def on(self, chain: Chain, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        """Displacement and velocity (cell, dof) of cells ``start`` to ``stop``; what lies beyond an end is left out."""
+        cells = self.centre - len(self.velocity) // 2 + np.arange(len(self.velocity))
+        cells = cells % chain.cells if chain.ends == "periodic" else cells
+        inside = (cells >= start) & (cells < stop)
+        u, v = np.zeros((2, stop - start, chain.cell.dofs))
+        for field, values in ((u, self.displacement), (v, self.velocity)):
+            np.add.at(field, cells[inside] - start, values[inside])
+        return u, v
+
+
+@lru_cache(maxsize=4)
+def gaussian_packet(cell: UnitCell, band: int, kappa: float, centre: int, width: float, way: int = 1) -> Packet:
+    """Waves of ``band`` (1-based) alone about ``kappa`` in (0, pi] that go up (``way`` 1) or down (-1) the cells.
+
+    u = Re sum a_k phi_k exp(i (k x - Om_k t)), a_k ~ exp(-(k - kappa)^2 width^2/2), x in cells from ``centre``: the
+    envelope is a Gaussian of standard deviation ``width``. Vectors phi_k are turned so that they are in phase with that
+    at ``kappa``; a wave that stands counts as going up.
+    """
+    ring = 1 << max(int(np.ceil(np.log2(32 * width))), 7)
+    middle = bloch(cell, kappa)
+    main = kappa * way * (1 if middle.group_velocity[band - 1] >= 0 else -1)
+    k = 2 * np.pi * np.fft.fftfreq(ring, 1.0)
+    share = np.exp(-0.5 * (((k - main + np.pi) % (2 * np.pi) - np.pi) * width) ** 2)
+    waves = np.flatnonzero(share > 1e-18)
+    point = bloch(cell, k[waves])
+    vectors, omega = point.vectors[:, :, band - 1], point.frequency[:, band - 1]
+    overlap = (vectors * np.asarray(cell.masses)) @ bloch(cell, main).vectors[:, band - 1].conj()
+    amplitudes = np.zeros((2, ring, cell.dofs), complex)
+    amplitudes[0, waves] = vectors * (share[waves] * np.exp(-1j * np.angle(overlap)))[:, None]
+    amplitudes[1, waves] = -1j * omega[:, None] * amplitudes[0, waves]
+    fields = np.fft.fftshift(np.fft.ifft(amplitudes, axis=1), axes=1)
+    peak = np.abs(fields[0]).max()
+    u, v = fields.real / peak
+    return Packet(centre, u, v, float(np.sum((share[waves] * omega) ** 2) / (2 * ring * peak**2)))

@@ -69,7 +69,7 @@ class LinearRun(NamedTuple):
     def reached(self, case: Case) -> np.ndarray:
         """Linear relative displacement over clearance (site) at the amplitude of ``case``."""
         envelope = self.envelope[np.asarray(case.contacts.sites, int) - 1]
-        return np.asarray(abs(case.drive.amplitude) * envelope / np.asarray(case.contacts.clearance or [], float))
+        return np.asarray(factor(case) * envelope / np.asarray(case.contacts.clearance or [], float))
 
     def joined(self, other: "LinearRun | str | None") -> "LinearRun":
         """The run with the measures that another record of it tells as well."""
@@ -104,11 +104,19 @@ def measured(analysis: xr.Dataset) -> Record:
     return row | ({"entropy/start": float(analysis.attrs["entropy/start"])} if "entropy/history" in row else {})
 
 
+def factor(case: Case) -> float:
+    """By how much the wave of ``case`` is larger than that of its linear run."""
+    return 1.0 if case.initial else abs(case.drive.amplitude)
+
+
 def linear_case(case: Case) -> Case:
-    """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone share it."""
+    """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone share it.
+
+    With an initial state the drive is that of the case.
+    """
     table = case.model_dump(by_alias=True, exclude_none=True)
     table["contacts"] = {"sites": 0}
-    table["drive"]["amplitude"] = 1.0
+    table["drive"]["amplitude"] = case.drive.amplitude if case.initial else 1.0
     table["output"] = {}
     return Case.from_table(table | {"name": "linear"})
 

@@ -23,7 +23,7 @@ from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
-from vipetsc.studies.linear import MARGIN, PARTS, LinearRun, leading_cell, linear_case, linear_name, measured
+from vipetsc.studies.linear import MARGIN, PARTS, LinearRun, factor, leading_cell, linear_case, linear_name, measured
 from vipetsc.studies.recorded import completed
 
 FIELDS = "displacement", "velocity"
@@ -81,7 +81,7 @@ class MemberStore:
         assert isinstance(linear, LinearRun)
         quiet = not whole and bool((linear.reached(case) < MARGIN).all())
         if quiet:
-            ended = {"episodes": 0, "work": linear.statistics["work"] * case.drive.amplitude**2, "dissipated": 0.0}
+            ended = {"episodes": 0, "work": linear.statistics["work"] * factor(case) ** 2, "dissipated": 0.0}
             statistics = {key: linear.statistics[key] for key in ("engine", "ledger_error")} | ended
             record = {"reason": "complete: scaled from the linear run", "linear": name, "site": site}
             record |= {"statistics": statistics, "warnings": []}

@@ -165,6 +165,10 @@ class Propagator(Engine):
             f" another (at most {MOST_SITES} may)"
         )
 
+    def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
+        self._layout.place(cells, energy, self._components[0])
+        self._forces.begin(motion, energy)
+
     def fill(self, samples: Samples) -> Stretch:
         """A stop is at the last sample. Without room it goes to the sample before."""
         sys.audit("vipetsc.step")

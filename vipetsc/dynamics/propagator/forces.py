@@ -192,6 +192,18 @@ class Forces:
         self._logged[groups.numbers[self._mine]] = True
         self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist(), model.chain.cell.reduced_mass)
 
+    def begin(self, motion: np.ndarray, energy: float) -> None:
+        """Begin with w and w' of all sites as ``motion`` (site, 2), and so much ``energy`` in J as work."""
+        clusters, tracks = self.clusters, self.tracker.tracks
+        clusters.energy[self._numbers < 0] = energy
+        for i in self.tracker.begin(motion).tolist():
+            # As if the contact were old: its force is smooth.
+            duration = impact_time(tracks.time, abs(clusters.contacts.sites["approach"][i]))
+            clusters.history["onset"][i], clusters.history["duration"][i] = -duration, duration
+            c = int(np.searchsorted(self.dofs.first, i, side="right")) - 1
+            first = clusters.first_substep * duration / clusters.interval
+            clusters.state["length"][c] = min(clusters.state["length"][c], first)
+
     def sites(self, c: int) -> list[int]:
         """The sites, counted from 1, of cluster ``c``; none of -1."""
         numbers = self._numbers[self.dofs.first[c] : self.dofs.first[c + 1]] if c >= 0 else self._numbers[:0]

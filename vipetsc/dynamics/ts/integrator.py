@@ -109,6 +109,11 @@ class Integrator(Engine):
         with self.state.localForm() as local:
             observe(self.time if time is None else time, local.array, self.lattice, motion)
 
+    def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
+        self.layout.place(cells, energy, self.state.array)
+        self.tracker.begin(motion)
+        self._restart(True)
+
     def fill(self, samples: Samples) -> Stretch:
         """A sample at which it stops is not taken."""
         for k in range(len(samples.work)):
@@ -229,10 +234,13 @@ class Integrator(Engine):
 
     def _switch(self) -> None:
         """Switch modes of all landed sites and set the step with which to go on."""
-        tracker = self.tracker
-        was_free = not self._any_open
-        self.counts["switches"] += tracker.switch(self.time, self.state.array_r[self.lattice.shape.dissipated :])
-        shortest = self.comm.allreduce(tracker.contact_time(), MPI.MIN)
+        was_free, losses = not self._any_open, self.state.array_r[self.lattice.shape.dissipated :]
+        self.counts["switches"] += self.tracker.switch(self.time, losses)
+        self._restart(was_free)
+
+    def _restart(self, was_free: bool) -> None:
+        """Set the step with which to go on from a state whose sites have new modes."""
+        shortest = self.comm.allreduce(self.tracker.contact_time(), MPI.MIN)
         self._any_open = bool(np.isfinite(shortest))
         if self._any_open and not self._fixed_step:
             if was_free:
@@ -240,7 +248,7 @@ class Integrator(Engine):
             self.step = min(self.step, self._first_share * shortest)
         elif not was_free:
             self.step = self.free_step
-        self.observe(tracker.start)
+        self.observe(self.tracker.start)
         self.ts.restartStep()
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
