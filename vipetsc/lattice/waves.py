@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eig
+from scipy.linalg import lapack
 
 from vipetsc.lattice.cell import UnitCell
 
@@ -73,18 +73,19 @@ def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
     one = np.broadcast_to(np.eye(r), qq.shape)
     left = np.block([[one, qq], [np.zeros_like(qq), pq]])
     right = np.block([[-qp, s * qp], [-pp, s * pp - one]])
-    waves = BlochWaves(np.ones((len(omegas), 2 * r), complex), np.zeros_like(left), np.zeros_like(left), inner, s)
-    for i, omega in enumerate(omegas):
-        (alpha, beta), states = eig(left[i], right[i], homogeneous_eigvals=True)
-        growth = np.log(np.maximum(np.abs(alpha), 1e-300)) - np.log(np.maximum(np.abs(beta), 1e-300))
-        flux = np.imag(np.sum(states[r:].conj() * states[:r], axis=0))
-        neutral = (np.abs(growth) < NEUTRAL) & (omega.imag == 0)
-        order = np.argsort(np.where(neutral, -np.sign(flux) * NEUTRAL, growth))
-        for wave, n in enumerate(order):
-            waves.factor[i, wave] = alpha[n] / beta[n] if wave < r else beta[n] / alpha[n]
-            waves.state[i, :, wave] = states[:, n]
-        if omega == 0:
-            _make_static(cell, waves, i)
+    solved = [lapack.zggev(a, b, compute_vl=0) for a, b in zip(left, right, strict=True)]
+    alpha, beta, states = (np.array([answer[n] for answer in solved]) for n in (0, 1, 3))
+    states /= np.linalg.norm(states, axis=1, keepdims=True)
+    sizes = np.maximum(np.abs([alpha, beta]), 1e-300)
+    growth, flux = np.log(sizes[0] / sizes[1]), np.sum(states[:, r:].conj() * states[:, :r], axis=1).imag
+    neutral = (np.abs(growth) < NEUTRAL) & (omegas.imag == 0)[:, None]
+    order = np.argsort(np.where(neutral, -np.sign(flux) * NEUTRAL, growth), axis=1)
+    alpha, beta = (np.take_along_axis(x, order, axis=1) for x in (alpha, beta))
+    states = np.take_along_axis(states, order[:, None], axis=2)
+    factor = np.concatenate([alpha[:, :r] / beta[:, :r], beta[:, r:] / alpha[:, r:]], axis=1)
+    waves = BlochWaves(factor, states, np.zeros_like(states), inner, s)
+    for i in np.nonzero(omegas == 0)[0]:
+        _make_static(cell, waves, int(i))
     return waves
 
 

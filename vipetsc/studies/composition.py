@@ -1,8 +1,7 @@
 """Several sites composed from the answer of one: waves between them, there and back, without a fitted number.
 
 Between the sites the lattice is linear, so all that sites do to each other goes through G_kj(omega), the response of
-the relative displacement at site k to a pair of forces at site j, ends of the lattice included (one sparse solve a
-frequency). With the self response g of an infinite lattice, c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j: what arrives
+the relative displacement at site k to a pair of forces at site j, ends of the lattice included. With the self response g of an infinite lattice, c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j: what arrives
 at a site is the linear wave and what the others, and the ends, send back. f1 = Phi1(|c|/D) c closes the system: it is
 solved by GMRES with Phi1 held, and once more with that of what comes out, until it stays.
 
@@ -14,11 +13,10 @@ contact, the share is lost that a driven wave of that amplitude loses. Waves tha
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import diags
-from scipy.sparse.linalg import LinearOperator, gmres, splu
+from scipy.sparse.linalg import LinearOperator, gmres
 
 from vipetsc.case import Model
-from vipetsc.lattice import bloch
+from vipetsc.lattice import Compliance, bloch
 from vipetsc.studies.response import DECAY, RELEASE, SiteResponse, in_contact, power_per_area, self_response
 
 WIDTH = 8  # of the burst's line, half of what is followed around a frequency
@@ -68,18 +66,8 @@ class Network:
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
         """Of w at the sites to forces at the sites and the drive (frequency, site, site and 1); of a site alone."""
-        chain, d = self.model.chain, self.cell.dofs
-        sites, stiffness, masses = np.array(chain.sites), chain.stiffness_matrix(), diags(chain.masses())
-        pairs = np.zeros((chain.cells * d, len(sites) + 1), complex)
-        pairs[sites * d + self.cell.resonator, np.arange(len(sites))] = 1
-        pairs[sites * d + self.cell.host, np.arange(len(sites))] = -1
-        pairs[self.model.drive_cell * d + self.model.drive_mass, -1] = 1
-        omega = middle + self.offset - 1j * self.decay
-        rows = []
-        for w in omega:
-            u = splu((stiffness - masses * w**2).tocsc()).solve(pairs)
-            rows.append(u[sites * d + self.cell.resonator] - u[sites * d + self.cell.host])
-        return np.array(rows), self_response(self.cell, omega)
+        omega, drive = middle + self.offset - 1j * self.decay, (self.model.drive_cell, self.model.drive_mass)
+        return Compliance(self.model.chain, points=(drive,)).response(omega), self_response(self.cell, omega)
 
     def _propagates(self, middle: float) -> np.ndarray:
         """Whether a wave of each frequency around ``middle`` exists."""

@@ -2,7 +2,7 @@
 
 A burst meets a site in a lattice so long that nothing comes back. With w the relative displacement of the contact pair,
 w_0 that of the lattice without contacts and g(omega) the response of w to a pair of opposite forces at the infinite
-lattice (an integral over Bloch waves), the contact's force is f = (w - w_0)/g at every frequency. Around the drive's
+lattice, the contact's force is f = (w - w_0)/g at every frequency. Around the drive's
 frequency Om, w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), around 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds
 the clearance D, contact goes on until |c| < ``RELEASE`` D. While it does, all of it is taken for a function of
 z = |c|/D, averaged over bins of log z, over the burst's rise and fall and over runs of several amplitudes. What a whole
@@ -14,19 +14,16 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from vipetsc.io.records import Record
-from vipetsc.lattice import Band, UnitCell, bloch, pass_bands, waves_at
+from vipetsc.lattice import Band, Chain, Compliance, UnitCell, bloch, pass_bands, waves_at
 
 RELEASE = 0.35  # of the clearance: below, contact has ended in every run of both laws (last separations: .2 to .33)
 BINS = 40
-WAVENUMBERS = 4096
 DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that nothing comes round
 
 
 def self_response(cell: UnitCell, omega: np.ndarray) -> np.ndarray:
     """g (omega) in m/N of an infinite lattice at frequencies ``omega`` in rad/s, below the real axis."""
-    waves = bloch(cell, 2 * np.pi * np.arange(WAVENUMBERS) / WAVENUMBERS)
-    weight = np.abs(waves.vectors[:, cell.resonator] - waves.vectors[:, cell.host]) ** 2
-    return np.array([np.mean(np.sum(weight / (waves.frequency**2 - w**2), axis=1)) for w in omega])
+    return Compliance(Chain(cell, 1, sites=(0,)), infinite=True).at(omega)[:, 0, 0]
 
 
 def power_per_area(cell: UnitCell, omega: float) -> tuple[int, float, float] | None:
