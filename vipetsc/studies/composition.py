@@ -1,9 +1,10 @@
 """Several sites composed from the answer of one: waves between them, there and back, without a fitted number.
 
 Between the sites the lattice is linear, so all that sites do to each other goes through G_kj(omega), the response of
-the relative displacement at site k to a pair of forces at site j, ends of the lattice included. With the self response g of an infinite lattice, c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j: what arrives
-at a site is the linear wave and what the others, and the ends, send back. f1 = Phi1(|c|/D) c closes the system: it is
-solved by GMRES with Phi1 held, and once more with that of what comes out, until it stays.
+the relative displacement at site k to a pair of forces at site j, ends of the lattice included. With the self response
+g of an infinite lattice, c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j: what arrives at a site is the linear wave and
+what the others, and the ends, send back. f1 = Phi1(|c|/D) c closes the system: it is solved by GMRES with Phi1 held,
+and once more with that of what comes out, until it stays.
 
 Third harmonics f3 = Phi3(z) |c| (c/|c|)^3 of the sites add with their phases; a site in contact is stiff to those of
 others: f3 has -c3/g besides. They press on contacts: z = (|c| + |c3|)/D. Of what the upper bands carry past a site in

@@ -2,11 +2,11 @@
 
 A burst meets a site in a lattice so long that nothing comes back. With w the relative displacement of the contact pair,
 w_0 that of the lattice without contacts and g(omega) the response of w to a pair of opposite forces at the infinite
-lattice, the contact's force is f = (w - w_0)/g at every frequency. Around the drive's
-frequency Om, w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), around 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds
-the clearance D, contact goes on until |c| < ``RELEASE`` D. While it does, all of it is taken for a function of
-z = |c|/D, averaged over bins of log z, over the burst's rise and fall and over runs of several amplitudes. What a whole
-burst loses and gives to other bands then comes out right by a factor that depends on the largest z of the burst.
+lattice, the contact's force is f = (w - w_0)/g at every frequency. Around the drive's frequency Om,
+w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), around 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds the clearance D,
+contact goes on until |c| < ``RELEASE`` D. While it does, all of it is taken for a function of z = |c|/D, averaged over
+bins of log z, over the burst's rise and fall and over runs of several amplitudes. What a whole burst loses and gives to
+other bands then comes out right by a factor that depends on the largest z of the burst.
 """
 
 from typing import NamedTuple, Self
