@@ -15,9 +15,12 @@ Method = Literal["2a", "3bs", "5f", "5dp", "5bs", "6vr", "7vr", "8vr"]
 """Runge-Kutta methods of PETSc (``-ts_rk_type``)."""
 
 
+MULTIPLE_OF_PI = r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*"
+
+
 def number(value: Any) -> Any:
     """Wavenumbers may be written as multiples of pi: "5pi/9"."""
-    match = isinstance(value, str) and re.fullmatch(r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*", value)
+    match = isinstance(value, str) and re.fullmatch(MULTIPLE_OF_PI, value)
     if not match:
         return value
     return float(match[1] or 1) * np.pi / float(match[2] or 1)
@@ -39,7 +42,7 @@ def _text(value: Any) -> Any:
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Wavenumber = Annotated[float, BeforeValidator(number), Field(gt=0, le=np.pi)]
+Wavenumber = Annotated[float, Field(gt=0, le=np.pi), BeforeValidator(number)]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.case import CaseError, Problem
-from vipetsc.cli import verbs
+from vipetsc.cli import reference, verbs
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StoppedError, StopRequest
 
@@ -44,6 +44,8 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "only": ("--only", {"nargs": "+", "default": [], "metavar": "ID",
                         "help": "only what these figures (fig05) and claims (C7) need"}),
     "quick": ("--quick", {"action": "store_true", "help": "coarse grids: minutes, marked on every picture"}),
+    "shell": ("shell", {"choices": ("bash", "zsh"), "help": "the shell whose completions are printed"}),
+    "topic": ("topic", {"nargs": "?", "metavar": "TOPIC", "help": "a chapter; a list of them if left out"}),
     "list": ("--list", {"action": "store_true", "help": "what is done, what is left and how long it takes"}),
 }  # fmt: skip
 
@@ -64,6 +66,9 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
     "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs set"),
     "plot": (verbs.plot, "pictures of a finished run again, from its files", "path fig format"),
     "paper": (verbs.paper, "every figure and claim of the paper, and a report", "only quick list out"),
+    "manual": (reference.manual, "a chapter of the manual, as plain text", "topic"),
+    "schema": (reference.schema, "the JSON schema of case files, for editors", ""),
+    "completion": (reference.completion, "what a shell needs to complete verbs, options and files", "shell"),
     "doctor": (verbs.doctor, "versions and what is missing", ""),
 }
 
@@ -99,7 +104,8 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
         return verbs.STOPPED
 
 
-def _parser() -> Parser:
+def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
+    """The parser of all verbs; ``complete`` tells a shell how arguments are completed, by their names here."""
     parser = Parser(
         prog="vipetsc",
         description="Waves in phononic lattices with vibro-impacts. Without a verb: the built-in four-band case.",
@@ -109,8 +115,10 @@ def _parser() -> Parser:
     subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, (function, text, keys) in VERBS.items():
         verb = subparsers.add_parser(name, help=text, description=text)
-        verb.set_defaults(function=function)
+        verb.set_defaults(function=function, parser=_parser)
         for key in keys.split():
             flag, details = ARGUMENTS[key]
-            verb.add_argument(flag, **details)
+            argument = verb.add_argument(flag, **details)
+            if complete and flag in complete:
+                argument.complete = complete[flag]  # type: ignore[attr-defined]
     return parser

@@ -1,0 +1,133 @@
+"""What the program tells about itself: chapters, the schema of case files beside their validator, completion."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import vipetsc as package
+from vipetsc.case import keys
+from vipetsc.case.reading import SECTIONS, CaseError, read_section
+from vipetsc.case.schema import DriveTable
+from vipetsc.cli.main import VERBS
+
+ROOT = Path(package.__file__).parents[1]
+CASES = sorted([*(ROOT / "runs").glob("*.toml"), *(ROOT / "vipetsc/paper/cases").glob("*.toml")])
+
+
+def classes() -> dict[str, set[str]]:
+    """The keys that the validator knows of every class of a section, tables within tables as well."""
+    found, left = {}, list(keys.tables().values())
+    while left:
+        table = left.pop()
+        if table.__name__ not in found:
+            found[table.__name__] = {field.alias or name for name, field in table.model_fields.items()}
+            left += [inner for field in table.model_fields.values() for inner in keys._within(field.annotation)]
+    return found
+
+
+def test_schema_manual_texts_and_validator_name_the_same_keys():
+    schema = keys.json_schema()
+    assert set(schema["properties"]) == {"name", *SECTIONS}
+    validator, varied = classes(), set(schema["$defs"]["SweepTable"]["properties"]) & set(SECTIONS)
+    assert {name: set(item.get("properties", {})) for name, item in schema["$defs"].items()} == validator | {
+        "SweepTable": validator["SweepTable"] | varied
+    }
+    assert {name: set(texts) for name, texts in keys.texts().items()} == {
+        name: names for name, names in (validator | {"CaseFile": {"name"}}).items() if names
+    }
+    shown = {}
+    for path, text in re.findall(r"^## \[(\S+)\]\n(.*?)(?=^## |\Z)", keys.chapter(), flags=re.M | re.S):
+        shown[path] = set(re.findall(r"^\| `(\w+)` \|", text, flags=re.M))
+    for section, table in keys.tables().items():
+        assert shown[section] == validator[table.__name__], section
+    assert sum(map(len, shown.values())) == sum(map(len, validator.values()))
+
+
+def test_a_refused_key_names_those_of_the_schema():
+    _, problems = read_section(DriveTable, {"xyzzy": 1}, "drive")
+    told = set(problems[0].remedy.removeprefix("unknown key; valid keys: ").split(", "))
+    assert told == set(keys.json_schema()["$defs"]["DriveTable"]["properties"])
+
+
+@pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
+def test_the_schema_takes_every_case_file(path):
+    jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), keys.json_schema())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lattice.cels = 3",
+        "lattice.cells = 1",
+        "lattice.ends = 'loose'",
+        "drive.wavenumber = '5p/9'",
+        "drive.wavenumber = 4.0",
+        "contacts.sites = [1.5]",
+        "contacts.restitution = 1.5",
+        "nnm.guards.turn = -1.0",
+        "nnm.own.masses = 'heavy'",
+        "drvie.amplitude = 1.0",
+        "sweep.ranks = 0",
+    ],
+)
+def test_what_the_validator_refuses_of_one_key_the_schema_refuses(text):
+    from vipetsc.case.every import load_every
+
+    table = tomllib.loads(text)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(table, keys.json_schema())
+    key, value = text.split(" = ")
+    with pytest.raises(CaseError):
+        load_every(None, [f"{key}={value}"])
+
+
+def test_multiples_of_pi_are_wavenumbers_in_the_schema():
+    for value in ("5pi/9", "pi", ".5 pi", 1.0):
+        jsonschema.validate({"drive": {"wavenumber": value}}, keys.json_schema())
+
+
+def test_the_verb_schema_prints_it(in_process):
+    assert json.loads(in_process("schema").stdout) == json.loads(json.dumps(keys.json_schema()))
+
+
+def test_bash_completes_verbs_options_and_files(in_process, tmp_path):
+    script = in_process("completion", "bash").stdout
+    (tmp_path / "case.toml").touch()
+
+    def completed(*words: str) -> set[str]:
+        line = f"COMP_WORDS=({' '.join(words)} '') COMP_CWORD={len(words)}; COMP_WORDS[-1]="
+        asked = f"{script}\n{line}\n_shtab_vipetsc; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+        ended = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True, check=False)
+        return set(ended.stdout.split())
+
+    assert completed("vipetsc") >= set(VERBS)
+    assert "case.toml" in completed("vipetsc", "run")
+    assert completed("vipetsc", "completion") == {"bash", "zsh"}
+
+
+def test_zsh_reads_its_completion(in_process):
+    script = in_process("completion", "zsh").stdout
+    assert script.startswith("#compdef vipetsc")
+    if shutil.which("zsh"):
+        subprocess.run(["zsh", "-n"], input=script, text=True, check=True)
+
+
+def test_the_manual_at_the_prompt(in_process):
+    listed = in_process("manual").stdout
+    index = (ROOT / "vipetsc/manual/index.md").read_text(encoding="utf-8")
+    names = {"case-keys", *re.findall(r"\]\(([\w-]+)\.md\)", index)}
+    assert set(re.findall(r"^  ([\w-]+) ", listed, flags=re.M)) == names
+    shown = in_process("manual", "case-keys").stdout
+    assert re.search(r"^`frequency` +number > 0 +rad/s +angular frequency", shown, flags=re.M)
+    trust = in_process("manual", "trust").stdout
+    assert "performance (manual performance)" in trust and "](" not in trust
+    wrong = in_process("manual", "cooking")
+    assert wrong.returncode == 2 and "there are case-file, case-keys" in wrong.stderr

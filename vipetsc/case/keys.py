@@ -1,0 +1,152 @@
+"""Every key of a case file: as a JSON schema for editors, and as a chapter of the manual.
+
+Types, bounds and defaults come from the sections, units and texts from ``keys.toml``: what is neither there nor here is
+no key, which a test says.
+"""
+
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from importlib.resources import files
+from typing import Any, get_args
+
+from pydantic.json_schema import models_json_schema
+
+from vipetsc.case.case import Case
+from vipetsc.case.disorder import DisorderTable
+from vipetsc.case.every import OF_SECTION
+from vipetsc.case.reading import SECTIONS, CaseFile, Section
+from vipetsc.case.schema import MULTIPLE_OF_PI
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+Schema = dict[str, Any]
+
+
+def tables() -> dict[str, type[Section]]:
+    """The class of each section that a case file may have, in the order of ``SECTIONS``."""
+    of_section: dict[str, type[Section]] = {"disorder": DisorderTable}
+    kinds: dict[str, type[CaseFile]] = {"": Case, **OF_SECTION}
+    for section, kind in kinds.items():
+        for name, field in kind.model_fields.items():
+            for table in _within(field.annotation):
+                if not issubclass(table, CaseFile):
+                    of_section[section if name == "options" and section else name] = table
+    return {name: of_section[name] for name in SECTIONS}
+
+
+def _within(annotation: Any) -> Iterator[type[Section]]:
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _within(argument)
+
+
+@cache
+def texts() -> dict[str, dict[str, list[str]]]:
+    """Unit and text of every key, by the name of its class."""
+    return tomllib.loads((files("vipetsc.case") / "keys.toml").read_text(encoding="utf-8"))
+
+
+def json_schema() -> Schema:
+    """The JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key."""
+    of_class = {table.__name__: table for table in tables().values()}
+    _, whole = models_json_schema([(table, "validation") for table in of_class.values()])
+    classes: Schema = whole["$defs"]
+    for name, schema in classes.items():
+        for key, item in schema.get("properties", {}).items():
+            unit, text = texts()[name][key]
+            item.pop("title", None)
+            item["description"] = f"{text} ({unit})" if unit else text
+        schema["description"] = schema.get("description", "").partition("\n\n")[0].replace("\n", " ").replace("``", "`")
+    classes["DriveTable"]["properties"]["wavenumber"]["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
+    classes["PetscTable"]["additionalProperties"] = {"type": ["string", "number", "boolean"]}
+    # What a sweep takes in turn may be lists or ranges of anything.
+    varied = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
+    classes["SweepTable"]["properties"] |= {key: {"type": "object"} for key in sorted(varied)}
+    sections = {key: {"$ref": f"#/$defs/{table.__name__}"} for key, table in tables().items()}
+    named = {"type": "string", "description": texts()["CaseFile"]["name"][1]}
+    about = {"$schema": DIALECT, "title": "case file of vipetsc", "type": "object", "additionalProperties": False}
+    return about | {"properties": {"name": named} | sections, "$defs": classes}
+
+
+def chapter() -> str:
+    """The manual's chapter with a table of the keys of every section, those of tables within it below it."""
+    schema = json_schema()
+    lines = [
+        "# Every key of a case file",
+        "",
+        "As files are checked, and as `vipetsc schema` tells editors. Keys without a",
+    ]
+    lines += [
+        "default may be left out, but for those marked as needed. Masses, cells, sites and bands count from 1.",
+        "",
+    ]
+    shown: set[str] = set()
+    for name, reference in schema["properties"].items():
+        if "$ref" in reference:
+            lines += _section(name, reference["$ref"].rpartition("/")[2], schema["$defs"], shown)
+    return "\n".join(lines)
+
+
+def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator[str]:
+    """The table of one section, and those of the tables in it that were not shown yet."""
+    if name in shown:
+        return
+    shown.add(name)
+    schema, inner = classes[name], []
+    yield from (f"## [{path}]", "", schema["description"], "")
+    rows = [(key, item) for key, item in schema.get("properties", {}).items() if "description" in item]
+    if rows:
+        yield from ("| key | value | unit | default | |", "|---|---|---|---|---|")
+    for key, item in rows:
+        unit, text = texts()[name][key]
+        needed = "needed" if key in schema.get("required", ()) else ""
+        default = item.get("default")
+        plain = default is not None and "{" not in str(default)  # not a table of its own
+        shown_default = f"`{_toml(default)}`" if plain else needed
+        yield f"| `{key}` | {_kind(item)} | {unit} | {shown_default} | {text} |"
+        inner += [(f"{path}.{key}", reference) for reference in _references(item)]
+    yield ""
+    for where, reference in inner:
+        yield from _section(where, reference, classes, shown)
+
+
+def _references(item: Any) -> Iterator[str]:
+    """Names of the classes that the schema of a key refers to."""
+    if isinstance(item, dict):
+        if "$ref" in item:
+            yield item["$ref"].rpartition("/")[2]
+        for value in item.values():
+            yield from _references(value)
+    elif isinstance(item, list):
+        for value in item:
+            yield from _references(value)
+
+
+def _toml(value: Any) -> str:
+    """A default as it stands in a case file."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else f"{value:g}"
+
+
+def _kind(item: Schema) -> str:
+    """What the value of a key may be, with its bounds."""
+    if "anyOf" in item:
+        return " or ".join(_kind(choice) for choice in item["anyOf"] if choice.get("type") != "null")
+    if "$ref" in item:
+        return "table"
+    if "enum" in item or "const" in item:
+        return ", ".join(f'`"{value}"`' for value in item.get("enum", [item.get("const")]))
+    if item.get("type") == "array":
+        low, high = item.get("minItems", 0), item.get("maxItems")
+        count = f"{low} " if low == high else f"{low} or more " if low else ""
+        return f"list of {count}{_kind(item['items'])}"
+    if item.get("type") == "object":
+        return f"table of {_kind(item['additionalProperties'])}"
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    bounds = ", ".join(f"{sign} {item[key]:.6g}" for key, sign in signs.items() if key in item)
+    names = {"number": "number", "integer": "whole number", "boolean": "true, false", "string": "text"}
+    if "pattern" in item:
+        return "text as described"
+    return " ".join(filter(None, (names[item["type"]], bounds)))

@@ -1,0 +1,78 @@
+"""Verbs that tell about the program itself: chapters of the manual, the schema of case files, shell completion."""
+
+import argparse
+import json
+import re
+from importlib.resources import files
+
+from mpi4py import MPI
+
+from vipetsc.case import CaseError, Problem
+from vipetsc.cli.verbs import DONE, echo
+from vipetsc.parallel import StopRequest, on_root
+
+KEYS = "case-keys"  # the chapter that is made from the schema
+
+
+def chapters() -> dict[str, str]:
+    """Names of the manual's chapters and their titles, in the order of its index."""
+    folder = files("vipetsc") / "manual"
+    names = [KEYS, *re.findall(r"\]\((\S+)\.md\)", (folder / "index.md").read_text(encoding="utf-8"))]
+    return {name: chapter(name).partition("\n")[0].removeprefix("# ") for name in sorted(names)}
+
+
+def chapter(name: str) -> str:
+    """The text of a chapter; that of all keys is made of their schema."""
+    if name == KEYS:
+        from vipetsc.case.keys import chapter as all_keys
+
+        return all_keys()
+    return (files("vipetsc") / "manual" / f"{name}.md").read_text(encoding="utf-8")
+
+
+def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """A chapter of the manual as plain text, or which there are."""
+    titles = on_root(comm, chapters)
+    if options.topic is None:
+        width = max(map(len, titles))
+        echo(comm, "\n".join(f"  {name:<{width}}  {title}" for name, title in titles.items()))
+        echo(comm, "vipetsc manual TOPIC shows one")
+    elif options.topic in titles:
+        echo(comm, on_root(comm, lambda: plain(chapter(options.topic))))
+    else:
+        known = ", ".join(titles)
+        raise CaseError([Problem("TOPIC", options.topic, f"no chapter; there are {known}")], "manual")
+    return DONE
+
+
+def plain(text: str) -> str:
+    """Markdown for a terminal: links and pictures by their words, tables in columns."""
+    text = re.sub(r"!\[([^\]]*)\]\([^)]*\)", r"[picture: \1]", text)
+    text = re.sub(r"\[([^\]]+)\]\((?!http)(\w[\w-]*)\.md\)", r"\1 (manual \2)", text)
+    return re.sub(r"(?m)(^\|.*\n)+", lambda rows: _columns(rows[0]), text)
+
+
+def _columns(rows: str) -> str:
+    """The rows of a table in columns of equal width; the last one is free."""
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows.splitlines()]
+    cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]) - 1)]
+    lines = ["  ".join([*(f"{cell:<{n}}" for cell, n in zip(row, widths, strict=False)), row[-1]]) for row in cells]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def schema(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """The JSON schema of case files."""
+    from vipetsc.case.keys import json_schema
+
+    echo(comm, on_root(comm, lambda: json.dumps(json_schema(), indent=2)))
+    return DONE
+
+
+def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """A script by which the shell completes verbs, options and files."""
+    import shtab
+
+    kinds = {"case": shtab.FILE, "path": shtab.FILE, "--out": shtab.DIRECTORY}
+    echo(comm, on_root(comm, lambda: shtab.complete(options.parser(kinds), options.shell)))
+    return DONE
