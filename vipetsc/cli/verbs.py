@@ -21,6 +21,7 @@ from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
 from vipetsc.cli.plot import draw_source, source_of
 from vipetsc.io.atomic import write_text
+from vipetsc.io.folder import origin
 from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_root
 
@@ -162,7 +163,7 @@ def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
             for leftover in folder.glob(".*.part"):  # of a command that was killed
                 leftover.unlink()
             picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
-            text = json.dumps(numbers | {"picture": str(picture)}, indent=2)
+            text = json.dumps(numbers | {"picture": str(picture)} | origin(), indent=2)
             write_text(folder / "bands.json", text + "\n")
         return text if options.json else f"{tables.bands_report(numbers)}\n  {picture}"
 

@@ -8,11 +8,14 @@ written.
 import os
 import platform
 import shutil
+import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -197,15 +200,41 @@ def _finish_swap(path: Path, kind: FolderKind) -> None:
 
 
 def provenance(comm: MPI.Comm) -> dict[str, Any]:
-    """Versions, ranks and command, as every output carries them."""
+    """Versions, when, where and how a result was made, as every output carries them; two of them never compare."""
+    return origin() | {"ranks": comm.size}
+
+
+def origin() -> dict[str, Any]:
+    """What ``provenance`` tells of this rank alone, for what is made without the others.
+
+    PETSc options are those of its database: with those that are part of a case, which stand in it, all that were given.
+    """
+    options = PETSc.Options().getAll()
     return {
         "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,
+        "revision": revision(),
         "petsc_version": ".".join(map(str, PETSc.Sys.getVersion())),
         "mpi_version": MPI.Get_library_version().split(",")[0].strip(),
         "hdf5_version": h5py.version.hdf5_version,
         "numpy_version": np.__version__,
         "python_version": platform.python_version(),
-        "ranks": comm.size,
         "command": " ".join(["vipetsc", *sys.argv[1:]]),
+        "petsc_options": " ".join(f"-{name} {value}".strip() for name, value in sorted(options.items())) or "none",
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "host": platform.node(),
     }
+
+
+@cache
+def revision() -> str:
+    """The commit of the package's sources by git, with a "+" if they were changed since; else "none"."""
+    root = Path(vipetsc.__file__).parents[1]
+    if not ((root / ".git").exists() and (root / "pyproject.toml").exists()):
+        return "none"
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
+    try:
+        told = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "none"
+    return told.stdout.strip()

@@ -119,7 +119,8 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell, inputs: str) -
         write_claims(plan.measure(root), path)
         record["claims"], record["cpu"]["claims"] = inputs, time.process_time() - begin
     text = path.read_text(encoding="utf-8")
-    versions = {key: value for key, value in provenance(comm).items() if key.endswith("_version")}
+    about = provenance(comm)
+    versions = {key: value for key, value in about.items() if key.endswith("_version")}
     cpu = {key: seconds for key, seconds in record["cpu"].items() if key != "report"}
     inputs = fingerprint(text, json.dumps([inputs, record["figures"], versions, cpu]))
     if not is_whole(report) or record.get("report") != inputs:
@@ -130,7 +131,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell, inputs: str) -
         paths = [[root / "figures" / f"{stem}.png" for stem in stems.get(f.id, ())] for f in plan.figures]
         pictures = [(f, list(filter(Path.exists, ps))) for f, ps in zip(plan.figures, paths, strict=True)]
         statistics = {step.name: step.statistics(root) for step in plan.steps if step.state(root) == DONE}
-        write_report(report, plan.note, json.loads(text), pictures, statistics, versions, cpu)
+        write_report(report, plan.note, json.loads(text), pictures, statistics, about, cpu)
         record["report"], record["cpu"]["report"] = inputs, time.process_time() - begin
     write_made(root, record)
     return json.loads(text)

@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 import vipetsc
 from vipetsc.case import Case, Sweep
-from vipetsc.io.folder import FolderError
+from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble
 from vipetsc.spectra import power_law
@@ -155,7 +155,7 @@ def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
             left_out.append(f"{name}: {relation}")
         else:
             related[name] = relation
-    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__, "case": ensemble.attrs["case"]}
+    about = origin() | {"format_version": FORMAT_VERSION, "case": ensemble.attrs["case"]}
     about |= {"left_out": left_out, "sources": _sources(folder, branches)}
     about |= {f"{name}/{key}": value for name, data in related.items() for key, value in data.attrs.items()}
     groups = [data.rename({key: f"{name}/{key}" for key in data.variables}) for name, data in related.items()]

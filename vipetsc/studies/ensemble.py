@@ -13,6 +13,7 @@ import vipetsc
 from vipetsc.case import Sweep
 from vipetsc.case.disorder import SEED
 from vipetsc.case.sweep import coordinate
+from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
 from vipetsc.io.records import Line, Record, merge_records, read_records
 from vipetsc.spectra import FEWEST, doubt, normalised, power_law
@@ -197,8 +198,9 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     places = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
     numbers = results.first[results.status == FAILED]
     failed = [f"{tuple(place)}: {results.reasons[n]}" for place, n in zip(places, numbers, strict=True)]
-    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
-    about |= {name: sorted(values) for name, values in results.used.items()}
+    about = (
+        origin() | {"format_version": FORMAT_VERSION} | {name: sorted(values) for name, values in results.used.items()}
+    )
     about |= {"case": plan.to_toml(), "failed": failed, "warnings": json.dumps(warnings)}
     data |= _fits(data, names[AMPLITUDE]) if AMPLITUDE in names else {}
     if any(axis.keys() == {SEED} for axis in plan.axes):

@@ -16,6 +16,7 @@ from vipetsc.dynamics import simulate
 from vipetsc.dynamics.recorder import recorded_cells
 from vipetsc.dynamics.run import Result
 from vipetsc.io.atomic import discard, write_text
+from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import Record, RecordFile
@@ -125,7 +126,9 @@ class MemberStore:
                 if whole and not all_kept:
                     write_netcdf(folder / "run.h5", thinned(run, case).assign_attrs(case=case.to_toml()))
             if whole:
-                write_netcdf(folder / "analysis.h5", analysis.assign_attrs(case=case.to_toml()))
+                write_netcdf(
+                    folder / "analysis.h5", analysis.assign_attrs(origin() | analysis.attrs, case=case.to_toml())
+                )
                 for name in ("summary.json", "case.toml"):  # the record and the run tell both
                     (folder / name).unlink(missing_ok=True)
             warnings = [*result.warnings, *json.loads(analysis.attrs.get("warnings", "[]"))]

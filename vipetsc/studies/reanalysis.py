@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.case import Case, Sweep
-from vipetsc.io.folder import FolderError
+from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run, outdated
 from vipetsc.io.records import RecordFile
@@ -89,7 +89,8 @@ def measure_run(
         linear = read_linear(sweep or folder.parent, case)
         arrival = linear.arrival_at(leading_cell(case)) if linear else None
         options = options_of(run, folder, overrides)
-        write_netcdf(folder / "analysis.h5", analyse(run, measures, arrival, options))
+        analysis = analyse(run, measures, arrival, options)
+        write_netcdf(folder / "analysis.h5", analysis.assign_attrs(origin() | analysis.attrs))
     return folder / "analysis.h5"
 
 

@@ -1,0 +1,81 @@
+"""When, where and from what a result was made: in every file, and never compared."""
+
+from __future__ import annotations
+
+import json
+import platform
+import re
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+
+from mpi4py import MPI
+
+import pytest
+
+import vipetsc as package
+from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.case import Sweep
+from vipetsc.dynamics import simulate
+from vipetsc.io import folder as io_folder
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.studies.reanalysis import measure_run
+from vipetsc.studies.sweep import run_sweep
+
+WANTED = {"vipetsc_version", "petsc_version", "revision", "command", "petsc_options", "date", "host"}
+SHORT = {"lattice": {"preset": "four-band", "cells": 12}, "contacts": {"sites": [4], "clearance": 2e-4},
+         "drive": {"cycles": 3}, "time": {"end": 0.02, "engine": "propagator"}}  # fmt: skip
+
+
+def attributes(path: Path) -> dict:
+    with open_netcdf(path, "result") as data:
+        return data.attrs
+
+
+def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_process):
+    before = datetime.now(UTC).replace(microsecond=0)
+    simulate(small_case(**SHORT), tmp_path / "run")
+    measure_run(tmp_path / "run")
+    run_sweep(
+        Sweep.from_table(SHORT | {"sweep": {"drive": {"amplitude": [1.0, 30.0]}}}), tmp_path / "sweep", MPI.COMM_SELF
+    )
+    for name in ("run/run.h5", "run/analysis.h5", "sweep/ensemble.h5"):
+        about = attributes(tmp_path / name)
+        assert about.keys() >= WANTED, name
+        assert before <= datetime.fromisoformat(about["date"]) <= datetime.now(UTC)
+        assert about["host"] == platform.node()
+    assert json.loads((tmp_path / "run/summary.json").read_text()).keys() >= WANTED
+    in_process("bands", "--out", tmp_path / "bands")
+    assert json.loads((tmp_path / "bands/bands.json").read_text()).keys() >= WANTED
+    # Another time, place and revision, the same bits.
+    monkeypatch.setattr(io_folder, "revision", lambda: "other")
+    monkeypatch.setattr(platform, "node", lambda: "elsewhere")
+    simulate(small_case(**SHORT), tmp_path / "again")
+    assert attributes(tmp_path / "again/run.h5")["host"] == "elsewhere"
+    assert attributes(tmp_path / "again/run.h5")["revision"] == "other"
+    assert_same_bits(datasets(tmp_path / "run/run.h5"), datasets(tmp_path / "again/run.h5"))
+
+
+def test_the_format_of_a_file_is_its_own(tmp_path):
+    run_sweep(Sweep.from_table(SHORT | {"sweep": {"drive": {"amplitude": [1.0]}}}), tmp_path, MPI.COMM_SELF)
+    assert attributes(tmp_path / "ensemble.h5")["format_version"] == 2
+
+
+def test_petsc_options_are_told(petsc_options):
+    petsc_options(ts_monitor="ascii:nowhere.txt")
+    assert "-ts_monitor ascii:nowhere.txt" in io_folder.origin()["petsc_options"]
+
+
+def test_the_revision_is_that_of_git():
+    root = Path(package.__file__).parents[1]
+    if not (root / ".git").exists():
+        pytest.skip("no git repository around the package")
+    head = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout
+    assert re.fullmatch(rf"{head[:12]}\+?", io_folder.revision.__wrapped__())
+
+
+def test_a_package_in_a_foreign_repository_has_no_revision(tmp_path, monkeypatch):
+    (tmp_path / ".git").mkdir()
+    (tmp_path / "vipetsc").mkdir()
+    monkeypatch.setattr(package, "__file__", str(tmp_path / "vipetsc/__init__.py"))
+    assert io_folder.revision.__wrapped__() == "none"
