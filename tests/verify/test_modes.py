@@ -10,13 +10,14 @@ import pytest
 
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.lattice import Chain, Contact, contact_stiffness, four_band
+from vipetsc.modes import special as special_points
 from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
 from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import Point, linear_start, resonance
 from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Relative, Shooting
-from vipetsc.modes.special import locate, switch
+from vipetsc.modes.special import _Segment, locate, switch
 from vipetsc.modes.system import SmoothSpring, System
 
 D = 10**-2.75
@@ -387,3 +388,26 @@ def test_failure_says_where_why_and_what_to_turn():
     assert f"E = {points[-1].energy:.9g} J" in text
     assert "residuals of the last attempt" in text
     assert "turn nnm." in text
+
+
+def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
+    """Beside a grazing point the contacts are those of either end of its step; bisection finds the same points."""
+    problem, points = in_phase
+    steps = [(a, b) for a, b in itertools.pairwise(points) if a.episodes != b.episodes][:12]
+
+    def located() -> list[Point]:
+        return [p for a, b in steps for p in locate(problem, a, b, grazing=True) if p.kind == "grazing"]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(special_points, "brentq", lambda *_, **__: 1 / 0)  # nothing is bisected
+        touching = located()
+    assert len(touching) == len(steps)
+    for (a, b), point in zip(steps, touching, strict=True):
+        segment = _Segment(problem, "relative", a, b)
+        beside = [segment.at(point.step + shift * segment.length).episodes for shift in (-1e-4, 1e-4)]
+        assert beside == [a.episodes, b.episodes]
+        assert point.episodes == min(beside)
+    monkeypatch.setattr(special_points, "graze", lambda *_: (_ for _ in ()).throw(ArithmeticError("no luck")))
+    steps = steps[:3]
+    for point, same in zip(touching, located(), strict=False):
+        assert point.energy == pytest.approx(same.energy, rel=1e-9)

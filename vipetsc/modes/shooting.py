@@ -158,7 +158,7 @@ class Shooting:
         self.flow, self.system, self.map, self.tolerance = flow, flow.system, shooting_map, tolerance
         n, size = self.system.dofs, self.system.dofs + 1
         # the half of the state that is free at the arc's start, and the half that should vanish at its end
-        self._free = slice(0, n) if shooting_map.start == "rest" else slice(n, 2 * n)
+        self.free = slice(0, n) if shooting_map.start == "rest" else slice(n, 2 * n)
         self._zero = slice(n, 2 * n) if shooting_map.end == "rest" else slice(0, n)
         self._newton = BorderedNewton(self._function, self.matrix, size, tolerance, max_newton)
         self._chart: Chart
@@ -167,7 +167,7 @@ class Shooting:
     def arc(self, x: np.ndarray, period: float) -> Arc:
         """The arc from initial values ``x``; raises FlowError where the flow fails."""
         start = np.zeros(2 * self.system.dofs)
-        start[self._free] = x
+        start[self.free] = x
         return self.flow.arc(start, self.map.fraction * period, period)
 
     def residual(self, arc: Arc) -> np.ndarray:
@@ -178,7 +178,7 @@ class Shooting:
         """Derivative (n, n + 1) of the residual with respect to initial values and period."""
         n, masses = self.system.dofs, self.system.masses
         rate = arc.end[n:] if self.map.end == "centre" else -self.system.forces(arc.end[:n]) / masses
-        return np.column_stack([arc.sensitivity[self._zero, self._free], self.map.fraction * rate])
+        return np.column_stack([arc.sensitivity[self._zero, self.free], self.map.fraction * rate])
 
     def energy(self, x: np.ndarray) -> float:
         """Energy in J of the orbit with initial values ``x``."""

@@ -10,10 +10,12 @@ import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.modes.continuation import ContinuationError, Frame, unit
+from vipetsc.modes.graze import graze
 from vipetsc.modes.point import Point, repetitions, resonance
 from vipetsc.modes.shooting import MAPS, Relative, Shooting
 
 Test = Callable[[Point], float]
+Knot = tuple[np.ndarray, np.ndarray]  # the unknowns of a branch and their slope at an arclength
 # A point of a segment is nearer to where it was sought than this share of its length.
 FURTHEST = 0.5
 # Rounding keeps Newton's method from the tolerance near the tips of narrow tongues; so many times of it is enough here.
@@ -95,27 +97,41 @@ def at_energy(problem: Shooting, left: Point, right: Point, energy: float, chart
 class _Segment:
     """The branch between two points, parametrised by arclength along the left point's tangent.
 
-    ``begin`` is the arclength from the start of the step that the segment is a part of.
+    ``begin`` is the arclength from the start of the step that the segment is a part of. The unknowns and their slopes
+    at arclengths where they are ``known``, the ends at first, give the first guess at others.
     """
 
     def __init__(self, problem: Shooting, chart: str, left: Point, right: Point, begin: float = 0.0) -> None:
         self.left, self.right, self.begin, self.frame = left, right, begin, Frame(problem, chart, left)
-        self.chord = self.frame.chart.encode(right.x, right.period) - self.frame.xi
-        self.length = float(self.frame.tangent @ self.chord)
+        end = self.frame.chart.encode(right.x, right.period)
+        self.length, self.known = float(self.frame.tangent @ (end - self.frame.xi)), dict[float, Knot]()
+        self._know(0.0, self.frame.xi, self.frame.tangent)
+        self._know(self.length, end, np.linalg.solve(self.frame.chart.derivative(end), right.tangent))
         self.make = partial(_Segment, problem, chart)
+
+    def _know(self, arclength: float, xi: np.ndarray, direction: np.ndarray) -> None:
+        self.known[arclength] = xi, direction / (self.frame.tangent @ direction)
+
+    def _guess(self, arclength: float) -> np.ndarray:
+        """The cubic through the nearest known places before and behind."""
+        before, behind = max(s for s in self.known if s <= arclength), min(s for s in self.known if s >= arclength)
+        (a, slope_a), (b, slope_b), h = self.known[before], self.known[behind], behind - before
+        share = (arclength - before) / (h or 1.0)
+        bend = 3 * (b - a) - h * (2 * slope_a + slope_b) + share * (2 * (a - b) + h * (slope_a + slope_b))
+        return np.asarray(a + share * h * slope_a + share**2 * bend)
 
     def at(self, arclength: float) -> Point:
         """The point at an arclength; raises ArithmeticError if Newton's method fails there or leaves the step."""
-        frame, share = self.frame, arclength / self.length
-        # a parabola through both points, tangent at the left one
-        guess = frame.xi + arclength * frame.tangent + share**2 * (self.chord - self.length * frame.tangent)
+        frame, guess = self.frame, self._guess(arclength)
         attempt = frame.correct(guess, arclength)
         allowed = ROUNDING * frame.problem.tolerance
         if attempt.arc is None or not (attempt.converged or attempt.history[-1] <= allowed):
             raise ArithmeticError(f"{attempt.reason}; residuals {attempt.residuals}")
         if np.linalg.norm(attempt.xi - guess) > FURTHEST * self.length:
             raise ArithmeticError("Newton's method leaves the step")
-        return frame.point(attempt, self.right.index, arclength)[0]
+        point, direction = frame.point(attempt, self.right.index, arclength)
+        self._know(arclength, attempt.xi, direction)
+        return point
 
     def roots(self, kind: str, test: Test, floor: float, before: Point | None) -> list[Point]:
         """Points where ``test`` vanishes: one between values of two signs beyond ``floor``, or two around a turn."""
@@ -145,16 +161,29 @@ class _Segment:
                 return test(self.left)
             return test(self.right) if arclength == self.length else test(at(arclength))
 
-        accuracy = 1e-11 if kind == "grazing" else 1e-14
         try:
-            arclength = brentq(value, 0.0, self.length, xtol=accuracy * self.length, rtol=1e-14)
+            if kind == "grazing" and halvings:
+                arclength = self.touch()
+            else:
+                arclength = brentq(value, 0.0, self.length, xtol=1e-12 * self.length, rtol=1e-14)
             point = at(arclength)
+            if kind == "grazing":  # what just touches is not counted
+                point = replace(point, episodes=min(self.left.episodes, self.right.episodes))
             return replace(point, kind=kind, step=self.begin + point.step)
         except (ArithmeticError, ValueError) as error:
             if halvings == 0:
                 raise ArithmeticError(error) from error
         first, second = self.split()
         return (first if test(first.left) * test(first.right) < 0 else second).root(kind, test, halvings - 1)
+
+    def touch(self) -> float:
+        """The arclength where a contact grazes; raises ArithmeticError if none does within the segment."""
+        frame, touching = self.frame, max(self.left, self.right, key=lambda p: p.episodes)
+        xi = graze(frame, self._guess(0.5 * self.length), touching)
+        arclength = float(frame.tangent @ (xi - frame.xi))
+        if not 0 < arclength < self.length:
+            raise ArithmeticError("the touch lies outside of the step")
+        return arclength
 
     def split(self, arclength: float | None = None) -> "tuple[_Segment, _Segment]":
         """The parts before and behind an arclength, or about the middle; raises ArithmeticError if there is none."""
