@@ -60,6 +60,25 @@ def small_case(**sections) -> Case:
     return Case.from_table(table)
 
 
+def search_table(cells: int, sites: list[int], **sections: dict[str, Any]) -> dict[str, Any]:
+    """The table of a search for clearances of a four-band lattice under a short burst; ``sections`` update it."""
+    table: dict[str, Any] = {
+        "name": "small",
+        "lattice": {"preset": "four-band", "cells": cells},
+        "contacts": {"sites": sites, "clearance": 2e-4},
+        "drive": {"cycles": 3},
+        "time": {"end": 0.03, "rtol": 1e-7},
+        "optimise": {"budget": 14, "curve": [20.0], "variables": {"clearance": [1e-5, 1e-3]}},
+    }
+    for name, values in sections.items():
+        table[name] = table[name] | values
+    return table
+
+
+# A second objective that the first one contradicts.
+TWO = "optimise.objective=[{measure='transmitted', amplitudes=[5.0]}, {measure='transmitted', goal='minimise'}]"
+
+
 def datasets(path: Path) -> dict[str, np.ndarray]:
     """Every dataset of an HDF5 file by its path."""
     found = {}

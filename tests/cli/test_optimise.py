@@ -8,36 +8,26 @@ import sys
 import time
 
 import pytest
+import tomli_w
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
+from tests.conftest import (
+    TWO,
+    alone_and_on_two_ranks,
+    assert_same_bits,
+    clean_environment,
+    datasets,
+    modified,
+    search_table,
+)
 from vipetsc.io.records import read_records
 
-CASE = """
-[lattice]
-preset = "four-band"
-cells = 16
-[contacts]
-sites = [4, 9]
-clearance = 2e-4
-[drive]
-cycles = 3
-[time]
-end = 0.03
-rtol = 1e-7
-[optimise]
-budget = 14
-curve = [20.0]
-[optimise.variables]
-clearance = [1e-5, 1e-3]
-"""
 FIGURES = {"convergence", "compared_designs", "compared_curves"}
-TWO = "optimise.objective=[{measure='transmitted', amplitudes=[5.0]}, {measure='transmitted', goal='minimise'}]"
 
 
 @pytest.fixture
 def case(tmp_path):
     path = tmp_path / "small.toml"
-    path.write_text(CASE)
+    path.write_text(tomli_w.dumps(search_table(16, [4, 9])))
     return path
 
 

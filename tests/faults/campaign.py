@@ -20,7 +20,20 @@ from tests.faults.scenarios import SCENARIOS
 from tests.faults.trials import Crew, judge, last_words, matrix, references
 from vipetsc.case import Case
 
-KILLED = ("run", "run-ts", "run-resumed", "run-force", "sweep", "sweep-team", "nnm", "design", "paper")
+KILLED = (
+    "run",
+    "run-ts",
+    "run-resumed",
+    "run-force",
+    "sweep",
+    "sweep-team",
+    "nnm",
+    "design",
+    "paper",
+    "law",
+    "predict",
+    "optimise",
+)
 
 
 def faults(options: argparse.Namespace) -> dict[str, Any]:

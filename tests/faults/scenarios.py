@@ -70,6 +70,28 @@ lambda = { first = 0.1, last = 1.0, count = 2 }
 eta = { count = 3 }
 wavenumbers = 11
 """
+# One site of the four-band lattice, under a burst that is short enough for few cells.
+LAW = """
+[lattice]
+preset = "four-band"
+[contacts]
+sites = [4, 9]
+clearance = 2e-4
+[drive]
+cycles = 3
+amplitude = 20.0
+[time]
+end = 0.03
+rtol = 1e-7
+[law]
+distance = 20
+largest = 2.0
+tolerance = 0.5
+finest = 0.5
+samples = 1
+"""
+PREDICT = LAW + "[predict]\namplitudes = [5.0, 20.0]\npoints = 16\n"
+OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
 # A picture for each kind of folder is enough, and costs the least.
 DRAWN = ("ledger", "branch", "deflections", "amplitudes")
 SAMPLES_A_CHUNK = 20
@@ -113,6 +135,9 @@ SCENARIOS = {
         Scenario("sweep-team", TEAM, f"sweep {OUT}"),
         Scenario("nnm", BRANCHES, f"nnm {OUT}"),
         Scenario("design", DESIGN, f"design {OUT}"),
+        Scenario("law", LAW, f"law {OUT} {PLAIN}"),
+        Scenario("predict", PREDICT, f"predict {OUT} {PLAIN}"),
+        Scenario("optimise", OPTIMISE, f"optimise {OUT} {PLAIN}"),
         Scenario("analyse", TEAM.replace("ranks = 2", ""), "analyse {out}", f"sweep {OUT}"),
         Scenario("plot", RUN, "plot {out}", f"run {OUT} {PLAIN}"),
         Scenario("bands", RUN, f"bands {OUT}"),
@@ -193,7 +218,11 @@ def _content(path: Path) -> dict:
         found["text"] = path.read_bytes()
     elif path.suffix == ".jsonl":
         rows = map(json.loads, path.read_text().splitlines())
-        found = {row.get("id") or row["linear"]: (row.get("status"), row.get("measures")) for row in rows}
+        for row in rows:
+            if "key" in row:
+                found[str(row["key"])] = row | {"cpu_seconds": None}
+            else:
+                found[row.get("id") or row["linear"]] = row.get("status"), row.get("measures")
     elif path.name == "summary.json":
         numbers = json.loads(path.read_text())["statistics"]
         found = {key: value for key, value in numbers.items() if not key.endswith("_seconds")}

@@ -17,7 +17,7 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
 # The verbs on each number of ranks, all phases among them.
-VERBS = {2: ("run-ts", "run-force", "nnm", "design", "paper"), 3: ("run", "sweep-team")}
+VERBS = {2: ("run-ts", "run-force", "nnm", "design", "paper", "law", "predict"), 3: ("run", "sweep-team", "optimise")}
 KILLS = 2  # every one ends a worker and costs seconds
 
 

@@ -2,42 +2,20 @@
 
 from __future__ import annotations
 
-import tomllib
-
 from mpi4py import MPI
 
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets
+from tests.conftest import TWO, StopAt, assert_same_bits, datasets, search_table
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.parallel import StoppedError, StopRequest
 from vipetsc.studies.optimise import run_search
 
-TABLE = """
-name = "small"
-[lattice]
-preset = "four-band"
-cells = 16
-[contacts]
-sites = [4, 9]
-clearance = 2e-4
-[drive]
-cycles = 3
-[time]
-end = 0.03
-rtol = 1e-7
-[optimise]
-budget = 14
-curve = [20.0]
-[optimise.variables]
-clearance = [1e-5, 1e-3]
-sites = [3, 12]
-"""
-TWO = "optimise.objective=[{measure='transmitted', amplitudes=[5.0]}, {measure='transmitted', goal='minimise'}]"
-
 
 def plan(*changes):
-    return OptimiseCase.from_table(tomllib.loads(TABLE), changes)
+    bounds = {"variables": {"clearance": [1e-5, 1e-3], "sites": [3, 12]}}
+    table = search_table(16, [4, 9])
+    return OptimiseCase.from_table(table | {"optimise": table["optimise"] | bounds}, changes)
 
 
 @pytest.fixture(scope="module")

@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
-import tomllib
 from types import SimpleNamespace
+
+from mpi4py import MPI
 
 import numpy as np
 import pytest
+import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.conftest import search_table
 from vipetsc.case import CaseError, case_id
 from vipetsc.case.disorder import Deviation
 from vipetsc.case.every import load_every
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judge
 from vipetsc.studies.optimise import Search
+from vipetsc.studies.recorded import RecordedRuns
 from vipetsc.studies.sampler import CmaEs, Nsga2, front, knee
 
-TABLE = """
-name = "small"
-[lattice]
-preset = "four-band"
-cells = 40
-[contacts]
-sites = [10, 20, 30]
-clearance = { first = 2e-4, last = 1e-4 }
-[optimise]
-budget = 12
-[optimise.variables]
-clearance = [1e-5, 1e-2]
-"""
+BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
+TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "last": 1e-4}}, optimise=BOUNDS)
 
 
 def plan(*changes: str) -> OptimiseCase:
-    return OptimiseCase.from_table(tomllib.loads(TABLE), changes)
+    return OptimiseCase.from_table(TABLE, changes)
 
 
 @pytest.mark.parametrize(
@@ -61,6 +55,8 @@ def plan(*changes: str) -> OptimiseCase:
         (["optimise.samples=3"], "no [disorder]"),
         (["disorder.clearance.relative=-0.1"], "disorder.clearance.relative = -0.1"),
         (["contacts.sites=[50]"], "outside the lattice"),
+        (["lattice.ends=periodic", "optimise.objective=[{measure='transmitted'}]"], "the last site of a ring"),
+        (["lattice.preset=diatomic", "drive={wavenumber='5pi/9', band=2}"], "the driven band is the highest of 2"),
         (["optimise=3"], "say what varies"),
     ],
 )  # fmt: skip
@@ -73,7 +69,8 @@ def test_what_is_wrong_with_a_search_is_named(changes, message):
 
 def test_all_problems_come_at_once(tmp_path):
     path = tmp_path / "bad.toml"
-    path.write_text(TABLE + "masses.9 = [1.0, 2.0]\nsites = [30, 2]\n")
+    wrong = {"masses": {"9": [1.0, 2.0]}, "sites": [30, 2]}
+    path.write_text(tomli_w.dumps(TABLE | {"optimise": BOUNDS | {"variables": BOUNDS["variables"] | wrong}}))
     for read in (OptimiseCase.load, load_every):
         with pytest.raises(CaseError) as error:
             read(path)
@@ -299,3 +296,21 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
     known[case_id(runs[5.0, 1])] = {"reason": "stalled"}
     losses, reason = Scarce(small, known).losses(small.base)
     assert np.isnan(losses).all() and reason == "5 N: stalled"
+
+
+@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 1.00 TiB"), OSError(28, "full"), CaseError([])])
+def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
+    """One that fails otherwise has: it is not made again."""
+    asked = []
+
+    def work(key):
+        asked.append(key)
+        raise {"stalls": RuntimeError("stalled"), "short": error}[key]
+
+    for _ in range(2):
+        runs = RecordedRuns("small", tmp_path, MPI.COMM_SELF, StopRequest())
+        with pytest.raises(OSError, match=r"Unable|full|0 problem"):
+            runs.make(["stalls", "short"], work, failures=True)
+        known = RecordedRuns("small", tmp_path, MPI.COMM_SELF, StopRequest()).known
+        assert [*known] == ["stalls"] and known["stalls"]["reason"] == "stalled"
+    assert asked == ["stalls", "short", "short"]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
+import copy
 
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 
-from tests.conftest import datasets, small_case
+from tests.conftest import datasets, search_table, small_case
 from vipetsc.case import Case
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.dynamics import simulate
@@ -19,26 +19,10 @@ from vipetsc.studies import optimise
 from vipetsc.studies.linear import LinearRun, linear_case
 from vipetsc.studies.objective import measured
 
-TABLE = """
-name = "small"
-[lattice]
-preset = "four-band"
-cells = 24
-[contacts]
-sites = [6, 12, 13]
-clearance = 2e-4
-[drive]
-amplitude = 24.33
-cycles = 6
-[time]
-end = 0.08
-rtol = 1e-8
-[optimise]
-budget = 30
-curve = [12.0]
-[optimise.variables]
-clearance = [3e-5, 3e-3]
-"""
+SEARCH = {"budget": 30, "curve": [12.0], "variables": {"clearance": [3e-5, 3e-3]}}
+TABLE = search_table(
+    24, [6, 12, 13], drive={"amplitude": 24.33, "cycles": 6}, time={"end": 0.08, "rtol": 1e-8}, optimise=SEARCH
+)
 
 
 def objective(measure, **more):
@@ -87,7 +71,7 @@ def test_what_is_beyond_the_last_site_is_what_came_through(drive):
 
 
 def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
-    plan = OptimiseCase.from_table(tomllib.loads(TABLE))
+    plan = OptimiseCase.from_table(TABLE)
     optimise.run_search(plan, tmp_path)
     found = datasets(tmp_path / "optimum.h5")
     value, best = found["value"][:, 0], int(found["comparison/number"][1])
@@ -111,7 +95,7 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
 
     asked = []
     monkeypatch.setattr(optimise, "make_law", lambda *given, **options: asked.append(given) or Law())
-    table = tomllib.loads(TABLE)
+    table = copy.deepcopy(TABLE)
     table["optimise"] |= {"start": "matched", "budget": 2}
     table["contacts"]["sites"] = [12, 6, 13]
     optimise.run_search(OptimiseCase.from_table(table), tmp_path)

@@ -259,7 +259,16 @@ def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Pr
 def _problems_of(objective: ObjectiveTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
     """What is wrong with an objective, of a cell that stays as it is unless ``varied``."""
     bands, band, part = pass_bands(base.lattice.unit_cell()), objective.band, objective.part
-    if (objective.measure == "band_share") != (band is not None):
+    top = base.drive.frequency or 0.0
+    for other in sorted(bands, key=lambda b: b.low):  # of the driven band and those that overlap it
+        top = max(top, other.high) if other.low <= top else top
+    if objective.measure == "transmitted" and base.lattice.ends == "periodic":
+        remedy = "nothing lies beyond the last site of a ring; lattice.ends = fixed or free, or another measure"
+        yield Problem(f"{at}.measure", objective.measure, remedy)
+    elif objective.measure in ("upper_share_at_end", "ibtet") and top >= max(b.high for b in bands):
+        remedy = f"the driven band is the highest of {len(bands)}; band_share of another, or a drive on a lower one"
+        yield Problem(f"{at}.measure", objective.measure, remedy)
+    elif (objective.measure == "band_share") != (band is not None):
         remedy = "only band_share has a band" if band else f"missing; band_share needs a band, 1 to {len(bands)}"
         yield Problem(f"{at}.band", band, remedy)
     elif band and band > len(bands):

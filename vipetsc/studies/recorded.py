@@ -9,7 +9,7 @@ from mpi4py import MPI
 import xarray as xr
 
 import vipetsc
-from vipetsc.case import Case
+from vipetsc.case import Case, CaseError
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.run import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
@@ -18,6 +18,7 @@ from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float]
+SHORT = MemoryError, OSError, CaseError  # a case that was valid asks for more memory than there is
 
 
 class RecordedRuns:
@@ -45,7 +46,8 @@ class RecordedRuns:
         """Make the records of unknown ``keys`` by ``work``, which all ranks of a team call. Collective.
 
         The record of a run that fails is its ``reason`` if ``failures`` may be; else RuntimeError is raised on all
-        ranks. Raises StoppedError on all if some rank got a request to stop.
+        ranks. Raises OSError on all if memory or disk is short, of which there is no record: the run may come out the
+        next time. Raises StoppedError on all if some rank got a request to stop.
         """
         missing = [key for key in dict.fromkeys(keys) if key not in self.known]
         made, failed = dict[Key, Record](), list[str]()
@@ -65,7 +67,7 @@ class RecordedRuns:
             else:
                 failed.append(f"{key}: {reason}")
 
-        pool = TaskPool(self.comm, self.team, self.stop)
+        pool = TaskPool(self.comm, self.team, self.stop, SHORT)
         pool.share(missing, one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
         self.file.close()
         for more in self.comm.allgather(made):
