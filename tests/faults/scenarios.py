@@ -75,22 +75,21 @@ LAW = """
 [lattice]
 preset = "four-band"
 [contacts]
-sites = [4, 9]
+sites = [6]
 clearance = 2e-4
 [drive]
-cycles = 3
-amplitude = 20.0
+cycles = 8
+amplitude = 8.0
 [time]
-end = 0.03
+end = 0.06
 rtol = 1e-7
 [law]
-distance = 20
 largest = 2.0
 tolerance = 0.5
 finest = 0.5
 samples = 1
 """
-PREDICT = LAW + "[predict]\namplitudes = [5.0, 20.0]\npoints = 16\n"
+PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
 # A picture for each kind of folder is enough, and costs the least.
 DRAWN = ("ledger", "branch", "deflections", "amplitudes")
