@@ -219,7 +219,7 @@ def _content(path: Path) -> dict:
         rows = map(json.loads, path.read_text().splitlines())
         for row in rows:
             if "key" in row:
-                found[str(row["key"])] = row | {"cpu_seconds": None}
+                found[str(row["key"])] = repr(row | {"cpu_seconds": None, "crc32": None})  # NaN equals NaN
             else:
                 found[row.get("id") or row["linear"]] = row.get("status"), row.get("measures")
     elif path.name == "summary.json":

@@ -14,7 +14,7 @@ from vipetsc.io.records import read_records
 from vipetsc.io.store import RunMemory
 from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import LINEAR, SITE, Study, amplitudes_of, composed, predict, site_points
-from vipetsc.studies.response import BINS, RELEASE, SiteResponse, in_contact
+from vipetsc.studies.response import BINS, SiteResponse, in_contact
 
 SMALL = {
     "name": "small",
@@ -125,8 +125,18 @@ def test_a_site_that_nothing_reaches_changes_nothing(made):
 
 
 def test_contact_goes_on_until_release():
-    z = np.array([[0.9, 1.1, 0.9, RELEASE + 0.01, RELEASE - 0.01, 0.9]])
-    assert in_contact(z).tolist() == [[False, True, True, True, False, False]]
+    z = np.array([[0.9, 1.1, 0.9, 0.41, 0.39, 0.9]] * 2)
+    on = in_contact(z, np.array([0.4, 0.6]))
+    assert on.tolist() == [[False, True, True, True, False, False], [False, True, True, False, False, False]]
+
+
+def test_the_release_is_where_the_last_contact_of_a_run_ended(made):
+    """Records tell it, and the response interpolates it over the largest z; without contacts it is the onset."""
+    _, answers, _ = response(made)
+    site = answer(made)
+    assert all(0 < record["release"] < 1 for record in answers[4:])
+    z = [record["z"] for record in answers]
+    np.testing.assert_allclose(site.of_bursts(np.array(z))[-1], [record["release"] for record in answers])
 
 
 def test_runs_that_are_there_are_not_made_again(made, tmp_path, monkeypatch):

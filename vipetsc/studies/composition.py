@@ -18,9 +18,10 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from vipetsc.case import Model
 from vipetsc.lattice import Compliance, bloch
-from vipetsc.studies.response import DECAY, RELEASE, SiteResponse, in_contact, power_per_area, self_response
+from vipetsc.studies.response import DECAY, SiteResponse, in_contact, power_per_area, self_response
 
-WIDTH = 8  # of the burst's line, half of what is followed around a frequency
+WIDTH = 14  # of the burst's line, half of what is followed around a frequency
+WEAK = 0.35  # over clearance: weaker waves lose as much at a site in contact as a driven wave of this amplitude
 MOST, HELD = 60, 30  # iterations; those after which the sites in contact are held
 CLOSE = 1e-3
 
@@ -107,7 +108,7 @@ class Network:
         size, change = float(np.abs(linear).max()), 0.0
         for i in range(MOST):
             z = (np.abs(c) + np.abs(c3)) / self.clearance[:, None]
-            on = in_contact(z) & self.during if i < HELD else on
+            on = in_contact(z, site.of_bursts(z.max(axis=1))[-1]) & self.during if i < HELD else on
             if not on.any():
                 break
             fundamental, third, *_ = site.at(z)
@@ -129,7 +130,7 @@ class Network:
         assert here is not None
         _, third, lost, into = site.at(z)
         factor = site.of_bursts(z.max(axis=1))[:, :, None]
-        lost, into = lost * factor[0], into * factor[1:]
+        lost, into = lost * factor[0], into * factor[1:-1]
         power = here[2] * np.abs(c) ** 2 * on
         emitted = power * into
         dissipated, bands = float((power * lost).sum()) * step, emitted.sum(axis=(1, 2)) * step
@@ -157,7 +158,7 @@ class Network:
                 late = self.time - abs(cells[k] - cells[last]) / speed
                 passing, last = np.interp(late, self.time, passing, left=0.0), k
                 z = np.sqrt(np.maximum(passing, 0) / area) / self.clearance[k]
-                share = np.minimum(site.at(np.maximum(z, RELEASE))[2], 1) * on[k]
+                share = np.minimum(site.at(np.maximum(z, WEAK))[2], 1) * on[k]
                 total += float((passing * share).sum())
                 passing = passing * (1 - share) + emitted[k] / 2
         return total

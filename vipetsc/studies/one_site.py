@@ -75,8 +75,8 @@ def make_law(
         if not on_root(comm, path.exists):
             runs = Runs(case, claim.folder, comm, stop)
             grid = refine(runs, progress)
-            on_root(comm, lambda: write_netcdf(path, runs.dataset(grid)))
             runs.recorded.finish()
+            on_root(comm, lambda: write_netcdf(path, runs.dataset(grid)))
         claim.publish()
         return on_root(comm, lambda: ScatteringLaw.read(claim.path / "law.h5"))
 

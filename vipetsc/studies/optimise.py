@@ -178,8 +178,8 @@ def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest,
             more = on_root(comm, lambda: searches[0].go_on())
             bar.update(sum(len(search.designs) for search in searches))
         judge.make(on_root(comm, lambda: [run for row in _curves(searches[0]).values() for run in row]))
-        on_root(comm, lambda: _write(searches[0], folder))
         judge.recorded.finish()
+        on_root(comm, lambda: _write(searches[0], folder))
     finally:
         bar.close()
 

@@ -21,13 +21,14 @@ Job = TypeVar("Job", bound=Hashable)
 class TaskPool:
     """Teams of ranks that draw jobs until none are left, or until some rank got a request to stop (``stopped``).
 
-    ``busy`` is the time in s that this rank worked on them. ``fatal`` exceptions of a job end all, as a full disk does.
+    ``busy`` is the time in s that this rank worked on them. A job may end in ``failures``; other exceptions end
+    all jobs, as a full disk does.
     """
 
     def __init__(
-        self, comm: MPI.Comm, team: MPI.Comm, stop: StopRequest, fatal: tuple[type[Exception], ...] = ()
+        self, comm: MPI.Comm, team: MPI.Comm, stop: StopRequest, failures: tuple[type[Exception], ...] = (Exception,)
     ) -> None:
-        self.comm, self.team, self.stop, self.fatal = comm, team, stop, fatal
+        self.comm, self.team, self.stop, self.failures = comm, team, stop, failures
         self.stopped, self.busy = False, 0.0
 
     def share(
@@ -40,7 +41,7 @@ class TaskPool:
         """Do all ``jobs``, those that come first first; returns how many came out. Collective.
 
         ``fail`` is called on the first rank of a team with a job that failed, and why. Raises OSError on all ranks when
-        the disk is full, or after a fatal exception.
+        the disk is full, or after an exception that is no failure.
         """
         drawn, ended = SharedCounter(self.comm), SharedCounter(self.comm)
         block = max(len(jobs) * self.team.size // (BLOCKS * self.comm.size), 1)  # many small jobs are drawn together
@@ -93,8 +94,8 @@ class TaskPool:
         except Exception as error:
             failure, text = error, str(error)
             named = text if isinstance(error, RuntimeError) else f"{type(error).__name__}: {text}"
-            over = isinstance(error, self.fatal) or getattr(error, "errno", None) in FULL
-            ending = (ENDED, text or named) if over else (UNMADE, named)
+            over = not isinstance(error, self.failures) or getattr(error, "errno", None) in FULL
+            ending = (ENDED, text if isinstance(error, OSError) else named) if over else (UNMADE, named)
         met, since = self.team.Ibarrier(), time.monotonic()
         while not met.Test():
             if failure and time.monotonic() - since > PATIENCE:

@@ -85,8 +85,8 @@ def predict(
             def write() -> None:
                 write_netcdf(path, composed(case, linear, answers, members, largest).assign_attrs(about))
 
-            on_root(comm, write)
             study.recorded.finish()
+            on_root(comm, write)
         claim.publish()
         return on_root(comm, lambda: read_prediction(claim.path))
 
@@ -193,8 +193,9 @@ class Study:
         (burst, peak), clearance = self._burst, self.setting.clearance
         amplitude = z * clearance / peak
         run, w, _ = self._one(amplitude, [clearance])
-        lost = run["energy/dissipated"].values
-        sums = burst.sums(amplitude, clearance, self.largest, w, lost)
+        ends = run["impacts/separation"].values
+        end = float(np.nanmax(ends)) if len(ends) else np.nan
+        sums = burst.sums(amplitude, clearance, self.largest, w, run["energy/dissipated"].values, end)
         return {"z": z, "amplitude": amplitude, "largest": self.largest} | sums
 
     def _member(self, amplitude: float) -> Record:

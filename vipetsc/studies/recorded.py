@@ -9,7 +9,7 @@ from mpi4py import MPI
 import xarray as xr
 
 import vipetsc
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.run import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
@@ -18,7 +18,7 @@ from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float]
-SHORT = MemoryError, OSError, CaseError  # a case that was valid asks for more memory than there is
+FAILURES = RuntimeError, ArithmeticError  # of the run itself; too little memory (also as CaseError) or disk is none
 
 
 class RecordedRuns:
@@ -46,8 +46,8 @@ class RecordedRuns:
         """Make the records of unknown ``keys`` by ``work``, which all ranks of a team call. Collective.
 
         The record of a run that fails is its ``reason`` if ``failures`` may be; else RuntimeError is raised on all
-        ranks. Raises OSError on all if memory or disk is short, of which there is no record: the run may come out the
-        next time. Raises StoppedError on all if some rank got a request to stop.
+        ranks. Raises OSError on all, and there is no record, if memory or disk is short or if it was no failure
+        of the run itself: it may come out the next time. Raises StoppedError on all if some rank got a request to stop.
         """
         missing = [key for key in dict.fromkeys(keys) if key not in self.known]
         made, failed = dict[Key, Record](), list[str]()
@@ -67,18 +67,26 @@ class RecordedRuns:
             else:
                 failed.append(f"{key}: {reason}")
 
-        pool = TaskPool(self.comm, self.team, self.stop, SHORT)
+        pool = TaskPool(self.comm, self.team, self.stop, FAILURES)
         pool.share(missing, one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
         self.file.close()
         for more in self.comm.allgather(made):
             self.known |= more
         if pool.stopped:
             raise StoppedError(f"stopped on request with {len(self.known)} runs; the same command goes on")
-        for reason in (reason for reasons in self.comm.allgather(failed) for reason in reasons):
-            raise RuntimeError(f"one of the {what} did not come out, {reason}")
+        reasons = [reason for some in self.comm.allgather(failed) for reason in some]
+
+        def check() -> None:
+            if reasons:
+                raise RuntimeError(f"one of the {what} did not come out, {reasons[0]}")
+
+        on_root(self.comm, check)
 
     def finish(self) -> None:
-        """Put the records of all ranks into one file and let go of the team. Collective."""
+        """Put the records of all ranks into one file and let go of the team. Collective.
+
+        To be called before the result is written: a study that has one is complete.
+        """
 
         def merge() -> None:
             if parts := self._parts():
