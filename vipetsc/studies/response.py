@@ -91,7 +91,7 @@ class Burst:
             pair = self.envelope(force, *within), self.envelope(rate * self.g * force, *within)
             rows.append(0.5 * (pair[0] * pair[1].conj()).real)
         z = np.abs(c) / gap
-        release = float(min(np.interp(end, self.time, z), 1.0)) if np.isfinite(end) else 1.0
+        release = min(float(np.interp(end, self.time, z)), 1.0) if np.isfinite(end) else 1.0
         on = in_contact(z[None], np.array([release]))[0] & np.isfinite(end)
         grid = np.linspace(np.log(LOWEST), np.log(largest), BINS)
         place = np.clip(np.rint((np.log(np.maximum(z[on], LOWEST)) - grid[0]) / (grid[1] - grid[0])), 0, BINS - 1)
