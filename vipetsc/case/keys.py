@@ -47,6 +47,12 @@ def texts() -> dict[str, dict[str, list[str]]]:
     return tomllib.loads((files("vipetsc.case") / "keys.toml").read_text(encoding="utf-8"))
 
 
+def told(name: str, key: str) -> tuple[str, str]:
+    """Unit and text of a key of the class ``name``, empty where nothing is told."""
+    unit, text = texts().get(name, {}).get(key, ("", ""))
+    return unit, text
+
+
 def json_schema() -> Schema:
     """The JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key."""
     of_class = {table.__name__: table for table in tables().values()}
@@ -54,11 +60,12 @@ def json_schema() -> Schema:
     classes: Schema = whole["$defs"]
     for name, schema in classes.items():
         for key, item in schema.get("properties", {}).items():
-            unit, text = texts()[name][key]
+            unit, text = told(name, key)
             item.pop("title", None)
+            if key == "wavenumber":
+                item["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
             item["description"] = f"{text} ({unit})" if unit else text
         schema["description"] = schema.get("description", "").partition("\n\n")[0].replace("\n", " ").replace("``", "`")
-    classes["DriveTable"]["properties"]["wavenumber"]["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
     classes["PetscTable"]["additionalProperties"] = {"type": ["string", "number", "boolean"]}
     # What a sweep takes in turn may be lists or ranges of anything.
     varied = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
@@ -99,7 +106,7 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
     if rows:
         yield from ("| key | value | unit | default | |", "|---|---|---|---|---|")
     for key, item in rows:
-        unit, text = texts()[name][key]
+        unit, text = told(name, key)
         needed = "needed" if key in schema.get("required", ()) else ""
         default = item.get("default")
         plain = default is not None and "{" not in str(default)  # not a table of its own
@@ -137,7 +144,7 @@ def _kind(item: Schema) -> str:
     if "$ref" in item:
         return "table"
     if "enum" in item or "const" in item:
-        return ", ".join(f'`"{value}"`' for value in item.get("enum", [item.get("const")]))
+        return ", ".join(f"`{_toml(value)}`" for value in item.get("enum", [item.get("const")]))
     if item.get("type") == "array":
         low, high = item.get("minItems", 0), item.get("maxItems")
         count = f"{low} " if low == high else f"{low} or more " if low else ""
