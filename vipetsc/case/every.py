@@ -7,6 +7,7 @@ from vipetsc.case.case import Case
 from vipetsc.case.design import DesignCase
 from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.law import LawCase
+from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
@@ -15,7 +16,7 @@ from vipetsc.case.sweep import MOST_TRIED, Sweep
 
 OF_SECTION: dict[str, type[CaseFile]]
 OF_SECTION = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase, "law": LawCase, "optimise": OptimiseCase,
-              "predict": PredictCase}  # fmt: skip
+              "predict": PredictCase, "nfrc": NfrcCase}  # fmt: skip
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SECTIONS = ("lattice", "contacts", "disorder", "drive", "initial", "time", "output", "analysis", "petsc",
-            "sweep", "nnm", "design", "law", "optimise", "predict")  # fmt: skip
+            "sweep", "nnm", "design", "law", "optimise", "predict", "nfrc")  # fmt: skip
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")

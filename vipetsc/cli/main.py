@@ -16,7 +16,7 @@ from vipetsc.parallel import StoppedError, StopRequest
 
 Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 # Verbs that look at a request to stop, to save first; others end where they are.
-STOPPABLE = ("run", "sweep", "nnm", "law", "optimise", "predict", "paper")
+STOPPABLE = ("run", "sweep", "nnm", "nfrc", "law", "optimise", "predict", "paper")
 WITH_PETSC_OPTIONS = ("run", "sweep", "validate")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
@@ -55,6 +55,7 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
     "bands": (verbs.bands, "pass bands, gaps and group velocities of a cell", "case set out json"),
     "sweep": (verbs.sweep, "every combination in [sweep]; goes on where it was", "swept set out force resume"),
     "nnm": (verbs.nnm, "nonlinear normal modes: frequency-energy branches", "modal set out force resume"),
+    "nfrc": (verbs.nfrc, "steady states under a wave or a force, with stability", "case set out force resume"),
     "law": (verbs.law, "the scattering law of one site, refined; goes on where it was", "case set out force resume"),
     "optimise": (
         verbs.optimise,

@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
 from vipetsc.case.every import disorder_of, load_every
+from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import MOST_TRIED
@@ -128,6 +129,27 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         claim.publish()
         echo_paths(comm, draw_source("branches", [folder], comm, afresh=False))
     failed = comm.bcast(any(branch.ending.startswith("failed") for branch in branches))
+    return FAILED if failed else DONE
+
+
+def nfrc(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Steady states of sites under a wave or a force, with their stability: curves, their files and pictures."""
+    from vipetsc.modes.nfrc import claim_curves, follow_curves
+
+    case = _load(NfrcCase, options, comm)
+    folder = _output(options, case.name)
+    with claim_curves(case, folder, comm, options.force, options.resume) as claim:
+        curves = follow_curves(case, claim.folder, comm, claim.going_on, stop)
+        for curve in curves:
+            echo(comm, tables.table(curve.summary()))
+        stop.check(comm)
+        failed = comm.bcast([f"{c.name}: {c.ending}" for c in curves if c.ending.startswith("failed")])
+        if any(claim.folder.glob("branch-*.h5")):
+            claim.publish()
+            if case.output.figures:
+                echo_paths(comm, draw_source("branches", [folder], comm, afresh=False))
+    for sentence in failed:
+        echo(comm, f"vipetsc: {sentence}", sys.stderr)
     return FAILED if failed else DONE
 
 

@@ -13,6 +13,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.figures import (
+    answers,
     backbone,
     design,
     entropy,
@@ -155,7 +156,8 @@ def drawings(
             paths = [other / path.name for other in folders if (other / path.name).exists()]
             stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
             branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
-            yield stem, warned(partial(spec.function, paths), *branches)
+            function = answers.answers if "share" in branches[0] else spec.function  # of the verb nfrc, or nnm
+            yield stem, warned(partial(function, paths), *branches)
     elif source == RUN:
         run, analysis = files.get(folder / "run.h5", open_run), None
         if (folder / "analysis.h5").exists():

@@ -1,0 +1,117 @@
+"""The case of the verb ``nfrc``: the lattice, contacts and drive of a run, and ``[nfrc]``."""
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field
+
+from vipetsc.case.case import Case
+from vipetsc.case.reading import Problem, Section, Table, Valid
+from vipetsc.case.resolve import check_stiffness
+from vipetsc.case.schema import Positive, once
+from vipetsc.lattice import Contact, UnitCell, waves_at
+
+Restitution = Annotated[float, Field(ge=0, le=1)]
+
+
+class NfrcTable(Section):
+    """Steady answers of the sites to a ``wave`` of a ``band`` that comes in, or to a ``force`` on the driven mass.
+
+    ``over`` the amplitude (of a wave: the relative displacement that it alone would make at the first site, over the
+    clearance there; of a force: N) or the frequency (rad/s), within the ``range`` [low, high]: a curve for each of
+    the others in ``fixed`` (frequencies: by default the drive's) and each of the ``restitutions`` (by default that
+    of ``[contacts]``). The lattice is ``infinite``, or ends where its cells do. ``harmonics`` is the number of the
+    last one; motions that are not ``symmetric`` (w(t + T/2) = -w(t)) have even ones too. Steps are in units of the
+    clearance and of the amplitude that touches, or half the range of frequencies.
+    """
+
+    source: Literal["wave", "force"] = "wave"
+    infinite: bool = True
+    band: Annotated[int, Field(ge=1)] | None = None
+    direction: Literal["forward", "backward"] = "forward"
+    over: Literal["amplitude", "frequency"] = "amplitude"
+    range: list[Positive] = Field([0.5, 2.0], min_length=2, max_length=2)
+    fixed: Annotated[list[Positive], AfterValidator(once)] = Field([])
+    restitutions: Annotated[list[Restitution], AfterValidator(once)] = Field([])
+    harmonics: int = Field(41, ge=1, le=2000)
+    symmetric: bool = True
+    points: int = Field(1000, ge=1)
+    first_step: Positive = 0.02
+    smallest_step: Positive = 1e-9
+    largest_step: Positive = 0.1
+    tolerance: Positive = 1e-11
+    max_newton: int = Field(10, ge=1)
+
+    @property
+    def towards(self) -> int:
+        """+1 for a wave to higher cells, -1 to lower ones."""
+        return 1 if self.direction == "forward" else -1
+
+
+class NfrcCase(Case):
+    """A case of the verb ``nfrc``: that of a run with the section ``[nfrc]``."""
+
+    nfrc: NfrcTable
+
+    @classmethod
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The resolved sections, and everything that is wrong with them."""
+        fields, problems = super().read(table)
+        if problems:
+            return fields, problems
+        nfrc, case = fields["nfrc"], cls(name="nfrc", **{k: v for k, v in fields.items() if k in cls.model_fields})
+        cell, frequency = case.lattice.unit_cell(), case.drive.frequency or 0.0
+        nfrc["restitutions"] = nfrc["restitutions"] or [case.contacts.restitution]
+        if nfrc["over"] == "amplitude":
+            nfrc["fixed"] = nfrc["fixed"] or [frequency]
+        if nfrc["source"] == "wave" and nfrc.get("band") is None:
+            first = nfrc["fixed"][0] if nfrc["over"] == "amplitude" else nfrc["range"][0]
+            nfrc["band"] = max(waves_at(cell, first), key=lambda wave: wave[2], default=(None,))[0]
+        return fields, list(_check_waves(NfrcTable(**nfrc), cell))
+
+    @classmethod
+    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
+        """What is wrong between keys."""
+        yield from super().check(sections, valid)
+        if not valid("nfrc"):
+            return
+        nfrc = sections["nfrc"]
+        if not nfrc.range[0] < nfrc.range[1]:
+            yield Problem("nfrc.range", nfrc.range, "must be [low, high]")
+        if nfrc.source == "wave" and not nfrc.infinite:
+            yield Problem("nfrc.infinite", False, "a wave comes in where the lattice does not end; leave it out")
+        if nfrc.over == "frequency" and not nfrc.fixed:
+            yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
+        if not nfrc.smallest_step < nfrc.largest_step:
+            yield Problem("nfrc.smallest_step", nfrc.smallest_step, "must be below nfrc.largest_step")
+        if valid("contacts"):
+            yield from check_stiffness(sections["contacts"], True, valid)
+            if sections["contacts"].sites in (0, []):
+                yield Problem("contacts.sites", sections["contacts"].sites, "name a cell with a contact")
+
+    @property
+    def frequency(self) -> float:
+        """A frequency of the curves in rad/s."""
+        return self.nfrc.fixed[0] if self.nfrc.over == "amplitude" else self.nfrc.range[0]
+
+    def contact(self, restitution: float) -> Contact:
+        """The contact law with a ``restitution``."""
+        return replace(self.model().contact, restitution=restitution)
+
+    def curves(self) -> list[tuple[str, float, float]]:
+        """Name, restitution and the fixed parameter of every curve."""
+        return [(f"r{r:g}-{f:.6g}", r, f) for r, f in itertools.product(self.nfrc.restitutions, self.nfrc.fixed)]
+
+
+def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:
+    """There is a wave of the band at every frequency where a curve begins."""
+    if nfrc.source != "wave":
+        return
+    over = nfrc.over == "amplitude"
+    for frequency in nfrc.fixed if over else nfrc.range[:1]:
+        if nfrc.band not in [band for band, *_ in waves_at(cell, frequency)]:
+            key = "nfrc.fixed" if over else "nfrc.range"
+            where = "in no pass band" if nfrc.band is None else f"not in band {nfrc.band}"
+            yield Problem(key, frequency, f"lies {where}, so that no such wave comes in (rad/s)")
