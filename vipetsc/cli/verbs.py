@@ -144,7 +144,7 @@ def nfrc(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
             echo(comm, tables.table(curve.summary()))
         stop.check(comm)
         failed = comm.bcast([f"{c.name}: {c.ending}" for c in curves if c.ending.startswith("failed")])
-        if any(claim.folder.glob("branch-*.h5")):
+        if on_root(comm, lambda: any(claim.folder.glob("branch-*.h5"))):
             claim.publish()
             if case.output.figures:
                 echo_paths(comm, draw_source("branches", [folder], comm, afresh=False))

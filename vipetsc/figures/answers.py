@@ -59,7 +59,8 @@ def _energy(axes: Axes, data: xr.Dataset, p: np.ndarray) -> None:
     for i, name in enumerate(data["way"].values.astype(str)):
         label, colour = SHARES[name]
         share = data["share"].values[:, i]
-        axes.plot(p, share, color=colour, lw=0.6, ls="--")
-        axes.plot(p, np.where(stable, share, np.nan), color=colour, lw=1.4, label=label)
+        if np.isfinite(share).any():  # what leaves is not told of a finite lattice
+            axes.plot(p, share, color=colour, lw=0.6, ls="--")
+            axes.plot(p, np.where(stable, share, np.nan), color=colour, lw=1.4, label=label)
     axes.set(ylabel="share of the energy", ylim=(-0.02, 1.04))
     axes.legend(fontsize=6, loc="best")

@@ -21,9 +21,9 @@ from scipy.optimize import brentq
 from vipetsc.modes.harmonics import ForceSeries
 
 LEAST = 1e-4  # growth rate over Om up to which a motion counts as stable
-COARSE, FINEST = 32, 14  # intervals of half a strip; halvings of one in which D turns by more than TURN
+COARSE, FINEST = 24, 14  # intervals of half a strip; halvings of one in which D turns by more than TURN
 TURN = 0.7  # rad
-RATES = np.geomspace(LEAST, 3.0, 28)  # over Om: between these real roots are looked for
+RATES = np.geomspace(LEAST, 3.0, 18)  # over Om: between these real roots are looked for
 
 
 class At(Protocol):
@@ -51,10 +51,13 @@ class Hill:
                 new, self.compliance.at(at.ravel()).reshape(*shape, *series.potential.shape * 2), strict=True
             ):
                 self._known[mu] = g
-        return np.array([self._determinant(series, mu) for mu in exponents.tolist()])
+        jacobian = series.jacobian()
+        fixed = np.array_equal(jacobian, series.jacobian(1.0))  # nothing dissipates
+        each = ((mu, jacobian if fixed else series.jacobian(mu)) for mu in exponents.tolist())
+        return np.array([self._determinant(self._known[mu], of) for mu, of in each])
 
-    def _determinant(self, series: ForceSeries, exponent: complex) -> complex:
-        g, jacobian, value = self._known[exponent], series.jacobian(exponent), 1 + 0j
+    def _determinant(self, g: np.ndarray, jacobian: np.ndarray) -> complex:
+        value = 1 + 0j
         for block in self._blocks:
             matrix = np.einsum("kij,jkl->ikjl", g[block], jacobian[:, block, block])
             size = matrix.shape[0] * matrix.shape[1]
@@ -85,6 +88,8 @@ class Hill:
             changes = np.nonzero(values[1:] * values[:-1] < 0)[0]
             if changes.size:
                 low, high = RATES[changes[-1]], RATES[changes[-1] + 1]
-                root = brentq(lambda x, line=line: self.determinants(series, np.array([x + line]))[0].real, low, high)
+                root = brentq(
+                    lambda x, line=line: self.determinants(series, np.array([x + line]))[0].real, low, high, xtol=1e-6
+                )
                 largest = max(largest, float(root))
         return largest

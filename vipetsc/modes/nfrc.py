@@ -240,7 +240,7 @@ def _first(states: SteadyStates) -> SteadyPoint:
     if z < 1:
         guess = states.balance.pack(amplitude * linear) / states.clearance
     else:
-        below = options.model_copy(update={"over": "amplitude", "range": [0.9 * amplitude / z, amplitude]})
+        below = options.model_copy(update={"over": "amplitude", "range": [1e-3 * amplitude, amplitude]})
         ramp = SteadyStates(states.case.model_copy(update={"nfrc": below}), states.restitution, omega)
         points = list(Steady(ramp, _first(ramp), options.points))
         if not points or not np.isclose(points[-1].xi[-1] * ramp.scale, amplitude):

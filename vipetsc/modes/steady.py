@@ -149,7 +149,7 @@ class SteadyStates:
 
     def _shares(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
         """T, R, U and L over what comes in (4,); what leaves is not told of a finite lattice."""
-        first, shares = forces[:, 1], np.zeros(4)
+        first, shares = forces[:, 1], np.full(4, 0.0 if self.options.infinite else np.nan)
         loss *= omega / (2 * np.pi)
         wave = self._known[omega][1] if self.wave else None
         if wave is not None:

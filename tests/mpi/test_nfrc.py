@@ -1,0 +1,24 @@
+"""The same curves of steady states, bit for bit, on any number of ranks."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.conftest import assert_same_bits, datasets
+from tests.unit.test_nfrc import case
+from vipetsc.modes.nfrc import follow_curves
+from vipetsc.parallel import on_root
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_curves_are_the_same_on_any_number_of_ranks(folder):
+    comm, of = MPI.COMM_WORLD, case(harmonics=5, restitutions=[1.0, 0.7], points=8)
+    on_root(comm, lambda: [(folder / name).mkdir() for name in ("shared", "alone")] and None)
+    curves = follow_curves(of, folder / "shared", comm)
+    assert len(curves) == (2 if comm.rank == 0 else 0)
+    on_root(comm, lambda: follow_curves(of, folder / "alone", MPI.COMM_SELF) and None)
+    for name, *_ in of.curves():
+        paths = [folder / part / f"branch-{name}.h5" for part in ("shared", "alone")]
+        on_root(comm, lambda paths=paths: assert_same_bits(*map(datasets, paths)))
