@@ -12,6 +12,7 @@ preset = "four-band"
 [contacts]
 sites = [100]
 clearance = 1.8e-3
+restitution = 1.0
 [nfrc]
 range = [0.97, 1.01]
 harmonics = 5

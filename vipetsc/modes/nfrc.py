@@ -25,6 +25,7 @@ from vipetsc.modes.steady import Steady, SteadyPoint, SteadyStates
 from vipetsc.parallel import StoppedError, StopRequest
 
 SAVE_EVERY = 10.0  # s between two writings of a growing curve
+MOST_RAMP = 10_000  # points on the way to the beginning of a range
 FAILURES = (ContinuationError, FlowError, ArithmeticError, ValueError)
 WAYS = "transmitted", "reflected", "upper", "lost"
 KINDS = "regular", "fold"
@@ -242,7 +243,7 @@ def _first(states: SteadyStates) -> SteadyPoint:
     else:
         below = options.model_copy(update={"over": "amplitude", "range": [1e-3 * amplitude, amplitude]})
         ramp = SteadyStates(states.case.model_copy(update={"nfrc": below}), states.restitution, omega)
-        points = list(Steady(ramp, _first(ramp), options.points))
+        points = list(Steady(ramp, _first(ramp), MOST_RAMP))
         if not points or not np.isclose(points[-1].xi[-1] * ramp.scale, amplitude):
             raise ContinuationError(
                 f"growing amplitudes do not reach {amplitude:g}: begin nfrc.range or nfrc.fixed lower"
