@@ -130,7 +130,7 @@ def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
     state = np.concatenate([u.ravel(), v.ravel()])
     end = moved(chain, of.contact(1.0), 2, 1, 2010.0, state, 14.0)[:, -1]
     assert np.abs(end - state)[:24].max() < 1e-5 * np.abs(state[:24]).max()
-    assert np.nanmax(np.abs(curve.column("share")[:, 3])) < 1e-9
+    assert np.isnan(curve.column("share")).all()  # nothing leaves and nothing is lost
 
 
 def test_a_stable_state_under_a_wave_stays_in_a_long_lattice(tmp_path):

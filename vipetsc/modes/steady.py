@@ -158,6 +158,7 @@ class SteadyStates:
             first = np.append(first, amplitude)
             moved = self.compliance.field(omega, first, [self.point[0]])[0, self.point[1]]
             given = 0.5 * amplitude * float((1j * omega * moved).real)
+            given *= given > 1e-12 * amplitude * omega * abs(moved)  # nothing but rounding if nothing leaves or is lost
         if self.options.infinite:
             out = self.compliance.outgoing(omega, first, wave, amplitude).sum(axis=1)
             shares[:2] = out if self.options.towards > 0 else out[::-1]
