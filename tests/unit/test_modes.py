@@ -29,7 +29,7 @@ from vipetsc.modes.follow import follow_all
 from vipetsc.modes.point import Point, half_traces, linear_start, multipliers, repetitions, sample_orbit
 from vipetsc.modes.reference import Newmark
 from vipetsc.modes.shooting import MAPS, Chart, Grazing, Logarithmic, Relative, Shooting
-from vipetsc.modes.special import _Segment, locate, switch
+from vipetsc.modes.special import Segment, locate, switch
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
 
@@ -574,19 +574,19 @@ def test_a_root_that_newton_misses_is_sought_in_half_of_the_step(short_branch, m
     steps = itertools.pairwise(short_branch.points)
     a, b = next((a, b) for a, b in steps if a.energy_tangent * b.energy_tangent < 0 and a.episodes > 0)
     (fold,) = (p for p in locate(problem, a, b) if p.kind == "fold-energy")
-    at, missed = _Segment.at, []
+    at, missed = Segment.at, []
 
     def fails_once_off_the_middle(self, arclength):
         if self.length > 0.9 * b.step and arclength != 0.5 * self.length:
             raise ArithmeticError("no luck")
         return at(self, arclength)
 
-    monkeypatch.setattr(_Segment, "at", fails_once_off_the_middle)
+    monkeypatch.setattr(Segment, "at", fails_once_off_the_middle)
     (again,) = (p for p in locate(problem, a, b, missed=missed) if p.kind == "fold-energy")
     assert again.energy == pytest.approx(fold.energy, rel=1e-12)
     assert again.step == pytest.approx(fold.step, rel=1e-3)
     assert not missed
-    monkeypatch.setattr(_Segment, "at", lambda *_: (_ for _ in ()).throw(ArithmeticError("never")))
+    monkeypatch.setattr(Segment, "at", lambda *_: (_ for _ in ()).throw(ArithmeticError("never")))
     assert not locate(problem, a, b, missed=missed)
     assert missed[0].startswith(f"a fold-energy after point {a.index} (E = {a.energy:.9g} J) is not located")
 

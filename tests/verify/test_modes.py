@@ -17,7 +17,7 @@ from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import Point, linear_start, resonance
 from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Relative, Shooting
-from vipetsc.modes.special import _Segment, locate, switch
+from vipetsc.modes.special import Segment, locate, switch
 from vipetsc.modes.system import SmoothSpring, System
 
 D = 10**-2.75
@@ -403,7 +403,7 @@ def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
         touching = located()
     assert len(touching) == len(steps)
     for (a, b), point in zip(steps, touching, strict=True):
-        segment = _Segment(problem, "relative", a, b)
+        segment = Segment(problem, "relative", a, b)
         beside = [segment.at(point.step + shift * segment.length).episodes for shift in (-1e-4, 1e-4)]
         assert beside == [a.episodes, b.episodes]
         assert point.episodes == min(beside)

@@ -19,7 +19,7 @@ from vipetsc.case.resolve import (
     with_preset,
 )
 from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive, once
-from vipetsc.lattice import Contact, contact_stiffness
+from vipetsc.lattice import Contact, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import groups_of
 
 MOST_MASSES = 4000
@@ -84,15 +84,23 @@ class Guards(Section):
 class NnmTable(Section):
     """Nonlinear normal modes.
 
-    ``system``: ``reduced`` (the paper's model of the cell's contact pair), ``chain`` (the lattice with its sites)
-    or ``own`` (``[nnm.own]``). ``modes`` are linear modes (1-based, lowest first). ``energy`` in J and
-    ``frequency`` in Hz bound the branch; ``direction`` is where energy goes first. ``orbits_at`` lists energies in J:
-    the orbits of these energies, wherever the branch passes one, are stored beside those of the regions; ``compare``
-    corrects every fourth point with other flows; ``switch`` follows the branches that cross at these kinds of special
-    points, ``switch_points`` points each.
+    ``system``: ``reduced`` (the paper's model of the cell's contact pair), ``chain`` (the lattice with its sites),
+    ``own`` (``[nnm.own]``), or ``condensed`` (the lattice of any length, by harmonics of its sites alone; the
+    others with the ``method`` condensed). Branches of these begin at ``start_frequency`` in rad/s, outside the pass
+    bands, with contact at ``start_sites`` (numbers of sites, from 1; negative ones move the other way), and take at
+    most ``harmonics``, as many as keep the part left out below ``truncation``. ``modes`` are linear modes (1-based,
+    lowest first). ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is where energy goes
+    first. ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one, are
+    stored beside those of the regions; ``compare`` corrects every fourth point with other flows; ``switch`` follows
+    the branches that cross at these kinds of special points, ``switch_points`` points each.
     """
 
-    system: Literal["reduced", "chain", "own"] = "reduced"
+    system: Literal["reduced", "chain", "own", "condensed"] = "reduced"
+    method: Literal["shooting", "condensed"] = "shooting"
+    start_frequency: list[Positive] = Field([])
+    start_sites: list[int] = Field([])
+    harmonics: int = Field(1023, ge=15)
+    truncation: Positive = 1e-7
     custom: SystemTable | None = Field(None, alias="own")
     modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = Field([1, 2], min_length=1)
     map: Literal["auto", "quarter", "half", "whole"] = "auto"
@@ -165,6 +173,8 @@ class NnmCase(CaseFile):
             if not site_cells(lattice, contacts):
                 problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
             problems += check_sites(lattice, contacts)
+        elif nnm.system == "condensed":
+            return [*problems, *_check_condensed(lattice, contacts, nnm, valid)]
         elif nnm.system == "reduced":
             if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
                 problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
@@ -181,7 +191,13 @@ class NnmCase(CaseFile):
     def physics(self) -> tuple[Any, ...]:
         """What a branch that is resumed must keep: the system, the shooting map and the flow."""
         nnm = self.nnm
-        return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian
+        begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation
+        return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian, begun
+
+    @property
+    def condensed(self) -> bool:
+        """Whether branches are those of motions condensed onto contacts and springs."""
+        return self.nnm.system == "condensed" or self.nnm.method == "condensed"
 
     def contact(self) -> Contact:
         """The contact law without dissipation; the stiffness is 0 in a system without contacts."""
@@ -200,6 +216,10 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
             yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
     if nnm.direction != "up" and not nnm.energy[0] > 0:
         yield Problem("nnm.energy", nnm.energy, "going down needs a lowest energy above 0 (J)")
+    condensed = nnm.system == "condensed" or nnm.method == "condensed"
+    for key in ("compare", "switch") if condensed else ("start_frequency", "start_sites"):
+        if given := getattr(nnm, key):
+            yield Problem(f"nnm.{key}", given, f"goes with motions that are {'shot' if condensed else 'condensed'}")
     if not nnm.smallest_step < nnm.largest_step:
         yield Problem("nnm.smallest_step", nnm.smallest_step, "must be below nnm.largest_step")
     if nnm.system != "own" or nnm.custom is None:
@@ -212,3 +232,21 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
         if start == end or max(start, end) > masses:
             remedy = f"is not a pair of the system's {masses} masses (0 is the ground)"
             yield Problem(f"nnm.own.{key}", [start, end], remedy)
+
+
+def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable, valid: Valid) -> Iterator[Problem]:
+    """What is wrong with the sites and the start of a lattice's motions."""
+    sites = site_cells(lattice, contacts)
+    if not sites:
+        yield Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}")
+    yield from check_sites(lattice, contacts)
+    yield from check_stiffness(contacts, True, valid)
+    if not nnm.start_frequency:
+        yield Problem("nnm.start_frequency", [], "name frequencies in rad/s, between the pass bands or above them")
+    if outside := [n for n in nnm.start_sites if not 1 <= abs(n) <= len(sites)]:
+        yield Problem("nnm.start_sites", outside, f"number the sites from 1 to {len(sites)}, with a sign")
+    bands = pass_bands(lattice.unit_cell()) if not check_cell(lattice)[1] else ()
+    inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
+    if inside:
+        told = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
+        yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({told} rad/s); motions there radiate")

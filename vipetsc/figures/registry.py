@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures import (
     answers,
-    backbone,
+    breather,
     design,
     entropy,
     lattice,
@@ -68,7 +68,7 @@ FIGURES = {
     **_specs(SWEEP, transfer.transfer, transfer.transfer_dispersions, transfer.band_energies, measure="transfer"),
     **_specs(SWEEP, transfer_curves.ibtet, transfer_curves.ibtet_backbone, measure="transfer"),
     **_specs(SWEEP, transfer_curves.phase_regimes, measure="transfer"),
-    "branch": FigureSpec(backbone.backbone, BRANCHES),
+    "branch": FigureSpec(breather.branches, BRANCHES),
     **_specs(DESIGN, design.deflections, design.cost_maps),
     **_specs(LAW, law.law),
     **_specs(PREDICTION, prediction.prediction),

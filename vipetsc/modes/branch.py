@@ -87,24 +87,13 @@ class Branch:
 
     def to_dataset(self) -> xr.Dataset:
         """The branch as it is in its file."""
-        count, n = len(self.points), self.dofs
         kinds = np.array([KINDS.index(p.kind) for p in self.points], np.int8)
         flags = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
-        x = np.array([p.x for p in self.points]).reshape(count, n)
-        tangent = np.array([p.tangent for p in self.points], float).reshape(count, n + 1)
-        traces = np.array([p.half_traces for p in self.points], complex).reshape(count, n - 1)
-        at_rest = "initial displacement (velocity in m/s for maps from the centre)"
         data = {
-            "point": variable("point", np.arange(count), "1", "place along the branch"),
-            "dof": variable("dof", np.arange(1, n + 1), "1", "degree of freedom, from 1"),
-            "pair": variable("pair", np.arange(1, n), "1", "pair of Floquet multipliers, the trivial one left out"),
+            "point": variable("point", np.arange(len(self.points)), "1", "place along the branch"),
             "region": variable("point", self.regions().astype(np.int64), "1", REGION),
             "kind": variable("point", kinds, "1", "kind of point", **flags),
-            "initial": variable(("point", "dof"), x, "m", at_rest),
-            "tangent": variable(("point", "dof"), tangent[:, :-1], "m", "tangent of the branch: initial values"),
-            "tangent_period": variable("point", tangent[:, -1], "s", "tangent of the branch: period"),
-            "half_trace": variable(("point", "pair"), traces.real, "1", "Floquet half-trace, real part"),
-            "half_trace_imaginary": variable(("point", "pair"), traces.imag, "1", "Floquet half-trace, imaginary part"),
+            **self.unknowns(),
         }
         for name, (stored, _, units, text) in QUANTITIES.items():
             data[stored] = variable("point", self.column(name), units, text)
@@ -112,6 +101,23 @@ class Branch:
         attributes |= {"next_step": self.next_step, "warnings": json.dumps(self.findings), "fits": self.fits()}
         attributes["tongues"] = len(self.tongues())
         return xr.Dataset(data | self.extra, attrs=attributes)
+
+    def unknowns(self) -> Variables:
+        """Initial values, tangents and half-traces of the points."""
+        count, n = len(self.points), self.dofs
+        x = np.array([p.x for p in self.points]).reshape(count, n)
+        tangent = np.array([p.tangent for p in self.points], float).reshape(count, n + 1)
+        traces = np.array([p.half_traces for p in self.points], complex).reshape(count, n - 1)
+        at_rest = "initial displacement (velocity in m/s for maps from the centre)"
+        return {
+            "dof": variable("dof", np.arange(1, n + 1), "1", "degree of freedom, from 1"),
+            "pair": variable("pair", np.arange(1, n), "1", "pair of Floquet multipliers, the trivial one left out"),
+            "initial": variable(("point", "dof"), x, "m", at_rest),
+            "tangent": variable(("point", "dof"), tangent[:, :-1], "m", "tangent of the branch: initial values"),
+            "tangent_period": variable("point", tangent[:, -1], "s", "tangent of the branch: period"),
+            "half_trace": variable(("point", "pair"), traces.real, "1", "Floquet half-trace, real part"),
+            "half_trace_imaginary": variable(("point", "pair"), traces.imag, "1", "Floquet half-trace, imaginary part"),
+        }
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -125,10 +131,14 @@ class Branch:
         columns["tangent"] = np.column_stack([data["tangent"].values, data["tangent_period"].values])
         columns["half_traces"] = [c if np.any(c.imag != 0) else c.real for c in traces]
         points = [Point(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
-        name, case, ending = (str(about[key]) for key in ("name", "case", "ending"))
-        next_step, complete = float(about["next_step"]), bool(about["complete"])
-        findings = json.loads(about.get("warnings", "[]"))
-        return cls(name, case, data.sizes["dof"], points, next_step, complete, ending, findings)
+        return cls(dofs=data.sizes["dof"], points=points, **cls.told(about))
+
+    @staticmethod
+    def told(about: dict[Any, Any]) -> dict[str, Any]:
+        """What the attributes of a file tell of its branch."""
+        named: dict[str, Any] = {key: str(about[key]) for key in ("name", "case", "ending")}
+        named |= {"next_step": float(about["next_step"]), "complete": bool(about["complete"])}
+        return named | {"findings": json.loads(about.get("warnings", "[]"))}
 
 
 def tell_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:

@@ -16,7 +16,9 @@ which has the same solutions. The sign of s_k is the one that keeps the poles of
 **Energy** of a conservative motion, which is constant, from its means over a period: with dG/domega = 2 omega
 b^T (K - omega^2 M)^-1 M (K - omega^2 M)^-1 b,
 
-    E = F_0 . G(0) F_0/2 + sum_{k>0} F_k* . (G + omega dG/domega) F_k/4 + mean potential of f,    omega = k Om.
+    E = F_0 . G(0) F_0/2 + sum_{k>0} F_k* . (G + omega dG/domega) F_k/4 + mean potential of f,    omega = k Om;
+
+it is evaluated for the shifted compliance, less the energy of the added springs.
 """
 
 from typing import Protocol
@@ -37,17 +39,6 @@ class Compliance(Protocol):
         """G at frequencies in rad/s, which may be complex."""
 
 
-def with_rate(compliance: Compliance, omegas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """G and dG/domega (frequencies, pairs, pairs) at ``omegas`` (frequencies,) in rad/s, not negative."""
-    values, sizes = compliance.at(omegas), np.maximum(omegas, 1e-3 * omegas.max())
-    if np.iscomplexobj(values):
-        ahead, behind = compliance.at(omegas + STEP * sizes), compliance.at(omegas - STEP * sizes)
-        return values, (ahead - behind) / (2 * STEP * sizes[:, None, None])
-    around = compliance.at((omegas + RADIUS * sizes * NODES[:, None]).ravel()).reshape(len(NODES), *values.shape)
-    slopes = np.einsum("n,nkij->kij", NODES.conj(), around).real / len(NODES)
-    return values, slopes / (RADIUS * sizes)[:, None, None]
-
-
 class Balance:
     """The equations of motions with the harmonics ``orders``, in real unknowns x: cosines, then sines if not left out.
 
@@ -60,8 +51,9 @@ class Balance:
         self.orders = np.arange(1, last + 1, 2) if odd else np.arange(last + 1)
         self._sines = self.orders[:0] if cosines else self.orders[self.orders > 0]
         self.size = forces.pairs * (len(self.orders) + len(self._sines))
+        self.weight = 1.0
         self._shift: np.ndarray | None = None
-        self._last: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._last: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
         self._series: tuple[np.ndarray, float, ForceSeries] | None = None
 
     def pack(self, z: np.ndarray) -> np.ndarray:
@@ -81,17 +73,31 @@ class Balance:
             self._series = x.copy(), omega, self.forces.series(self.unpack(x), omega)
         return self._series[2]
 
-    def compliances(self, omega: float) -> tuple[np.ndarray, np.ndarray]:
-        """G and dG/domega (orders, pairs, pairs) at the multiples ``orders`` of ``omega``."""
+    def weigh(self, weight: float) -> None:
+        """Take ``weight`` times the compliances of all orders but the first: on the way from one harmonic to all."""
+        self.weight, self._last, self._shift = weight, None, None
+
+    def compliances(self, omega: float) -> np.ndarray:
+        """G (1 + nodes, orders, pairs, pairs) at the multiples ``orders`` of ``omega``, and around each of them."""
         if self._last is None or self._last[0] != omega:
-            self._last = omega, *with_rate(self.compliance, self.orders * omega)
-        return self._last[1:]
+            rates = self.orders * omega
+            sizes = np.maximum(rates, 1e-3 * rates[-1])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                values = self.compliance.at(rates)
+            if not np.all(np.isfinite(values)):  # on a linear mode
+                values = self.compliance.at(rates * (1 + 1e-15))
+            circle = RADIUS * NODES if np.isrealobj(values) else STEP * np.array([1.0, -1.0])
+            around = self.compliance.at((rates + sizes * circle[:, None]).ravel())
+            values = np.concatenate([values[None], around.reshape(len(circle), *values.shape)])
+            values[:, self.orders != 1] *= self.weight
+            self._last = omega, values, sizes * len(circle), circle
+        return self._last[1]
 
     def shift(self, omega: float) -> None:
         """Choose the shifting stiffnesses at ``omega``; they stay until the next choice."""
         g, one = self.compliances(omega)[0], np.eye(self.forces.pairs)
         squared = np.maximum(self.orders, 1) ** 2
-        mass = 1 / (self.orders[-1] ** 2 * np.abs(np.trace(g[-1])) / len(one))  # times omega^2
+        mass = 1 / (self.orders[-1] ** 2 * np.abs(np.trace(g[-1])) / self.weight / len(one))  # times omega^2
         size = (mass * squared)[:, None, None]
         plus, minus = (np.linalg.svd(one + sign * size * g, compute_uv=False)[:, -1] for sign in (1, -1))
         self._shift = np.where((plus >= minus)[:, None, None], size, -size)
@@ -101,18 +107,29 @@ class Balance:
         if self._shift is None:
             self.shift(omega)
         assert self._shift is not None
-        g, rate = self.compliances(omega)
-        factor = np.linalg.inv(np.eye(self.forces.pairs) + self._shift * g)
-        return factor @ g, factor @ rate @ factor, self._shift, factor
+        values = self.compliances(omega)
+        assert self._last is not None
+        factor = np.linalg.inv(np.eye(self.forces.pairs) + self._shift * values)
+        shifted, (scale, circle) = factor @ values, self._last[2:]
+        slopes = np.einsum("n,nkij->kij", 1 / circle, shifted[1:]) / scale[:, None, None]
+        if len(circle) == len(NODES):  # the other half of the circle is its conjugate
+            return shifted[0].real, slopes.real, self._shift, factor[0].real
+        return shifted[0], slopes, self._shift, factor[0]
+
+    def shifted_force(self, x: np.ndarray, omega: float) -> tuple[np.ndarray, np.ndarray]:
+        """F - s Z (orders, pairs, 1) complex in N and s (orders, 1, 1) in N/m."""
+        shift = self._shifted(omega)[2]
+        force, moved = (part.T[self.orders, :, None] for part in (self.series(x, omega).forces, self.unpack(x)))
+        return force - shift * moved, shift
 
     def residual(self, x: np.ndarray, omega: float, linear: np.ndarray | float = 0.0) -> np.ndarray:
         """Z + G_s (F - s Z) - A Z^linear as unknowns (size,), in m; ``linear`` (pairs, K + 1) complex."""
-        shifted, _, shift, factor = self._shifted(omega)
+        shifted, _, _, factor = self._shifted(omega)
         z = self.unpack(x)
-        force, moved = self.series(x, omega).forces.T[self.orders, :, None], z.T[self.orders, :, None]
+        moved = z.T[self.orders, :, None]
         given = np.broadcast_to(linear, z.shape).T[self.orders, :, None]
         out = np.zeros_like(z)
-        out[:, self.orders] = (moved + shifted @ (force - shift * moved) - factor @ given)[..., 0].T
+        out[:, self.orders] = (moved + shifted @ self.shifted_force(x, omega)[0] - factor @ given)[..., 0].T
         return self.pack(out)
 
     def derivative(self, x: np.ndarray, omega: float) -> tuple[np.ndarray, np.ndarray]:
@@ -132,9 +149,8 @@ class Balance:
         matrix += np.einsum("ij,ku->ikju", np.eye(pairs), same)
         matrix = matrix.reshape(pairs, count, -1)
         jacobian = np.concatenate([matrix.real, matrix[:, sines].imag], axis=1).reshape(self.size, self.size)
-        force, moved = series.forces.T[self.orders, :, None], z.T[self.orders, :, None]
         out = np.zeros_like(z)
-        out[:, self.orders] = (self.orders[:, None, None] * rate @ (force - shift * moved))[..., 0].T
+        out[:, self.orders] = (self.orders[:, None, None] * rate @ self.shifted_force(x, omega)[0])[..., 0].T
         return jacobian, self.pack(out)
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
@@ -144,16 +160,17 @@ class Balance:
         the bound k^-3 of their fall.
         """
         last, forces = self.orders[-1], np.abs(self.series(x, omega).forces)
-        g = np.abs(self.compliances(omega)[0][-1]).sum(axis=1)
+        g = np.abs(self.compliances(omega)[0, -1]).sum(axis=1)
         beyond = np.arange(self.last + 1, forces.shape[1])
         left_out = (g[:, None] * forces[:, beyond] * (last / beyond) ** 2).sum(axis=1) * 4 / 3
         return float(left_out.max() / np.abs(self.unpack(x)).sum(axis=1).max())
 
     def energy(self, x: np.ndarray, omega: float) -> float:
         """Energy in J of a conservative motion."""
-        g, rate = self.compliances(omega)
-        series = self.series(x, omega)
-        force = series.forces.T[self.orders]
-        quadratic = g + (self.orders * omega)[:, None, None] * rate
-        share = np.where(self.orders == 0, 0.5, 0.25)
-        return float(np.einsum("k,ki,kij,kj->", share, force.conj(), quadratic, force).real + series.potential.sum())
+        shifted, rate, _, _ = self._shifted(omega)
+        (force, shift), moved = self.shifted_force(x, omega), self.unpack(x).T[self.orders]
+        force = force[..., 0]
+        quadratic = shifted + (self.orders * omega)[:, None, None] * rate
+        energies = np.einsum("ki,kij,kj->k", force.conj(), quadratic, force).real
+        energies -= shift[:, 0, 0] * np.sum(np.abs(moved) ** 2, axis=1)  # what the added springs hold
+        return float(np.where(self.orders == 0, 0.5, 0.25) @ energies + self.series(x, omega).potential.sum())

@@ -1,7 +1,8 @@
 """Pseudo-arclength continuation as an iterator over points; the caller owns the loop."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +15,14 @@ class ContinuationError(RuntimeError):
     """The branch cannot go on; the message says where, why, and which option to turn."""
 
 
-# What a guard holds down, for messages.
+# What a guard holds down, for messages, and where it is set.
 GUARDED = {
-    "half_trace": "the half-trace changes too much",
-    "contacts": "more than one contact appears or goes",
-    "corrector": "the corrector goes too far",
-    "turn": "the branch turns too sharply",
-    "turn_relative": "the branch turns too sharply in the relative chart",
+    "half_trace": ("the half-trace changes too much", "nnm.guards.half_trace"),
+    "contacts": ("more than one contact appears or goes", "nnm.guards.contacts"),
+    "corrector": ("the corrector goes too far", "nnm.guards.corrector"),
+    "turn": ("the branch turns too sharply", "nnm.guards.turn"),
+    "turn_relative": ("the branch turns too sharply in the relative chart", "nnm.guards.turn_relative"),
+    "truncation": ("the harmonics left out are too large", "nnm.harmonics or nnm.truncation"),
 }
 
 
@@ -35,9 +37,15 @@ class Frame:
             gaps = problem.system.gaps(point.x) if problem.map.start == "rest" else np.array([np.inf])
             near = np.abs(gaps / problem.system.clearances).min(initial=np.inf) < 0.05
             chart = "grazing" if near else "relative"
-        self.problem, self.chart = problem, CHARTS[chart](problem.system, point.x, point.period)
+        self.problem: Any = problem
+        self.chart: Any = CHARTS[chart](problem.system, point.x, point.period)
         self.xi = self.chart.encode(point.x, point.period)
-        self.tangent = unit(np.linalg.solve(self.chart.derivative(self.xi), point.tangent))
+        self.tangent = unit(self.direction(point))
+
+    def direction(self, point: Point) -> np.ndarray:
+        """The branch's direction at another ``point``, of any length, in these unknowns."""
+        derivative = self.chart.derivative(self.chart.encode(point.x, point.period))
+        return np.linalg.solve(derivative, point.tangent)
 
     def correct(self, guess: np.ndarray, step: float) -> Attempt:
         """Newton's method from ``guess`` for the orbit at the arclength ``step`` along the tangent."""
@@ -61,12 +69,15 @@ class Continuation:
     the tangent at the start is degenerate.
     """
 
+    frame: Callable[..., Frame] = Frame
+
     def __init__(
         self, problem: Shooting, start: Point, control: NnmTable, direction: int = 1, step: float | None = None
     ) -> None:
-        self.problem, self.control, self.point = problem, control, start
+        self.problem: Any = problem
+        self.control, self.point = control, start
         if not start.tangent.size:
-            self.point = replace(start, tangent=first_tangent(problem, start, direction))
+            self.point = replace(start, tangent=self.first_tangent(start, direction))
         self.step = control.first_step if step is None else step
         self.ending, self.finished = "not finished", False
 
@@ -83,7 +94,7 @@ class Continuation:
         self.ending = f"{self.control.points} points reached: raise nnm.points and resume to go on"
 
     def _next(self) -> Point:
-        last, frame = self.point, Frame(self.problem, self.control.chart, self.point)
+        last, frame = self.point, self.frame(self.problem, self.control.chart, self.point)
         residuals, why, knob = "none", "no step tried", "nnm.max_newton or nnm.tolerance"
         while self.step >= self.control.smallest_step:
             attempt = frame.correct(frame.xi + self.step * frame.tangent, self.step)
@@ -97,7 +108,7 @@ class Continuation:
                 effort = max(strain / 0.7, point.newton / 5, 0.5)  # a step at most doubles
                 self.step = min(self.step / effort, self.control.largest_step)
                 return point
-            why, knob = GUARDED[guard], f"nnm.guards.{guard}"
+            why, knob = GUARDED[guard]
             self.step *= min(max(0.8 / strain, 0.1), 0.7)
         raise ContinuationError(
             f"step below {self.control.smallest_step:g} after point {last.index} "
@@ -110,17 +121,25 @@ class Continuation:
         last, step = self.point, self.step
         point, direction = frame.point(attempt, last.index + 1, step)
         changes = {
-            "half_trace": half_trace_change(last, point),
             "contacts": abs(point.episodes - last.episodes),
             "corrector": float(np.linalg.norm(attempt.xi - frame.xi - step * frame.tangent)) / step,
             "turn": float(np.arccos(min(direction @ frame.tangent, 1.0))),
-            "turn_relative": relative_turn(self.problem, last, point),
+            **self.changes(last, point),
         }
-        strains = {guard: change / (getattr(self.control.guards, guard) or np.inf) for guard, change in changes.items()}
-        for guard in ("contacts", "turn_relative"):  # within these bounds there is no reason to slow down
+        bounds = {guard: getattr(self.control.guards, guard, 1.0) or np.inf for guard in changes}
+        strains = {guard: change / bounds[guard] for guard, change in changes.items()}
+        for guard in strains.keys() & {"contacts", "turn_relative", "truncation"}:  # no reason to slow down within
             strains[guard] *= strains[guard] > 1
         worst = max(strains, key=lambda guard: strains[guard])
         return point, strains[worst], worst
+
+    def changes(self, last: Point, point: Point) -> dict[str, float]:
+        """What else is guarded from point to point."""
+        return {"half_trace": half_trace_change(last, point), "turn_relative": relative_turn(self.problem, last, point)}
+
+    def first_tangent(self, start: Point, direction: int) -> np.ndarray:
+        """Tangent at a corrected point, towards growing (+1) or falling (-1) energy."""
+        return first_tangent(self.problem, start, direction)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

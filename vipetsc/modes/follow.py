@@ -59,6 +59,7 @@ def follow_all(
     resume: bool = False,
     listener: Listener | None = None,
     stop: StopRequest | None = None,
+    kind: "type[Follower] | None" = None,
 ) -> list[Branch]:
     """All branches of ``case``, written into ``folder``; rank r follows every size-th one, from r on.
 
@@ -68,15 +69,19 @@ def follow_all(
     branches on rank 0, in the order of ``nnm.modes``; an empty list on the others.
     """
     mine = {}
-    for job in range(comm.rank, len(case.nnm.modes), comm.size):
-        follower = Follower(case, folder, provenance(comm), listener, stop, resume)
-        mine[job] = follower.follow(case.nnm.modes[job] - 1)
+    starts = range(len(case.nnm.start_frequency)) if case.nnm.start_frequency else [m - 1 for m in case.nnm.modes]
+    for job in range(comm.rank, len(starts), comm.size):
+        follower = (kind or Follower)(case, folder, provenance(comm), listener, stop, resume)
+        mine[job] = follower.follow(starts[job])
     branches = {job: group for part in comm.gather(mine) or [] for job, group in part.items()}
     return [branch for job in sorted(branches) for branch in branches[job]]
 
 
 class Follower:
     """Follows the branches of a case into a folder; ``about`` are attributes of the files."""
+
+    continuation: type[Continuation] = Continuation
+    branch_type: type[Branch] = Branch
 
     def __init__(
         self,
@@ -96,11 +101,16 @@ class Follower:
         flow = FiniteDifferences(flow) if options.jacobian == "differences" else flow
         shooting_map = MAPS[automatic if options.map == "auto" else options.map]
         self.problem = Shooting(flow, shooting_map, options.tolerance, options.max_newton)
+        self.dofs = self.system.dofs
+
+    def name_of(self, mode: int) -> str:
+        """The name of the branch of ``mode`` (0-based)."""
+        return self.system.branch_name(mode)
 
     def follow(self, mode: int) -> list[Branch]:
         """The branch of ``mode`` (0-based), then the branches that cross it if the case asks for them."""
         sys.audit("vipetsc.member", mode + 1)
-        branch = self._begun(self.system.branch_name(mode))
+        branch = self._begun(self.name_of(mode))
         if not branch.complete:
             self._save(branch, lambda: self._follow(branch, mode))
         if branch.points:
@@ -133,8 +143,12 @@ class Follower:
             ]
             branch.findings += down.findings
         self.grow(branch, self.problem, start, options, -1 if options.direction == "down" else 1)
-        branch.extra = sampled(self.problem, [*self._typical(branch), *self._asked(branch)])
-        for flow in options.compare:
+        self.finish(branch)
+
+    def finish(self, branch: Branch) -> None:
+        """Add the orbits of a branch, and what other flows make of it."""
+        branch.extra = sampled(self.problem, [*self._typical(branch), *self.asked(branch)])
+        for flow in self.options.compare:
             branch.extra |= compare(self.problem, branch.regular(), FLOWS[flow](self.system))
 
     def grow(self, branch: Branch, problem: Shooting, start: Point, control: NnmTable, direction: int = 1) -> None:
@@ -144,22 +158,22 @@ class Follower:
         on request; the branch holds the points so far.
         """
         control = control.model_copy(update={"points": max(control.points - max(len(branch.regular()) - 1, 0), 0)})
-        points = Continuation(problem, start, control, direction, branch.next_step or None)
-        monitor = BranchMonitor(problem, control.guards)
+        points = self.continuation(problem, start, control, direction, branch.next_step or None)
+        check = self.monitored(problem, control)
         for point in branch.regular():
-            monitor.check(point)
+            check(point)
         before, last, finding, saved = next(iter(branch.regular()[-2:-1]), None), points.point, None, time.monotonic()
-        branch.points, grazing = branch.points or [last], self.options.locate_grazing
+        branch.points = branch.points or [last]
         try:
             for point in points:
                 sys.audit("vipetsc.step")
                 if self.options.locate:
-                    branch.points += locate(problem, last, point, control.chart, grazing, before, branch.findings)
+                    branch.points += self.located(problem, control, last, point, before, branch.findings)
                 branch.points.append(point)
                 branch.next_step = points.step
                 if self.listener is not None:
                     self.listener(branch, point)
-                finding = monitor.check(point)
+                finding = check(point)
                 if finding is not None:
                     branch.findings.append(finding)
                     break
@@ -171,29 +185,46 @@ class Follower:
                     raise StoppedError(f"stopped on request after point {point.index}; resume goes on")
                 before, last = last, point
         finally:
-            branch.findings += [
-                jump for jump in jumps(branch.regular(), problem, control) if jump not in branch.findings
-            ]
+            found = self.jumps(branch.regular(), problem, control)
+            branch.findings += [jump for jump in found if jump not in branch.findings]
         branch.ending, branch.complete = finding or points.ending, finding is not None or points.finished
+
+    def monitored(self, problem: Shooting, control: NnmTable) -> Callable[[Point], str | None]:
+        """What tells of every point whether its branch does what it should not."""
+        return BranchMonitor(problem, control.guards).check
+
+    def located(
+        self, problem: Shooting, control: NnmTable, left: Point, right: Point, before: Point | None, missed: list[str]
+    ) -> list[Point]:
+        """The special points between two points."""
+        return locate(problem, left, right, control.chart, self.options.locate_grazing, before, missed)
+
+    def jumps(self, points: list[Point], problem: Shooting, control: NnmTable) -> Iterator[str]:
+        """Sentences about jumps between ``points``."""
+        return jumps(points, problem, control)
 
     def _begun(self, name: str) -> Branch:
         """The branch as it is in its file when results are resumed, else one without points."""
         path = self.folder / f"branch-{name}.h5"
         if self.resume and path.exists():
             try:
-                branch = Branch.read(path)
+                branch = self.branch_type.read(path)
                 branch.case = self.case.to_toml()
                 return branch
             except OSError as error:
                 logger.warning("vipetsc: warning: %s; made again", error)
-        return Branch(name, self.case.to_toml(), self.system.dofs)
+        return self.branch_type(name, self.case.to_toml(), self.dofs)
 
     def _start(self, mode: int) -> Point:
+        return linear_start(self.problem, mode, self.start_energy(mode))
+
+    def start_energy(self, mode: int) -> float:
+        """Energy in J of the first point."""
         if self.options.start_energy != "auto":
-            return linear_start(self.problem, mode, self.options.start_energy)
+            return self.options.start_energy
         graze = self.system.grazing_energy(mode)
         energy = graze / 100 if math.isfinite(graze) else 1e-3
-        return linear_start(self.problem, mode, max(energy, self.options.energy[0] * 1.001))
+        return max(energy, self.options.energy[0] * 1.001)
 
     def _typical(self, branch: Branch) -> list[Point]:
         """The regular points in the middle of every region."""
@@ -201,7 +232,7 @@ class Follower:
         groups = ([p for p, at in regular if at == region] for region in range(5))
         return [group[len(group) // 2] for group in groups if group]
 
-    def _asked(self, branch: Branch) -> Iterator[Point]:
+    def asked(self, branch: Branch) -> Iterator[Point]:
         """The orbits at the energies asked for, wherever the branch passes one."""
         for energy in self.options.orbits_at:
             pairs = itertools.pairwise(branch.regular())
@@ -210,9 +241,13 @@ class Follower:
                 branch.findings.append(f"the branch has no orbit of {energy:g} J")
             for left, right in steps:
                 try:
-                    yield at_energy(self.problem, left, right, energy, self.options.chart)
+                    yield self.at_energy(left, right, energy)
                 except ArithmeticError as error:
                     branch.findings.append(f"the orbit of {energy:g} J after point {left.index} is not found: {error}")
+
+    def at_energy(self, left: Point, right: Point, energy: float) -> Point:
+        """The orbit of an ``energy`` in J between two points on both sides of it."""
+        return at_energy(self.problem, left, right, energy, self.options.chart)
 
     def _crossing(self, branch: Branch) -> list[Branch]:
         """The branches that cross ``branch`` at the kinds of special points asked for."""

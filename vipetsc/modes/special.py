@@ -67,7 +67,7 @@ def locate(
     well. An energy fold always has a half-trace of 1 and is not reported as a branch point too; it begins or ends the
     tongue of a ``resonance``. What cannot be located is appended to ``missed`` in a sentence.
     """
-    points, segment = list[Point](), _Segment(problem, chart, left, right)
+    points, segment = list[Point](), Segment(problem, chart, left, right)
     touching = sum(p.episodes > 0 for p in (left, right))
     kinds = list(special_kinds(problem))
     if grazing and left.episodes != right.episodes:
@@ -91,23 +91,25 @@ def at_energy(problem: Shooting, left: Point, right: Point, energy: float, chart
 
     Raises ArithmeticError if Newton's method fails.
     """
-    return _Segment(problem, chart, left, right).root("regular", lambda p: p.energy / energy - 1, HALVINGS)
+    return Segment(problem, chart, left, right).root("regular", lambda p: p.energy / energy - 1, HALVINGS)
 
 
-class _Segment:
+class Segment:
     """The branch between two points, parametrised by arclength along the left point's tangent.
 
     ``begin`` is the arclength from the start of the step that the segment is a part of. The unknowns and their slopes
     at arclengths where they are ``known``, the ends at first, give the first guess at others.
     """
 
+    frame_type: Callable[..., Frame] = Frame
+
     def __init__(self, problem: Shooting, chart: str, left: Point, right: Point, begin: float = 0.0) -> None:
-        self.left, self.right, self.begin, self.frame = left, right, begin, Frame(problem, chart, left)
+        self.left, self.right, self.begin, self.frame = left, right, begin, self.frame_type(problem, chart, left)
         end = self.frame.chart.encode(right.x, right.period)
         self.length, self.known = float(self.frame.tangent @ (end - self.frame.xi)), dict[float, Knot]()
         self._know(0.0, self.frame.xi, self.frame.tangent)
-        self._know(self.length, end, np.linalg.solve(self.frame.chart.derivative(end), right.tangent))
-        self.make = partial(_Segment, problem, chart)
+        self._know(self.length, end, self.frame.direction(right))
+        self.make = partial(type(self), problem, chart)
 
     def _know(self, arclength: float, xi: np.ndarray, direction: np.ndarray) -> None:
         self.known[arclength] = xi, direction / (self.frame.tangent @ direction)
@@ -142,7 +144,7 @@ class _Segment:
             return [self.root(kind, test, HALVINGS)]
         if before is None or not self.left.step:
             return []
-        turn, parts = _turn((-self.left.step, test(before)), (0.0, a), (self.length, b)), tuple[_Segment, ...]()
+        turn, parts = _turn((-self.left.step, test(before)), (0.0, a), (self.length, b)), tuple[Segment, ...]()
         with suppress(ArithmeticError):  # whether there are two is not known
             parts = self.split(turn) if turn else ()
         return [part.root(kind, test, HALVINGS) for part in parts if test(part.left) * test(part.right) < 0]
@@ -185,7 +187,7 @@ class _Segment:
             raise ArithmeticError("the touch lies outside of the step")
         return arclength
 
-    def split(self, arclength: float | None = None) -> "tuple[_Segment, _Segment]":
+    def split(self, arclength: float | None = None) -> "tuple[Segment, Segment]":
         """The parts before and behind an arclength, or about the middle; raises ArithmeticError if there is none."""
         for place in (arclength,) if arclength else self.length * MIDDLES:
             with suppress(ArithmeticError):
