@@ -185,8 +185,8 @@ class Follower:
                     raise StoppedError(f"stopped on request after point {point.index}; resume goes on")
                 before, last = last, point
         finally:
-            found = self.jumps(branch.regular(), problem, control)
-            branch.findings += [jump for jump in found if jump not in branch.findings]
+            jumped = self.jumps(branch.regular(), problem, control)
+            branch.findings += [jump for jump in jumped if jump not in branch.findings]
         branch.ending, branch.complete = finding or points.ending, finding is not None or points.finished
 
     def monitored(self, problem: Shooting, control: NnmTable) -> Callable[[Point], str | None]:
