@@ -294,6 +294,8 @@ def test_bad_cases_are_refused(change, key):
         case(change)
 
 
-def test_shot_branches_have_no_start_frequency():
-    with pytest.raises(CaseError, match=r"nnm.start_frequency"):
-        NnmCase.from_toml(BREATHER.format(omega=4000.0, points=3, cells=3, site=2).replace('"condensed"', '"chain"'))
+def test_branches_shot_with_dense_matrices_have_no_start_frequency():
+    for system in ("reduced", 'chain"\nshooting = "dense'):
+        text = BREATHER.format(omega=4000.0, points=3, cells=3, site=2).replace("condensed", system)
+        with pytest.raises(CaseError, match=r"nnm.start_frequency"):
+            NnmCase.from_toml(text)

@@ -22,7 +22,8 @@ from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive, o
 from vipetsc.lattice import Contact, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import groups_of
 
-MOST_MASSES = 4000
+# Masses solved for with dense matrices, and without any; of a lattice, beyond which "auto" does without.
+MOST_MASSES, MOST_OF_LATTICE, FEW_MASSES = 4000, 40_000, 100
 # Keys of [contacts] that a preset gives, as for a run; the others are those of a run alone.
 MATERIAL = "law", "modulus", "radius", "poisson"
 
@@ -92,7 +93,9 @@ class NnmTable(Section):
     lowest first). ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is where energy goes
     first. ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one, are
     stored beside those of the regions; ``compare`` corrects every fourth point with other flows; ``switch`` follows
-    the branches that cross at these kinds of special points, ``switch_points`` points each.
+    the branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting`` "krylov"
+    does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there so many of the
+    largest ``multipliers`` (true: 8) are found.
     """
 
     system: Literal["reduced", "chain", "own", "condensed"] = "reduced"
@@ -103,6 +106,8 @@ class NnmTable(Section):
     truncation: Positive = 1e-7
     custom: SystemTable | None = Field(None, alias="own")
     modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = Field([1, 2], min_length=1)
+    shooting: Literal["auto", "dense", "krylov"] = "auto"
+    multipliers: bool | Annotated[int, Field(ge=1)] = False
     map: Literal["auto", "quarter", "half", "whole"] = "auto"
     flow: Literal["compiled", "tsrk", "newmark"] = "compiled"
     jacobian: Literal["variational", "differences"] = "variational"
@@ -125,6 +130,12 @@ class NnmTable(Section):
     switch_points: int = Field(100, ge=1)
     switch_amplitude: Positive = 1e-3
     guards: Guards = Guards()
+
+    def is_krylov(self, dofs: int) -> bool:
+        """Whether orbits of a lattice of so many masses are shot without dense matrices."""
+        needs_dense = self.compare or self.switch or self.flow != "compiled" or self.jacobian != "variational"
+        auto = bool(self.start_frequency or self.multipliers) or (dofs > FEW_MASSES and not needs_dense)
+        return self.method == "shooting" and self.shooting != "dense" and (auto or self.shooting == "krylov")
 
 
 class NnmCase(CaseFile):
@@ -167,15 +178,20 @@ class NnmCase(CaseFile):
         if nnm.system == "chain":
             dofs = cell.dofs * lattice.cells if cell else 2
             rigid = int(lattice.ends != "fixed")
-            if dofs > MOST_MASSES:
-                remedy = f"makes {dofs} masses; orbits are solved for with dense matrices, at most {MOST_MASSES}"
+            krylov = nnm.is_krylov(dofs)
+            most, what = (MOST_OF_LATTICE, "on all ranks") if krylov else (MOST_MASSES, "with dense matrices")
+            problems += _check_shooting(nnm, dofs)
+            if dofs > most:
+                remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
                 return [*problems, Problem("lattice.cells", lattice.cells, remedy)]
             if not site_cells(lattice, contacts):
                 problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
             problems += check_sites(lattice, contacts)
-        elif nnm.system == "condensed":
+        elif nnm.multipliers or nnm.shooting == "krylov":
+            problems.append(Problem("nnm.system", nnm.system, 'multipliers and "krylov" are for "chain"'))
+        if nnm.system == "condensed":
             return [*problems, *_check_condensed(lattice, contacts, nnm, valid)]
-        elif nnm.system == "reduced":
+        if nnm.system == "reduced":
             if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
                 problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
             if contacts.clearance is None and lattice.preset is None:
@@ -191,8 +207,14 @@ class NnmCase(CaseFile):
     def physics(self) -> tuple[Any, ...]:
         """What a branch that is resumed must keep: the system, the shooting map and the flow."""
         nnm = self.nnm
-        begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation
+        begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation, self.krylov
         return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian, begun
+
+    @property
+    def krylov(self) -> bool:
+        """Whether orbits are shot on all ranks together, by matrix-free Newton-Krylov."""
+        of_chain = self.nnm.system == "chain"
+        return of_chain and self.nnm.is_krylov(self.lattice.unit_cell().dofs * self.lattice.cells)
 
     @property
     def condensed(self) -> bool:
@@ -217,7 +239,8 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
     if nnm.direction != "up" and not nnm.energy[0] > 0:
         yield Problem("nnm.energy", nnm.energy, "going down needs a lowest energy above 0 (J)")
     condensed = nnm.system == "condensed" or nnm.method == "condensed"
-    for key in ("compare", "switch") if condensed else ("start_frequency", "start_sites"):
+    starts = ("start_sites",) if nnm.system == "chain" else ("start_frequency", "start_sites")
+    for key in ("compare", "switch") if condensed else starts:
         if given := getattr(nnm, key):
             yield Problem(f"nnm.{key}", given, f"goes with motions that are {'shot' if condensed else 'condensed'}")
     if not nnm.smallest_step < nnm.largest_step:
@@ -250,3 +273,17 @@ def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTab
     if inside:
         told = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
         yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({told} rad/s); motions there radiate")
+
+
+def _check_shooting(nnm: NnmTable, dofs: int) -> Iterator[Problem]:
+    """What of [nnm] does not go with the way in which a lattice of ``dofs`` masses is shot."""
+    krylov = nnm.is_krylov(dofs)
+    defaults = {"compare": [], "switch": [], "orbits_at": [], "flow": "compiled", "jacobian": "variational"}
+    for key, value in defaults.items() if krylov else ():
+        if getattr(nnm, key) != value:
+            yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs dense matrices: nnm.shooting = "dense"')
+    if nnm.shooting == "dense" and (nnm.multipliers or nnm.start_frequency):
+        key = "multipliers" if nnm.multipliers else "start_frequency"
+        yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs nnm.shooting = "krylov"; "dense" has all half-traces')
+    if krylov and dofs > MOST_MASSES and not nnm.start_frequency:
+        yield Problem("nnm.modes", nnm.modes, f"are known up to {MOST_MASSES} masses: give nnm.start_frequency")

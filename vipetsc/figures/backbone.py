@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from vipetsc.figures import style
 from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, note, shade_regions
@@ -63,6 +64,9 @@ def backbone(paths: Sequence[Path]) -> Figure:
         panels[0].set_title(f"({tag}) {', '.join(filter(None, heading))}")
         energy = branch["energy"].values
         panels[-1].set(xscale="log", xlim=(energy.min(), energy.max()), xlabel="energy (J)")
+        if energy.max() < 10 * energy.min():  # labels of less than a decade
+            panels[-1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            panels[-1].xaxis.set_minor_formatter(NullFormatter())
         for page in lower:
             portraits(page, branch)
     return figure

@@ -36,7 +36,7 @@ def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> 
     Follows the branch from the left point with the guards on, until it passes the right one, is further from the left
     point than three times the step, or cannot go on.
     """
-    chart = Relative(problem.system, left.x, left.period)
+    chart = problem.chart("relative", left.x, left.period)
     origin, goal = chart.encode(left.x, left.period), chart.encode(right.x, right.period)
     reach = float(np.linalg.norm(goal - origin))
     last, first, anywhere = origin, min(control.first_step, reach / 4), [0.0, np.inf]
@@ -80,7 +80,7 @@ class BranchMonitor:
 
     def __init__(self, problem: Shooting, guards: Guards) -> None:
         self._problem, self._guards = problem, guards
-        self._linear = problem.system.linear_modes()[0] / (2 * np.pi)
+        self._linear = problem.system.linear_modes()[0] / (2 * np.pi) if problem.dense else np.full(1, np.inf)
         self._track = np.empty((0, problem.system.dofs + 2))
         self._touched = self._repeats = False
 
@@ -98,7 +98,7 @@ class BranchMonitor:
         places = self._guards.standstill
         if 0 < places <= len(track) and np.ptp(self._track[-places:], axis=0).max() <= self._guards.advance:
             return f"does not advance: {places} points up to {point.index} are one, at E = {point.energy:.9g} J"
-        if point.index % REPETITIONS_EVERY == 0:
+        if point.index % REPETITIONS_EVERY == 0 and self._problem.dense:
             times = repetitions(self._problem, point)
             twice, self._repeats = self._repeats and times > 1, times > 1  # once, it may be at the tip of a tongue
             if twice:

@@ -77,7 +77,8 @@ class Branch:
 
     def to_csv(self) -> str:
         """The branch as CSV text, a row a point; numbers in full precision."""
-        traces = ["half_trace"] if self.dofs == 2 else [f"half_trace_{i}" for i in range(1, self.dofs)]
+        pairs = len(self.points[0].half_traces) if self.points else self.dofs - 1
+        traces = ["half_trace"] if self.dofs == 2 else [f"half_trace_{i + 1}" for i in range(pairs)]
         names = ["energy", "frequency", "period", *(f"x{i + 1}" for i in range(self.dofs)), *traces]
         lines = [",".join([*names, "multiplier_max", "slope", "contacts", "region", "kind"])]
         for p, region in zip(self.points, self.regions(), strict=True):
@@ -107,11 +108,12 @@ class Branch:
         count, n = len(self.points), self.dofs
         x = np.array([p.x for p in self.points]).reshape(count, n)
         tangent = np.array([p.tangent for p in self.points], float).reshape(count, n + 1)
-        traces = np.array([p.half_traces for p in self.points], complex).reshape(count, n - 1)
+        pairs = len(self.points[0].half_traces) if self.points else n - 1
+        traces = np.array([p.half_traces for p in self.points], complex).reshape(count, pairs)
         at_rest = "initial displacement (velocity in m/s for maps from the centre)"
         return {
             "dof": variable("dof", np.arange(1, n + 1), "1", "degree of freedom, from 1"),
-            "pair": variable("pair", np.arange(1, n), "1", "pair of Floquet multipliers, the trivial one left out"),
+            "pair": variable("pair", np.arange(1, pairs + 1), "1", "pair of multipliers, the trivial one left out"),
             "initial": variable(("point", "dof"), x, "m", at_rest),
             "tangent": variable(("point", "dof"), tangent[:, :-1], "m", "tangent of the branch: initial values"),
             "tangent_period": variable("point", tangent[:, -1], "s", "tangent of the branch: period"),

@@ -1,7 +1,7 @@
 """Branches of condensed motions of a case: their starts, their files with harmonics and states of the lattice."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -183,6 +183,11 @@ def states(problem: CondensedProblem, points: list[Point]) -> Variables:
     fields = [state_of(problem, point) for point in points]
     cells = sorted(set().union(*(field for field in fields)))
     u = np.array([[field.get(cell, 0 * next(iter(field.values()))) for cell in cells] for field in fields])
+    return stored_states(points, cells, u)
+
+
+def stored_states(points: list[Point], cells: Sequence[int], u: np.ndarray) -> Variables:
+    """Displacements ``u`` (point, cell, dof) of ``cells``, from 0, at phase 0, where all is at rest."""
     axes = "orbit", "states/cell", "states/dof"
     return {
         "orbit": variable("orbit", np.arange(1, len(points) + 1), "1", "stored motion"),

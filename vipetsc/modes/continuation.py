@@ -5,10 +5,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.sparse import spmatrix
+from scipy.sparse.linalg import spsolve
 
 from vipetsc.case.nnm import NnmTable
+from vipetsc.modes.newton import Attempt
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import CHARTS, Attempt, Relative, Shooting
+from vipetsc.modes.shooting import Shooting
 
 
 class ContinuationError(RuntimeError):
@@ -38,14 +41,14 @@ class Frame:
             near = np.abs(gaps / problem.system.clearances).min(initial=np.inf) < 0.05
             chart = "grazing" if near else "relative"
         self.problem: Any = problem
-        self.chart: Any = CHARTS[chart](problem.system, point.x, point.period)
+        self.chart: Any = problem.chart(chart, point.x, point.period)
         self.xi = self.chart.encode(point.x, point.period)
         self.tangent = unit(self.direction(point))
 
     def direction(self, point: Point) -> np.ndarray:
         """The branch's direction at another ``point``, of any length, in these unknowns."""
         derivative = self.chart.derivative(self.chart.encode(point.x, point.period))
-        return np.linalg.solve(derivative, point.tangent)
+        return solved(derivative, point.tangent)
 
     def correct(self, guess: np.ndarray, step: float) -> Attempt:
         """Newton's method from ``guess`` for the orbit at the arclength ``step`` along the tangent."""
@@ -142,6 +145,11 @@ class Continuation:
         return first_tangent(self.problem, start, direction)
 
 
+def solved(derivative: np.ndarray | spmatrix, vectors: np.ndarray) -> np.ndarray:
+    """The derivative of a chart, dense or sparse, solved for ``vectors`` (n,) or (n, m)."""
+    return np.linalg.solve(derivative, vectors) if isinstance(derivative, np.ndarray) else spsolve(derivative, vectors)
+
+
 def unit(vector: np.ndarray) -> np.ndarray:
     """The vector over its length."""
     return vector / np.linalg.norm(vector)
@@ -166,9 +174,9 @@ def relative_turn(problem: Shooting, a: Point, b: Point) -> float:
     """Angle in rad between the tangents of two points in the chart ``relative`` at the first; 0 without a tangent."""
     if not (a.tangent.size and b.tangent.size):
         return 0.0
-    chart = Relative(problem.system, a.x, a.period, rest=problem.map.start == "rest")
+    chart = problem.chart("relative", a.x, a.period, rest=problem.map.start == "rest")
     scale = chart.derivative(chart.encode(a.x, a.period))
-    before, after = np.linalg.solve(scale, np.column_stack([a.tangent, b.tangent])).T
+    before, after = solved(scale, np.column_stack([a.tangent, b.tangent])).T
     return float(np.arccos(min(unit(before) @ unit(after), 1.0)))
 
 
@@ -177,15 +185,14 @@ def first_tangent(problem: Shooting, start: Point, direction: int) -> np.ndarray
 
     Raises ContinuationError at a branch point, where the tangent is not unique.
     """
-    chart = Relative(problem.system, start.x, start.period)
+    chart = problem.chart("relative", start.x, start.period)
     xi = chart.encode(start.x, start.period)
-    matrix = problem.jacobian(problem.arc(start.x, start.period)) @ chart.derivative(xi)
-    values, directions = np.linalg.svd(matrix)[1:]
+    values, null = problem.null_vector(chart, xi)
     if values[-1] < 1e-12 * values[0]:
         raise ContinuationError(
             f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values {values}; "
             "start elsewhere (nnm.start_energy) or switch branches there"
         )
-    tangent = chart.derivative(xi) @ directions[-1]
+    tangent = chart.derivative(xi) @ null
     energy_tangent = problem.energy_gradient(start.x) @ tangent[:-1]
     return tangent * (np.sign(energy_tangent) * direction or direction)

@@ -27,7 +27,7 @@ from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import at_energy, locate, switch
 from vipetsc.modes.system import System
-from vipetsc.parallel import StoppedError, StopRequest
+from vipetsc.parallel import StoppedError, StopRequest, on_root
 
 # The flows by their names in case files.
 FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
@@ -82,6 +82,7 @@ class Follower:
 
     continuation: type[Continuation] = Continuation
     branch_type: type[Branch] = Branch
+    comm: MPI.Comm = MPI.COMM_SELF  # of the ranks that follow a branch together
 
     def __init__(
         self,
@@ -114,7 +115,7 @@ class Follower:
         if not branch.complete:
             self._save(branch, lambda: self._follow(branch, mode))
         if branch.points:
-            for half in self.folder.glob(f"branch-{branch.name}-down.*"):
+            for half in self.folder.glob(f"branch-{branch.name}-down.*") if self.comm.rank == 0 else ():
                 half.unlink()  # it is the beginning of the whole
         return [branch, *self._crossing(branch)]
 
@@ -127,7 +128,15 @@ class Follower:
         except FAILURES as error:
             branch.ending = f"failed: {error}"
         if branch.points or not branch.ending.startswith("stopped"):
-            branch.write(self.folder, self.about)
+            self.write(branch)
+
+    def write(self, branch: Branch) -> None:
+        """Write a branch; one that ranks follow together is written by one of them."""
+        on_root(self.comm, lambda: branch.write(self.folder, self.about))
+
+    def judged(self, point: Point) -> Point:
+        """The point with what else is to be known of it."""
+        return point
 
     def _follow(self, branch: Branch, mode: int) -> None:
         """The branch itself, its orbits and what other flows make of it."""
@@ -163,23 +172,23 @@ class Follower:
         for point in branch.regular():
             check(point)
         before, last, finding, saved = next(iter(branch.regular()[-2:-1]), None), points.point, None, time.monotonic()
-        branch.points = branch.points or [last]
+        branch.points = branch.points or [self.judged(last)]
         try:
             for point in points:
                 sys.audit("vipetsc.step")
                 if self.options.locate:
                     branch.points += self.located(problem, control, last, point, before, branch.findings)
-                branch.points.append(point)
+                branch.points.append(point := self.judged(point))
                 branch.next_step = points.step
-                if self.listener is not None:
+                if self.listener is not None and self.comm.rank == 0:
                     self.listener(branch, point)
                 finding = check(point)
                 if finding is not None:
                     branch.findings.append(finding)
                     break
-                stopped = self.stop.requested and not points.finished
-                if stopped or time.monotonic() - saved > SAVE_EVERY:
-                    branch.write(self.folder, self.about)
+                stopped = self.stop.agreed(self.comm) and not points.finished
+                if stopped or self.comm.bcast(time.monotonic() - saved > SAVE_EVERY):
+                    self.write(branch)
                     saved = time.monotonic()
                 if stopped:
                     raise StoppedError(f"stopped on request after point {point.index}; resume goes on")
@@ -206,9 +215,9 @@ class Follower:
     def _begun(self, name: str) -> Branch:
         """The branch as it is in its file when results are resumed, else one without points."""
         path = self.folder / f"branch-{name}.h5"
-        if self.resume and path.exists():
+        if self.resume and on_root(self.comm, path.exists):
             try:
-                branch = self.branch_type.read(path)
+                branch = on_root(self.comm, lambda: self.branch_type.read(path))
                 branch.case = self.case.to_toml()
                 return branch
             except OSError as error:

@@ -51,17 +51,14 @@ class BorderedNewton:
         max_newton: int = 7,
     ) -> None:
         self.function, self.matrix, self.tolerance = function, matrix, tolerance
-        self._snes = snes = PETSc.SNES().create(PETSc.COMM_SELF)
-        self._xi = PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF)
-        dense = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
-        dense.setUp()
+        self._xi, jacobian = self._allocate(size)
+        self._snes = snes = PETSc.SNES().create(self._xi.comm)
         snes.setOptionsPrefix("nnm_")
         snes.setFunction(self._function, self._xi.duplicate())
-        snes.setJacobian(self._jacobian, dense)
+        snes.setJacobian(self._jacobian, jacobian)
         snes.setTolerances(max_it=max_newton)
         snes.setConvergenceTest(self._test)
-        snes.getKSP().setType("preonly")
-        snes.getKSP().getPC().setType("lu")
+        self._configure(snes.getKSP())
         options = PETSc.Options("nnm_")
         if not options.hasName("snes_linesearch_type"):
             options["snes_linesearch_type"] = "basic"  # step control is the continuation's business
@@ -72,17 +69,36 @@ class BorderedNewton:
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Newton's method from ``guess`` (size,)."""
         self._row, self._history = (row, value), []
-        self._xi.setArray(guess)
+        self._xi.setArray(self._local(guess))
         try:
             self._snes.solve(None, self._xi)
         except FlowError as error:
             return Attempt(False, str(error), self._history, guess, left_domain=True)
         reason = self._snes.getConvergedReason()
-        return Attempt(reason > 0, _REASONS.get(reason, str(reason)), self._history, self._xi.getArray().copy())
+        return Attempt(reason > 0, _REASONS.get(reason, str(reason)), self._history, self._whole(self._xi).copy())
+
+    def _allocate(self, size: int) -> tuple[PETSc.Vec, PETSc.Mat]:
+        """The vector of unknowns, and the matrix for the derivative."""
+        dense = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
+        dense.setUp()
+        return PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF), dense
+
+    def _configure(self, ksp: PETSc.KSP) -> None:
+        """Choose the linear solver, before the options are looked at."""
+        ksp.setType("preonly")
+        ksp.getPC().setType("lu")
+
+    def _local(self, array: np.ndarray) -> np.ndarray:
+        """What of an ``array`` (size,) belongs into this rank's part of a vector."""
+        return array
+
+    def _whole(self, vector: PETSc.Vec) -> np.ndarray:
+        """All of a vector."""
+        return np.asarray(vector.getArray(readonly=True))
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        xi, (row, value) = x.getArray(readonly=True), self._row
-        f.setArray(np.append(self.function(xi), row @ xi - value))
+        xi, (row, value) = self._whole(x), self._row
+        f.setArray(self._local(np.append(self.function(xi), row @ xi - value)))
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
         matrix.getDenseArray()[:] = np.vstack([self.matrix(x.getArray(readonly=True)), self._row[0]])

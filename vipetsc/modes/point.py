@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from vipetsc.modes.flow import Arc
-from vipetsc.modes.shooting import Attempt, Chart, Relative, Shooting
+from vipetsc.modes.shooting import Attempt, Chart, Shooting
 
 # An orbit that passes a part of its period again to this share of its size repeats it.
 SAME = 1e-6
@@ -35,8 +35,10 @@ def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
 
     The basic map is the half period (seen with the sign reversed) for the quarter-period map and the period for the
     others; its diagonal block is derived in the package's docstring. The left eigenvector of its trivial eigenvalue is
-    known, so that it is removed exactly.
+    known, so that it is removed exactly. None without the matrix of sensitivities: ``floquet`` does without.
     """
+    if not problem.dense:
+        return np.empty(0)
     root = np.sqrt(problem.system.masses)
     n, quarter, s = len(root), problem.map.quarter, arc.sensitivity
     a, b, c, d = (root[:, None] * block / root for block in (s[:n, :n], s[:n, n:], s[n:, :n], s[n:, n:]))
@@ -73,7 +75,8 @@ class Point:
 
     ``x`` (n,) are initial displacements in m (velocities in m/s for maps from the centre), ``half_traces`` (n - 1,),
     ``tangent`` d(x, period) (n + 1,) of any length, empty where a branch begins, ``kind`` is regular or the name of a
-    special point; the others are ``QUANTITIES``.
+    special point; ``multipliers`` (number, 2) are the largest of a lattice's
+    and their residuals; the others are ``QUANTITIES``.
     """
 
     x: np.ndarray
@@ -92,6 +95,7 @@ class Point:
     step: float = 0.0
     kind: str = "regular"
     resonance: int = 0
+    multipliers: np.ndarray = field(default_factory=lambda: np.empty((0, 2), complex))
 
     @property
     def frequency(self) -> float:
@@ -110,7 +114,9 @@ class Point:
             energy=problem.energy(x),
             residual=float(np.abs(problem.residual(arc)).max()) / float(np.abs(x).max()),
             half_traces=traces,
-            multiplier=float(np.abs(multipliers(traces, problem.map.quarter)).max(initial=1.0)),
+            multiplier=float(
+                np.abs(multipliers(traces, problem.map.quarter)).max(initial=1.0 if problem.dense else np.nan)
+            ),
             episodes=arc.episodes,
             closed=arc.closed / arc.duration,
             newton=len(attempt.history) - 1,
@@ -133,7 +139,7 @@ def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
         raise ValueError(f"mode {mode + 1} is a rigid-body motion; it has no period")
     amplitude = np.sqrt(2 * energy) / (omega[mode] if problem.map.start == "rest" else 1.0)
     x, period = shapes[:, mode] * amplitude, 2 * np.pi / omega[mode]
-    chart = Relative(problem.system, x, period)
+    chart = problem.chart("relative", x, period)
     xi = chart.encode(x, period)
     row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
     attempt = problem.solve(chart, xi, row, row @ xi)

@@ -149,6 +149,8 @@ class Shooting:
     ``STEP_TOLERANCE``, where rounding allows no more, or after ``max_newton`` steps.
     """
 
+    dense = True  # sensitivities are a matrix
+
     def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
         if "centre" in (shooting_map.start, shooting_map.end) and not flow.system.odd:
             raise ValueError(
@@ -160,9 +162,16 @@ class Shooting:
         # the half of the state that is free at the arc's start, and the half that should vanish at its end
         self.free = slice(0, n) if shooting_map.start == "rest" else slice(n, 2 * n)
         self._zero = slice(n, 2 * n) if shooting_map.end == "rest" else slice(0, n)
-        self._newton = BorderedNewton(self._function, self.matrix, size, tolerance, max_newton)
+        self._newton = self._create_newton(size, max_newton)
         self._chart: Chart
         self._last: tuple[np.ndarray, Arc] | None = None
+
+    def _create_newton(self, size: int, max_newton: int) -> BorderedNewton:
+        return BorderedNewton(self._function, self.matrix, size, self.tolerance, max_newton)
+
+    def chart(self, name: str, x: np.ndarray, period: float, **options: bool) -> Chart:
+        """The chart of that name at ``x``; ``options`` are the chart's."""
+        return CHARTS[name](self.system, x, period, **options)
 
     def arc(self, x: np.ndarray, period: float) -> Arc:
         """The arc from initial values ``x``; raises FlowError where the flow fails."""
@@ -203,6 +212,12 @@ class Shooting:
         """Unit tangent (n + 1,) in the chart of the last attempt, at its ``xi``, turned towards ``reference``."""
         direction = np.linalg.svd(self.matrix(xi))[2][-1]  # the null vector
         return -direction if direction @ reference < 0 else direction
+
+    def null_vector(self, chart: Chart, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Singular values (n,) of the Jacobian in a ``chart``, largest first, and its unit null vector (n + 1,)."""
+        matrix = self.jacobian(self.arc(*chart.decode(xi))) @ chart.derivative(xi)
+        values, directions = np.linalg.svd(matrix)[1:]
+        return values, directions[-1]
 
     def _arc(self, xi: np.ndarray) -> Arc:
         if self._last is None or not np.array_equal(self._last[0], xi):

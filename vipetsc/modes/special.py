@@ -47,7 +47,7 @@ def special_kinds(problem: Shooting) -> Iterator[tuple[str, Test, float]]:
     if problem.map.quarter:
         levels[0.0] = "period-doubling"
     for level, kind in levels.items():
-        for i in range(problem.system.dofs - 1):
+        for i in range(problem.system.dofs - 1 if problem.dense else 0):
             yield kind, crossing(level, i), 1e-6
 
 
@@ -82,7 +82,8 @@ def locate(
         except ArithmeticError as error:
             if missed is not None:
                 missed.append(f"a {kind} after point {left.index} (E = {left.energy:.9g} J) is not located: {error}")
-    folds = (replace(p, resonance=resonance(problem, p)) if p.kind == "fold-energy" else p for p in points)
+    tips = {id(p): resonance(problem, p) for p in points if p.kind == "fold-energy" and problem.dense}
+    folds = (replace(p, resonance=tips[id(p)]) if id(p) in tips else p for p in points)
     return sorted(folds, key=lambda p: p.step)
 
 

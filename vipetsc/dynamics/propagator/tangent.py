@@ -66,14 +66,14 @@ class TangentPropagator(Propagator):
         return cells.reshape(2 * layout.dofs, layout.owned).copy()
 
     def contacts(self) -> tuple[np.ndarray, int]:
-        """Times (interval, 2) in s in which a site that this rank logs was closed, and the onsets among them."""
-        tape, spans, onsets = self._forces.clusters.tape, [np.zeros((0, 2))], 0
+        """Times (interval, 2) in s in which a site that this rank logs was closed, and the number of its contacts."""
+        tape, spans, episodes = self._forces.clusters.tape, [np.zeros((0, 2))], 0
         for c in np.flatnonzero(self._forces.logs):
             rows = tape.rows[c, : tape.used[c]]
             begin = rows["begin"] + rows["position"] * self.series.interval
             spans.append(np.column_stack([begin, begin + rows["length"] * self.series.interval]))
-            onsets += int(rows["onset"].sum())
-        return np.concatenate(spans), onsets
+            episodes += int(np.sum((rows["onset"] > 0) | (begin == 0.0)))
+        return np.concatenate(spans), episodes
 
     def _linearised(self) -> tuple[np.ndarray, np.ndarray]:
         """The matrices of the orbit, and where they belong."""

@@ -1,0 +1,28 @@
+"""A branch of breathers shot on all ranks together: the same orbits and multipliers on any number of them."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.unit.test_floquet import case
+from vipetsc.modes.lattice_follow import LatticeBranch, follow_together
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_the_same_branch_on_any_number_of_ranks(folder):
+    branches = follow_together(case(multipliers=2), folder, COMM)
+    assert len(branches) == (COMM.rank == 0)
+    if COMM.rank == 0:
+        together = LatticeBranch.read(folder / "branch-breather-1600.h5")
+        (alone,) = follow_together(case(multipliers=2), folder, MPI.COMM_SELF)
+        assert len(together.points) == len(alone.points) == 3
+        for a, b in zip(together.points, alone.points, strict=True):
+            assert a.period == pytest.approx(b.period, rel=1e-10)
+            assert a.energy == pytest.approx(b.energy, rel=1e-10)
+            np.testing.assert_allclose(a.x, b.x, atol=1e-10 * np.abs(b.x).max())
+            np.testing.assert_allclose(np.abs(a.multipliers[:, 0]), np.abs(b.multipliers[:, 0]), rtol=1e-8)

@@ -1,0 +1,118 @@
+"""Floquet multipliers of a lattice's periodic motion from the action of its monodromy matrix, without that matrix.
+
+The multipliers mu of a conservative motion come in pairs mu, 1/mu. Nearly all of them, the waves of the lattice far
+from the sites, lie on the unit circle; an instability is a few outside, where Arnoldi's method is slow to tell them
+from the circle. SLEPc's Krylov-Schur method (Stewart 2001) is therefore given the power ``POWER`` of the map, which
+brings |mu| to |mu|^POWER at no cost in orthogonalisation; it is odd, so that mu and -mu stay apart. An odd orbit,
+u(t + T/2) = -u(t), needs half a period: with the sign reversed that map has the multipliers nu, and mu = nu^2. The
+direction of the motion itself, whose multiplier is a defective 1, is deflated: the map acts orthogonally to it.
+
+The space of the vectors that converge is then projected on the map itself (Rayleigh and Ritz), so that each multiplier
+has a residual of its own, |M x - nu x| / |x|. What lies so near to the circle that it does not converge is left out: an
+instability that a run of a hundred periods would not show. Displacements count times the frequency, both times the
+square root of the mass: without contact, kinetic and potential energy of a motion of that frequency.
+
+References
+----------
+G. W. Stewart, A Krylov-Schur algorithm for large eigenproblems, SIAM J. Matrix Anal. Appl. 23 (2001) 601-614.
+"""
+
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+
+from vipetsc.dynamics.eigen import load_slepc
+from vipetsc.modes.lattice_flow import LatticeArc
+from vipetsc.modes.lattice_shooting import LatticeShooting
+from vipetsc.modes.point import Point
+
+POWER = 25
+# Tolerance and restarts of the Krylov-Schur method, and its vectors beyond three times those wanted.
+TOLERANCE, RESTARTS, VECTORS = 1e-10, 16, 16
+
+
+class Monodromy:
+    """The map of variations over an ``arc``, times ``sign``, in scaled blocks; as a matrix, ``POWER`` times that."""
+
+    def __init__(self, arc: LatticeArc, scale: np.ndarray, sign: int) -> None:
+        self.arc, self.scale, self.sign = arc, scale, sign
+
+    def apply(self, blocks: np.ndarray) -> np.ndarray:
+        """The map once, on blocks (number, 2 dof, owned cell)."""
+        return self.sign * self.scale * self.arc.move(blocks / self.scale)
+
+    def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """The power of the map times ``x``."""
+        block = x.getArray(readonly=True).reshape(1, *self.scale.shape)
+        for _ in range(POWER):
+            block = self.apply(block)
+        y.setArray(block.ravel())
+
+
+def largest_multipliers(problem: LatticeShooting, point: Point, wanted: int) -> np.ndarray:
+    """The ``wanted`` largest multipliers of an orbit, or fewer, and their residuals: (number, 2), largest first.
+
+    Raises FlowError where the orbit cannot be followed, CaseError without SLEPc; collective.
+    """
+    flow, comm, system, odd = problem.lattice_flow, problem.comm, problem.system, problem.map.quarter
+    start, omega = np.append(point.x, 0 * point.x), 2 * np.pi / point.period
+    arc = flow.arc(flow.share(start), point.period / (2 if odd else 1))
+    scale = flow.share(np.sqrt(np.append(omega**2 * system.masses, system.masses)))
+    phase = flow.share(np.append(0 * point.x, -system.forces(point.x) / system.masses)) * scale
+    phase /= np.sqrt(comm.allreduce(float(np.sum(phase**2))))
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(len(start))
+    seed = flow.share(noise + np.tile(system.contact_rows.sum(axis=0), 2))
+    monodromy = Monodromy(arc, scale, -1 if odd else 1)
+    try:
+        basis = _krylov_basis(monodromy, phase, seed, wanted, comm)
+        if not len(basis):
+            return np.empty((0, 2), complex)
+        values, residuals = _ritz(monodromy, basis, phase, comm)
+    finally:
+        arc.engine.destroy()
+    order = np.argsort(-np.abs(values), kind="stable")[:wanted]
+    values = values[order] ** 2 if odd else values[order]
+    return np.stack([values, residuals[order].astype(complex)], axis=-1)
+
+
+def _krylov_basis(monodromy: Monodromy, phase: np.ndarray, seed: np.ndarray, wanted: int, comm: MPI.Comm) -> np.ndarray:
+    """Orthonormal blocks (number, 2 dof, owned cell) that hold the eigenvectors of the largest multipliers."""
+    slepc, shape = load_slepc(), phase.shape
+    shell = PETSc.Mat().createPython(((phase.size, None),) * 2, monodromy, comm=comm)
+    shell.setUp()
+    vectors = [shell.createVecRight() for _ in range(2)]
+    for vector, block in zip(vectors, (phase, seed), strict=True):
+        vector.setArray(block.ravel())
+    eps: Any = slepc.EPS().create(comm)
+    eps.setOperators(shell)
+    eps.setProblemType(slepc.EPS.ProblemType.NHEP)
+    eps.setWhichEigenpairs(slepc.EPS.Which.LARGEST_MAGNITUDE)
+    size = shell.getSize()[0]
+    eps.setDimensions(min(wanted, size - 2), min(3 * wanted + VECTORS, size - 1))
+    eps.setTolerances(TOLERANCE, RESTARTS)
+    eps.setDeflationSpace(vectors[:1])
+    eps.setInitialSpace(vectors[1:])
+    eps.setOptionsPrefix("multipliers_")
+    eps.setFromOptions()
+    eps.solve()
+    blocks = [vector.getArray(readonly=True).reshape(shape).copy() for vector in eps.getInvariantSubspace()]
+    for petsc_object in (eps, shell, *vectors):
+        petsc_object.destroy()
+    return np.array(blocks).reshape(-1, *shape)
+
+
+def _ritz(monodromy: Monodromy, basis: np.ndarray, phase: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
+    """Ritz values (number,) of the map on a basis orthogonal to ``phase``, and their residuals."""
+
+    def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.asarray(comm.allreduce(a.reshape(len(a), phase.size) @ b.reshape(len(b), phase.size).T))
+
+    basis = np.linalg.solve(np.linalg.cholesky(products(basis, basis)), basis.reshape(len(basis), phase.size))
+    moved = monodromy.apply(basis.reshape(-1, *phase.shape)).reshape(basis.shape)
+    moved -= products(moved, phase[None]) * phase.ravel()
+    values, vectors = np.linalg.eig(products(basis, moved))
+    rest = vectors.T @ moved - values[:, None] * (vectors.T @ basis)
+    return values, np.sqrt(comm.allreduce(np.sum(np.abs(rest) ** 2, axis=1)))

@@ -1,0 +1,147 @@
+"""Follow branches of whole lattices, all ranks together, and judge their stability by their largest multipliers."""
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+from mpi4py import MPI
+
+import numpy as np
+
+from vipetsc.case import NnmCase
+from vipetsc.case.nnm import NnmTable
+from vipetsc.case.resolve import build_chain
+from vipetsc.io.folder import provenance
+from vipetsc.io.netcdf import Variables, open_netcdf, variable
+from vipetsc.modes.branch import Branch
+from vipetsc.modes.condensed_follow import stored_states
+from vipetsc.modes.floquet import largest_multipliers
+from vipetsc.modes.follow import Follower, Listener
+from vipetsc.modes.lattice_shooting import LatticeShooting
+from vipetsc.modes.point import Point
+from vipetsc.modes.shooting import MAPS, Shooting
+from vipetsc.modes.special import locate
+from vipetsc.modes.system import System
+from vipetsc.parallel import StopRequest
+
+MULTIPLIERS = {
+    "multiplier": "largest Floquet multipliers, real part",
+    "multiplier_imaginary": "largest Floquet multipliers, imaginary part",
+    "multiplier_residual": "residual of the multiplier's vector over its size",
+}
+
+
+class LatticeBranch(Branch):
+    """A branch with the largest multipliers of its points."""
+
+    def unknowns(self) -> Variables:
+        """As of ``Branch``, and the multipliers; NaN where fewer converged."""
+        most, data = max((len(p.multipliers) for p in self.points), default=0), super().unknowns()
+        if not most:
+            return data
+        largest = np.full((len(self.points), most, 2), np.nan, complex)
+        for row, p in zip(largest, self.points, strict=True):
+            row[: len(p.multipliers)] = p.multipliers
+        axes, values = (
+            ("point", "multiplier_number"),
+            (largest[..., 0].real, largest[..., 0].imag, largest[..., 1].real),
+        )
+        data["multiplier_number"] = variable(
+            "multiplier_number", np.arange(1, most + 1), "1", "number of a multiplier, the largest first"
+        )
+        for part, (name, text) in zip(values, MULTIPLIERS.items(), strict=True):
+            data[name] = variable(axes, part, "1", text)
+        return data
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The branch in an HDF5 file."""
+        branch = super().read(path)
+        with open_netcdf(path, "branch", ("point",)) as file:
+            parts = [file[name].values for name in MULTIPLIERS if name in file]
+        if parts:
+            largest = np.stack([parts[0] + 1j * parts[1], parts[2]], axis=-1)
+            rows = (row[np.isfinite(row[:, 0])] for row in largest)
+            branch.points = [replace(p, multipliers=row) for p, row in zip(branch.points, rows, strict=True)]
+        return branch
+
+
+class LatticeFollower(Follower):
+    """As ``Follower``, for a lattice on all ranks of ``comm``."""
+
+    branch_type = LatticeBranch
+
+    def __init__(
+        self,
+        case: NnmCase,
+        folder: Path,
+        comm: MPI.Comm,
+        listener: Listener | None,
+        stop: StopRequest | None,
+        resume: bool,
+    ) -> None:
+        sys.audit("vipetsc.set-up", case.name)
+        self.case, self.options, self.folder, self.listener, self.comm = case, case.nnm, folder, listener, comm
+        self.stop, self.resume, self.about, options = stop or StopRequest(), resume, provenance(comm), case.nnm
+        chain = build_chain(case.lattice, case.contacts)
+        self.system = System.from_chain(chain, case.contact(), dense=False)
+        shooting_map = MAPS["quarter" if options.map == "auto" else options.map]
+        limits = options.tolerance, options.max_newton
+        self.lattice = LatticeShooting(self.system, chain, shooting_map, comm, *limits)
+        self.problem, self.dofs = self.lattice, self.system.dofs
+
+    def name_of(self, mode: int) -> str:
+        """The name of the branch of ``mode`` (0-based), or of that start frequency."""
+        gaps = self.options.start_frequency
+        return f"breather-{gaps[mode]:g}" if gaps else self.system.branch_name(mode)
+
+    def judged(self, point: Point) -> Point:
+        """The point with its largest multipliers, if they are asked for."""
+        wanted = self.options.multipliers
+        if not wanted:
+            return point
+        found = largest_multipliers(self.lattice, point, 8 if wanted is True else int(wanted))
+        return replace(point, multipliers=found, multiplier=float(np.abs(found[:, 0]).max(initial=1.0)))
+
+    def _start(self, mode: int) -> Point:
+        gaps = self.options.start_frequency
+        return self.lattice.breather(gaps[mode]) if gaps else super()._start(mode)
+
+    def located(
+        self, problem: Shooting, control: NnmTable, left: Point, right: Point, before: Point | None, missed: list[str]
+    ) -> list[Point]:
+        """The folds between two points: half-traces are not known."""
+        return locate(problem, left, right, control.chart, False, before, missed)
+
+    def monitored(self, problem: Shooting, control: NnmTable) -> Callable[[Point], str | None]:
+        """No monitor: it integrates other orbits, and compares with all linear modes."""
+        return lambda point: None
+
+    def jumps(self, points: list[Point], problem: Shooting, control: NnmTable) -> Iterator[str]:
+        """None are told without half-traces."""
+        return iter(())
+
+    def finish(self, branch: Branch) -> None:
+        """Add the states at phase 0 of the first and the last point."""
+        points, shape = [branch.points[0], branch.regular()[-1]], (self.lattice.lattice_flow.chain.cells, -1)
+        if self.problem.map.start == "rest":
+            branch.extra = stored_states(points, range(shape[0]), np.array([p.x.reshape(shape) for p in points]))
+
+
+def follow_together(
+    case: NnmCase,
+    folder: Path,
+    comm: MPI.Comm,
+    resume: bool = False,
+    listener: Listener | None = None,
+    stop: StopRequest | None = None,
+) -> list[Branch]:
+    """As ``follow_all``, for a lattice: the branches one after the other, each by all ranks."""
+    follower = LatticeFollower(case, folder, comm, listener, stop, resume)
+    gaps: Any = case.nnm.start_frequency
+    branches = [
+        b for job in (range(len(gaps)) if gaps else [m - 1 for m in case.nnm.modes]) for b in follower.follow(job)
+    ]
+    return branches if comm.rank == 0 else []
