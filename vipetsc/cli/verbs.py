@@ -115,16 +115,13 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
 def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
-    from vipetsc.modes.condensed_follow import CondensedFollower
-    from vipetsc.modes.follow import Follower, claim_branches, follow_all
-    from vipetsc.modes.lattice_follow import follow_together
+    from vipetsc.modes.follow import claim_branches
+    from vipetsc.modes.lattice_follow import follow_case
 
     case = _load(NnmCase, options, comm)
     folder = _output(options, case.name)
     with claim_branches(case, folder, comm, options.force, options.resume) as claim:
-        given = case, claim.folder, comm, claim.going_on, tables.branch_log(sys.stderr), stop
-        kind = CondensedFollower if case.condensed else Follower
-        branches = follow_together(*given) if case.krylov else follow_all(*given, kind)
+        branches = follow_case(case, claim.folder, comm, claim.going_on, tables.branch_log(sys.stderr), stop)
         for branch in branches:
             echo(comm, tables.branch_table(branch))
             for finding in branch.findings:

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from mpi4py import MPI
 
@@ -16,9 +16,9 @@ from vipetsc.case.resolve import build_chain
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import Variables, open_netcdf, variable
 from vipetsc.modes.branch import Branch
-from vipetsc.modes.condensed_follow import stored_states
+from vipetsc.modes.condensed_follow import CondensedFollower, stored_states
 from vipetsc.modes.floquet import largest_multipliers
-from vipetsc.modes.follow import Follower, Listener
+from vipetsc.modes.follow import Follower, Listener, follow_all
 from vipetsc.modes.lattice_shooting import LatticeShooting
 from vipetsc.modes.point import Point
 from vipetsc.modes.shooting import MAPS, Shooting
@@ -102,8 +102,8 @@ class LatticeFollower(Follower):
         wanted = self.options.multipliers
         if not wanted:
             return point
-        found = largest_multipliers(self.lattice, point, 8 if wanted is True else int(wanted))
-        return replace(point, multipliers=found, multiplier=float(np.abs(found[:, 0]).max(initial=1.0)))
+        largest = largest_multipliers(self.lattice, point, 8 if wanted is True else int(wanted))
+        return replace(point, multipliers=largest, multiplier=float(np.abs(largest[:, 0]).max(initial=1.0)))
 
     def _start(self, mode: int) -> Point:
         gaps = self.options.start_frequency
@@ -130,7 +130,7 @@ class LatticeFollower(Follower):
             branch.extra = stored_states(points, range(shape[0]), np.array([p.x.reshape(shape) for p in points]))
 
 
-def follow_together(
+def follow_case(
     case: NnmCase,
     folder: Path,
     comm: MPI.Comm,
@@ -138,10 +138,11 @@ def follow_together(
     listener: Listener | None = None,
     stop: StopRequest | None = None,
 ) -> list[Branch]:
-    """As ``follow_all``, for a lattice: the branches one after the other, each by all ranks."""
-    follower = LatticeFollower(case, folder, comm, listener, stop, resume)
-    gaps: Any = case.nnm.start_frequency
-    branches = [
-        b for job in (range(len(gaps)) if gaps else [m - 1 for m in case.nnm.modes]) for b in follower.follow(job)
-    ]
+    """As ``follow_all``, by the way that the case asks for: the branches of a lattice each by all ranks together."""
+    if not case.krylov:
+        kind = CondensedFollower if case.condensed else Follower
+        return follow_all(case, folder, comm, resume, listener, stop, kind)
+    follower, gaps = LatticeFollower(case, folder, comm, listener, stop, resume), case.nnm.start_frequency
+    jobs = range(len(gaps)) if gaps else [mode - 1 for mode in case.nnm.modes]
+    branches = [branch for job in jobs for branch in follower.follow(job)]
     return branches if comm.rank == 0 else []
