@@ -183,10 +183,10 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
 
 
 def test_sweeps_jump_between_stable_states(tmp_path):
-    """A made-up S with a stable upper part: up it jumps at one fold, down at the other."""
+    """A made-up S with a stable upper part: up it jumps at one fold, to the nearer of two states, down at the other."""
     curve = Curve("s", case())
-    p = [0.5, 0.8, 1.0, 0.9, 0.7, 0.6, 0.8, 1.0, 1.2]
-    for i, (at, stable) in enumerate(zip(p, [1, 1, 0, 0, 0, 0, 1, 1, 1], strict=True)):
+    p = [0.5, 0.8, 1.0, 0.9, 0.7, 0.6, 0.8, 1.0, 1.2, 1.15, 1.05, 0.95]
+    for i, (at, stable) in enumerate(zip(p, [1, 1, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1], strict=True)):
         measures = {"amplitude": at, "unstable": 1 - stable, "largest": np.array([0.1 * i])}
         kind = "fold" if i in (2, 5) else "regular"
         curve.points.append(SteadyPoint(np.zeros(1), np.zeros(1), 0.1, kind, measures))
@@ -218,3 +218,16 @@ def test_a_site_is_needed_and_validate_reads_the_section(tmp_path):
     path = tmp_path / "x.toml"
     path.write_text('[lattice]\npreset = "four-band"\n[nfrc]\n[contacts]\nsites = [10]\n')
     assert "NfrcCase" in [type(of).__name__ for of in load_every(path)]
+
+
+def test_a_force_on_an_infinite_lattice_gives_what_leaves_and_is_lost(tmp_path):
+    force = {"source": "force", "harmonics": 7, "largest_step": 1.0}
+    touching = SteadyStates(case(**force), 0.7, 1023.27).scale
+    (curve,) = follow_curves(
+        case(contacts={"restitution": 0.7}, **force, range=[0.99 * touching, 1.0005 * touching]),
+        tmp_path,
+        MPI.COMM_SELF,
+    )
+    assert curve.complete and curve.points[-1].measures["episodes"] == 2
+    assert np.abs(curve.column("share").sum(axis=1) - 1).max() < 1e-8
+    assert curve.points[-1].measures["share"][3] > 0
