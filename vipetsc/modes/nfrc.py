@@ -139,7 +139,7 @@ def _jumps(path: list[int]) -> Iterator[tuple[int, int]]:
 
 
 def swept(curve: Curve, sign: int) -> list[int]:
-    """Points that a slow sweep of the parameter passes, up (``sign`` 1) or down (-1), from its first stable state on.
+    """Points that a slow sweep of the parameter passes, up (``sign`` 1) from the first stable state, or then down (-1).
 
     At a fold, or where a state becomes unstable, it jumps to the stable state with the parameter's value whose largest
     relative displacement at the first site is nearest; it ends where there is none.
@@ -152,7 +152,7 @@ def swept(curve: Curve, sign: int) -> list[int]:
     stable |= (kinds == "fold") & beside
     if not stable.any():
         return []
-    path = [int(np.argmin(np.where(stable, p, np.inf)))]
+    path = [int(np.argmin(np.where(stable, p, np.inf))) if sign > 0 else swept(curve, 1)[-1]]
     passed = set(path)
     while True:
         i = path[-1]
