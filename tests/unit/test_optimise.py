@@ -21,7 +21,7 @@ from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judge
 from vipetsc.studies.optimise import Search
 from vipetsc.studies.recorded import RecordedRuns
-from vipetsc.studies.sampler import CmaEs, Nsga2, front, knee
+from vipetsc.studies.sampler import CmaEs, Nsga2, front, knee, smooth
 
 BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
 TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "last": 1e-4}}, optimise=BOUNDS)
@@ -131,7 +131,7 @@ def searched(sampler, function, generations):
 
 
 def cma(**options):
-    return CmaEs(np.full(4, 0.5), np.zeros(4), 0.2, **({"seed": 3, "population": None} | options))
+    return CmaEs(np.full(4, 0.5), np.zeros(4), np.eye(4), 0.2, **({"seed": 3, "population": None} | options))
 
 
 def test_cma_es_finds_the_least_and_stays_in_the_cube():
@@ -165,9 +165,20 @@ def test_where_nothing_differs_generations_stay_within_bounds():
 
 def test_the_step_of_a_whole_number_does_not_vanish():
     """Where the others contract, neighbouring cells are still tried."""
-    sampler = CmaEs(np.full(2, 0.52), np.array([0.0, 0.02]), 0.2, 5, None)
+    sampler = CmaEs(np.full(2, 0.52), np.array([0.0, 0.02]), np.eye(2), 0.2, 5, None)
     points, _ = searched(sampler, lambda p: ((p - 0.5) ** 2).sum(axis=1, keepdims=True), 30)
     assert np.std(points[-12:, 0]) < 0.001 and np.std(points[-12:, 1]) > 0.002
+
+
+def test_a_first_generation_changes_neighbours_together():
+    """The mean has the step that is asked, the slope half of it, and differences of neighbours have little."""
+    sampler = CmaEs(np.full(10, 0.5), np.zeros(10), smooth(10), 0.02, 4, 4000)
+    points = sampler.ask() - 0.5
+    assert np.std(points.mean(axis=1)) == pytest.approx(0.02, rel=0.05)
+    modes = points @ smooth(10) / (smooth(10) ** 2).sum(axis=0)
+    assert np.allclose(np.std(modes, axis=0), 0.02, rtol=0.08)
+    assert np.abs(np.corrcoef(modes.T) - np.eye(10)).max() < 0.1
+    assert np.std(points[:, 0] - points[:, 1]) < 0.02 < np.std(points[:, 0] - points[:, -1])
 
 
 def test_nsga_ii_finds_the_front_of_two_bowls():
@@ -217,7 +228,7 @@ def spent(search):
 
 
 def recorder(searched):
-    return Recorder(searched.to_unit(searched.begin()), np.zeros(3), 0.2, 1, None)
+    return Recorder(searched.to_unit(searched.begin()), np.zeros(3), smooth(3), 0.2, 1, None)
 
 
 def test_a_search_spends_its_budget_and_keeps_the_best():

@@ -27,7 +27,7 @@ from vipetsc.studies.linear import LinearRun, linear_case
 from vipetsc.studies.objective import Judge
 from vipetsc.studies.one_site import make_law
 from vipetsc.studies.recorded import run_in_memory
-from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, front, knee
+from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, front, knee, smooth
 from vipetsc.studies.sweep import is_whole
 
 POPULATION = 24  # of NSGA-II
@@ -210,7 +210,9 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
     if len(options.objective) == 2:
         return Nsga2(point, options.step, options.seed, options.population or POPULATION)
     steps = np.array([1 / (v.high - v.low) if v.kind == "whole" else 0.0 for v in plan.variables()])
-    return CmaEs(point, steps, options.step, options.seed, options.population)
+    directions, gaps = np.eye(len(point)), np.array([v.name.startswith("clearance") for v in plan.variables()])
+    directions[np.ix_(gaps, gaps)] = smooth(int(gaps.sum()))
+    return CmaEs(point, steps, directions, options.step, options.seed, options.population)
 
 
 def _curves(search: Search) -> dict[str, list[Case]]:

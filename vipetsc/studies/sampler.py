@@ -17,11 +17,20 @@ class CmaEs:
     """Covariance matrix adaptation (Hansen 2016, arXiv:1604.00772), by ``cma``.
 
     A search that has contracted begins again at the best point, with twice the population, up to ``LARGEST`` times the
-    first. ``steps`` (variable) are those of whole numbers in the unit cube, 0 for others.
+    first. ``steps`` (variable) are those of whole numbers in the unit cube, 0 for others. It begins with the deviation
+    ``step`` along each of the ``directions`` (variable, direction); points beyond the cube are mirrored into it.
     """
 
-    def __init__(self, start: np.ndarray, steps: np.ndarray, step: float, seed: int, population: int | None) -> None:
-        self._random, self._step, self._steps = np.random.default_rng(seed), step, steps
+    def __init__(
+        self,
+        start: np.ndarray,
+        steps: np.ndarray,
+        directions: np.ndarray,
+        step: float,
+        seed: int,
+        population: int | None,
+    ) -> None:
+        self._random, self._step, self._steps, self._directions = np.random.default_rng(seed), step, steps, directions
         self._best: tuple[float, np.ndarray] = np.inf, start
         self._begin({"popsize": population} if population else {})
         self._first = int(self._search.popsize)
@@ -29,21 +38,23 @@ class CmaEs:
     def _begin(self, options: dict[str, Any]) -> None:
         from cma.evolution_strategy import CMAEvolutionStrategy
 
-        options |= {"bounds": [0, 1], "minstd": (WHOLE * self._steps).tolist(), "tolx": RESOLVED}
+        options |= {"minstd": (WHOLE * self._steps).tolist(), "tolx": RESOLVED}
         options |= {"randn": lambda *shape: self._random.standard_normal(shape), "seed": np.nan}
         options |= {"verbose": -10}  # nor does it read options from a file cma_signals.in
-        self._search = CMAEvolutionStrategy(self._best[1].tolist(), self._step, options)
+        self._centre = self._best[1]
+        self._search = CMAEvolutionStrategy([0.0] * len(self._centre), self._step, options)
 
     def ask(self) -> np.ndarray:
         """The next generation."""
         self._asked = self._search.ask()
-        return np.array(self._asked)
+        self._points = 1 - np.abs(1 - (self._centre + np.array(self._asked) @ self._directions.T) % 2)
+        return self._points
 
     def tell(self, losses: np.ndarray) -> None:
         """Its losses (design, 1)."""
         least = int(np.argmin(losses[:, 0]))
         if losses[least, 0] < self._best[0]:
-            self._best = float(losses[least, 0]), np.array(self._asked[least])
+            self._best = float(losses[least, 0]), self._points[least]
         self._search.tell(self._asked, losses[:, 0].tolist())
         if self._search.stop():
             self._begin({"popsize": min(2 * len(self._asked), LARGEST * self._first)})
@@ -81,6 +92,16 @@ class Nsga2:
 
 
 Sampler = CmaEs | Nsga2
+
+
+def smooth(count: int) -> np.ndarray:
+    """Directions (variable, direction) in which like variables in a row change together first, one by one last.
+
+    Cosines over the row: the mean by 1, the slope by 1/2, the bend by 1/3 (root mean square over the row), and so on.
+    """
+    order = np.arange(count)
+    cosines = np.cos(np.pi * np.outer(order + 0.5, order) / count) * np.where(order, np.sqrt(2), 1)
+    return np.asarray(cosines / (1 + order))
 
 
 def front(losses: np.ndarray) -> np.ndarray:
