@@ -3,12 +3,17 @@
 from importlib import import_module
 
 __version__ = "0.1.0"
-__all__ = ["Case", "simulate"]
+__all__ = ["Case", "open", "simulate"]
 
 
 def __getattr__(name: str) -> object:
     """Load a name when it is first used: importing the package must not start PETSc, whose options come first."""
-    modules = {"Case": "vipetsc.case", "simulate": "vipetsc.dynamics.run"}
+    modules = {
+        "Case": ("vipetsc.case", "Case"),
+        "open": ("vipetsc.io.read", "open_results"),
+        "simulate": ("vipetsc.dynamics.run", "simulate"),
+    }
     if name in modules:
-        return getattr(import_module(modules[name]), name)
+        module, attribute = modules[name]
+        return getattr(import_module(module), attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
+BAR = "vipetsc.bar"  # the logger whose level switches bars off
 STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 
 
@@ -174,7 +175,7 @@ class Progress:
         self._begin = self._last = time.monotonic()
         self._first = 0.0
         self._show = show and comm.rank == 0
-        terminal = self._show and sys.stderr.isatty()
+        terminal = self._show and sys.stderr.isatty() and logging.getLogger(BAR).level < logging.CRITICAL
         layout = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
         self._bar = tqdm(total=total, unit=unit, bar_format=layout, file=sys.stderr) if terminal else None
 

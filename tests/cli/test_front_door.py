@@ -50,7 +50,7 @@ def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, in_process, case, 
     assert summary["statistics"]["ledger_error"] < 1e-8
     assert summary["petsc_version"]
     files = {p.name for p in (tmp_path / "out").iterdir()}
-    assert files == {"run.h5", "summary.json", "case.toml", "analysis.h5", "figures"}
+    assert files == {"run.h5", "summary.json", "case.toml", "analysis.h5", "run.xdmf", "figures"}
     pictures = {p.name: p.stat().st_size for p in (tmp_path / "out" / "figures").glob("*.png")}
     wanted = {"modal_energies", "spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
     assert {f"{name}.png" for name in wanted} <= pictures.keys()
@@ -62,7 +62,7 @@ def test_run_leaves_a_traceable_run_and_its_pictures(vipetsc, in_process, case, 
 def assert_the_same_command_finishes_what_is_missing(in_process, case, out):
     """What is there stays as it is."""
     before = modified(out)
-    for missing in ((), ("analysis.h5",), ("figures/ledger.png", "summary.json")):
+    for missing in ((), ("analysis.h5",), ("figures/ledger.png", "summary.json", "run.xdmf")):
         for name in missing:
             (out / name).unlink()
             if name == "analysis.h5":
@@ -96,6 +96,7 @@ def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
         "summary.json",
         "case.toml",
         "analysis.h5",
+        "run.xdmf",
     }
 
 

@@ -10,13 +10,16 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.case import CaseError, Problem
-from vipetsc.cli import reference, verbs
+from vipetsc.cli import export, reference, verbs
+from vipetsc.cli.messages import told
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StoppedError, StopRequest
 
 Verb = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 # Verbs that look at a request to stop, to save first; others end where they are.
 STOPPABLE = ("run", "sweep", "nnm", "nfrc", "law", "optimise", "predict", "paper")
+# Verbs whose answer is what was asked for, and stays with --quiet.
+ASKED = ("validate", "bands", "manual", "schema", "completion", "doctor")
 WITH_PETSC_OPTIONS = ("run", "sweep", "validate")
 
 # Names and options of ``add_argument``; one that a verb describes differently has a second entry.
@@ -38,12 +41,16 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "path": ("path", {"type": Path, "nargs": "+", "metavar": "PATH",
                       "help": "folder of a run, a search or a law, or its run.h5, design.h5, law.h5; or folders of"
                               " branches, whose branches of one name share a page"}),
+    "results": ("path", {"type": Path, "nargs": "+", "metavar": "PATH", "help": "folder or file of results"}),
     "fig": ("--fig", {"action": "append", "metavar": "NAME", "help": "only this figure; may be repeated"}),
     "format": ("--format", {"action": "append", "choices": ("png", "pdf"),
                             "help": "png if left out; may be repeated"}),
     "only": ("--only", {"nargs": "+", "default": [], "metavar": "ID",
                         "help": "only what these figures (fig05) and claims (C7) need"}),
     "quick": ("--quick", {"action": "store_true", "help": "coarse grids: minutes, marked on every picture"}),
+    "quiet": ("--quiet", {"action": "store_true", "help": "tell warnings and errors alone"}),
+    "verbose": ("--verbose", {"action": "store_true", "help": "tell every phase and all statistics"}),
+    "log": ("--log", {"type": Path, "metavar": "FILE", "help": "add what is told to FILE, with the time"}),
     "shell": ("shell", {"choices": ("bash", "zsh"), "help": "the shell whose completions are printed"}),
     "topic": ("topic", {"nargs": "?", "metavar": "TOPIC", "help": "a chapter; a list of them if left out"}),
     "list": ("--list", {"action": "store_true", "help": "what is done, what is left and how long it takes"}),
@@ -66,12 +73,36 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
     "design": (verbs.design, "the (lambda, eta) search of the four-band cell", "case set out force resume"),
     "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs set"),
     "plot": (verbs.plot, "pictures of a finished run again, from its files", "path fig format"),
+    "export": (export.export, "XDMF (ParaView) beside a run, and curves of any results as CSV", "results"),
     "paper": (verbs.paper, "every figure and claim of the paper, and a report", "only quick list out"),
     "manual": (reference.manual, "a chapter of the manual, as plain text", "topic"),
     "schema": (reference.schema, "the JSON schema of case files, for editors", ""),
     "completion": (reference.completion, "what a shell needs to complete verbs, options and files", "shell"),
     "doctor": (verbs.doctor, "versions and what is missing", ""),
 }
+
+
+EXAMPLES = {
+    "run": "run runs/diatomic.toml --set drive.amplitude=0.8 --out runs/soft",
+    "validate": "validate runs/three-mass.toml",
+    "bands": "bands runs/three-mass.toml --json",
+    "sweep": "sweep runs/interband-amplitudes.toml --set sweep.ranks=1",
+    "nnm": "nnm runs/nnm-hertz.toml --quiet --log nnm.log",
+    "nfrc": "nfrc runs/nfrc.toml",
+    "law": "law runs/law.toml --set law.tolerance=0.02",
+    "optimise": "optimise runs/optimise-clearances.toml --set optimise.budget=40",
+    "predict": "predict runs/predict.toml",
+    "design": "design runs/design.toml --set design.lambda.count=10",
+    "analyse": "analyse runs/four-band --set analysis.band_stride=1",
+    "plot": "plot runs/four-band --fig dispersion --format pdf",
+    "export": "export runs/four-band",
+    "paper": "paper --quick --only fig09 C7",
+    "manual": "manual case-file",
+    "schema": "schema > vipetsc.schema.json",
+    "completion": "completion bash > ~/.local/share/bash-completion/completions/vipetsc",
+    "doctor": "doctor",
+}
+EVERY_VERB = "quiet verbose log"
 
 
 class Parser(argparse.ArgumentParser):
@@ -87,6 +118,17 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
     if not arguments or (arguments[0].startswith("-") and arguments[0] not in ("-h", "--help", "--version")):
         arguments = ["run", *arguments]  # of the built-in case
     options = _parser().parse_args(arguments)
+    try:
+        with told(MPI.COMM_WORLD, options, asked=options.verb in ASKED or getattr(options, "list", False)):
+            return _call(options, petsc or {})
+    except FolderError as error:  # the file of --log
+        if MPI.COMM_WORLD.rank == 0:
+            print(f"vipetsc: {error}", file=sys.stderr, flush=True)
+        return verbs.BAD_INPUT
+
+
+def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
+    """The exit code of the verb, called with a request to stop at hand; what is bad input is told."""
     try:
         if petsc and options.verb not in WITH_PETSC_OPTIONS:
             raise CaseError([Problem(f"-{name}", None, f"{options.verb} takes no PETSc options") for name in petsc])
@@ -115,9 +157,12 @@ def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
     parser.add_argument("--version", action="version", version=f"vipetsc {vipetsc.__version__}")
     subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, (function, text, keys) in VERBS.items():
-        verb = subparsers.add_parser(name, help=text, description=text)
+        example = f"example: vipetsc {EXAMPLES[name]}" if name in EXAMPLES else None
+        verb = subparsers.add_parser(
+            name, help=text, description=text, epilog=example, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
         verb.set_defaults(function=function, parser=_parser)
-        for key in keys.split():
+        for key in (*keys.split(), *EVERY_VERB.split()):
             flag, details = ARGUMENTS[key]
             argument = verb.add_argument(flag, **details)
             if complete and flag in complete:

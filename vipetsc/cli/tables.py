@@ -1,10 +1,12 @@
 """What the verbs print: tables of a case, its bands, and how runs, sweeps and branches ended."""
 
 import json
+import logging
 import math
+import shutil
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -21,8 +23,7 @@ if TYPE_CHECKING:
     from vipetsc.modes.point import Point
     from vipetsc.studies.sweep import SweepResult
 
-# Time of one step of the default method per mass and per step, measured on one 2020s core.
-_STEP_SECONDS, _STEP_SECONDS_PER_MASS = 2e-5, 7e-8
+logger = logging.getLogger(__name__)
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
@@ -104,6 +105,7 @@ def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
 
 def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
     """What follows from a case of a run: bands, drive, times, samples, file size, cost."""
+    from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_indices, memory_available, memory_needed
     from vipetsc.dynamics.recorder import recorded_cells, written_together
 
@@ -113,13 +115,10 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
     bands, waves = pass_bands(cell), waves_at(cell, model.drive.frequency)
     columns = len(recorded_cells(case.output, chain.cells)) * cell.dofs * len(case.output.fields)
     size = 8 * (columns * -(-model.samples // case.output.stride) + len(chain.sites) * model.samples)
-    # At least one step a sample, and the top band resolved.
-    steps = model.samples * max(np.ceil(model.sample_interval * bands[-1].high / 0.37), 1) * 1.3
-    seconds = steps * (_STEP_SECONDS + _STEP_SECONDS_PER_MASS * chain.cells * cell.dofs / ranks)
-    duration = f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
+    cost = estimate(case, ranks)
+    hits = f", {duration(cost.contacts)} of it for about {cost.episodes:.1g} contacts" if cost.episodes else ""
     writer = "parallel" if written_together(model, case.output, ranks) else "gather"
-    engine = "ts" if case.time.engine == "ts" else "propagator"
-    needed, left = sum(memory_needed(model, case.output, engine, ranks).values()), memory_available() / ranks
+    needed, left = sum(memory_needed(model, case.output, cost.engine, ranks).values()), memory_available() / ranks
     return [
         ("case", case.name),
         ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {chain.ends} ends, "
@@ -137,11 +136,18 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
         ("burst, end", f"{model.drive.duration:.6g} s, {model.end:.6g} s"),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
-        ("file size", f"{size / 2**20:.4g} MiB ({writer})"),
+        ("engine", cost.engine + (f": {cost.note}" if cost.note else "")),
+        ("disk", f"{size / 2**20:.4g} MiB ({writer}), twice that until the run has ended; "
+                 f"{shutil.disk_usage('.').free / 2**30:.4g} GiB are free here"),
         ("memory", f"{needed / 1e9:.3g} GB on a rank" + f", and here are {left / 1e9:.3g} GB" * (needed > left)),
-        ("cost", f"about {steps:.3g} steps of engine ts, {duration} on {ranks} rank{'s' * (ranks > 1)}"
-                 " before contacts"),
+        ("time", f"about {duration(cost.seconds)} on {ranks} rank{'s' * (ranks > 1)}{hits}"),
+        ("faster", cost.faster),
     ]  # fmt: skip
+
+
+def duration(seconds: float) -> str:
+    """Seconds, or minutes, in two digits."""
+    return f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
 
 
 def initial_text(case: Case) -> str:
@@ -182,8 +188,8 @@ def _first_few(items: Sequence[object]) -> str:
     return "none" if not items else shown + (f", ... ({len(items)})" if len(items) > 8 else "")
 
 
-def run_table(result: "Result") -> str:
-    """How a run ended and its numbers."""
+def run_table(result: "Result", faster: str = "") -> str:
+    """How a run ended and its numbers; ``faster``: what would have been."""
     s = result.statistics
     if s["engine"] == "propagator":
         steps = f"{s['steps']} linear ({s['method']}, {s['bandwidth']} cells each way, exact to {s['truncation']:.1g})"
@@ -203,11 +209,12 @@ def run_table(result: "Result") -> str:
         ("time", f"{s['wall_seconds']:.2f} s wall, {s['cpu_seconds']:.2f} s CPU of all ranks"),
         ("folder", str(result.folder)),
         ("engine", f"{s['engine']}: {s['engine_note']}" if "engine_note" in s else ""),
+        ("faster", faster),
     ]
     return f"{result.sentence}\n{table(rows)}"
 
 
-def branch_log(stream: TextIO) -> Callable[["Branch", "Point"], None]:
+def branch_log() -> Callable[["Branch", "Point"], None]:
     """A live table of growing branches: a line a point, no more than two a second."""
     title = "branch           point      T (s)        E (J)  Newton  contacts  max multiplier\n"
     last = -math.inf
@@ -217,11 +224,10 @@ def branch_log(stream: TextIO) -> Callable[["Branch", "Point"], None]:
         now = time.monotonic()
         if now - last < 0.5:
             return
-        stream.write(
+        logger.info(
             f"{title}{branch.name:<14} {point.index:7d} {point.period:10.4e} {point.energy:12.6e} {point.newton:7d}"
-            f" {point.episodes:9d} {point.multiplier:15.6g}\n"
+            f" {point.episodes:9d} {point.multiplier:15.6g}"
         )
-        stream.flush()
         title, last = "", now
 
     return show

@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TextIO, TypeVar
+from typing import TypeVar
 
 from mpi4py import MPI
 
@@ -20,6 +20,7 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
+from vipetsc.cli.messages import echo, logger
 from vipetsc.cli.plot import draw_source, source_of
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import origin
@@ -29,12 +30,6 @@ from vipetsc.parallel import StopRequest, on_root
 DONE, FAILED, BAD_INPUT, STOPPED = 0, 1, 2, os.EX_TEMPFAIL
 
 AnyCase = TypeVar("AnyCase", bound=CaseFile)
-
-
-def echo(comm: MPI.Comm, text: str, stream: TextIO | None = None) -> None:
-    """Print ``text`` on rank 0."""
-    if comm.rank == 0:
-        print(text, file=stream or sys.stdout, flush=True)
 
 
 def echo_paths(comm: MPI.Comm, paths: Iterable[Path]) -> None:
@@ -70,6 +65,8 @@ def _output(options: argparse.Namespace, name: str) -> Path:
 def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """One simulation, its analysis and pictures; or a member of a sweep again, with all its fields."""
     from vipetsc.dynamics import simulate
+    from vipetsc.dynamics.cost import estimate
+    from vipetsc.io.export import has_xdmf, write_xdmf
     from vipetsc.studies.reanalysis import is_measured, measure_run
 
     case = _load(Case, options, comm) if options.member is None else on_root(comm, lambda: _member(options))
@@ -80,10 +77,13 @@ def run(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     with locked(comm, folder):
         result = simulate(case, folder, comm, force=options.force, resume=options.resume, stop=stop, progress=True)
         echo_warnings(comm, [warning for warning in result.warnings if warning not in known])
-        echo(comm, tables.run_table(result))
+        echo(comm, tables.run_table(result, on_root(comm, lambda: estimate(case, comm.size).faster)))
+        if comm.rank == 0:
+            logger.debug("statistics %s", json.dumps(result.statistics))
         stop.check(comm)
         if case.output.fields and result.statistics["samples"] > 1:
             on_root(comm, lambda: is_measured(folder) or measure_run(folder, around))
+            on_root(comm, lambda: has_xdmf(folder) or write_xdmf(folder))
             stop.check(comm)
             if case.output.figures:
                 echo_paths(comm, draw_source("run", [folder], comm, afresh=False))
@@ -121,7 +121,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     case = _load(NnmCase, options, comm)
     folder = _output(options, case.name)
     with claim_branches(case, folder, comm, options.force, options.resume) as claim:
-        branches = follow_case(case, claim.folder, comm, claim.going_on, tables.branch_log(sys.stderr), stop)
+        branches = follow_case(case, claim.folder, comm, claim.going_on, tables.branch_log(), stop)
         for branch in branches:
             echo(comm, tables.branch_table(branch))
             for finding in branch.findings:

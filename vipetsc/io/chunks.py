@@ -104,7 +104,9 @@ def described(name: str, data: xr.Dataset) -> tuple[list[str], dict[str, str]]:
     """Dimensions and attributes of a variable of ``LARGE`` beside ``data``, whose time may be that of the fields."""
     dims, units, text = LARGE[name]
     dims = dims if "field_time" in data else dims.replace("field_time", "time")
-    return dims.split(), {"units": units, "long_name": text}
+    # As the CF conventions have it: the time of an episode is a coordinate of what is told of it.
+    at = {"coordinates": "onset"} if name.startswith("impacts/") and name != "impacts/onset" else {}
+    return dims.split(), {"units": units, "long_name": text, **at}
 
 
 def writers(output: Chunks) -> MPI.Comm:

@@ -48,18 +48,20 @@ class FolderKind:
 
     noun: str
     results: tuple[str, ...]
-    beside: tuple[str, ...] = ("figures",)
+    beside: tuple[str, ...] = ("figures", "curves")
     marker: str = "case.toml"
     free: str = ""
 
 
-RUN = FolderKind("run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "figures"), free="analysis")
-BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures"))
+RUN = FolderKind(
+    "run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "run.xdmf", "curves", "figures"), free="analysis"
+)
+BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures", "curves"))
 SEARCH = FolderKind("search", ("design.h5",))
 LAW = FolderKind("law", ("law.h5", "law-runs*.jsonl"))
 SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
 PREDICTION = FolderKind("prediction", ("prediction.h5", "prediction-runs*.jsonl"))
-OPTIMUM = FolderKind("optimum", ("optimum.h5", "optimum-runs*.jsonl"), ("figures", "law", "best*.toml"))
+OPTIMUM = FolderKind("optimum", ("optimum.h5", "optimum-runs*.jsonl"), ("figures", "curves", "law", "best*.toml"))
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, PAPER)
 

@@ -10,7 +10,7 @@ The dataset is flat rather than a ``DataTree`` because there a group inherits th
 
 import json
 import sys
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -68,7 +68,13 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
 def add_variable(
     file: h5py.File, name: Hashable, dims: Sequence[Hashable], shape: Sequence[int], dtype: Any, attributes: Any
 ) -> h5py.Dataset:
-    """An empty dataset over coordinates added before; itself a coordinate if its one dimension has its name."""
+    """An empty dataset over coordinates added before; itself a coordinate if its one dimension has its name.
+
+    Its group gets soft links to coordinates outside it: what opens the group alone finds them there.
+    """
+    group = PurePosixPath(str(name)).parent
+    if name in file:
+        del file[str(name)]  # such a link
     dataset = file.create_dataset(str(name), tuple(shape), dtype)
     if tuple(dims) == (name,):
         dataset.make_scale(PurePosixPath(str(name)).name)
@@ -77,6 +83,9 @@ def add_variable(
             if dim not in file:
                 raise ValueError(f"{name}: its dimension {dim} has no coordinate")
             dataset.dims[axis].attach_scale(file[str(dim)])
+            link = group / PurePosixPath(str(dim)).name
+            if str(link) not in file:
+                file[str(link)] = h5py.SoftLink(f"/{dim}")
     dataset.attrs.update(attributes)
     return dataset
 
@@ -91,9 +100,10 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     sys.audit("vipetsc.read", str(path))
     try:
         groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
+        links = _links(path)
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise OSError(f"{path} cannot be opened as a {kind}: {error}") from error
-    data, closing = _flat(groups), ExitStack()
+    data, closing = _flat(groups, links), ExitStack()
     for group in groups.values():
         closing.callback(group.close)
     data.set_close(closing.close)
@@ -105,12 +115,24 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     return data
 
 
-def _flat(groups: dict[str, xr.Dataset]) -> xr.Dataset:
-    """All groups in one dataset, names of variables, dimensions and attributes by their paths.
+def _links(path: str | Path) -> set[PurePosixPath]:
+    """The soft links in a file, to coordinates outside a group."""
+    with h5py.File(path) as file:
+        groups = [file]
+        file.visititems(lambda name, item: groups.append(item) if isinstance(item, h5py.Group) else None)
+        links = ((g, key) for g in groups for key in g if isinstance(g.get(key, getlink=True), h5py.SoftLink))
+        return {PurePosixPath(group.name) / key for group, key in links}
+
+
+def _flat(groups: dict[str, xr.Dataset], links: Collection[PurePosixPath]) -> xr.Dataset:
+    """All groups in one dataset, names of variables, dimensions and attributes by their paths; ``links`` are left out.
 
     The coordinate of a dimension stands in the same group, or in the nearest one around it.
     """
-    nodes = {PurePosixPath(group): data for group, data in groups.items()}
+    nodes = {
+        PurePosixPath(g): data.drop_vars([n.name for n in links if n.parent == PurePosixPath(g)])
+        for g, data in groups.items()
+    }
     scales = {node / str(n) for node, data in nodes.items() for n, item in data.variables.items() if item.dims == (n,)}
     variables: dict[str, xr.Variable] = {}
     attributes: dict[str, Any] = {}

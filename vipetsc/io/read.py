@@ -16,6 +16,8 @@ import xarray as xr
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.chain import cells_between
 
+# Of the files in a folder, the one that is opened.
+FIRST = "run.h5", "optimum.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
 Selectable = TypeVar("Selectable", xr.Dataset, xr.DataArray)
 
 
@@ -27,6 +29,26 @@ def open_run(path: str | Path) -> xr.Dataset:
     run = open_netcdf(path, "run", ("time", "cell", "energy", "case"))
     run.encoding["source"] = str(path)
     return run
+
+
+def open_results(path: str | Path) -> xr.Dataset:
+    """Any file of results, or the one in a folder that tells most, as ``vipetsc.open``; a context manager.
+
+    Names are paths in the file, units attributes of the variables, the resolved case (TOML) is ``attrs["case"]``;
+    ``Case.of`` reads it. Episodes of a run have their ``impacts/onset`` as a coordinate. Raises ValueError for a folder
+    without results or with several branches, and as ``open_netcdf``.
+    """
+    path = Path(path)
+    if path.is_dir() and (path / "ensemble.h5").exists():
+        return open_ensemble(path)
+    files = [path]
+    if path.is_dir():
+        files = [path / name for name in FIRST if (path / name).exists()][:1] or sorted(path.glob("branch-*.h5"))
+    if len(files) != 1:
+        raise ValueError(f"{path}: holds {', '.join(file.name for file in files) or 'no results'}; name a file")
+    data = open_netcdf(files[0], "result")
+    data.encoding["source"] = str(files[0])
+    return data.set_coords([name for name in ("impacts/onset",) if name in data])
 
 
 def field_time(run: xr.Dataset) -> np.ndarray:

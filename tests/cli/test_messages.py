@@ -1,0 +1,113 @@
+"""What is told where: --quiet, --verbose, --log and the help of every verb; a bar on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pty
+import re
+import shlex
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+import pytest
+
+import vipetsc as package
+from vipetsc import parallel
+from vipetsc.cli.main import EXAMPLES, VERBS, _parser
+from vipetsc.parallel import BAR, Progress
+
+ROOT = Path(package.__file__).parents[1]
+TINY = ("--set", "lattice.cells=12", "--set", "contacts.sites=[4]", "--set", "drive.cycles=3",
+        "--set", "time.end=0.02", "--set", "time.engine=propagator", "--set", "output.figures=false",
+        "--set", "contacts.clearance=2e-4")  # fmt: skip
+STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3}"
+
+
+def test_every_verb_has_an_example_that_it_takes(in_process):
+    assert EXAMPLES.keys() == VERBS.keys()
+    for name, example in EXAMPLES.items():
+        words = shlex.split(example.partition(" > ")[0])
+        options = _parser().parse_args(words)
+        assert options.verb == name
+        if getattr(options, "case", None):
+            assert (ROOT / options.case).exists(), example
+    shown = in_process("law", "--help")
+    assert shown.returncode == 0 and "example: vipetsc law runs/law.toml" in shown.stdout
+
+
+def test_quiet_tells_nothing_but_warnings(in_process, tmp_path):
+    ended = in_process("run", *TINY, "--out", tmp_path / "run", "--quiet")
+    assert ended.returncode == 0 and (tmp_path / "run/run.h5").exists()
+    assert ended.stdout == ""
+    assert all(line.startswith("vipetsc: warning: ") for line in ended.stderr.splitlines())
+    other = in_process("run", *TINY, "--out", tmp_path / "run", "--quiet", "--set", "drive.amplitude=3")
+    assert other.returncode == 2 and "holds another run" in other.stderr
+    assert "GB on a rank" in in_process("validate", "--quiet").stdout  # what is asked for
+
+
+def test_the_log_holds_all_that_is_told_with_its_time(in_process, tmp_path):
+    log = tmp_path / "run.log"
+    first = in_process("run", *TINY, "--out", tmp_path / "run", "--log", log, "--quiet")
+    assert first.returncode == 0, first.stderr
+    text = log.read_text()
+    assert re.search(rf"^{STAMP} INFO complete: 101 samples", text, flags=re.M)
+    second = in_process("run", *TINY, "--out", tmp_path / "run", "--set", "drive.amplitude=3", "--log", log)
+    assert second.returncode == 2
+    assert log.read_text().startswith(text)  # it is added to
+    assert re.search(rf"^{STAMP} WARNING vipetsc: .*holds another run", log.read_text(), flags=re.M)
+    assert not logging.getLogger("vipetsc").handlers
+
+
+def test_a_log_that_cannot_be_written_is_bad_input(in_process, tmp_path):
+    ended = in_process("run", *TINY, "--out", tmp_path / "run", "--log", tmp_path / "no" / "run.log")
+    assert ended.returncode == 2
+    assert ended.stderr.startswith(f"vipetsc: --log {tmp_path / 'no' / 'run.log'}: No such file")
+    assert not any(tmp_path.iterdir())
+
+
+def test_what_ends_a_verb_stands_in_its_log(in_process, tmp_path, monkeypatch):
+    def fail(*arguments: object) -> int:
+        raise RuntimeError("the disk is on fire")
+
+    monkeypatch.setitem(VERBS, "doctor", (fail, *VERBS["doctor"][1:]))
+    with pytest.raises(RuntimeError):
+        in_process("doctor", "--log", tmp_path / "log")
+    assert re.search(rf"^{STAMP} CRITICAL vipetsc: the disk is on fire", (tmp_path / "log").read_text(), flags=re.M)
+
+
+def test_verbose_tells_phases_and_statistics(in_process, tmp_path):
+    ended = in_process("run", *TINY, "--out", tmp_path / "run", "--verbose")
+    for text in ("set-up four-band", "claim ", "analyse", 'statistics {"samples": 101'):
+        assert re.search(rf"^{re.escape(text)}", ended.stderr, flags=re.M), text
+    after = in_process("run", *TINY, "--out", tmp_path / "more")
+    assert "set-up" not in after.stderr
+
+
+@pytest.mark.parametrize(("quiet", "bar"), [(False, True), (True, False)])
+def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
+    outer, inner = pty.openpty()
+    with os.fdopen(inner, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        monkeypatch.setattr(logging.getLogger(BAR), "level", logging.CRITICAL if quiet else logging.NOTSET)
+        progress = Progress(MPI.COMM_SELF, 1.0, "s")
+        progress.update(0.5)
+        progress.close()
+        terminal.write("end")
+        terminal.flush()
+        shown = os.read(outer, 10_000).decode()
+    os.close(outer)
+    assert ("50%|" in shown or "0%|" in shown) == bar and shown.endswith("end")
+
+
+def test_lines_elsewhere_come_every_five_seconds(monkeypatch, caplog):
+    now = [0.0]
+    monkeypatch.setattr(parallel.time, "monotonic", lambda: now[0])
+    with caplog.at_level(logging.INFO, logger="vipetsc"):
+        progress = Progress(MPI.COMM_SELF, 20.0, "s")
+        for second in range(20):
+            now[0] = float(second)
+            progress.update(float(second))
+    assert [record.getMessage().split("  ")[0].strip() for record in caplog.records] == ["25 %", "50 %", "75 %"]

@@ -1,0 +1,156 @@
+"""Results as other programs read them: XDMF by its references into run.h5, CSV, ``vipetsc.open``, plain xarray."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+from mpi4py import MPI
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import vipetsc as package
+from tests.conftest import assert_same_bits, datasets, small_case
+from vipetsc.case import Case, Sweep
+from vipetsc.dynamics import simulate
+from vipetsc.io import export
+from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
+from vipetsc.io.read import open_run
+from vipetsc.studies.sweep import run_sweep
+
+FAST = {"time": {"end": 0.03, "engine": "propagator"}, "lattice": {"cells": 16}}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A short run with contacts, whose fields are those of a window, every second cell and every third sample."""
+    path = tmp_path_factory.mktemp("run")
+    simulate(small_case(**FAST, output={"window": [3, 15], "every": 2, "stride": 3}), path)
+    export.write_xdmf(path)
+    return path
+
+
+def slab(item: ElementTree.Element, folder) -> np.ndarray:
+    """What a hyperslab of the XDMF format refers to, checked against the dataset in the file."""
+    selection, source = item.findall("DataItem")
+    start, stride, count = np.array(selection.text.split(), int).reshape(
+        [int(n) for n in selection.get("Dimensions").split()]
+    )
+    name, _, path = source.text.strip().partition(":")
+    with h5py.File(folder / name) as file:
+        dataset = file[path]
+        assert [int(n) for n in source.get("Dimensions").split()] == list(dataset.shape)
+        assert source.get("NumberType") == "Float" and int(source.get("Precision")) == dataset.dtype.itemsize
+        assert all(start + (count - 1) * stride < dataset.shape)
+        part = dataset[tuple(slice(a, a + n * s, s) for a, n, s in zip(start, count, stride, strict=True))]
+    return part.reshape([int(n) for n in item.get("Dimensions").split()])
+
+
+def test_every_reference_of_the_mesh_leads_to_its_field(folder):
+    grids = ElementTree.parse(folder / "run.xdmf").getroot().findall("Domain/Grid/Grid")
+    with open_run(folder / "run.h5") as run:
+        displacement, velocity = run["displacement"].values, run["velocity"].values
+        times, cells = run["field_time"].values, run["cell"].values
+    assert len(grids) == len(times) == len(displacement)
+    assert [float(grid.find("Time").get("Value")) for grid in grids] == times.tolist()
+    for row, grid in enumerate(grids):
+        fields = {item.get("Name"): slab(item.find("DataItem"), folder) for item in grid.findall("Attribute")}
+        assert fields["displacement (m)"].tobytes() == displacement[row].tobytes()
+        assert fields["velocity (m/s)"].tobytes() == velocity[row].tobytes()
+        assert [int(n) for n in grid.find("Topology").get("Dimensions").split()] == list(displacement.shape[1:])
+        origin, spacing = ([float(x) for x in item.text.split()] for item in grid.findall("Geometry/DataItem"))
+        assert (origin[0] + spacing[0] * np.arange(len(cells))).tolist() == cells.tolist()
+
+
+def test_long_runs_show_every_nth_sample_to_the_end(folder, monkeypatch):
+    monkeypatch.setattr(export, "MOST_FRAMES", 7)
+    export.write_xdmf(folder)
+    grids = ElementTree.parse(folder / "run.xdmf").getroot().findall("Domain/Grid/Grid")
+    with open_run(folder / "run.h5") as run:
+        times = run["field_time"].values
+    shown = [float(grid.find("Time").get("Value")) for grid in grids]
+    assert len(shown) <= 7 and shown == times[:: -(-len(times) // 7)].tolist()
+
+
+def test_a_run_without_fields_has_no_mesh(tmp_path):
+    simulate(small_case(**FAST, output={"fields": []}), tmp_path)
+    assert export.write_xdmf(tmp_path) is None
+
+
+def test_groups_carry_their_time_in_plain_xarray(folder):
+    with xr.open_dataset(folder / "run.h5", engine="h5netcdf") as run:
+        time = run.time.values
+    with xr.open_dataset(folder / "run.h5", engine="h5netcdf", group="energy") as energy:
+        assert energy.work.time.values.tolist() == time.tolist()
+        assert energy.time.attrs["units"] == "s"
+    with xr.open_dataset(folder / "run.h5", engine="h5netcdf", group="impacts") as impacts:
+        assert "onset" in impacts.loss.coords and impacts.onset.attrs["units"] == "s"
+        assert impacts.loss.sizes["episode"] > 2
+
+
+def test_links_are_no_variables_and_give_way_to_one(tmp_path):
+    data = {
+        "time": variable("time", [0.0, 1.0], "s", "time"),
+        "site": variable("site", [1, 2, 3], "1", "site"),
+        "g/a": variable(["time", "site"], np.ones((2, 3)), "1", "a"),
+        "g/site": variable("time", [5.0, 6.0], "1", "not the coordinate"),
+    }
+    write_netcdf(tmp_path / "x.h5", xr.Dataset(data))
+    with open_netcdf(tmp_path / "x.h5", "file") as back:
+        assert set(back.variables) == {"time", "site", "g/a", "g/site"}
+        assert back["g/site"].values.tolist() == [5.0, 6.0] and back["g/site"].dims == ("time",)
+        assert back["g/a"].dims == ("time", "site")
+
+
+def test_open_gives_units_and_the_case(folder):
+    with package.open(folder) as run, package.open(folder / "run.h5") as same:
+        assert run["velocity"].attrs["units"] == "m/s" and run["energy/work"].coords["time"].attrs["units"] == "s"
+        assert "impacts/onset" in run["impacts/force"].coords
+        assert Case.of(run) == Case.of(same) and Case.of(run).lattice.cells == 16
+        assert set(run.variables) == set(datasets(folder / "run.h5"))
+
+
+def test_open_names_what_it_cannot_choose(tmp_path):
+    with pytest.raises(ValueError, match="no results"):
+        package.open(tmp_path)
+    for name in ("branch-a.h5", "branch-b.h5"):
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=r"branch-a.h5, branch-b.h5; name a file"):
+        package.open(tmp_path)
+
+
+def test_curves_are_tables_with_units_and_every_digit(folder, in_process):
+    before = datasets(folder / "run.h5")
+    ended = in_process("export", folder)
+    assert ended.returncode == 0, ended.stderr
+    ledger = pd.read_csv(folder / "curves/run-time.csv", float_precision="round_trip")
+    impacts = pd.read_csv(folder / "curves/run-episode.csv", float_precision="round_trip")
+    with open_run(folder / "run.h5") as run:
+        assert ledger["energy/work (J)"].values.tobytes() == run["energy/work"].values.tobytes()
+        assert ledger["time (s)"].values.tobytes() == run["time"].values.tobytes()
+        assert impacts["impacts/force (N)"].values.tobytes() == run["impacts/force"].values.tobytes()
+        assert impacts["impacts/onset (s)"].values.tobytes() == run["impacts/onset"].values.tobytes()
+    assert f"  {folder / 'run.xdmf'}" in ended.stdout.splitlines()
+    assert_same_bits(before, datasets(folder / "run.h5"))
+
+
+def test_a_sweep_is_one_table_of_members(tmp_path):
+    table = {"lattice": {"preset": "four-band", "cells": 12}, "contacts": {"sites": [4], "clearance": 2e-4}}
+    axes = {"drive": {"amplitude": [1.0, 30.0]}, "contacts": {"restitution": [0.5, 1.0]}}
+    plan = Sweep.from_table(table | {"drive": {"cycles": 3}, "time": {"end": 0.02}, "sweep": axes})
+    run_sweep(plan, tmp_path, MPI.COMM_SELF)
+    assert [path.name for path in export.write_curves(tmp_path) if "members" in path.name] == ["ensemble-members.csv"]
+    members = pd.read_csv(tmp_path / "curves/ensemble-members.csv", float_precision="round_trip")
+    with package.open(tmp_path) as ensemble:
+        picked = ensemble.sel(amplitude=30.0, restitution=0.5)
+        row = members[(members["amplitude (N)"] == 30.0) & (members["restitution"] == 0.5)]
+        assert len(members) == 4 and row["ibtet"].item() == picked["ibtet"].item()
+
+
+def test_what_holds_no_results_is_refused(in_process, tmp_path):
+    ended = in_process("export", tmp_path)
+    assert ended.returncode == 2 and "holds no results" in ended.stderr
+    assert not any(tmp_path.iterdir())

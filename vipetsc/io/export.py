@@ -1,0 +1,98 @@
+"""Results in the forms of other programs: XDMF for ParaView, which reads ``run.h5`` itself, and curves as CSV."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+import xarray as xr
+
+from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.read import field_time, open_results, open_run
+
+MOST_FRAMES = 5000  # of a run with more samples, every n-th; a frame takes about 1 kB of the text
+MOST_ROWS = 1_000_000  # of a table
+FIELDS = "displacement", "velocity"
+
+
+def write_xdmf(folder: Path) -> Path | None:
+    """Write ``run.xdmf`` beside ``run.h5``; None for a run without fields. Raises as ``open_run``.
+
+    A regular mesh of nodes (cell, mass), and at every frame the fields as hyperslabs of the datasets in ``run.h5``.
+    """
+    with open_run(folder / "run.h5") as run:
+        fields = [name for name in FIELDS if name in run]
+        if not fields:
+            return None
+        times, shape = field_time(run), run[fields[0]].shape
+        cells = run["cell"].values
+        units = {name: run[name].attrs["units"] for name in fields}
+    root = Xml.Element("Xdmf", Version="3.0")
+    series = _child(_child(root, "Domain"), "Grid", Name="run", GridType="Collection", CollectionType="Temporal")
+    spacing = float(cells[1] - cells[0]) if len(cells) > 1 else 1.0
+    for row in range(0, shape[0], -(-shape[0] // MOST_FRAMES)):
+        grid = _child(series, "Grid", Name=f"sample {row}", GridType="Uniform")
+        _child(grid, "Time", Value=repr(float(times[row])))
+        _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=_words(shape[1:]))
+        geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
+        for values in ((cells[0], 1), (spacing, 1)):  # cells count along the slow axis
+            _child(geometry, "DataItem", _words(values), Dimensions="2", Format="XML")
+        for name in fields:
+            node = _child(grid, "Attribute", Name=f"{name} ({units[name]})", AttributeType="Scalar", Center="Node")
+            slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=_words(shape[1:]))
+            start, stride, count = (row, 0, 0), (1, 1, 1), (1, *shape[1:])
+            _child(slab, "DataItem", _words((*start, *stride, *count)), Dimensions="3 3", Format="XML")
+            about = {"Format": "HDF", "NumberType": "Float", "Precision": "8", "Dimensions": _words(shape)}
+            _child(slab, "DataItem", f"run.h5:/{name}", **about)
+    Xml.indent(root, " ")
+    write_text(folder / "run.xdmf", Xml.tostring(root, "unicode", xml_declaration=True) + "\n")
+    return folder / "run.xdmf"
+
+
+def has_xdmf(folder: Path) -> bool:
+    """Whether ``run.xdmf`` is there, and not older than ``run.h5``."""
+    mesh, run = folder / "run.xdmf", folder / "run.h5"
+    return mesh.exists() and mesh.stat().st_mtime_ns >= run.stat().st_mtime_ns
+
+
+def _child(parent: Xml.Element, tag: str, text: str | None = None, **attributes: str) -> Xml.Element:
+    child = Xml.SubElement(parent, tag, attributes)
+    child.text = text
+    return child
+
+
+def _words(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.17g}" for value in values)
+
+
+def write_curves(path: Path) -> list[Path]:
+    """Write the curves of the results in ``path`` as CSV files beside them, in ``curves/``; raises as ``open_results``.
+
+    Variables over the same dimensions share a table, with a row a point, their coordinates first, units in the head.
+    Fields and maps, over other dimensions than the axes of a sweep, are none.
+    """
+    written = []
+    with open_results(path) as data:
+        source = Path(data.encoding.get("source", path / "ensemble.h5"))
+        axes = data["status"].dims if "status" in data else ()
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for name, item in data.data_vars.items():
+            if len(item.dims) == 1 or (axes and item.dims == axes):
+                groups.setdefault(tuple(map(str, item.dims)), []).append(str(name))
+        for dims, names in groups.items():
+            table = data[names]
+            table = table.drop_vars([n for n, item in table.coords.items() if not set(item.dims) <= set(dims)])
+            if np.prod([data.sizes[dim] for dim in dims]) <= MOST_ROWS:
+                stem = f"{source.stem}-{'-'.join(dims) if dims != axes else 'members'}".replace("/", "-")
+                written.append(_write_table(source.parent / "curves" / f"{stem}.csv", table))
+    return written
+
+
+def _write_table(path: Path, table: xr.Dataset) -> Path:
+    frame = table.to_dataframe().reset_index()
+    units = {str(name): item.attrs.get("units", "1") for name, item in table.variables.items()}
+    frame.columns = [name if units.get(name, "1") in ("1", "") else f"{name} ({units[name]})" for name in frame.columns]
+    path.parent.mkdir(exist_ok=True)
+    with atomic_write(path) as aside:
+        frame.to_csv(aside, index=False, float_format="%.17g")
+    return path
