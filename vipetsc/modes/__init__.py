@@ -38,6 +38,9 @@ Narrow tongues of internal resonances lie close together, and a residual cannot 
 go, the correction over the step and the turn of the tangent, in the step's chart and in ``relative``; ``audit`` looks
 for jumps afterwards, for a branch that retraces itself, stands still or passes on to another one, and compares flows.
 
+**Condensed.** ``condensed`` has the equations of a motion's harmonics where the system is nonlinear, ``harmonics`` the
+forces in them, ``breather`` the start and the continuation, ``condensed_follow`` the files.
+
 **Files.** ``follow`` shares the branches of a case over ranks; ``branch`` writes and reads them, tells the regions of
 a backbone and fits their power laws; ``point`` is one orbit, with its samples and its resonance.
 

@@ -15,11 +15,11 @@ from vipetsc.lattice import Compliance, DenseCompliance, pass_bands
 from vipetsc.lattice.moments import QuickCompliance
 from vipetsc.modes.branch import KINDS, Branch
 from vipetsc.modes.breather import CondensedContinuation, CondensedPoint, CondensedProblem, CondensedSegment
-from vipetsc.modes.follow import Follower, Listener
+from vipetsc.modes.follow import FAILURES, Follower, Listener
 from vipetsc.modes.harmonics import SiteForces
 from vipetsc.modes.point import QUANTITIES, Point
 from vipetsc.modes.system import System
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StoppedError, StopRequest
 
 # A field is left out below this share of its largest value; a harmonic's is followed so many cells from a site.
 NEGLIGIBLE, FIRST_REACH, LAST_REACH = 1e-16, 8, 2048
@@ -171,6 +171,14 @@ class CondensedFollower(Follower):
             bounds = [max(low, control.frequency[0]), min(high, control.frequency[1])]
             control = control.model_copy(update={"frequency": bounds})
         super().grow(branch, problem, start, control, direction)
+
+    def _follow(self, branch: Branch, mode: int) -> None:
+        try:
+            super()._follow(branch, mode)
+        except (StoppedError, *FAILURES):
+            if branch.points:
+                self.finish(branch)
+            raise
 
     def finish(self, branch: Branch) -> None:
         """Add the states at phase 0 of the first and the last point, and of those asked for."""
