@@ -130,4 +130,4 @@ def test_the_manual_at_the_prompt(in_process):
     trust = in_process("manual", "trust").stdout
     assert "performance (manual performance)" in trust and "](" not in trust
     wrong = in_process("manual", "cooking")
-    assert wrong.returncode == 2 and "there are case-file, case-keys" in wrong.stderr
+    assert wrong.returncode == 2 and ", case-file, case-keys" in wrong.stderr
