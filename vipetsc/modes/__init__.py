@@ -42,7 +42,8 @@ for jumps afterwards, for a branch that retraces itself, stands still or passes 
 forces in them, ``breather`` the start and the continuation, ``condensed_follow`` the files.
 
 **Files.** ``follow`` shares the branches of a case over ranks; ``branch`` writes and reads them, tells the regions of
-a backbone and fits their power laws; ``point`` is one orbit, with its samples and its resonance.
+a backbone and fits their power laws; ``point`` is one orbit, with its samples and its resonance. Lattices on
+all ranks: ``lattice_flow``, ``lattice_shooting``, ``lattice_follow``, ``floquet`` (multipliers, matrix-free).
 
 A loop of one's own (importing the package loads PETSc)::
 

@@ -126,8 +126,7 @@ class LatticeFollower(Follower):
     def finish(self, branch: Branch) -> None:
         """Add the states at phase 0 of the first and the last point."""
         points, shape = [branch.points[0], branch.regular()[-1]], (self.lattice.lattice_flow.chain.cells, -1)
-        if self.problem.map.start == "rest":
-            branch.extra = stored_states(points, range(shape[0]), np.array([p.x.reshape(shape) for p in points]))
+        branch.extra = stored_states(points, range(shape[0]), np.array([p.x.reshape(shape) for p in points]))
 
 
 def follow_case(
