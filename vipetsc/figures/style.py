@@ -7,6 +7,7 @@ from pathlib import Path
 from textwrap import wrap
 
 import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator
@@ -64,6 +65,9 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     with atomic_write(path) as partial_path:
         if path.suffix == ".pdf" and not strip:
             FigureCanvasPdf(figure).print_pdf(partial_path)  # ``savefig`` would draw it twice
+        elif path.suffix == ".png" and not strip:
+            figure.set_dpi(SCREEN)
+            FigureCanvasAgg(figure).print_png(partial_path)
         else:
             dpi = SCREEN if path.suffix == ".png" else None
             figure.savefig(partial_path, format=path.suffix[1:], dpi=dpi, bbox_inches=strip)
