@@ -27,7 +27,7 @@ eigenvalues are the half-traces c = (mu + 1/mu)/2 of the multipliers. For a quar
 reversed has I - 2 D^T A, and its multipliers are squared. One c = 1 is trivial: energy is conserved. c in (-1, 1) is
 stable; c = 1 is a fold of the energy or a branch point; c = -1 breaks the symmetry (quarter) or doubles the period
 (others); c = 0 doubles the period of a quarter's orbit (``special`` locates them by arclength and switches branches).
-dE along the tangent vanishes at energy folds, dT at frequency folds.
+dE along the tangent vanishes at energy folds, dT at frequency folds; ``graze`` has a touch as two more equations.
 
 **Continuation.** Keller (1977): from a point with unit tangent t in the unknowns xi of a chart (of order one, so that
 an arclength means something) the next one solves H(xi) = 0 and t . (xi - xi0) = s, by Newton's method of PETSc's
