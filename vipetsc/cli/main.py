@@ -36,6 +36,9 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "force": ("--force", {"action": "store_true", "help": "begin anew, and replace the results in the output folder"}),
     "resume": ("--resume", {"action": "store_true", "help": "go on with what is in the output folder, nothing else"}),
     "json": ("--json", {"action": "store_true", "help": "print JSON instead of a table"}),
+    "modes": ("--modes", {"type": int, "metavar": "N", "help": "also the N linear modes of the finite lattice"
+                          " that are nearest to a frequency, and their shapes"}),
+    "near": ("--near", {"type": float, "metavar": "OMEGA", "help": "that frequency in rad/s; 0 if left out"}),
     "runs": ("path", {"type": Path, "nargs": "+", "metavar": "PATH",
                       "help": "folder of a run or of a sweep, or a run.h5"}),
     "path": ("path", {"type": Path, "nargs": "+", "metavar": "PATH",
@@ -59,7 +62,7 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
 VERBS: dict[str, tuple[Verb, str, str]] = {
     "run": (verbs.run, "one simulation, its analysis and pictures", "case member set out force resume"),
     "validate": (verbs.validate, "check a case; print band edges, frequency, end time, size and cost", "case set"),
-    "bands": (verbs.bands, "pass bands, gaps and group velocities of a cell", "case set out json"),
+    "bands": (verbs.bands, "pass bands, gaps and group velocities of a cell", "case modes near set out json"),
     "sweep": (verbs.sweep, "every combination in [sweep]; goes on where it was", "swept set out force resume"),
     "nnm": (verbs.nnm, "nonlinear normal modes: frequency-energy branches", "modal set out force resume"),
     "nfrc": (verbs.nfrc, "steady states under a wave or a force, with stability", "case set out force resume"),

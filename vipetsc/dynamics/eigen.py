@@ -1,9 +1,34 @@
-"""SLEPc, where there is one: everything else runs without it."""
+"""Linear modes of a lattice near a frequency, by SLEPc where there is one: everything else runs without it.
 
-from typing import Any
+K x = Om^2 M x by Krylov-Schur iteration on (K - s M)^-1 M (Stewart 2001), s the square of the frequency asked. The
+factors are those of a direct solver, whose cost grows as the cells: the matrix is a band.
+"""
+
+from typing import Any, NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
 
 from vipetsc.case import CaseError
 from vipetsc.case.reading import Problem
+from vipetsc.dynamics.matrices import LatticeMatrices
+
+# Direct solvers for one rank, for several; the first that PETSc has. MUMPS takes ten times as long for a band.
+DIRECT = ("superlu", "petsc"), ("superlu_dist", "mumps")
+TOLERANCE, RESTARTS, OF_COPIES = 1e-11, 60, 4
+SHIFT = 1e-9  # of the largest Om^2, by which s differs from the frequency asked, which may be that of a mode
+
+
+class NearModes(NamedTuple):
+    """Modes by their ``frequency`` (mode) in rad/s; ``shapes`` (mode, cell, dof) in 1/sqrt(kg) of the rank's cells.
+
+    ``residual`` (mode) is the norm of K x - Om^2 M x over the largest Om^2 and that of M x.
+    """
+
+    frequency: np.ndarray
+    shapes: np.ndarray
+    residual: np.ndarray
 
 
 def load_slepc() -> Any:
@@ -15,3 +40,61 @@ def load_slepc() -> Any:
         how = "apt install slepc-dev python3-slepc4py; conda-forge: slepc4py; it must belong to the PETSc of petsc4py"
         raise CaseError([Problem("slepc4py", None, f"{remedy} ({error}); Debian: {how}")], "this machine") from None
     return SLEPc
+
+
+def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
+    """The ``count`` modes nearest to ``near`` in rad/s, lowest first; all ranks must call it.
+
+    After them others are sought beside them, a few restarts long, until none is nearer: a Krylov space may miss copies
+    of a mode. Raises CaseError where they lie so close, as at the edge of a band, that not all can be told apart.
+    """
+    eps, square = load_slepc().EPS().create(matrices.comm), near**2
+    eps.setOperators(matrices.stiffness, matrices.mass)
+    eps.setProblemType(eps.ProblemType.GHEP)
+    eps.setWhichEigenpairs(eps.Which.TARGET_MAGNITUDE)
+    eps.setTarget(square - SHIFT * matrices.largest)
+    _solve_directly(eps.getST())
+    pairs: list[tuple[float, PETSc.Vec]] = []
+    wanted = count
+    while wanted:
+        eps.setDimensions(wanted, min(max(3 * wanted, 20), matrices.rows - len(pairs)))
+        eps.setTolerances(TOLERANCE, OF_COPIES if pairs else RESTARTS)
+        eps.setDeflationSpace([vector for _, vector in pairs])
+        eps.solve()
+        farthest, before = max((abs(value - square) for value, _ in pairs), default=np.inf), len(pairs)
+        for i in range(min(eps.getConverged(), wanted)):
+            vector = matrices.vector()
+            value = eps.getEigenpair(i, vector).real
+            if abs(value - square) < farthest:
+                pairs.append((value, vector))
+        if not before and len(pairs) < count:
+            remedy = f"only {len(pairs)} of {count} modes come out, the others crowd: ask for fewer, or for another"
+            raise CaseError([Problem("--near", near, remedy)])
+        wanted = int(before != len(pairs) < matrices.rows)
+    pairs = sorted(sorted(pairs, key=lambda pair: abs(pair[0] - square))[:count], key=lambda pair: pair[0])
+    eps.destroy()
+    return NearModes(*(np.array(part) for part in zip(*(_mode(matrices, *pair) for pair in pairs), strict=True)))
+
+
+def _solve_directly(st: Any) -> None:
+    """Let the spectral transformation ``st`` invert with a direct solver."""
+    st.setType("sinvert")
+    several = st.comm.size > 1
+    solver = next((name for name in DIRECT[several] if name == "petsc" or PETSc.Sys.hasExternalPackage(name)), None)
+    if solver is None:
+        remedy = "has no direct solver for several ranks, superlu_dist or mumps; call it on one"
+        raise CaseError([Problem("PETSc", None, remedy)], "this machine")
+    ksp = st.getKSP()
+    ksp.setType("preonly")
+    ksp.getPC().setType("lu")
+    ksp.getPC().setFactorSolverType(solver)
+
+
+def _mode(matrices: LatticeMatrices, value: float, vector: PETSc.Vec) -> tuple[float, np.ndarray, float]:
+    """Frequency, shape and residual of a mode."""
+    stiff, heavy = matrices.stiffness * vector, matrices.mass * vector
+    mass = vector.dot(heavy)
+    stiff.axpy(-value, heavy)
+    shape = vector.array_r.reshape(-1, matrices.chain.cell.dofs) / np.sqrt(mass)
+    frequency = 0.0 if value < 1e-12 * matrices.largest else float(np.sqrt(value))  # free ends
+    return frequency, shape, stiff.norm() / (matrices.largest * heavy.norm())

@@ -36,7 +36,7 @@ class Layout:
         chain = model.chain
         self.comm, self.cells, self.dofs = comm, chain.cells, chain.cell.dofs
         self.periodic = chain.ends == "periodic"
-        cuts = [r * (self.cells // comm.size) + min(r, self.cells % comm.size) for r in range(comm.size + 1)]
+        cuts = cell_cuts(self.cells, comm.size)
         self.ranges = np.array([*pairwise(cuts)])
         of_ledger, _ = np.histogram([model.drive_cell, *chain.sites], cuts)
         sizes = 2 * self.dofs * np.diff(cuts) + of_ledger
@@ -95,6 +95,11 @@ class Layout:
             at += len(share["cells"])
         ledger = tables["work"][: self.owns_drive], tables["losses"]["loss"][list(self.sites)]
         y[2 * self.dofs * self.owned : self.size] = np.concatenate(ledger)
+
+
+def cell_cuts(cells: int, ranks: int) -> list[int]:
+    """The first cell of every rank, and behind the last one: equal blocks, the first ranks have one more."""
+    return [r * (cells // ranks) + min(r, cells % ranks) for r in range(ranks + 1)]
 
 
 def join(shares: Sequence[Mapping[str, np.ndarray]], keys: Mapping[str, str | None]) -> dict[str, np.ndarray]:

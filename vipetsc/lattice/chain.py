@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.cell import UnitCell
@@ -70,19 +70,23 @@ class Chain:
 
     def stiffness_matrix(self) -> csc_matrix:
         """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; needs little for <= 1e6."""
+        return self.stiffness_rows(0, self.cells).tocsc()
+
+    def stiffness_rows(self, start: int, stop: int) -> csr_matrix:
+        """The rows ((stop - start) dofs, cells dofs) of the stiffness in N/m of cells ``start`` to ``stop``."""
         n, d = self.cells, self.cell.dofs
         rows, columns, values = [], [], []
-        index, every = np.arange(n), np.ones(n, bool)
+        index, every = np.arange(start, stop, dtype=np.int64), np.ones(stop - start, bool)
         for mass, offset, other, stiffness in self.cell.couplings():
             neighbour = index + offset
             inside = every if self.ends == "periodic" else (neighbour >= 0) & (neighbour < n)
             held = every if self.ends == "fixed" else inside
             here = index * d + mass
-            rows += [here[held], here[inside]]
+            rows += [here[held] - start * d, here[inside] - start * d]
             columns += [here[held], neighbour[inside] % n * d + other]
             values += [np.full(held.sum(), stiffness), np.full(inside.sum(), -stiffness)]
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-        return coo_matrix(entries, shape=(n * d, n * d)).tocsc()
+        return coo_matrix(entries, shape=((stop - start) * d, n * d)).tocsr()
 
     def masses(self) -> np.ndarray:
         """Masses (cells dofs,) in kg, ordered cell by cell."""

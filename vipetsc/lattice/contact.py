@@ -81,6 +81,17 @@ class Contact:
         elastic = np.maximum(w - clearance, 0) ** self.exponent - np.maximum(-w - clearance, 0) ** self.exponent
         return self.stiffness * elastic * self.dissipation_factor(rate, approach)
 
+    def slopes(
+        self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike, approach: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of ``force`` by w in N/m and by w' in N s/m."""
+        w, approach = np.asarray(w, float), np.asarray(approach, float)
+        x, n, g = np.maximum(np.abs(w) - clearance, 0), self.exponent, self.dissipation_factor(rate, approach)
+        damping = self.damping / np.copysign(np.maximum(np.abs(approach), self.approach_floor), approach)
+        clipped = (g <= 0) if self.adhesion == "clip" else False
+        by_rate = np.where(clipped, 0.0, np.sign(w) * x**n * damping)
+        return self.stiffness * np.where(x > 0, n * x ** (n - 1), 0) * g, self.stiffness * by_rate
+
     def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
         """Elastic energy kc x^(n+1)/(n+1) in J stored at relative displacement w in m."""
         x = np.maximum(np.abs(np.asarray(w, float)) - clearance, 0)

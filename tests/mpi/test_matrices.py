@@ -1,0 +1,141 @@
+"""Stiffness, mass and contact Jacobian as shared matrices; linear modes near a frequency, on any number of ranks."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.conftest import small_case
+from vipetsc.case import CaseError
+from vipetsc.dynamics import eigen
+from vipetsc.dynamics.eigen import modes_near
+from vipetsc.dynamics.layout import Layout, create_record
+from vipetsc.dynamics.matrices import LatticeMatrices
+from vipetsc.dynamics.ts.right_hand_side import right_hand_side
+from vipetsc.lattice import Chain, Contact, Spring, UnitCell, four_band
+from vipetsc.lattice.modes import frequencies, mode_shape
+from vipetsc.studies.linear_modes import find_modes
+
+COMM = MPI.COMM_WORLD
+WHOLE = UnitCell((1.0, 2.0, 4.0), (Spring(0, 0, 3.0, True), Spring(0, 1, 5.0), Spring(2, 1, 7.0, True)), 0, 1)
+
+
+def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
+    """-M u'' (cell, dof) of this rank's cells by the right-hand side that PETSc calls."""
+    model = small_case(drive={"amplitude": 1e-3}).model()
+    model = type(model)(**vars(model) | {"chain": chain, "drive_mass": 0})
+    layout = Layout(model, COMM)
+    state, lattice = layout.create_vector(), create_record(model, layout)
+    layout.place(np.hstack([u, 0 * u])[layout.start : layout.stop], 0.0, state.array)
+    state.ghostUpdate()
+    rate = np.zeros(layout.size)
+    with state.localForm() as local:
+        right_hand_side(0.0, local.array, rate, lattice)
+    d, n = layout.dofs, layout.owned
+    return -rate[d * n : 2 * d * n].reshape(d, n).T * np.asarray(chain.cell.masses)
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+@pytest.mark.parametrize("cells", [2, 3, 25])
+def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells):
+    """To the last bit in whole numbers, where sums are exact in any order; otherwise to their rounding."""
+    rng = np.random.default_rng(3)
+    for cell, u in ((WHOLE, rng.integers(-99, 99, (cells, 3)) * 1.0), (four_band(), rng.standard_normal((cells, 4)))):
+        chain = Chain(cell, cells, ends)
+        matrices = LatticeMatrices(chain, COMM)
+        mine = slice(matrices.start, matrices.stop)
+        product = (matrices.stiffness * matrices.vector(u[mine])).array_r.reshape(u[mine].shape)
+        expected = stencil(chain, u)
+        assert np.abs(product - expected).max(initial=0) <= (0 if cell is WHOLE else 1e-10)
+        momentum = (matrices.mass * matrices.vector(u[mine])).array_r.reshape(u[mine].shape)
+        assert np.array_equal(momentum, u[mine] * np.asarray(cell.masses))
+        # Exactly as many entries as were needed are there.
+        assert matrices.stiffness.getInfo()["nz_unneeded"] == 0
+        matrices.destroy()
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize(
+    "contact", [Contact("hertz", 1e6), Contact("hertz", 1e6, 0.4), Contact("bilinear", 1e4, 0.1, "clip")]
+)
+def test_the_contact_jacobian_is_the_derivative_of_the_force(contact):
+    sites, rng = (2, 5, 6, 9), np.random.default_rng(1)
+    chain = Chain(four_band(), 12, "fixed", sites, (1e-3,) * 4)
+    u, v = rng.standard_normal((2, 12, 4)) * 2e-3
+    u[2], v[9] = 0, [0, 1, -2, 0]
+    u[9] = [0, 0, 3e-3, 0]
+    approach = np.array([1.0, -1.0, 0.8, 1.2])
+
+    def force(u, v):
+        w, rate = (f[list(sites), 2] - f[list(sites), 1] for f in (u, v))
+        f, out = contact.force(w, 1e-3, rate, approach), np.zeros((12, 4))
+        out[list(sites), 1], out[list(sites), 2] = f, -f
+        return out
+
+    matrices = LatticeMatrices(chain, COMM)
+    mine = slice(matrices.start, matrices.stop)
+    fields = [matrices.vector(f[mine]) for f in (u, v)]
+    jacobians = matrices.contact_jacobian(contact, *fields, approach)
+    assert np.abs(force(u, v)).max() > 0
+    for i, jacobian in enumerate(jacobians):
+        step = rng.standard_normal((12, 4)) * 1e-9
+        ends = [force(u + s * step * (i == 0), v + s * step * (i == 1))[mine] for s in (1, -1)]
+        product = (jacobian * matrices.vector(step[mine])).array_r.reshape(step[mine].shape)
+        assert product == pytest.approx((ends[0] - ends[1]) / 2, abs=1e-6 * np.abs(ends[0]).max(initial=1e-3))
+        jacobian.destroy()
+    plain = matrices.contact_jacobian(contact, *fields)[1]
+    assert plain.norm() == 0.0
+    matrices.destroy()
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize(
+    ("ends", "cells", "near", "count"),
+    [("fixed", 60, 2034.0, 4), ("periodic", 60, 1000.0, 7), ("free", 40, 0.0, 3), ("fixed", 3, 900.0, 12)],
+)
+def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(ends, cells, near, count):
+    chain = Chain(four_band("calibrated"), cells, ends)
+    matrices = LatticeMatrices(chain, COMM)
+    modes = modes_near(matrices, count, near)
+    every = frequencies(chain)
+    nearest = np.sort(every[np.argsort(np.abs(every**2 - near**2), kind="stable")[:count]])
+    assert modes.frequency == pytest.approx(nearest, rel=1e-9, abs=1e-3)
+    assert modes.residual.max() < 1e-9
+    flat = modes.shapes.reshape(count, -1)
+    masses = np.tile(chain.cell.masses, matrices.stop - matrices.start)
+    gram = COMM.allreduce((flat * masses) @ flat.T)
+    assert gram == pytest.approx(np.eye(count), abs=1e-8)
+    matrices.destroy()
+
+
+@pytest.mark.parallel([1, 2])
+def test_the_edge_modes_of_the_lattice_and_their_file(folder):
+    case = small_case(lattice={"cells": 100}, contacts={"sites": [30]})
+    found = find_modes(case, 3, 2034.0, folder, COMM)
+    assert (found is None) == (COMM.rank > 0)
+    COMM.Barrier()
+    with xr.open_dataset(folder / "modes.h5", engine="h5netcdf") as data:
+        assert data["frequency"].values[:2] == pytest.approx(2034.8251, abs=1e-4)
+        assert data["kind"].values.tolist() == ["edge", "edge", "bulk"]
+        assert data["band"].values.tolist() == [0, 0, 3]
+        # Deep in the gap a mode sits in a cell or two of one end, or of both: they have one frequency.
+        assert data["participation"].values[:2].max() < 4 < 50 < data["participation"].values[2]
+        assert (data["left"] + data["right"]).values[:2] == pytest.approx(1.0, abs=1e-6)
+        bulk, shape = mode_shape(Chain(four_band("calibrated"), 100), 202), data["shape"].values[2]
+        assert np.abs(shape / np.abs(shape).max()) == pytest.approx(np.abs(bulk), abs=1e-6)
+
+
+@pytest.mark.parallel([1])
+def test_refused(monkeypatch, folder):
+    case = small_case()
+    for count, near, key in ((0, 1.0, "--modes"), (97, 1.0, "--modes"), (2, -1.0, "--near")):
+        with pytest.raises(CaseError, match=key):
+            find_modes(case, count, near, folder, COMM)
+    monkeypatch.setattr(eigen, "RESTARTS", 1)
+    with pytest.raises(CaseError, match="of 6 modes come out"):
+        modes_near(LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM), 6, 2034.0)
+    assert not (folder / "modes.h5").exists()

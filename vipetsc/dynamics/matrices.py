@@ -1,0 +1,82 @@
+"""The lattice's stiffness and mass as PETSc matrices shared over ranks, and the Jacobian of its contact forces.
+
+Degrees of freedom are ordered cell by cell; a rank owns the rows of its cells, the same as in ``dynamics.layout``, and
+assembles them from the couplings that the stencil of the right-hand side has. A row of the matrix sums K_ij u_j with
+the springs' stiffnesses added up on the diagonal, the columns of other ranks last; the stencil sums k (u_j - u_i)
+spring by spring: they agree to rounding, and to the last bit where products and sums are exact.
+"""
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from scipy.sparse import csr_matrix, diags
+
+from vipetsc.case import CaseError
+from vipetsc.case.reading import Problem
+from vipetsc.dynamics.layout import cell_cuts
+from vipetsc.lattice import Chain, Contact
+from vipetsc.parallel import on_every_rank
+
+
+class LatticeMatrices:
+    """``stiffness`` in N/m and ``mass`` in kg of ``chain`` without contacts, on the ranks of ``comm``.
+
+    This rank has the cells ``start`` to ``stop``; ``rows`` counts all rows, no squared frequency in (rad/s)^2 is above
+    ``largest`` (Gershgorin). Raises CaseError on all ranks where PETSc's indices do not count the
+    rows or a rank's entries.
+    """
+
+    def __init__(self, chain: Chain, comm: MPI.Comm) -> None:
+        self.chain, self.comm = chain, comm
+        self.start, self.stop = cell_cuts(chain.cells, comm.size)[comm.rank : comm.rank + 2]
+        masses, rows = np.tile(chain.cell.masses, self.stop - self.start), chain.cells * chain.cell.dofs
+        most, entries = int(np.iinfo(PETSc.IntType).max), len(chain.cell.couplings()) * 2 * (self.stop - self.start)
+        if comm.allreduce(max(rows, entries), MPI.MAX) > most:
+            remedy = "more rows or entries than the indices of this PETSc count; it needs one --with-64-bit-indices"
+            raise CaseError([Problem("lattice.cells", chain.cells, f"makes matrices of {remedy}")])
+        self.stiffness = self._matrix(on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop)))
+        shift, couplings = self.start * chain.cell.dofs, chain.cell.couplings()
+        self.rows, circles = rows, np.bincount([c[0] for c in couplings], [2 * c[3] for c in couplings])
+        self.largest = float(np.max(circles / np.asarray(chain.cell.masses)))
+        self.mass = self._matrix(diags([masses], [shift], (len(masses), rows), format="csr"))
+
+    def _matrix(self, rows: csr_matrix) -> PETSc.Mat:
+        """The matrix of which this rank has the ``rows``, allocated for exactly their entries."""
+        indices = (part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices))
+        return PETSc.Mat().createAIJ((rows.shape, rows.shape), csr=(*indices, rows.data), comm=self.comm)
+
+    def vector(self, cells: np.ndarray | None = None) -> PETSc.Vec:
+        """A vector of this rank's ``cells`` (cell, dof), zero if none are given."""
+        vector = self.stiffness.createVecRight()
+        if cells is not None:
+            vector.array[:] = np.ravel(cells)
+        return vector
+
+    def contact_jacobian(
+        self, contact: Contact, displacement: PETSc.Vec, velocity: PETSc.Vec, approach: np.ndarray | None = None
+    ) -> tuple[PETSc.Mat, PETSc.Mat]:
+        """Derivatives of the force on the masses, - b F with b = 1 at resonators and -1 at hosts, at a state.
+
+        In N/m by the displacement and in N s/m by the velocity; K minus the first is the stiffness beside that state.
+        ``approach`` (site,) has w'_minus in m/s of all sites, inf for none; without it nothing dissipates.
+        """
+        chain, d = self.chain, self.chain.cell.dofs
+        sites, gaps = np.array(chain.sites, np.int64), np.array(chain.clearances, float)
+        mine = (sites >= self.start) & (sites < self.stop)
+        before = np.full(mine.sum(), np.inf) if approach is None else np.asarray(approach, float)[mine]
+        first = (sites[mine] - self.start) * d
+        pairs = first + chain.cell.host, first + chain.cell.resonator
+        w, rate = (field.array_r[pairs[1]] - field.array_r[pairs[0]] for field in (displacement, velocity))
+        by_w, by_rate = contact.slopes(w, gaps[mine], rate, before)
+        rows, columns = (np.concatenate([pairs[i] for i in order]) for order in ((0, 0, 1, 1), (0, 1, 0, 1)))
+        shape, jacobians = ((self.stop - self.start) * d, chain.cells * d), []
+        for slope in (by_w, by_rate):
+            entries = np.concatenate([-slope, slope, slope, -slope]), (rows, columns + self.start * d)
+            jacobians.append(self._matrix(csr_matrix(entries, shape)))
+        return jacobians[0], jacobians[1]
+
+    def destroy(self) -> None:
+        """Free the matrices; all ranks must call it."""
+        self.stiffness.destroy()
+        self.mass.destroy()
