@@ -6,15 +6,19 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
 
 import numpy as np
 import xarray as xr
 
-from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
+from vipetsc.case import Case, CaseError, CaseFile, DesignCase, LawCase, NnmCase, Problem, Sweep
 from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
+from vipetsc.io.lock import locked
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
 if TYPE_CHECKING:
@@ -56,6 +60,19 @@ def bands_report(bands: dict[str, Any]) -> str:
             f"{best['wavenumber'] / np.pi:16.4f} {best['frequency']:8.2f} {best['group_velocity']:8.2f}"
         )
     return "\n".join(lines + [f" gap {gap['low']:9.2f} {gap['high']:9.2f}" for gap in bands["gaps"]])
+
+
+def modes_told(case: Case, count: int | None, near: float | None, folder: Path, comm: MPI.Comm) -> str:
+    """The linear modes of ``bands --modes`` on rank 0, which writes them; empty if none are asked for."""
+    if count is None and near is None:
+        return ""
+    if count is None:
+        raise CaseError([Problem("--near", near, "says near which frequency --modes are; give both")])
+    from vipetsc.studies.linear_modes import find_modes, modes_report
+
+    with locked(comm, folder):
+        data = find_modes(case, count, near or 0.0, folder, comm)
+    return "" if data is None else f"\n{modes_report(data)}\n  {folder / 'modes.h5'}"
 
 
 def sweep_table(result: "SweepResult") -> str:

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from mpi4py import MPI
 
-from vipetsc.case import Case, CaseError, CaseFile, DesignCase, LawCase, NnmCase, Problem, Sweep
+from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
 from vipetsc.case.every import disorder_of, load_every
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
@@ -190,17 +190,8 @@ def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
             write_text(folder / "bands.json", text + "\n")
         return text if options.json else f"{tables.bands_report(numbers)}\n  {picture}"
 
-    if options.modes is None and options.near is not None:
-        raise CaseError([Problem("--near", options.near, "says near which frequency --modes are; give both")])
-    rows: list[str] = []
-    if options.modes is not None:
-        from vipetsc.studies.linear_modes import find_modes, modes_report
-
-        with locked(comm, folder):
-            if (found := find_modes(case, options.modes, options.near or 0.0, folder, comm)) is not None:
-                rows = [modes_report(found), f"  {folder / 'modes.h5'}"]
-    text = on_root(comm, report)
-    echo(comm, "\n".join([text] if options.json else [text, *rows]))
+    modes = tables.modes_told(case, options.modes, options.near, folder, comm)
+    echo(comm, on_root(comm, report) + modes * (not options.json))
     return DONE
 
 
