@@ -133,7 +133,11 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
     columns = len(recorded_cells(case.output, chain.cells)) * cell.dofs * len(case.output.fields)
     size = 8 * (columns * -(-model.samples // case.output.stride) + len(chain.sites) * model.samples)
     cost = estimate(case, ranks)
-    hits = f", {duration(cost.contacts)} of it for about {cost.episodes:.1g} contacts" if cost.episodes else ""
+    hits = (
+        f", {duration(cost.contacts)} of it for about {float(f'{cost.episodes:.1g}'):g} contacts"
+        if cost.episodes
+        else ""
+    )
     writer = "parallel" if written_together(model, case.output, ranks) else "gather"
     needed, left = sum(memory_needed(model, case.output, cost.engine, ranks).values()), memory_available() / ranks
     return [
