@@ -1,8 +1,8 @@
 """What a run will cost, said before it is made: which engine makes it, how many contacts to expect, CPU time.
 
-Models of CPU time fitted to the paper's lattices on one core, within a factor of two or so there; on another machine both
-engines are off by one factor, and how they compare stays. Contacts are those of the linear wave: where waves return to
-the sites, up to several times as many.
+Models of CPU time fitted to the paper's lattices on one core, within a factor of two or so there; on another machine
+both engines are off by one factor, and how they compare stays. Contacts are those of the linear wave: where waves
+return to the sites, up to several times as many.
 """
 
 from dataclasses import dataclass
