@@ -96,7 +96,7 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
     if frequency.max() > 3 * frequency.min():
         axes.set(yscale="log", ylim=(None, 1.8 * frequency.max()))  # room for the regions' numerals
     touched = np.nonzero(branch["contacts"].values > 0)[0]
-    if few and touched.size:
+    if few and touched.size and touched[0] > 0:
         axes.legend(loc="upper left", fontsize=5.5, bbox_to_anchor=(0, 0.93))
         _grazing_inset(axes, branch, touched[0])
     else:
