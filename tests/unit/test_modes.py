@@ -164,6 +164,17 @@ def test_a_hump_beside_a_dip_in_one_quarter_of_a_step_is_found():
     assert 0 < share < 0.02
 
 
+def test_an_arc_that_ends_where_a_contact_just_closes_ends():
+    """The rest of the time, 1e-8 of it, is all rounding: a search that lands on its beginning again has no end."""
+    law = Contact("hertz", contact_stiffness(1e8, 0.005, 0.3))
+    flow = Dop853Flow(System.reduced(four_band("printed"), 10**-2.75, law))
+    start = np.array([7.732456897616884, 7.742513284851792, 0.0, 0.0])
+    arc = flow.arc(start, 0.0003398398033092859, 0.003147455285852897)
+    assert arc.episodes == 2
+    assert arc.events[:, 3].tolist() == [-1, 1]
+    assert np.abs(flow.system.gaps(arc.end[:2])) < 1e-14
+
+
 def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():
     """Slope (x - .05)(x - .15), so that .05 is a largest value and the gap rises again within the same quarter."""
     rise = np.polynomial.Polynomial.fromroots([0.05, 0.15]).integ().coef
