@@ -104,9 +104,12 @@ def described(name: str, data: xr.Dataset) -> tuple[list[str], dict[str, str]]:
     """Dimensions and attributes of a variable of ``LARGE`` beside ``data``, whose time may be that of the fields."""
     dims, units, text = LARGE[name]
     dims = dims if "field_time" in data else dims.replace("field_time", "time")
-    # As the CF conventions have it: the time of an episode is a coordinate of what is told of it.
-    at = {"coordinates": "onset"} if name.startswith("impacts/") and name != "impacts/onset" else {}
-    return dims.split(), {"units": units, "long_name": text, **at}
+    return dims.split(), {"units": units, "long_name": text}
+
+
+def coordinates(name: str) -> dict[str, str]:
+    """What a file says besides, by the CF conventions: an episode's time is a coordinate of what is told of it."""
+    return {"coordinates": "onset"} if name.startswith("impacts/") and name != "impacts/onset" else {}
 
 
 def writers(output: Chunks) -> MPI.Comm:

@@ -159,6 +159,7 @@ class RunFolder:
                     for name in (*columns, LOSSES, *self.recording.fields):
                         dims, about = chunks.described(name, data)
                         dtype = columns[name].dtype if name in columns else float
+                        about |= chunks.coordinates(name)
                         large[name] = add_variable(file, name, dims, [sizes[dim] for dim in dims], dtype, about)
                     for name, dataset in large.items():
                         if name not in columns:
