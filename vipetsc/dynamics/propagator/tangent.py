@@ -15,6 +15,7 @@ from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.tape import create_tape
 from vipetsc.dynamics.propagator.variations import Variations, linearise, move_variations
 from vipetsc.dynamics.samples import Samples
+from vipetsc.parallel import on_every_rank
 
 # Rows of the tape of a cluster.
 MOST_ROWS = 8192
@@ -89,13 +90,13 @@ class TangentPropagator(Propagator):
                 matrices.append(np.zeros((largest, largest)))
                 linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[-1])
         clusters.energy[:] = energy
-        return places, np.array(matrices).reshape(-1, largest, largest)
+        return places, np.array(matrices).reshape(len(matrices), largest, largest)
 
     def move(self, cells: np.ndarray) -> np.ndarray:
         """Where variations (variation, 2 dof, owned cell) of the beginning are at the orbit's end; collective."""
         count, rows, layout = len(cells), 2 * self._layout.dofs, self._layout
         if self._linear is None:
-            self._linear = self._linearised()
+            self._linear = on_every_rank(layout.comm, self._linearised)
         if self._moved is None or len(self._moved[0].components) != count:
             self._release()
             components = np.zeros((count, 2, self._components.shape[1]))
