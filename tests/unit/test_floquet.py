@@ -12,7 +12,8 @@ from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
 from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.lattice_follow import LatticeBranch, follow_case
+from vipetsc.modes.follow import follow_all
+from vipetsc.modes.lattice_follow import LatticeBranch, LatticeFollower
 from vipetsc.modes.lattice_shooting import LatticeShooting
 from vipetsc.modes.point import linear_start
 from vipetsc.modes.shooting import MAPS, Shooting
@@ -96,21 +97,21 @@ def test_a_branch_is_stored_with_its_multipliers_and_gone_on_with(tmp_path):
     short, whole = tmp_path / "short", tmp_path / "whole"
     for folder in (short, whole):
         folder.mkdir()
-    (branch,) = follow_case(case(multipliers=2), short, MPI.COMM_SELF)
+    (branch,) = follow_all(case(multipliers=2), short, MPI.COMM_SELF, kind=LatticeFollower)
     assert branch.name == "breather-1600"
     assert branch.ending.startswith("2 points reached")
     stored = LatticeBranch.read(short / "branch-breather-1600.h5")
     assert [p.multiplier for p in stored.points] == [p.multiplier for p in branch.points]
     np.testing.assert_array_equal(stored.points[0].multipliers, branch.points[0].multipliers)
     assert min(p.multiplier for p in stored.points) > 1.3
-    (resumed,) = follow_case(case(multipliers=2, points=3), short, MPI.COMM_SELF, resume=True)
-    (once,) = follow_case(case(multipliers=2, points=3), whole, MPI.COMM_SELF)
+    (resumed,) = follow_all(case(multipliers=2, points=3), short, MPI.COMM_SELF, resume=True, kind=LatticeFollower)
+    (once,) = follow_all(case(multipliers=2, points=3), whole, MPI.COMM_SELF, kind=LatticeFollower)
     assert [p.energy for p in resumed.points] == [p.energy for p in once.points]
     assert np.all(np.diff([p.energy for p in once.points]) > 0)
 
 
 def test_what_has_no_breather_says_so_and_keeps_what_there_is(tmp_path):
-    (branch,) = follow_case(case(start_frequency=[700.0], max_newton=2), tmp_path, MPI.COMM_SELF)
+    (branch,) = follow_all(case(start_frequency=[700.0], max_newton=2), tmp_path, MPI.COMM_SELF, kind=LatticeFollower)
     assert branch.ending.startswith("failed: no ")
     assert "nnm.start_frequency" in branch.ending
 

@@ -115,13 +115,13 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
 def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
-    from vipetsc.modes.follow import claim_branches
-    from vipetsc.modes.lattice_follow import follow_case
+    from vipetsc.modes.follow import claim_branches, follow_all
+    from vipetsc.modes.lattice_follow import follower_of
 
     case = _load(NnmCase, options, comm)
     folder = _output(options, case.name)
     with claim_branches(case, folder, comm, options.force, options.resume) as claim:
-        branches = follow_case(case, claim.folder, comm, claim.going_on, tables.branch_log(), stop)
+        branches = follow_all(case, claim.folder, comm, claim.going_on, tables.branch_log(), stop, follower_of(case))
         for branch in branches:
             echo(comm, tables.branch_table(branch))
             for finding in branch.findings:

@@ -1,13 +1,11 @@
 """Branches of condensed motions of a case: their starts, their files with harmonics and states of the lattice."""
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
-from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.io.netcdf import Variables, open_netcdf, variable
@@ -15,11 +13,11 @@ from vipetsc.lattice import Compliance, DenseCompliance, pass_bands
 from vipetsc.lattice.moments import QuickCompliance
 from vipetsc.modes.branch import KINDS, Branch
 from vipetsc.modes.breather import CondensedContinuation, CondensedPoint, CondensedProblem, CondensedSegment
-from vipetsc.modes.follow import FAILURES, Follower, Listener
+from vipetsc.modes.follow import FAILURES, Follower
 from vipetsc.modes.harmonics import SiteForces
 from vipetsc.modes.point import QUANTITIES, Point
 from vipetsc.modes.system import System
-from vipetsc.parallel import StoppedError, StopRequest
+from vipetsc.parallel import StoppedError
 
 # A field is left out below this share of its largest value; a harmonic's is followed so many cells from a site.
 NEGLIGIBLE, FIRST_REACH, LAST_REACH = 1e-16, 8, 2048
@@ -98,18 +96,9 @@ class CondensedFollower(Follower):
 
     branch_type, continuation = CondensedBranch, CondensedContinuation
 
-    def __init__(
-        self,
-        case: NnmCase,
-        folder: Path,
-        about: dict[str, Any],
-        listener: Listener | None = None,
-        stop: StopRequest | None = None,
-        resume: bool = False,
-    ) -> None:
-        sys.audit("vipetsc.set-up", case.name)
-        self.case, self.options, self.folder, self.about, self.listener = case, case.nnm, folder, about, listener
-        self.stop, self.resume, options = stop or StopRequest(), resume, case.nnm
+    def set_up(self) -> None:
+        """Make the problem: the compliance between contacts and springs, and their forces."""
+        case, options = self.case, self.options
         if options.system == "condensed":
             self.chain = build_chain(case.lattice, case.contacts)
             compliance: Any = QuickCompliance(Compliance(self.chain))
@@ -120,7 +109,7 @@ class CondensedFollower(Follower):
             compliance = DenseCompliance(system.masses, system.stiffness, self.rows)
             contacts = [(pair.law, pair.clearance) for pair in system.contacts]
             forces = SiteForces(contacts, [(s.quadratic, s.cubic) for s in system.springs])
-        self.problem: Any = CondensedProblem(compliance, forces, options)
+        self.problem = CondensedProblem(compliance, forces, options)
         self.dofs = forces.pairs
 
     def name_of(self, mode: int) -> str:

@@ -63,26 +63,32 @@ def follow_all(
 ) -> list[Branch]:
     """All branches of ``case``, written into ``folder``; rank r follows every size-th one, from r on.
 
-    Each branch is computed on one rank, so that its bits do not depend on their number. A branch that fails is
+    Each branch is computed on one rank, so that its bits do not depend on their number, or on all ranks together, as
+    the ``kind`` of follower says. A branch that fails is
     written as far as it came, says why in its ``ending``, and the others go on. A ``stop`` ends each branch at its next
     point, with an ending that begins with "stopped"; ``resume`` goes on from there, to the same bits. Returns all
     branches on rank 0, in the order of ``nnm.modes``; an empty list on the others.
     """
-    mine = {}
+    kind, mine = kind or Follower, {}
     starts = range(len(case.nnm.start_frequency)) if case.nnm.start_frequency else [m - 1 for m in case.nnm.modes]
+    if kind.shared:
+        together = kind(case, folder, provenance(comm), listener, stop, resume, comm)
+        every = [branch for start in starts for branch in together.follow(start)]
+        return every if comm.rank == 0 else []
     for job in range(comm.rank, len(starts), comm.size):
-        follower = (kind or Follower)(case, folder, provenance(comm), listener, stop, resume)
+        follower = kind(case, folder, provenance(comm), listener, stop, resume)
         mine[job] = follower.follow(starts[job])
     branches = {job: group for part in comm.gather(mine) or [] for job, group in part.items()}
     return [branch for job in sorted(branches) for branch in branches[job]]
 
 
 class Follower:
-    """Follows the branches of a case into a folder; ``about`` are attributes of the files."""
+    """Follows the branches of a case into a folder; ``about`` are attributes of the files, ``comm`` has who follows."""
 
     continuation: type[Continuation] = Continuation
     branch_type: type[Branch] = Branch
-    comm: MPI.Comm = MPI.COMM_SELF  # of the ranks that follow a branch together
+    shared = False  # whether all ranks follow a branch together
+    failures: tuple[type[Exception], ...] = FAILURES  # that end a branch, not the program
 
     def __init__(
         self,
@@ -92,16 +98,22 @@ class Follower:
         listener: Listener | None = None,
         stop: StopRequest | None = None,
         resume: bool = False,
+        comm: MPI.Comm = MPI.COMM_SELF,
     ) -> None:
         sys.audit("vipetsc.set-up", case.name)
         self.case, self.options, self.folder, self.about, self.listener = case, case.nnm, folder, about, listener
-        self.stop, self.resume = stop or StopRequest(), resume
-        options, self.system = case.nnm, System.from_case(case)
+        self.stop, self.resume, self.comm = stop or StopRequest(), resume, comm
+        self.dofs: int
+        self.set_up()
+
+    def set_up(self) -> None:
+        """Make the problem of the case, and count the unknowns of an orbit."""
+        options, self.system = self.options, System.from_case(self.case)
         flow: Flow = FLOWS[options.flow](self.system)
         automatic = "quarter" if self.system.odd else "half"
         flow = FiniteDifferences(flow) if options.jacobian == "differences" else flow
         shooting_map = MAPS[automatic if options.map == "auto" else options.map]
-        self.problem = Shooting(flow, shooting_map, options.tolerance, options.max_newton)
+        self.problem: Any = Shooting(flow, shooting_map, options.tolerance, options.max_newton)
         self.dofs = self.system.dofs
 
     def name_of(self, mode: int) -> str:
@@ -115,8 +127,9 @@ class Follower:
         if not branch.complete:
             self._save(branch, lambda: self._follow(branch, mode))
         if branch.points:
-            for half in self.folder.glob(f"branch-{branch.name}-down.*") if self.comm.rank == 0 else ():
-                half.unlink()  # it is the beginning of the whole
+            for suffix in ("h5", "csv"):  # of its beginning, which the whole has
+                half = self.folder / f"branch-{branch.name}-down.{suffix}"
+                on_root(self.comm, partial(half.unlink, missing_ok=True))
         return [branch, *self._crossing(branch)]
 
     def _save(self, branch: Branch, follow: Callable[[], None]) -> None:
@@ -125,7 +138,7 @@ class Follower:
             follow()
         except StoppedError as stopped:
             branch.ending = str(stopped)
-        except FAILURES as error:
+        except self.failures as error:
             branch.ending = f"failed: {error}"
         if branch.points or not branch.ending.startswith("stopped"):
             self.write(branch)

@@ -1,30 +1,27 @@
 """Follow branches of whole lattices, all ranks together, and judge their stability by their largest multipliers."""
 
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
-
-from mpi4py import MPI
 
 import numpy as np
 
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.case.resolve import build_chain
-from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import Variables, open_netcdf, variable
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.condensed_follow import CondensedFollower, stored_states
+from vipetsc.modes.continuation import ContinuationError
 from vipetsc.modes.floquet import largest_multipliers
-from vipetsc.modes.follow import Follower, Listener, follow_all
+from vipetsc.modes.flow import FlowError
+from vipetsc.modes.follow import Follower
 from vipetsc.modes.lattice_shooting import LatticeShooting
-from vipetsc.modes.point import Point
+from vipetsc.modes.point import Point, StartError
 from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate
 from vipetsc.modes.system import System
-from vipetsc.parallel import StopRequest
 
 MULTIPLIERS = {
     "multiplier": "largest Floquet multipliers, real part",
@@ -71,25 +68,18 @@ class LatticeBranch(Branch):
 class LatticeFollower(Follower):
     """As ``Follower``, for a lattice on all ranks of ``comm``."""
 
-    branch_type = LatticeBranch
+    branch_type, shared = LatticeBranch, True
+    # What all ranks meet together; anything else may be one rank's alone, and ends the program on all.
+    failures = ContinuationError, FlowError, StartError
 
-    def __init__(
-        self,
-        case: NnmCase,
-        folder: Path,
-        comm: MPI.Comm,
-        listener: Listener | None,
-        stop: StopRequest | None,
-        resume: bool,
-    ) -> None:
-        sys.audit("vipetsc.set-up", case.name)
-        self.case, self.options, self.folder, self.listener, self.comm = case, case.nnm, folder, listener, comm
-        self.stop, self.resume, self.about, options = stop or StopRequest(), resume, provenance(comm), case.nnm
+    def set_up(self) -> None:
+        """Make the problem of the lattice, shared over the ranks."""
+        case, options = self.case, self.options
         chain = build_chain(case.lattice, case.contacts)
         self.system = System.from_chain(chain, case.contact(), dense=False)
         shooting_map = MAPS["quarter" if options.map == "auto" else options.map]
         limits = options.tolerance, options.max_newton
-        self.lattice = LatticeShooting(self.system, chain, shooting_map, comm, *limits)
+        self.lattice = LatticeShooting(self.system, chain, shooting_map, self.comm, *limits)
         self.problem, self.dofs = self.lattice, self.system.dofs
 
     def name_of(self, mode: int) -> str:
@@ -129,19 +119,8 @@ class LatticeFollower(Follower):
         branch.extra = stored_states(points, range(shape[0]), np.array([p.x.reshape(shape) for p in points]))
 
 
-def follow_case(
-    case: NnmCase,
-    folder: Path,
-    comm: MPI.Comm,
-    resume: bool = False,
-    listener: Listener | None = None,
-    stop: StopRequest | None = None,
-) -> list[Branch]:
-    """As ``follow_all``, by the way that the case asks for: the branches of a lattice each by all ranks together."""
-    if not case.krylov:
-        kind = CondensedFollower if case.condensed else Follower
-        return follow_all(case, folder, comm, resume, listener, stop, kind)
-    follower, gaps = LatticeFollower(case, folder, comm, listener, stop, resume), case.nnm.start_frequency
-    jobs = range(len(gaps)) if gaps else [mode - 1 for mode in case.nnm.modes]
-    branches = [branch for job in jobs for branch in follower.follow(job)]
-    return branches if comm.rank == 0 else []
+def follower_of(case: NnmCase) -> type[Follower]:
+    """Who follows the branches of a ``case``, for ``follow_all``."""
+    if case.krylov:
+        return LatticeFollower
+    return CondensedFollower if case.condensed else Follower

@@ -22,7 +22,7 @@ from vipetsc.lattice import Chain
 from vipetsc.modes.harmonics import SiteForces
 from vipetsc.modes.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton
-from vipetsc.modes.point import Point
+from vipetsc.modes.point import Point, StartError
 from vipetsc.modes.shooting import Chart, Shooting, ShootingMap
 from vipetsc.modes.system import System
 
@@ -176,7 +176,7 @@ class LatticeShooting(Shooting):
         """The orbit of a frequency ``omega`` in rad/s, between the bands, in which the first site touches.
 
         The guess is a describing function: the amplitude at which the site's response to its own force's first
-        harmonic is itself. Raises ValueError if there is none or Newton's method does not converge from there.
+        harmonic is itself. Raises StartError if there is none or Newton's method does not converge from there.
         """
         system, period = self.system, 2 * np.pi / omega
         row, pair = system.contact_rows[0], system.contacts[0]
@@ -190,12 +190,12 @@ class LatticeShooting(Shooting):
         balances = [balance(w) for w in amplitudes]
         change = next((i for i, (a, b) in enumerate(pairwise(balances)) if a * b < 0), None)
         if change is None:
-            raise ValueError(f"no motion of {omega:g} rad/s balances the first site's contact: {REMEDY}")
+            raise StartError(f"no motion of {omega:g} rad/s balances the first site's contact: {REMEDY}")
         x = field * (brentq(balance, amplitudes[change], amplitudes[change + 1]) / (row @ field))
         chart = self.chart("relative", x, period)
         row = np.append(np.zeros(system.dofs), 1.0)
         attempt = self.solve(chart, chart.encode(x, period), row, 1.0)
         if not attempt.converged:
             why = f"({attempt.reason}; residuals {attempt.residuals})"
-            raise ValueError(f"no breather of {omega:g} rad/s is found {why}: {REMEDY}")
+            raise StartError(f"no breather of {omega:g} rad/s is found {why}: {REMEDY}")
         return Point.of(self, attempt, chart)

@@ -30,6 +30,10 @@ QUANTITIES: dict[str, tuple[str, type, str, str]] = {
 }
 
 
+class StartError(ValueError):
+    """There is no periodic orbit to begin a branch with; all ranks that seek one together find that out together."""
+
+
 def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:
     """Half-traces c (n - 1,) = (mu + 1/mu)/2 of the basic map's multipliers, the trivial pair left out.
 
@@ -132,11 +136,11 @@ class Point:
 def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
     """The periodic orbit of linear mode ``mode`` (0-based) at a small ``energy`` in J, corrected.
 
-    Raises ValueError if the mode has no stiffness, or Newton does not converge from the linear mode at that energy.
+    Raises StartError if the mode has no stiffness, or Newton does not converge from the linear mode at that energy.
     """
     omega, shapes = problem.system.linear_modes()
     if not omega[mode] > 0:
-        raise ValueError(f"mode {mode + 1} is a rigid-body motion; it has no period")
+        raise StartError(f"mode {mode + 1} is a rigid-body motion; it has no period")
     amplitude = np.sqrt(2 * energy) / (omega[mode] if problem.map.start == "rest" else 1.0)
     x, period = shapes[:, mode] * amplitude, 2 * np.pi / omega[mode]
     chart = problem.chart("relative", x, period)
@@ -145,7 +149,7 @@ def linear_start(problem: Shooting, mode: int, energy: float) -> Point:
     attempt = problem.solve(chart, xi, row, row @ xi)
     if not attempt.converged:
         why = f"({attempt.reason}; residuals {attempt.residuals}): lower nnm.start_energy"
-        raise ValueError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
+        raise StartError(f"no periodic orbit near linear mode {mode + 1} at E = {energy:g} J {why}")
     return Point.of(problem, attempt, chart)
 
 
