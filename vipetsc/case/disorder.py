@@ -12,11 +12,10 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.reading import Problem, Section, Table
-from vipetsc.case.schema import CONTACTS, ContactsTable, LatticeTable
+from vipetsc.case.schema import CONTACTS, ContactsTable, LatticeTable, NotNegative
 from vipetsc.lattice import UnitCell
 
 SEED = "disorder.seed"
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Deviation(Section):
@@ -118,7 +117,7 @@ def scatter(
         law["stiffness"] *= drawn["modulus"][0] / contacts.modulus
     tables = tables | {"contacts": law}
     if drawn.keys() & {"masses", "springs"}:
-        tables["lattice"] = _with_cell(tables["lattice"], lattice.unit_cell(), drawn)
+        tables["lattice"] = _with_cell(tables["lattice"], lattice.undamped_cell(), drawn)
         if lattice.preset and "stiffness" in law:
             law.setdefault("radius", CONTACTS["radius"])
     return tables, []
@@ -129,8 +128,10 @@ def _with_cell(lattice: Table, cell: UnitCell, drawn: dict[str, list[float]]) ->
     stiffness: list[float] = drawn.get("springs", [spring.stiffness for spring in cell.springs])
     springs: list[dict[str, Any]] = [
         {"start": s.start + 1, "end": s.end + 1, "stiffness": k, "next_cell": s.next_cell}
+        | ({"damping": s.damping} if s.damping else {})
         for s, k in zip(cell.springs, stiffness, strict=True)
     ]
     table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}
     rest = {key: value for key, value in lattice.items() if key not in ("preset", "lambda", "eta")}
+    table |= {"grounding": list(cell.grounding)} if cell.grounding else {}
     return rest | {"cell": table | {"contact": [cell.host + 1, cell.resonator + 1]}}

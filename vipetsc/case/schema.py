@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -42,6 +42,7 @@ def _text(value: Any) -> Any:
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Wavenumber = Annotated[float, Field(gt=0, le=np.pi), BeforeValidator(number)]
 
 
@@ -84,25 +85,39 @@ PRESETS: dict[str, Preset] = {
 
 
 class SpringTable(Section):
-    """A spring from mass ``start`` to mass ``end`` (1-based), of the next cell if ``next_cell``."""
+    """A spring from mass ``start`` to mass ``end`` (1-based), of the next cell if ``next_cell``, and a dashpot."""
 
     start: int
     end: int
     stiffness: Finite
     next_cell: bool = False
+    damping: Finite | None = None
 
 
 class CellTable(Section):
-    """A unit cell; ``contact`` names the host and the resonator (1-based masses)."""
+    """A unit cell; ``contact`` names the host and the resonator (1-based masses), ``grounding`` dashpots to ground."""
 
     masses: list[Finite] = Field(min_length=2)
     springs: list[SpringTable] = Field(min_length=1)
     contact: list[int] = Field(min_length=2, max_length=2)
+    grounding: list[Finite] | None = None
 
-    def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int]:
+    def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """Those of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
-        springs = tuple(Spring(s.start - 1, s.end - 1, s.stiffness, s.next_cell) for s in self.springs)
-        return tuple(self.masses), springs, self.contact[0] - 1, self.contact[1] - 1
+        springs = tuple(
+            Spring(s.start - 1, s.end - 1, s.stiffness, s.next_cell, s.damping or 0.0) for s in self.springs
+        )
+        return tuple(self.masses), springs, self.contact[0] - 1, self.contact[1] - 1, tuple(self.grounding or ())
+
+
+class RayleighTable(Section):
+    """Dashpots everywhere: to ground ``mass`` times each mass, beside each spring ``stiffness`` times its stiffness.
+
+    A mode of frequency w then has the damping ratio (mass/w + stiffness w)/2.
+    """
+
+    mass: NotNegative = 0.0
+    stiffness: NotNegative = 0.0
 
 
 class LatticeTable(Section):
@@ -115,9 +130,20 @@ class LatticeTable(Section):
     reading: Literal["printed", "calibrated"] = "calibrated"
     lam: Positive | None = Field(None, alias="lambda")
     eta: Annotated[float, Field(gt=0, lt=1)] | None = None
+    damping: RayleighTable | None = None
 
     def unit_cell(self) -> UnitCell:
-        """The unit cell: ``cell``, or the preset's in its reading; raises ValueError for an invalid one."""
+        """The unit cell: ``cell``, or the preset's in its reading, damped; raises ValueError for an invalid one."""
+        cell, rayleigh = self.undamped_cell(), self.damping
+        if rayleigh is None or not (rayleigh.mass or rayleigh.stiffness):
+            return cell
+        springs = tuple(replace(s, damping=s.damping + rayleigh.stiffness * s.stiffness) for s in cell.springs)
+        ground = cell.grounding or (0.0,) * cell.dofs
+        grounding = tuple(c + rayleigh.mass * m for c, m in zip(ground, cell.masses, strict=True))
+        return replace(cell, springs=springs, grounding=grounding)
+
+    def undamped_cell(self) -> UnitCell:
+        """The unit cell without what ``damping`` adds."""
         if self.cell is not None:
             return UnitCell(*self.cell.arguments())
         options = {key: value for key, value in (("lam", self.lam), ("eta", self.eta)) if value is not None}

@@ -195,7 +195,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
     return LatticeRecord(
         shape,
         np.array(masses, MASS),
-        np.array([c[1:] for c in couplings], COUPLING),
+        np.array([c[1:4] for c in couplings], COUPLING),
         np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
         np.array([chain.sites[i] for i in layout.sites], np.int64) - layout.start,
         create_contacts(model.contact, [chain.clearances[i] for i in layout.sites]),

@@ -13,7 +13,8 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case import Case, Model
+from vipetsc.case import Case, CaseError, Model
+from vipetsc.case.reading import Problem
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine
@@ -103,6 +104,8 @@ def simulate(
     case = with_database(case)
     check_options(case)
     model = case.model()
+    if model.chain.is_damped or not model.chain.is_uniform():
+        raise CaseError([Problem("lattice", None, "dashpots and cells that differ are not simulated yet")])
     kind, refusal = select_engine(case, model)
     check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
     watching: list[type[Observer]] = [Guard, *observers, Ledger, *([ProgressReport] if progress else [])]

@@ -6,3 +6,4 @@ from vipetsc.lattice.chain import Chain, ToneBurst
 from vipetsc.lattice.compliance import Compliance, DenseCompliance, IncidentWave
 from vipetsc.lattice.contact import Contact, contact_stiffness
 from vipetsc.lattice.modes import Modes, modes_of
+from vipetsc.lattice.variation import Coefficients, Variation

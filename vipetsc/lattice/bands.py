@@ -51,7 +51,7 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     frequency = np.sqrt(np.maximum(squared, 0))
     eigenvalue, u = np.linalg.eigh(cell.stiffness_matrix(off_zero) * scale)
     stiffness_slope = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
-    for mass, offset, other, stiffness in cell.couplings():
+    for mass, offset, other, stiffness, *_ in cell.couplings():
         stiffness_slope[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * off_zero * offset)
     eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope * scale @ u).real
     group_velocity = eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny)))

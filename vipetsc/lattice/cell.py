@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,30 +16,44 @@ Reading = Literal["printed", "calibrated"]
 class Spring:
     """A linear spring between two masses (0-based) of one cell, or from one cell to the next.
 
-    ``stiffness`` is in N/m. With ``next_cell`` the spring runs from mass ``start`` of a cell to mass
-    ``end`` of the cell after it.
+    ``stiffness`` is in N/m, ``damping`` that of a dashpot beside it in N s/m. With ``next_cell`` the spring runs from
+    mass ``start`` of a cell to mass ``end`` of the cell after it.
     """
 
     start: int
     end: int
     stiffness: float
     next_cell: bool = False
+    damping: float = 0.0
+
+
+class Coupling(NamedTuple):
+    """A spring as one of its masses sees it: cells to the ``other`` mass, N/m, N s/m, the spring's number (from 0)."""
+
+    mass: int
+    offset: int
+    other: int
+    stiffness: float
+    damping: float
+    spring: int
 
 
 @dataclass(frozen=True)
 class UnitCell:
     """Masses in kg, springs in N/m, and the contact pair; mass indices are 0-based.
 
-    Raises ValueError with all of ``cell_problems``.
+    ``grounding``: dashpots in N s/m from each mass to ground; () where there are none. Raises ValueError with all of
+    ``cell_problems``.
     """
 
     masses: tuple[float, ...]
     springs: tuple[Spring, ...]
     host: int
     resonator: int
+    grounding: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if problems := cell_problems(self.masses, self.springs, self.host, self.resonator):
+        if problems := cell_problems(self.masses, self.springs, self.host, self.resonator, self.grounding):
             raise ValueError("; ".join(message for _, message in problems))
 
     @property
@@ -52,16 +66,21 @@ class UnitCell:
         """Mass in kg of the contact pair's relative motion, 1/(1/m_host + 1/m_resonator)."""
         return 1 / (1 / self.masses[self.host] + 1 / self.masses[self.resonator])
 
-    def couplings(self) -> list[tuple[int, int, int, float]]:
-        """Every spring seen from both its ends: (mass, cell offset, other mass, stiffness in N/m).
+    @property
+    def is_damped(self) -> bool:
+        """Whether there is a dashpot."""
+        return any(self.grounding) or any(spring.damping for spring in self.springs)
+
+    def couplings(self) -> list[Coupling]:
+        """Every spring seen from both its ends.
 
         Sorted by mass and otherwise in the order of ``springs``, which fixes the order of every sum.
         """
         ends = []
-        for s in self.springs:
-            offset = int(s.next_cell)
-            ends += [(s.start, offset, s.end, s.stiffness), (s.end, -offset, s.start, s.stiffness)]
-        return sorted(ends, key=lambda c: c[0])
+        for i, s in enumerate(self.springs):
+            offset, of_spring = int(s.next_cell), (s.stiffness, s.damping, i)
+            ends += [Coupling(s.start, offset, s.end, *of_spring), Coupling(s.end, -offset, s.start, *of_spring)]
+        return sorted(ends, key=lambda c: c.mass)
 
     def stiffness_matrix(self, kappa: ArrayLike) -> np.ndarray:
         """Bloch stiffness (..., dofs, dofs) in N/m at wavenumber ``kappa`` in rad per cell; Hermitian.
@@ -69,16 +88,24 @@ class UnitCell:
         The paper's printed matrix lacks the -1/2 in row 1, column 2 of Eq. (S1); this one follows from
         the springs.
         """
+        return self._bloch(kappa, [c.stiffness for c in self.couplings()])
+
+    def damping_matrix(self, kappa: ArrayLike) -> np.ndarray:
+        """Bloch damping (..., dofs, dofs) in N s/m of all dashpots, as ``stiffness_matrix``."""
+        return self._bloch(kappa, [c.damping for c in self.couplings()]) + np.diag(self.grounding or [0.0] * self.dofs)
+
+    def _bloch(self, kappa: ArrayLike, values: list[float]) -> np.ndarray:
+        """The Bloch matrix of the couplings' ``values``."""
         kappa = np.asarray(kappa, float)
         k = np.zeros((*kappa.shape, self.dofs, self.dofs), complex)
-        for mass, offset, other, stiffness in self.couplings():
-            k[..., mass, mass] += stiffness
-            k[..., mass, other] -= stiffness * np.exp(1j * kappa * offset)
+        for (mass, offset, other, *_), value in zip(self.couplings(), values, strict=True):
+            k[..., mass, mass] += value
+            k[..., mass, other] -= value * np.exp(1j * kappa * offset)
         return k
 
 
 def cell_problems(
-    masses: tuple[float, ...], springs: tuple[Spring, ...], host: int, resonator: int
+    masses: tuple[float, ...], springs: tuple[Spring, ...], host: int, resonator: int, grounding: tuple[float, ...] = ()
 ) -> list[tuple[str, str]]:
     """Everything wrong with a cell as (key, message) pairs; empty for a valid one.
 
@@ -92,6 +119,8 @@ def cell_problems(
         key = f"springs[{i}]"
         if not 0 < s.stiffness < np.inf:
             problems.append((f"{key}.stiffness", f"stiffness {s.stiffness!r} must be positive (N/m)"))
+        if not 0 <= s.damping < np.inf:
+            problems.append((f"{key}.damping", f"damping {s.damping!r} must not be negative (N s/m)"))
         outside = [end for end in (s.start, s.end) if not 0 <= end < n]
         problems += [(key, f"mass {end + 1} is not one of the cell's {n}") for end in outside]
         if s.start == s.end and not s.next_cell:
@@ -99,6 +128,11 @@ def cell_problems(
     for name, index in (("host", host), ("resonator", resonator)):
         if not 0 <= index < n:
             problems.append(("contact", f"{name} {index + 1} is not one of the cell's {n} masses"))
+    if len(grounding) not in (0, n):
+        problems.append(("grounding", f"one dashpot for each of the {n} masses is needed, 0 for none"))
+    for i, c in enumerate(grounding, 1):
+        if not 0 <= c < np.inf:
+            problems.append((f"grounding[{i}]", f"damping {c!r} must not be negative (N s/m)"))
     if host == resonator:
         problems.append(("contact", "host and resonator must be two different masses"))
     if not any(s.next_cell for s in springs):

@@ -1,6 +1,7 @@
 """A finite lattice: its cells, its ends, its contact sites, the tone burst that drives it, its linear response."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.variation import Coefficients, Variation
 
 Ends = Literal["fixed", "free", "periodic"]
 Envelope = Literal["paper", "hann"]
@@ -59,7 +61,8 @@ class Chain:
     """``cells`` unit cells in a row; contact ``sites`` are 0-based cells, ``clearances`` in m, one a site.
 
     ``ends``: ``fixed`` puts a wall at either end, held by the inter-cell springs; ``free`` cuts those
-    springs; ``periodic`` joins the last cell to the first.
+    springs; ``periodic`` joins the last cell to the first. ``variation`` has what differs from ``cell``, which
+    stands for the lattice in all that is said of its bands; raises ValueError if it is not of all cells.
     """
 
     cell: UnitCell
@@ -67,6 +70,57 @@ class Chain:
     ends: Ends = "fixed"
     sites: tuple[int, ...] = ()
     clearances: tuple[float, ...] = ()
+    variation: Variation | None = None
+
+    def __post_init__(self) -> None:
+        for name, array in self.variation.items() if self.variation else ():
+            if array.shape != (shape := (self.cells, len(getattr(self._reference, name)))):
+                raise ValueError(f"variation of {name}: shape {array.shape}, not {shape}")
+
+    @cached_property
+    def differs(self) -> np.ndarray:
+        """Whether each cell (cells,) has a mass, a spring or a dashpot other than the reference cell's."""
+        differs = np.zeros(self.cells, bool)
+        for name, array in self.variation.items() if self.variation else ():
+            differs |= np.any(array != getattr(self._reference, name), axis=1)
+        return differs
+
+    @property
+    def is_damped(self) -> bool:
+        """Whether there is a dashpot anywhere."""
+        varied = [a for n, a in self.variation.items() if n in ("grounding", "damping")] if self.variation else []
+        return self.cell.is_damped or any(array.any() for array in varied)
+
+    def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
+        """Whether no cell from ``start`` to ``stop`` differs from the reference cell; of a ring they count on."""
+        if self.variation is None:
+            return True
+        cells = np.arange(start, self.cells if stop is None else stop)
+        return not self.differs[cells[self._exist(cells)] % self.cells].any()
+
+    def _exist(self, cells: np.ndarray) -> np.ndarray:
+        """Which of ``cells`` there are; of a ring all, counted on beyond its ends."""
+        return (cells >= 0) & (cells < self.cells) | (self.ends == "periodic")
+
+    @property
+    def _reference(self) -> Coefficients:
+        cell = self.cell
+        of_springs = np.array([(s.stiffness, s.damping) for s in cell.springs]).T
+        return Coefficients(np.array(cell.masses), np.array(cell.grounding or np.zeros(cell.dofs)), *of_springs)
+
+    def coefficients(self, start: int, stop: int) -> Coefficients:
+        """Masses, springs and dashpots of the cells ``start`` to ``stop``.
+
+        Cells beyond the ends are those of the ring, or as the reference cell: the spring to a wall on the left
+        belongs to cell -1.
+        """
+        cells = np.arange(start, stop)
+        exists = self._exist(cells)
+        arrays = [np.tile(reference, (len(cells), 1)) for reference in self._reference]
+        for array, name in zip(arrays, Coefficients._fields, strict=True):
+            if self.variation and (varied := getattr(self.variation, name)) is not None:
+                array[exists] = varied[cells[exists] % self.cells]
+        return Coefficients(*arrays)
 
     def stiffness_matrix(self) -> csc_matrix:
         """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; needs little for <= 1e6."""
@@ -74,23 +128,35 @@ class Chain:
 
     def stiffness_rows(self, start: int, stop: int) -> csr_matrix:
         """The rows ((stop - start) dofs, cells dofs) of the stiffness in N/m of cells ``start`` to ``stop``."""
+        return self._rows(start, stop, self.coefficients(start - 1, stop).stiffness)
+
+    def damping_rows(self, start: int, stop: int) -> csr_matrix:
+        """The same rows of the damping in N s/m."""
+        of_cells = self.coefficients(start - 1, stop)
+        shape = (stop - start) * self.cell.dofs, self.cells * self.cell.dofs
+        ground = diags([of_cells.grounding[1:].ravel()], [start * self.cell.dofs], shape)
+        return (self._rows(start, stop, of_cells.damping) + ground).tocsr()
+
+    def _rows(self, start: int, stop: int, values: np.ndarray) -> csr_matrix:
+        """Rows made of ``values`` (cell, spring) of the cells from ``start`` - 1 on."""
         n, d = self.cells, self.cell.dofs
-        rows, columns, values = [], [], []
+        rows, columns, entries = [], [], []
         index, every = np.arange(start, stop, dtype=np.int64), np.ones(stop - start, bool)
-        for mass, offset, other, stiffness in self.cell.couplings():
+        for mass, offset, other, _, _, spring in self.cell.couplings():
             neighbour = index + offset
             inside = every if self.ends == "periodic" else (neighbour >= 0) & (neighbour < n)
             held = every if self.ends == "fixed" else inside
             here = index * d + mass
             rows += [here[held] - start * d, here[inside] - start * d]
             columns += [here[held], neighbour[inside] % n * d + other]
-            values += [np.full(held.sum(), stiffness), np.full(inside.sum(), -stiffness)]
-        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-        return coo_matrix(entries, shape=((stop - start) * d, n * d)).tocsr()
+            value = values[1 + min(offset, 0) :][: stop - start, spring]
+            entries += [value[held], -value[inside]]
+        of_springs = np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))
+        return coo_matrix(of_springs, shape=((stop - start) * d, n * d)).tocsr()
 
     def masses(self) -> np.ndarray:
         """Masses (cells dofs,) in kg, ordered cell by cell."""
-        return np.tile(np.asarray(self.cell.masses), self.cells)
+        return self.coefficients(0, self.cells).masses.ravel()
 
     def wave_scale(self, drive: ToneBurst, cell: int = 0, mass: int = 0) -> float:
         """Displacement amplitude in m of the linear wave that ``drive`` makes; velocity is Om times that.

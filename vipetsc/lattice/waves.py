@@ -52,7 +52,7 @@ def blocks_of(cell: UnitCell) -> Blocks:
     """K_nn, the factors P and Q of K_{n,n+1}, and what the springs to the cells before and after add to K_nn."""
     d = cell.dofs
     inside, coupling, left, right = (np.zeros((d, d)) for _ in range(4))
-    for mass, offset, other, stiffness in cell.couplings():
+    for mass, offset, other, stiffness, *_ in cell.couplings():
         inside[mass, mass] += stiffness
         (left if offset < 0 else right)[mass, mass] += stiffness * abs(offset)
         (coupling if offset > 0 else inside)[mass, other] -= stiffness * (offset >= 0)

@@ -127,7 +127,7 @@ class System:
         """
         ground = {cell.host: 0.0, cell.resonator: 0.0}
         between = 0.0
-        for mass, offset, other, stiffness in cell.couplings():
+        for mass, offset, other, stiffness, *_ in cell.couplings():
             if offset == 0 and {mass, other} == set(ground):
                 between += stiffness / 2  # couplings lists every spring from both ends
             elif mass in ground:

@@ -147,7 +147,9 @@ class Propagator(Engine):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """A lattice shorter than P's band, or too many sites that feel one another within a step."""
+        """Dashpots, cells that differ, a lattice shorter than P's band, or too many sites close to one another."""
+        if model.chain.is_damped or not model.chain.is_uniform():
+            return "the lattice has dashpots or cells that differ"
         series = step_series(model)
         if series is None:
             shortest = StepSeries(model.chain, model.sample_interval / MOST_PARTS, model.rtol)

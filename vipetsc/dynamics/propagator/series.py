@@ -41,7 +41,7 @@ class StepSeries:
         cell = self.chain.cell
         root = 1 / np.sqrt(np.asarray(cell.masses))
         rows = np.zeros(cell.dofs)
-        for mass, _, other, stiffness in cell.couplings():
+        for mass, _, other, stiffness, *_ in cell.couplings():
             rows[mass] += stiffness * root[mass] * (root[mass] + root[other])
         return float(np.sqrt(rows.max())) * self.interval
 
@@ -110,7 +110,7 @@ class StepSeries:
         rows[0][:, :, width] = np.eye(unit.dofs)
         for _ in range(self.terms - 1):
             u, form = rows[-1] / masses, np.zeros_like(rows[0])
-            for mass, offset, other, stiffness in unit.couplings():
+            for mass, offset, other, stiffness, *_ in unit.couplings():
                 # No power reaches the last cells: what is rolled past them is zero.
                 force = np.roll(u[:, other], -offset, axis=-1) - u[:, mass]
                 acts = exists & np.roll(exists, -offset) if self.chain.ends == "free" else exists

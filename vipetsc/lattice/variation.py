@@ -1,0 +1,54 @@
+"""Cells that differ from a lattice's reference cell: masses, springs and dashpots of all cells."""
+
+import hashlib
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Coefficients(NamedTuple):
+    """Masses, springs and dashpots of consecutive cells; a spring to the next cell belongs to the one it begins in.
+
+    ``masses`` (cell, dof) in kg; ``grounding`` (cell, dof) in N s/m to ground; ``stiffness`` (cell, spring) in N/m;
+    ``damping`` (cell, spring) in N s/m beside the springs.
+    """
+
+    masses: np.ndarray
+    grounding: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Variation:
+    """The arrays of ``Coefficients`` over all cells, None where every cell is as the reference cell; read-only.
+
+    Two are equal if their arrays are, bit for bit.
+    """
+
+    masses: np.ndarray | None = None
+    grounding: np.ndarray | None = None
+    stiffness: np.ndarray | None = None
+    damping: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for name, array in self.items():
+            copy = np.array(array, float)
+            copy.flags.writeable = False
+            object.__setattr__(self, name, copy)
+
+    def items(self) -> list[tuple[str, np.ndarray]]:
+        """Names and arrays of what differs."""
+        return [(f.name, array) for f in fields(self) if (array := getattr(self, f.name)) is not None]
+
+    @cached_property
+    def _digest(self) -> bytes:
+        return hashlib.sha256(b"".join(name.encode() + array.tobytes() for name, array in self.items())).digest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Variation) and self._digest == other._digest
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
