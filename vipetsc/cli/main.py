@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import vipetsc
 from vipetsc.case import CaseError, Problem
-from vipetsc.cli import export, reference, verbs
+from vipetsc.cli import export, movie, reference, verbs
 from vipetsc.cli.messages import told
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StoppedError, StopRequest
@@ -46,8 +46,17 @@ ARGUMENTS: dict[str, tuple[str, dict[str, Any]]] = {
                               " branches, whose branches of one name share a page"}),
     "results": ("path", {"type": Path, "nargs": "+", "metavar": "PATH", "help": "folder or file of results"}),
     "fig": ("--fig", {"action": "append", "metavar": "NAME", "help": "only this figure; may be repeated"}),
-    "format": ("--format", {"action": "append", "choices": ("png", "pdf"),
-                            "help": "png if left out; may be repeated"}),
+    "format": ("--format", {"action": "append", "choices": ("png", "pdf", "gif", "mp4"),
+                            "help": "png if left out, of movies gif, and mp4 with ffmpeg; may be repeated"}),
+    "movie": ("--movie", {"nargs": "?", "choices": ("energy", "velocity"), "const": "energy",
+                          "help": "a movie of a run: energy of the bands by cell, or velocity of the hosts"}),
+    "speed": ("--speed", {"type": movie.positive, "metavar": "X", "help": "of a movie: seconds of the run in a second;"
+                          " 10 s for all if left out"}),
+    "from": ("--from", {"type": float, "metavar": "T", "dest": "start", "help": "of a movie: its first instant in s"}),
+    "to": ("--to", {"type": float, "metavar": "T", "dest": "stop", "help": "of a movie: its last instant in s"}),
+    "cells": ("--cells", {"type": movie.window, "metavar": "A:B", "help": "of a movie: the first and the last cell"}),
+    "rate": ("--rate", {"type": movie.positive, "metavar": "N", "help": "of a movie: frames a second, 15 if left out"}),
+    "width": ("--width", {"type": int, "metavar": "PIXELS", "help": "of a movie: 960 if left out"}),
     "only": ("--only", {"nargs": "+", "default": [], "metavar": "ID",
                         "help": "only what these figures (fig05) and claims (C7) need"}),
     "quick": ("--quick", {"action": "store_true", "help": "coarse grids: minutes, marked on every picture"}),
@@ -75,7 +84,11 @@ VERBS: dict[str, tuple[Verb, str, str]] = {
     "predict": (verbs.predict, "several sites from the answer of one, beside simulations", "case set out force resume"),
     "design": (verbs.design, "the (lambda, eta) search of the four-band cell", "case set out force resume"),
     "analyse": (verbs.analyse, "measures of runs already made, from their files", "runs set"),
-    "plot": (verbs.plot, "pictures of a finished run again, from its files", "path fig format"),
+    "plot": (
+        movie.plot,
+        "pictures of a finished run again, from its files; movies",
+        "path fig format movie speed from to cells rate width",
+    ),
     "export": (export.export, "XDMF (ParaView) beside a run, and curves of any results as CSV", "results"),
     "paper": (verbs.paper, "every figure and claim of the paper, and a report", "only quick list out"),
     "manual": (reference.manual, "a chapter of the manual, as plain text", "topic"),

@@ -59,13 +59,13 @@ def draw_source(
                 raise
             raise FolderError(f"{folders[0] / _NOT_OURS[source]} of vipetsc ({error})") from None
 
-    on_root(comm, lambda: _prepare(source, folders, names))
+    on_root(comm, lambda: prepare(source, folders, names))
     newest = None if afresh else on_root(comm, lambda: max(p.stat().st_mtime for f in folders for p in f.glob("*.h5")))
     drawn = on_every_rank(comm, draw_share)
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
 
 
-def _prepare(source: str, folders: Sequence[Path], names: list[str] | None) -> None:
+def prepare(source: str, folders: Sequence[Path], names: list[str] | None) -> None:
     """Check what is to be drawn, and measure what is missing or older than its run; on one rank."""
     from vipetsc.figures.registry import figure_names
 

@@ -21,7 +21,7 @@ from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
 from vipetsc.cli.messages import echo, logger
-from vipetsc.cli.plot import draw_source, source_of
+from vipetsc.cli.plot import draw_source
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import origin
 from vipetsc.io.lock import locked
@@ -262,13 +262,6 @@ def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> i
     folders = on_root(comm, lambda: [p.parent if p.name == "run.h5" else p for p in options.path if p.exists()])
     with locked(comm, *folders):
         echo_paths(comm, reanalyse_folders(options.path, comm, options.set))
-    return DONE
-
-
-def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Pictures of what folders hold again, from their files."""
-    source, folders = on_root(comm, lambda: source_of(options.path))
-    echo_paths(comm, draw_source(source, folders, comm, options.fig, tuple(options.format or ("png",))))
     return DONE
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image  # type: ignore[import-untyped]
+from PIL import Image
 
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED

@@ -12,25 +12,49 @@ lattice (Parseval), and each term is constant as long as no contact is closed. S
 still overlap.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from vipetsc.lattice import UnitCell, bloch
+from vipetsc.lattice.bands import BlochPoint
 
 
 def wave_energies(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Energies in J of the waves on a ring, and their group velocities in cells/s, each (wavenumber, band).
 
-    ``displacement`` in m and ``velocity`` in m/s are (cell, dof).
+    ``displacement`` in m and ``velocity`` in m/s are (cell, dof); wavenumbers are in the order of ``fftfreq``.
     """
-    cells = len(displacement)
-    point, masses = bloch(cell, 2 * np.pi * np.fft.fftfreq(cells, 1.0)), np.asarray(cell.masses)
+    cells, point = len(displacement), _waves(cell, len(displacement))
+    speed = point.group_velocity.copy()
+    speed[[0, cells // 2] if cells % 2 == 0 else [0]] = 0.0  # standing waves
+    return np.abs(_amplitudes(cell, displacement, velocity)) ** 2 / (2 * cells), speed
+
+
+def band_envelopes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Energies (band, cell) in J of the envelopes of the same waves, which sum to those of the bands over the cells.
+
+    The waves that go as exp(-i omega t) put together again are complex fields of the masses, psi_b(x); a cell has the
+    energy |psi_b|^2/2, without the swing of kinetic and spring energy within a period.
+    """
+    point, masses = _waves(cell, len(displacement)), np.asarray(cell.masses)
+    parts = _amplitudes(cell, displacement, velocity)[:, None] * point.vectors * np.sqrt(masses)[:, None]
+    return np.asarray(0.5 * (np.abs(np.fft.ifft(parts, axis=0)) ** 2).sum(axis=1).T)
+
+
+@lru_cache(maxsize=4)
+def _waves(cell: UnitCell, cells: int) -> BlochPoint:
+    return bloch(cell, 2 * np.pi * np.fft.fftfreq(cells, 1.0))
+
+
+def _amplitudes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """The amplitudes a_b(kappa), (wavenumber, band)."""
+    point, masses = _waves(cell, len(displacement)), np.asarray(cell.masses)
     q, p = (
         np.einsum("kdb,kd->kb", point.vectors.conj(), np.fft.fft(field, axis=0) * masses)
         for field in (displacement, velocity)
     )
-    speed = point.group_velocity.copy()
-    speed[[0, cells // 2] if cells % 2 == 0 else [0]] = 0.0  # standing waves
-    return np.abs(point.frequency * q + 1j * p) ** 2 / (2 * cells), speed
+    return np.asarray(point.frequency * q + 1j * p)
 
 
 def by_direction(energy: np.ndarray, speed: np.ndarray) -> np.ndarray:

@@ -1,0 +1,188 @@
+"""Movies: what the frames show, that they read no more than that, files whole or not at all, bad input told."""
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.unit.test_figures import NT, SHAPES, write_run
+from vipetsc.cli.main import main
+from vipetsc.figures import movie
+from vipetsc.figures.scenes import FADE, Shot, scenes
+from vipetsc.figures.style import rc_style
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.read import field_time, open_run
+from vipetsc.lattice import Chain, bloch, four_band
+from vipetsc.spectra import band_envelopes, wave_energies
+from vipetsc.studies.reanalysis import measure_run
+
+CELL = four_band()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run")
+    write_run(path / "run.h5")
+    measure_run(path)
+    return path
+
+
+@pytest.fixture
+def clear(folder):
+    """The same without pictures."""
+    for path in (folder / "figures").glob("*"):
+        path.unlink()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def opened(folder):
+    with open_run(folder / "run.h5") as run, open_netcdf(folder / "analysis.h5", "analysis") as analysis:
+        yield run, analysis
+
+
+@pytest.fixture(scope="module")
+def stage(opened):
+    with rc_style():
+        return movie.Stage(opened[0], scenes(*opened, Shot(speed=0.016, rate=3.0, width=320)), 320)
+
+
+def test_envelopes_of_bands_sum_to_the_energy_of_a_ring_and_are_where_the_wave_is():
+    chain, rng = Chain(CELL, 30, "periodic"), np.random.default_rng(3)
+    u, v = 1e-3 * rng.standard_normal((2, 30, 4))
+    energy = 0.5 * (np.square(v) @ CELL.masses).sum() + 0.5 * u.ravel() @ chain.stiffness_matrix() @ u.ravel()
+    envelopes = band_envelopes(CELL, u, v)
+    assert envelopes.sum() == pytest.approx(energy, rel=1e-12)
+    assert envelopes.sum(axis=1) == pytest.approx(wave_energies(CELL, u, v)[0].sum(axis=0), rel=1e-12)
+    # A packet of the third band that goes to higher cells: no other band, no swing within a period.
+    x, kappa = np.arange(200), 1.2
+    wave = bloch(CELL, kappa)
+    packet = np.exp(-(((x - 90) / 12) ** 2) + 1j * kappa * x)[:, None] * wave.vectors[:, 2]
+    for phase in (0.0, 0.7):
+        turned = packet * np.exp(-1j * phase)
+        envelopes = band_envelopes(CELL, turned.real, (-1j * wave.frequency[2] * turned).real)
+        assert envelopes[2].sum() > 0.999 * envelopes.sum()
+        assert envelopes[2].argmax() in (89, 90, 91)
+        assert envelopes[2, 60:120] == pytest.approx(
+            0.5 * wave.frequency[2] ** 2 * np.exp(-2 * ((x - 90) / 12) ** 2)[60:120], rel=0.15
+        )
+
+
+def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
+    content = scenes(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))  # a frame is 1.5 ms
+    onsets = np.linspace(0.01, 0.04, 6)
+    for site in (0, 1):
+        for k in range(1, len(content.time)):
+            holds = any(content.time[k - 1] < onset <= content.time[k] for onset in onsets[site::2])
+            expected = 1.0 if holds else FADE * content.flash[k - 1, site]
+            assert content.flash[k, site] == pytest.approx(expected), (site, k)
+    assert (content.flash == 1).sum() == 6
+    assert content.sites.tolist() == [8, 16]
+
+
+def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monkeypatch):
+    read, original = {}, h5py.Dataset.__getitem__
+
+    def counted(self, *key, **options):
+        values = original(self, *key, **options)
+        read[self.name] = read.get(self.name, 0) + np.size(values)
+        return values
+
+    with h5py.File(folder / "run.h5") as file:
+        time, velocity = (file[name][...] for name in ("time", "velocity"))
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
+    content = scenes(*opened, Shot("velocity", 0.01, 0.0308, 0.0208, 8.0, cells=(5, 14)))
+    assert content.time == pytest.approx(0.01 + np.arange(9) * 0.0026)
+    rows = np.abs(time - content.time[:, None]).argmin(axis=1)
+    assert np.array_equal(content.wave[:, 0], velocity[rows, 4:14, CELL.host])
+    assert read["/velocity"] == read["/displacement"] == 9 * 10 * CELL.dofs
+    assert content.cells.tolist() == list(range(5, 15))
+
+
+def test_a_gif_holds_every_frame_for_its_time(clear, stage):
+    count = len(stage.content.time)
+    (path,) = movie.write_movie(stage, 3.0, [clear / "figures" / "movie.gif"])
+    assert [p.name for p in path.parent.iterdir()] == ["movie.gif"]
+    with Image.open(path) as image:
+        assert (image.n_frames, image.size) == (count, (320, 180))
+        lasts = 0
+        for k in range(count):
+            image.seek(k)
+            lasts += image.info["duration"]
+            frame = np.asarray(image.convert("RGB"), int)
+            assert np.abs(frame - stage.frame(k)[..., :3]).mean() < 0.7, k  # 255 colours are left
+    assert lasts == round(1000 * count / 3, -1)
+    assert count == int((NT - 1) * 2e-4 / 0.016 * 3) + 1
+
+
+def test_an_mp4_is_made_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypatch):
+    program = tmp_path / "ffmpeg"
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    program.write_text('#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\n')
+    program.chmod(0o755)
+    (path,) = movie.write_movie(stage, 3.0, [clear / "figures" / "movie.mp4"])
+    frames = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 180, 320, 4)
+    assert len(frames) == len(stage.content.time)
+    assert np.array_equal(frames[3], stage.frame(3))
+    before = path.stat()
+    program.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
+    with pytest.raises(OSError, match="no such codec"):
+        movie.write_movie(stage, 3.0, [path])
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+    assert [p.name for p in path.parent.iterdir()] == ["movie.mp4"]
+
+
+def test_without_ffmpeg_there_is_a_gif_and_a_remedy(clear, monkeypatch, capsys):
+    monkeypatch.setattr(movie, "ffmpeg", lambda: None)
+    few = ["plot", str(clear), "--movie", "--speed", "0.016", "--rate", "2", "--width", "320"]
+    assert main(few) == 0
+    assert [p.name for p in (clear / "figures").iterdir()] == ["movie-energy.gif"]
+    assert "apt-get install" in (told := capsys.readouterr().err) and "imageio-ffmpeg" in told
+    assert main([*few, "--format", "mp4"]) == 2
+    assert "apt-get install" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--movie --from 2",
+        "--movie --from 0.03 --to 0.02",
+        "--movie --to nan",
+        "--movie --cells 20:40",
+        "--movie --cells 9:9",
+        "--movie --cells x",
+        "--movie --speed 0",
+        "--movie --speed 1e-9",
+        "--movie --speed 10",
+        "--movie --speed nan",
+        "--movie --rate 1000",
+        "--movie --width 10",
+        "--movie heat",
+        "--movie --format png",
+        "--movie --fig phase",
+        "--speed 2",
+        "--format gif",
+    ],
+)
+def test_what_cannot_be_is_told_and_nothing_written(clear, words, capsys):
+    before = sorted(clear.rglob("*"))
+    try:
+        code = main(["plot", str(clear), *words.split()])
+    except SystemExit as ended:
+        code = ended.code
+    assert code == 2
+    assert words.split()[-2] in (told := capsys.readouterr().err) or words.split()[0] in told
+    assert sorted(clear.rglob("*")) == before
+
+
+@pytest.mark.parametrize("shape", ["no sites", "window after the site", "single cell", "every third sample"])
+def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
+    write_run(tmp_path / "run.h5", **SHAPES[shape])
+    with rc_style(), open_run(tmp_path / "run.h5") as run:
+        shot = Shot("velocity", rate=0.3, width=320)
+        stage = movie.Stage(run, scenes(run, None, shot), shot.width)
+        assert field_time(run)[-1] >= stage.content.time[-1]
+        assert np.ptp(stage.frame(1)) > 0
+        if shape == "single cell":
+            with pytest.raises(ValueError, match="side by side"):
+                scenes(run, None, Shot())
