@@ -62,7 +62,8 @@ def test_rates_motion_and_energies_are_those_of_the_equations(ends):
     u, v = 1e-5 * rng.normal(size=(CELLS, d)), 1e-2 * rng.normal(size=(CELLS, d))
     u[SITES[0] - 1, [host, resonator]] = -2e-5, 1e-5  # indentation 2e-5 m at the first site
     u[SITES[1] - 1, [host, resonator]] = 1e-6, 2e-6
-    engine.lattice.contacts.sites[0] = (CLOSED, 1e-5, 0.02)
+    sites = engine.lattice.contacts
+    sites["mode"][0], sites["clearance"][0], sites["approach"][0] = CLOSED, 1e-5, 0.02
     work, lost = 0.25, np.array([0.5, 0.125])
     engine.state.array[:] = np.concatenate([u.T.ravel(), v.T.ravel(), [work], lost])
     f = engine.state.duplicate()

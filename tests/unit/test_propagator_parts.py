@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from tests.conftest import small_case
 from vipetsc.case import Case
-from vipetsc.contact.law import CLOSED, Contacts, ForceLaw, create_contacts
+from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.engine import Stretch
 from vipetsc.dynamics.layout import Burst, Layout, create_record
 from vipetsc.dynamics.propagator.collocation import (
@@ -221,9 +221,9 @@ def oscillator(damping: float = 0.0) -> tuple[Cluster, float]:
     """A mass on the stop x >= 0 (clearance 1, bilinear): x = v sin(rate t)/rate; and the rate."""
     mass, h, speed, rate = 0.02, 1e-4, 0.5, 3e4
     contact = small_case(contacts={"law": "bilinear"}).model().contact
-    law = ForceLaw(mass * rate**2, 1.0, damping, False, 0.0)
-    contacts = Contacts(law, create_contacts(contact, [1.0]).sites)
-    contacts.sites["mode"], contacts.sites["approach"] = CLOSED, speed
+    contacts = create_contacts(contact, [1.0])
+    contacts["mode"], contacts["approach"], contacts["stiffness"] = CLOSED, speed, mass * rate**2
+    contacts["exponent"], contacts["damping"], contacts["floor"] = 1.0, damping, 0.0
     burst = Burst(0.0, 1.0, 1.0, 0.0)
     response = np.full((1, 1, 1), h**2 / mass)
     cluster = Cluster(

@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.case import Case
+from vipetsc.contact.law import create_contacts
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.propagator.collocation import collocation
 from vipetsc.dynamics.propagator.series import StepSeries, first_onset
-from vipetsc.lattice import pass_bands
+from vipetsc.lattice import Contact, pass_bands
 from vipetsc.lattice.chain import Chain
 
 THREE_MASSES = {
@@ -215,7 +216,7 @@ def test_no_onset_is_missed(coefficients, length, clearance):
     s = np.linspace(0, length, 4001)
     w = np.abs(np.polynomial.polynomial.polyval(s, jet))
     assume(w[0] < clearance * 0.999)
-    found = first_onset(jet, clearance, length)
+    found = first_onset(jet, create_contacts(Contact("hertz", 1.0), [clearance])[0], length)
     if found > length:
         assert w.max() <= clearance * (1 + 1e-9)
     else:

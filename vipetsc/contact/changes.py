@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import allocating, kernel
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, Contacts, contact_force
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, contact_force, gap_of
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
-# A site has landed on its clearance when |side w - D| is within this share of D.
+# A site has landed on its clearance when |side w - D| is within this share of D (of its ``scale``).
 LANDED_W = 1e-10
 # ... and on g = 0 when |g| is within this.
 LANDED_G = 1e-9
@@ -51,47 +51,48 @@ class Extremes(NamedTuple):
 
 
 @kernel
-def _affine_form(contacts: Contacts, i: int, function: int) -> tuple[int, float, float, float, int]:
+def _affine_form(contacts: np.ndarray, i: int, function: int) -> tuple[int, float, float, float, int]:
     """Order k, factor, offset of a switching function ``factor`` d^k w/dt^k + ``offset``; its tolerance and mode.
 
     The offset is -inf where the site's mode has no such function.
     """
-    site = contacts.sites[i]
-    tolerance = LANDED_W * site.clearance
+    site = contacts[i]
+    tolerance = LANDED_W * site.scale
     if site.mode == FREE:
         side = 1 - 2 * function
-        return 0, float(side), -site.clearance, tolerance, side * CLOSED
+        return 0, float(side), -gap_of(site, side), tolerance, side * CLOSED
     side = 1 if site.mode > 0 else -1
     if function == 0:
-        return 0, float(-side), site.clearance, tolerance, FREE
-    if not contacts.law.clip:
+        return 0, float(-side), gap_of(site, side), tolerance, FREE
+    if not site.clip:
         return 1, 0.0, -np.inf, 0.0, site.mode
     clipped = abs(site.mode) == CLIPPED
     sign = 1.0 if clipped else -1.0
-    factor = sign * (contacts.law.damping / site.approach)
+    factor = sign * (site.damping / site.approach)
     return 1, factor, sign, LANDED_G, side * (CLOSED if clipped else CLIPPED)
 
 
 @kernel
-def switching(contacts: Contacts, i: int, function: int, motion: np.ndarray) -> Switching:
+def switching(contacts: np.ndarray, i: int, function: int, motion: np.ndarray) -> Switching:
     """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
     order, factor, offset, tolerance, mode = _affine_form(contacts, i, function)
     return Switching(factor * motion[order] + offset, factor * motion[order + 1], tolerance, mode)
 
 
 @kernel
-def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray) -> Change:
+def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray) -> Change:
     """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
 
     ``room`` (2, 6) is overwritten.
     """
     first, b, c = Change(2.0, -1, 0), room[0], room[1]
-    for i in range(contacts.sites.size):
+    for i in range(contacts.size):
         bernstein(start[i], end[i], h, b)
-        site = contacts.sites[i]
-        reach, within = site.clearance - LANDED_W * site.clearance, site.mode == FREE
+        site = contacts[i]
+        room_plus, room_minus = site.clearance - LANDED_W * site.scale, site.clearance_minus - LANDED_W * site.scale
+        within = site.mode == FREE
         for w in b:
-            within &= -reach < w < reach
+            within &= -room_minus < w < room_plus
         if within:
             continue
         for function in range(2):
@@ -107,19 +108,19 @@ def first_change(contacts: Contacts, start: np.ndarray, end: np.ndarray, h: floa
 
 
 @kernel
-def _push(contacts: Contacts, i: int, b: np.ndarray, d: np.ndarray, s: float, room: np.ndarray) -> float:
+def _push(contacts: np.ndarray, i: int, b: np.ndarray, d: np.ndarray, s: float, room: np.ndarray) -> float:
     """Contact force in N at share ``s`` of a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
     force, _ = contact_force(contacts, i, evaluate(b, s, room), evaluate(d, s, room))
-    return force if contacts.sites[i].mode > 0 else -force
+    return force if contacts[i].mode > 0 else -force
 
 
 @allocating
-def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
+def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     b, room = np.empty(6), np.empty(6)
     bernstein(start[i], end[i], h, b)
     d = 5.0 * (b[1:] - b[:5]) / h
-    site = contacts.sites[i]
+    site = contacts[i]
     side = 1.0 if site.mode > 0 else -1.0
     deepest = max(side * b[0], side * b[5])
     recoil = side * (b[:5] - b[1:])
@@ -143,4 +144,4 @@ def extremes(contacts: Contacts, i: int, start: np.ndarray, end: np.ndarray, h: 
         else:
             low = left
     largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high), room))
-    return Extremes(deepest - site.clearance, largest, smallest)
+    return Extremes(deepest - gap_of(site, side), largest, smallest)

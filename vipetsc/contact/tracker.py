@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gamma
 
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, SITE, Contacts, elastic_force
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, SITE, elastic_force, impact_time
 
 # Limits of the contact law, of which it is counted how often they acted.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
@@ -21,33 +20,12 @@ TRACKED = np.dtype([("number", np.int64), ("site", SITE), ("counts", COUNTS), ("
 which the separation is NaN, and whether it was seen to pull."""
 
 
-class ImpactTime(NamedTuple):
-    """Contact time ``factor`` depth/v of an isolated conservative impact at speed v (Johnson 1985, sec. 11.4).
-
-    The depth is (``inertia`` v^``power``/``stiffness``)^``root``; ``power`` is 2.
-    """
-
-    inertia: float
-    power: float
-    stiffness: float
-    root: float
-    factor: float
-
-
 class Tracks(NamedTuple):
     """``sites`` (site,) of dtype ``TRACKED``; the first ``closed[0]`` rows of ``log`` are episodes that have ended."""
 
     sites: np.ndarray
     log: np.ndarray
     closed: np.ndarray
-    time: ImpactTime
-
-
-@njit(error_model="numpy")
-def impact_time(time: ImpactTime, speed: float) -> float:
-    """Contact time in s at ``speed`` in m/s."""
-    depth = (time.inertia * speed**time.power / time.stiffness) ** time.root
-    return time.factor * depth / speed
 
 
 @njit(error_model="numpy")
@@ -58,46 +36,46 @@ def with_room(tracks: Tracks) -> Tracks:
         return tracks
     log = np.empty(2 * wanted, tracks.log.dtype)
     log[:used] = tracks.log[:used]
-    return Tracks(tracks.sites, log, tracks.closed, tracks.time)
+    return Tracks(tracks.sites, log, tracks.closed)
 
 
 @njit(error_model="numpy")
-def update_episode(contacts: Contacts, tracks: Tracks, i: int, reached: Extremes) -> None:
+def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extremes) -> None:
     """Update the open episode of site ``i`` with the extremes ``reached`` in a stretch of time."""
-    site, law = tracks.sites[i], contacts.law
+    site, law = tracks.sites[i], contacts[i]
     episode, pull = site.episode, -reached.smallest_force
     episode.indentation = max(episode.indentation, reached.indentation)
     episode.force = max(episode.force, reached.force)
     # No pull is that of the law continued to a landing short of D, or beyond g = 0.
-    none = (1.0 + law.damping) * elastic_force(law, LANDED_W * contacts.sites[i].clearance)
+    none = (1.0 + law.damping) * elastic_force(law, LANDED_W * law.scale)
     if pull > 0.0 and not site.pulls and pull > none + LANDED_G * elastic_force(law, episode.indentation):
         site.pulls = True
         site.counts.pulled += 1
 
 
 @njit(error_model="numpy")
-def update_episodes(contacts: Contacts, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> None:
+def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> None:
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
-    for i in range(contacts.sites.size):
-        if contacts.sites[i].mode != FREE:
+    for i in range(contacts.size):
+        if contacts[i].mode != FREE:
             update_episode(contacts, tracks, i, extremes(contacts, i, start, end, h))
 
 
 @njit(error_model="numpy")
-def switch_sites(contacts: Contacts, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, t: float) -> int:
+def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, t: float) -> int:
     """Switch every site that has landed at time ``t`` in s; returns how many. The log must have room.
 
     ``motion`` (sites, 3) holds w, w', w'', ``energies`` (sites,) what they dissipated so far in J.
     """
     switched = 0
-    for i in range(contacts.sites.size):
+    for i in range(contacts.size):
         for function in range(2):
             value, rate, tolerance, mode = switching(contacts, i, function, motion[i])
             if value < -tolerance:
                 continue
             # At a landing |w - D| is rounding: the rate tells on which side the site goes on.
             if rate <= 0.0 and value <= tolerance:
-                if contacts.sites[i].mode == FREE:
+                if contacts[i].mode == FREE:
                     tracks.sites[i].counts.grazes += 1
                 continue
             _set_mode(contacts, tracks, i, mode, motion[i, 1], energies[i], t)
@@ -107,8 +85,8 @@ def switch_sites(contacts: Contacts, tracks: Tracks, motion: np.ndarray, energie
 
 
 @njit(error_model="numpy")
-def _set_mode(contacts: Contacts, tracks: Tracks, i: int, mode: int, rate: float, energy: float, t: float) -> None:
-    site, track, floor = contacts.sites[i], tracks.sites[i], contacts.law.approach_floor
+def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: float, energy: float, t: float) -> None:
+    site, track, floor = contacts[i], tracks.sites[i], contacts[i].floor
     episode, was_free, side = track.episode, site.mode == FREE, (1 if mode > 0 else -1)
     site.mode = mode
     if was_free:
@@ -130,19 +108,14 @@ class ImpactTracker:
     """Switches the modes of ``contacts`` at located changes and logs every episode.
 
     ``start`` and ``end`` (sites, 3) hold w, w', w'' at both ends of the step at hand; the engine fills them.
-    ``numbers`` (sites,) are those of the sites in the log, from 0, or -1 for none; ``reduced_mass`` is m_host
-    m_resonator / (m_host + m_resonator) in kg.
+    ``numbers`` (sites,) are those of the sites in the log, from 0, or -1 for none.
     """
 
-    def __init__(self, contacts: Contacts, numbers: Sequence[int], reduced_mass: float) -> None:
+    def __init__(self, contacts: np.ndarray, numbers: Sequence[int]) -> None:
         self.contacts, sites = contacts, np.zeros(len(numbers), TRACKED)
         self.start, self.end = np.zeros((2, len(sites), 3))
         sites["number"] = numbers
-        kc, n = contacts.law.stiffness, contacts.law.exponent
-        # Integral of dx / sqrt(1 - x^(n+1)) over [0, 1]: pi/2 for n = 1, 1.4716 for n = 3/2.
-        integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
-        time = ImpactTime((n + 1) / 2 * reduced_mass, 2.0, kc, 1 / (n + 1), 2 * float(integral))
-        self.tracks = Tracks(sites, np.zeros(2 * len(sites), EPISODE), np.zeros(1, np.int64), time)
+        self.tracks = Tracks(sites, np.zeros(2 * len(sites), EPISODE), np.zeros(1, np.int64))
 
     def begin(self, motion: np.ndarray) -> np.ndarray:
         """Close the sites that begin beyond their clearance at t = 0; returns their indices.
@@ -150,17 +123,20 @@ class ImpactTracker:
         ``motion`` (site, 2) has w and w' of all numbered sites. When these contacts began is not known: w'_minus is the
         speed with which two masses alone come to w at w' without loss, mu (w'_minus^2 - w'^2)/2 = kc x^(n+1)/(n+1).
         """
-        sites, law, mine = self.contacts.sites, self.contacts.law, np.flatnonzero(self.tracks.sites["number"] >= 0)
-        (w, rate), D = motion[self.tracks.sites["number"][mine]].T, sites["clearance"][mine]
-        side, deep = np.where(w < 0, -1, 1), np.abs(w) - D
-        closed = (deep > LANDED_W * D) | ((deep >= -LANDED_W * D) & (side * rate > 0))
+        sites, mine = self.contacts, np.flatnonzero(self.tracks.sites["number"] >= 0)
+        (w, rate), near = motion[self.tracks.sites["number"][mine]].T, LANDED_W * sites["scale"][mine]
+        depths = w - sites["clearance"][mine], -w - sites["clearance_minus"][mine]
+        side, deep = np.where(depths[0] < depths[1], -1, 1), np.maximum(*depths)
+        closed = (deep > near) | ((deep >= -near) & (side * rate > 0))
         some, side, deep, rate = mine[closed], side[closed], np.maximum(deep[closed], 0.0), rate[closed]
-        # kc x^(n+1)/(n+1) over mu/2, of which the impact's time knows (n+1)/2 times mu.
-        speed = np.sqrt(rate**2 + law.stiffness * deep ** (law.exponent + 1) / self.tracks.time.inertia)
-        sites["approach"][some] = side * np.maximum(speed, law.approach_floor)
+        law = sites[some]
+        # kc x^(n+1)/(n+1) over mu/2, of which a site knows (n+1)/2 times mu.
+        n = law["exponent"]
+        speed = np.sqrt(rate**2 + law["stiffness"] * np.where(n == 1, deep**2, deep ** (n + 1)) / law["inertia"])
+        sites["approach"][some] = side * np.maximum(speed, law["floor"])
         sites["mode"][some] = side * CLOSED
-        if law.clip:
-            sites["mode"][some[1 + law.damping * rate / sites["approach"][some] < 0]] *= CLIPPED
+        clipped = law["clip"] & (1 + law["damping"] * rate / sites["approach"][some] < 0)
+        sites["mode"][some[clipped]] *= CLIPPED
         episodes = self.tracks.sites["episode"]
         episodes["site"][some], episodes["side"][some] = self.tracks.sites["number"][some], side
         episodes["approach_velocity"][some], episodes["separation"][some] = side * speed, np.nan
@@ -174,12 +150,12 @@ class ImpactTracker:
     @property
     def _lasting(self) -> np.ndarray:
         """The sites in contact."""
-        return np.flatnonzero(self.contacts.sites["mode"] != FREE)
+        return np.flatnonzero(self.contacts["mode"] != FREE)
 
     def contact_time(self) -> float:
         """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
-        speeds = np.abs(self.contacts.sites["approach"][self._lasting]).tolist()
-        return min((impact_time(self.tracks.time, speed) for speed in speeds), default=np.inf)
+        sites = self.contacts
+        return min((impact_time(sites[i], abs(sites[i]["approach"])) for i in self._lasting), default=np.inf)
 
     def accept_step(self, h: float) -> None:
         """Take the step of ``h`` seconds as done: update the open episodes; its end is the next one's start."""
@@ -205,11 +181,11 @@ class ImpactTracker:
 
     def checkpoint(self) -> np.ndarray:
         """Sites with their modes, counts and episodes (sites,) of dtype ``TRACKED``."""
-        self.tracks.sites["site"] = self.contacts.sites
+        self.tracks.sites["site"] = self.contacts
         return self.tracks.sites.copy()
 
     def restore(self, table: np.ndarray) -> None:
         """Go back to a checkpoint, the ``table`` of all sites by their numbers."""
         known = self.tracks.sites["number"] >= 0
         self.tracks.sites[known] = table[self.tracks.sites["number"][known]]
-        self.contacts.sites[known] = self.tracks.sites["site"][known]
+        self.contacts[known] = self.tracks.sites["site"][known]

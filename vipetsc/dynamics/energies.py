@@ -83,7 +83,8 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
         _add(sums, _SPRING, of_cells, unit)
     for i in range(sites):
         w, _ = relative_motion(y, lattice, i)
-        elastic[i] = elastic_energy(contacts.law, abs(w) - contacts.sites[i].clearance)
+        site = contacts[i]
+        elastic[i] = elastic_energy(site, max(w - site.clearance, -w - site.clearance_minus))
     _add(sums, _CONTACT, elastic, unit)
     _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + sites], unit)
     return sums

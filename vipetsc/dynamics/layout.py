@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Model
 from vipetsc.compiled import njit
-from vipetsc.contact.law import Contacts, create_contacts
+from vipetsc.contact.law import create_contacts
 from vipetsc.lattice import ToneBurst
 
 
@@ -160,7 +160,7 @@ class LatticeRecord(NamedTuple):
     couplings: np.ndarray
     springs: np.ndarray
     site_cells: np.ndarray
-    contacts: Contacts
+    contacts: np.ndarray
     burst: Burst
 
 
@@ -198,9 +198,15 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         np.array([c[1:4] for c in couplings], COUPLING),
         np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
         np.array([chain.sites[i] for i in layout.sites], np.int64) - layout.start,
-        create_contacts(model.contact, [chain.clearances[i] for i in layout.sites]),
+        site_records(model, layout.sites),
         create_burst(model.drive),
     )
+
+
+def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
+    """Free sites of dtype ``SITE``; a number of -1 is a site without stops."""
+    gaps = np.array([*model.chain.clearances, np.inf])[np.asarray(numbers, np.int64)]
+    return create_contacts(model.contact, gaps, model.chain.cell.reduced_mass, model.scale)
 
 
 @njit(error_model="numpy")

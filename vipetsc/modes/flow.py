@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import inlined, kernel, njit
-from vipetsc.contact.law import ForceLaw, elastic_force_and_slope
+from vipetsc.contact.law import elastic_force_and_slope
 from vipetsc.modes.changes import EXTREMUM, NONE, Change, first_rise, hermite
 from vipetsc.modes.system import System
 
@@ -85,7 +85,7 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
             contact = system.contacts[c]
             x = side[c] * elongation(system.rows, c, y, 0, 0, n) - contact.clearance
             # past the exit, which is landed on anyway, the law is odd
-            force, slope = elastic_force_and_slope(ForceLaw(contact.stiffness, contact.exponent, 0.0, False, 0.0), x)
+            force, slope = elastic_force_and_slope(contact, x)
             _add(system.rows, c, (side[c] * force, slope), y, pull, shape)
     for s in range(system.springs.size):
         a, b, z = system.springs[s].quadratic, system.springs[s].cubic, elongation(system.spring_rows, s, y, 0, 0, n)

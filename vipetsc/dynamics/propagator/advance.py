@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import Change, extremes, first_change, switching
-from vipetsc.contact.law import CLOSED, FREE, contact_force
+from vipetsc.contact.law import CLOSED, FREE, contact_force, gap_of
 from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.dynamics.propagator.collocation import (
     EXIT,
@@ -49,8 +49,8 @@ def _advance_freely(cluster: Cluster) -> int:
     """Go to the first onset, or to the end of the step, while no force acts."""
     state = cluster.state[0]
     rest, first = 1.0 - state.position, 2.0
-    for i in range(cluster.contacts.sites.size):
-        first = min(first, first_onset(cluster.taylor[i], cluster.contacts.sites[i].clearance, rest))
+    for i in range(cluster.contacts.size):
+        first = min(first, first_onset(cluster.taylor[i], cluster.contacts[i], rest))
     if first > rest:
         state.position = 1.0
         return DONE
@@ -64,7 +64,7 @@ def _advance_freely(cluster: Cluster) -> int:
 @inlined
 def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     """The next substep: as long as its error allows, not beyond the drive's end, short while a contact is young."""
-    state, sites = cluster.state[0], cluster.contacts.sites
+    state, sites = cluster.state[0], cluster.contacts
     fastest = cluster.omega_max_h
     if cluster.taylor.shape[0] > sites.size:
         fastest += cluster.burst.frequency * (1.0 + 1.0 / cluster.burst.cycles) * cluster.interval
@@ -74,7 +74,7 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     longest = length
     for i in trial.closed:
         # A young contact's force goes as the root of its age.
-        if cluster.contacts.law.exponent != 1.0 and abs(sites[i].mode) == CLOSED:
+        if sites[i].exponent != 1.0 and abs(sites[i].mode) == CLOSED:
             age = (state.begin - cluster.history[i].onset) / cluster.interval + state.position
             if age * cluster.interval <= 1e-7 * cluster.history[i].duration:
                 return Substep(ONSET, longest)
@@ -130,8 +130,8 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     change = first_change(cluster.contacts, *motion, h * substep.length, trial.sums.bernstein)
     if change.share > 1.0:
         return substep, False
-    mode = cluster.contacts.sites[change.site].mode
-    separates = cluster.contacts.law.exponent != 1.0 and abs(mode) == CLOSED and change.function == 0
+    site = cluster.contacts[change.site]
+    separates = site.exponent != 1.0 and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
         # The force begins and ends as a root: one substep for each.
         state.length = 0.5 * change.share * substep.length
@@ -167,7 +167,7 @@ def _take_down(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     if tape.rows.shape[1] == 0:
         return
     for i in trial.closed:
-        k, site, motion = tape.used[0], cluster.contacts.sites[i], cluster.site_motion[i]
+        k, site, motion = tape.used[0], cluster.contacts[i], cluster.site_motion[i]
         tape.used[0] += 1
         if k < tape.rows.shape[1]:
             row = tape.rows[0, k]
@@ -183,8 +183,8 @@ def _take_down(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> None:
     """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
     start, end, history = cluster.site_motion[i], trial.site_motion[i], cluster.history[i]
-    side = 1.0 if cluster.contacts.sites[i].mode > 0 else -1.0
-    depth = max(side * start[0], side * end[0]) - cluster.contacts.sites[i].clearance
+    side = 1.0 if cluster.contacts[i].mode > 0 else -1.0
+    depth = max(side * start[0], side * end[0]) - gap_of(cluster.contacts[i], side)
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]
     force, smallest, largest = max(first, last), min(first, last), max(first, last)
@@ -202,7 +202,7 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
 @kernel
 def _select_active(cluster: Cluster) -> Trial:
     """The room for a substep of a cluster, of those DoFs on which forces act."""
-    state, sites, room, closed = cluster.state[0], cluster.contacts.sites, cluster.trial, 0
+    state, sites, room, closed = cluster.state[0], cluster.contacts, cluster.trial, 0
     for i in range(sites.size):
         if sites[i].mode != FREE:
             room.active[closed] = room.closed[closed] = i

@@ -14,7 +14,7 @@ from numpy.polynomial.legendre import leggauss, legval
 from scipy.special import binom
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.law import Contacts, contact_force
+from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.layout import Burst, drive_force
 from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
 from vipetsc.dynamics.propagator.tape import Tape
@@ -89,7 +89,7 @@ class Cluster(NamedTuple):
     ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is room for a substep of the largest, ``tape`` a log.
     """
 
-    contacts: Contacts
+    contacts: np.ndarray
     burst: Burst
     response: np.ndarray
     nodes: Collocation
@@ -147,7 +147,7 @@ def create_trial(dofs: int, terms: int) -> Trial:
 @kernel
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
     """``out`` (site, 3) = w, w', w'' of every site at the present position, where the series is ``taylor``."""
-    state, sites, h = cluster.state[0], cluster.contacts.sites.size, cluster.interval
+    state, sites, h = cluster.state[0], cluster.contacts.size, cluster.interval
     forces = cluster.trial.sums.forces[: cluster.taylor.shape[0]]
     for i in range(sites):
         out[i, 0], out[i, 1] = taylor[i, 0], taylor[i, 1] / h
@@ -196,7 +196,7 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
             at = substep.length * cluster.nodes.share[substep.kind, node]
             free_w[a, node], slope = evaluate(cluster.taylor[active[a]], at)
             free_v[a, node] = slope / h
-            if active[a] == contacts.sites.size:
+            if active[a] == contacts.size:
                 trial.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
     for a in range(n):
         for b in range(n):
@@ -222,20 +222,20 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
         for i in trial.closed:
             for node in range(NODES):
                 trial.force[i, node] = -contact_force(contacts, i, trial.w[i, node], trial.v[i, node])[0]
-    trial.force[: contacts.sites.size] = 0.0
+    trial.force[: contacts.size] = 0.0
     return False
 
 
 @kernel
-def _replace(contacts: Contacts, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
+def _replace(contacts: np.ndarray, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
     """Put the motion of DoF ``i`` at the nodes into ``trial``; largest change of a site's, inf if it is not finite."""
     change = 0.0
     for node in range(NODES):
         if not abs(w[node]) + abs(v[node]) < np.inf:
             return np.inf
-        if i < contacts.sites.size:
-            site = contacts.sites[i]
-            change = max(change, abs(w[node] - trial.w[i, node]) / site.clearance)
+        if i < contacts.size:
+            site = contacts[i]
+            change = max(change, abs(w[node] - trial.w[i, node]) / site.scale)
             change = max(change, abs(v[node] - trial.v[i, node]) / (abs(v[node]) + abs(site.approach)))
         trial.w[i, node], trial.v[i, node] = w[node], v[node]
     return change
@@ -276,7 +276,7 @@ def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
             for node in range(NODES):
                 coefficient += cluster.nodes.tail[row, node] * trial.force[i, node]
             last += abs(coefficient)
-        allowed = cluster.rtol * abs(cluster.contacts.sites[i].approach) + cluster.atol
+        allowed = cluster.rtol * abs(cluster.contacts[i].approach) + cluster.atol
         error = SUPERCONVERGENCE * last * length * cluster.response[i, i, 0] / cluster.interval
         worst = max(worst, error / allowed)
     return worst
@@ -290,7 +290,7 @@ def accumulate_moments(cluster: Cluster, trial: Trial, substep: Substep) -> None
         for node in range(NODES):
             duration = h * substep.length * cluster.nodes.weight[substep.kind, node]
             power = trial.force[i, node] * trial.v[i, node]
-            if i < cluster.contacts.sites.size:
+            if i < cluster.contacts.size:
                 power = contact_force(cluster.contacts, i, trial.w[i, node], trial.v[i, node])[1]
             cluster.energy[i] += duration * power
             rest = 1.0 - position - substep.length * cluster.nodes.share[substep.kind, node]

@@ -14,9 +14,9 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Extremes
-from vipetsc.contact.law import FREE, Contacts, create_contacts
-from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, impact_time, switch_sites, update_episode, with_room
-from vipetsc.dynamics.layout import Layout, create_burst, join
+from vipetsc.contact.law import FREE, impact_time
+from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, switch_sites, update_episode, with_room
+from vipetsc.dynamics.layout import Layout, create_burst, join, site_records
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation, create_trial
 from vipetsc.dynamics.propagator.series import DofTables, StepSeries
@@ -83,7 +83,7 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
     first, stop = dofs.first[c], dofs.first[c + 1]
     sites = stop - 1 if stop - 1 == dofs.driven else stop
     return Cluster(
-        Contacts(clusters.contacts.law, clusters.contacts.sites[first:sites]),
+        clusters.contacts[first:sites],
         clusters.burst,
         clusters.response[first:stop],
         clusters.nodes,
@@ -106,8 +106,8 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
 @njit(error_model="numpy")
 def update_extremes(cluster: Cluster, tracks: Tracks) -> None:
     """Bring the open episodes of a cluster up to date."""
-    for i in range(cluster.contacts.sites.size):
-        if cluster.contacts.sites[i].mode != FREE:
+    for i in range(cluster.contacts.size):
+        if cluster.contacts[i].mode != FREE:
             history = cluster.history[i]
             reached = Extremes(history.indentation, history.force, history.smallest_force)
             update_episode(cluster.contacts, tracks, i, reached)
@@ -118,11 +118,11 @@ def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     """Switch the sites of a cluster that have landed, ``now`` in s; sets the length of the next substep."""
     contacts, state = cluster.contacts, cluster.state[0]
     update_extremes(cluster, tracks)
-    was_free = contacts.sites["mode"] == FREE
+    was_free = contacts["mode"] == FREE
     state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, now)
-    is_free = contacts.sites["mode"] == FREE
+    is_free = contacts["mode"] == FREE
     for i in np.flatnonzero(was_free & ~is_free):
-        duration, history = impact_time(tracks.time, abs(contacts.sites[i].approach)), cluster.history[i]
+        duration, history = impact_time(contacts[i], abs(contacts[i].approach)), cluster.history[i]
         history.onset, history.duration = now, duration
         history.indentation, history.force, history.smallest_force = 0.0, 0.0, 0.0
         state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
@@ -146,9 +146,9 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
         if outcome != CHANGED:
             return outcome == DONE, tracks
         tracks = with_room(tracks)
-        sites = tracks.sites[first : first + cluster.contacts.sites.size]
+        sites = tracks.sites[first : first + cluster.contacts.size]
         now = begin + state.position * cluster.interval
-        _switch(cluster, Tracks(sites, tracks.log, tracks.closed, tracks.time), now)
+        _switch(cluster, Tracks(sites, tracks.log, tracks.closed), now)
     return False, tracks
 
 
@@ -166,7 +166,7 @@ class Forces:
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
         count, terms = len(dofs), series.terms
         self.clusters = Cluster(
-            contacts=create_contacts(model.contact, dofs["clearance"]),
+            contacts=site_records(model, groups.numbers),
             burst=create_burst(model.drive),
             response=_responses(groups, self.dofs, model, series),
             nodes=collocation(2 * terms),
@@ -190,15 +190,15 @@ class Forces:
         self._mine = np.repeat(self.logs, np.diff(groups.first))  # DoFs
         self._numbers, self._logged = groups.numbers, np.zeros(len(all_dofs), bool)
         self._logged[groups.numbers[self._mine]] = True
-        self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist(), model.chain.cell.reduced_mass)
+        self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist())
 
     def begin(self, motion: np.ndarray, energy: float) -> None:
         """Begin with w and w' of all sites as ``motion`` (site, 2), and so much ``energy`` in J as work."""
-        clusters, tracks = self.clusters, self.tracker.tracks
+        clusters = self.clusters
         clusters.energy[self._numbers < 0] = energy
         for i in self.tracker.begin(motion).tolist():
             # As if the contact were old: its force is smooth.
-            duration = impact_time(tracks.time, abs(clusters.contacts.sites["approach"][i]))
+            duration = impact_time(clusters.contacts[i], abs(clusters.contacts["approach"][i]))
             clusters.history["onset"][i], clusters.history["duration"][i] = -duration, duration
             c = int(np.searchsorted(self.dofs.first, i, side="right")) - 1
             first = clusters.first_substep * duration / clusters.interval

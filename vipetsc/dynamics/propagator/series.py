@@ -8,13 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import factorial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.changes import LANDED_W
+from vipetsc.contact.law import gap_of
 from vipetsc.lattice.chain import Chain
 
 MOST_TERMS = 24
@@ -256,8 +257,8 @@ def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
 
 
 @kernel
-def first_onset(series: np.ndarray, clearance: float, length: float) -> float:
-    """First s in [0, length] at which |w| comes within rounding of the clearance and grows; 2 if none does.
+def first_onset(series: np.ndarray, site: Any, length: float) -> float:
+    """First s in [0, length] at which w comes within rounding of a clearance of the ``site`` and grows; 2 if none does.
 
     |w''| has a bound over the whole length, so that a parabola bounds |w| from above: up to where that meets the
     clearance nothing can have happened.
@@ -269,12 +270,14 @@ def first_onset(series: np.ndarray, clearance: float, length: float) -> float:
         if k >= 2:
             curvature += k * (k - 1) * abs(series[k]) * scale / (length * length)
         scale *= length
-    tolerance = LANDED_W * clearance
-    if bound < clearance - tolerance:
+    tolerance = LANDED_W * site.scale
+    if bound < min(site.clearance, site.clearance_minus) - tolerance:
         return 2.0
     first = 2.0
     for side in (1.0, -1.0):
-        s = 0.0
+        s, clearance = 0.0, gap_of(site, side)
+        if clearance == np.inf:
+            continue
         while s <= length:
             w, rate = evaluate(series, s)
             gap, closing = clearance - side * w, side * rate

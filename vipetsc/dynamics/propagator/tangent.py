@@ -46,9 +46,9 @@ class TangentPropagator(Propagator):
         exchange(self._halo, 0, here[: cells.size].reshape(cells.shape))
         for c in range(len(clusters.state)):
             expand_free_motion(dofs, c, self._halo.columns, clusters.taylor)
-        w, sites, history = clusters.taylor[:, 0], clusters.contacts.sites, clusters.history
-        closed = np.abs(w) > sites["clearance"]
-        if self._layout.comm.allreduce(bool(closed.any())) and clusters.contacts.law.damping:
+        w, sites, history = clusters.taylor[:, 0], clusters.contacts, clusters.history
+        closed = np.where(w < 0, -w - sites["clearance_minus"], w - sites["clearance"]) > 0
+        if self._layout.comm.allreduce(bool((closed & (sites["damping"] != 0)).any())):
             raise ValueError("a contact that dissipates is closed at the beginning")
         sites["mode"] = np.where(closed, np.sign(w) * CLOSED, 0)
         sites["approach"] = np.where(closed, np.sign(w) * speed, 1.0)

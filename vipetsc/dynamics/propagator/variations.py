@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.contact.law import CLIPPED, ForceLaw, elastic_force_and_slope
+from vipetsc.contact.law import CLIPPED, elastic_force_and_slope, gap_of
 from vipetsc.dynamics.propagator.collocation import (
     NODES,
     Cluster,
@@ -33,14 +33,14 @@ from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator,
 
 
 @kernel
-def _slopes(law: ForceLaw, clearance: float, row: Any, w: float, v: float) -> tuple[float, float, float]:
+def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, float]:
     """Derivatives to w, w' and w'_minus of the force on a closed site's relative displacement."""
     if abs(row.mode) == CLIPPED:
         return 0.0, 0.0, 0.0
     side = 1.0 if row.mode > 0 else -1.0
-    elastic, slope = elastic_force_and_slope(law, side * w - clearance)
-    g = 1.0 + law.damping * v / row.approach
-    by_rate = -side * elastic * law.damping / row.approach
+    elastic, slope = elastic_force_and_slope(site, side * w - gap_of(site, side))
+    g = 1.0 + site.damping * v / row.approach
+    by_rate = -side * elastic * site.damping / row.approach
     return -slope * g, by_rate, -by_rate * v / row.approach
 
 
@@ -48,7 +48,7 @@ def _slopes(law: ForceLaw, clearance: float, row: Any, w: float, v: float) -> tu
 def _begin_contact(cluster: Cluster, row: Any, x: np.ndarray, first: int) -> None:
     """Set the variations of w'_minus of a site whose contact begins, in the columns ``x`` (column, number)."""
     at = row.site * cluster.taylor.shape[1]
-    floored = abs(row.rate) < cluster.contacts.law.approach_floor
+    floored = abs(row.rate) < cluster.contacts[row.site].floor
     for j in range(x.shape[0]):
         change = x[j, at + 1] / cluster.interval - row.acceleration * x[j, at] / row.rate
         x[j, first + row.site] = 0.0 if floored else change
@@ -65,8 +65,7 @@ def _force_variations(
     for a in range(sites):
         i, row = rows[a].site, rows[a]
         for node in range(NODES):
-            clearance = cluster.contacts.sites[i].clearance
-            slopes[node] = _slopes(cluster.contacts.law, clearance, row, motion[a, 0, node], motion[a, 1, node])
+            slopes[node] = _slopes(cluster.contacts[i], row, motion[a, 0, node], motion[a, 1, node])
             at = substep.length * cluster.nodes.share[substep.kind, node]
             for j in range(columns):
                 w = v = 0.0
@@ -96,7 +95,7 @@ def linearise(
     cluster = select_cluster(clusters, dofs, c)
     room, (count, terms) = cluster.trial, cluster.taylor.shape
     size, begin, position = count * terms, 0, 0.0
-    columns = size + cluster.contacts.sites.size
+    columns = size + cluster.contacts.size
     x, moments = np.eye(columns), np.zeros((columns, count, terms))
     while begin < rows.size:
         row, stop = rows[begin], begin

@@ -52,7 +52,7 @@ class Integrator(Engine):
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         self.comm, self.layout = layout.comm, layout
         self.lattice = create_record(model, layout)
-        self.tracker = ImpactTracker(self.lattice.contacts, layout.sites, model.chain.cell.reduced_mass)
+        self.tracker = ImpactTracker(self.lattice.contacts, layout.sites)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
         self.time = 0.0
         self.state = layout.create_vector()

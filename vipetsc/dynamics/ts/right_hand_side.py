@@ -14,7 +14,7 @@ from numba import carray
 from numba.core.ccallback import CFunc
 
 from vipetsc.compiled import cfunc, njit
-from vipetsc.contact.law import FREE, SITE, Contacts, ForceLaw, contact_force
+from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
 from vipetsc.dynamics.layout import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape, drive_force
 from vipetsc.dynamics.native import pointer
@@ -118,7 +118,7 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         _spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
     for i in range(lattice.site_cells.size):
         power = 0.0
-        if lattice.contacts.sites[i].mode != FREE:
+        if lattice.contacts[i].mode != FREE:
             cell = lattice.site_cells[i]
             w, rate = relative_motion(y, lattice, i)
             force, power = contact_force(lattice.contacts, i, w, rate)
@@ -132,7 +132,7 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         f[shape.work] = force * y[driven]
 
 
-_TABLES = ("masses", "couplings", "springs", "site_cells", "sites")
+_TABLES = ("masses", "couplings", "springs", "site_cells", "contacts")
 
 
 def _c_struct(record: type) -> np.dtype:
@@ -144,7 +144,6 @@ CONTEXT = np.dtype(
     [
         ("array", np.int64),  # receives the address of a vector's array; first, so that its address is the context's
         ("shape", _c_struct(Shape)),
-        ("law", _c_struct(ForceLaw)),
         ("burst", _c_struct(Burst)),
         ("address", np.dtype([(name, np.int64) for name in _TABLES])),
         ("length", np.dtype([(name, np.int64) for name in _TABLES])),
@@ -172,7 +171,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.couplings), (size.couplings,), COUPLING),
         carray(pointer(at.springs), (size.springs,), SPRING),
         carray(pointer(at.site_cells), (size.site_cells,), np.int64),
-        Contacts(context.law, carray(pointer(at.sites), (size.sites,), SITE)),
+        carray(pointer(at.contacts), (size.contacts,), SITE),
         context.burst,
     )
     rate = carray(pointer(context.array), (shape.owned,), np.float64)
@@ -196,8 +195,8 @@ def compile_callback() -> CFunc:
 def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
     """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``."""
     callback, context = compile_callback(), np.zeros(1, CONTEXT)
-    tables = lattice._asdict() | {"sites": lattice.contacts.sites}
-    context["shape"], context["law"], context["burst"] = lattice.shape, lattice.contacts.law, lattice.burst
+    tables = lattice._asdict()
+    context["shape"], context["burst"] = lattice.shape, lattice.burst
     context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
     context["length"] = tuple(tables[name].size for name in _TABLES)
     ts.setAttr("callback", (callback, context, lattice))  # PETSc holds bare pointers: all must live as long as ts
