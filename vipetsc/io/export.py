@@ -13,6 +13,10 @@ from vipetsc.io.read import field_time, open_results, open_run
 MOST_FRAMES = 5000  # of a run with more samples, every n-th; a frame takes about 1 kB of the text
 MOST_ROWS = 1_000_000  # of a table
 FIELDS = "displacement", "velocity"
+HEAD = """<?xml version="1.0" encoding="utf-8"?>
+<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">
+"""
+TAIL = "</Grid></Domain></Xdmf>\n"
 
 
 def write_xdmf(folder: Path) -> Path | None:
@@ -27,25 +31,22 @@ def write_xdmf(folder: Path) -> Path | None:
         times, shape = field_time(run), run[fields[0]].shape
         cells = run["cell"].values
         units = {name: run[name].attrs["units"] for name in fields}
-    root = Xml.Element("Xdmf", Version="3.0")
-    series = _child(_child(root, "Domain"), "Grid", Name="run", GridType="Collection", CollectionType="Temporal")
-    spacing = float(cells[1] - cells[0]) if len(cells) > 1 else 1.0
-    for row in range(0, shape[0], -(-shape[0] // MOST_FRAMES)):
-        grid = _child(series, "Grid", Name=f"sample {row}", GridType="Uniform")
-        _child(grid, "Time", Value=repr(float(times[row])))
-        _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=_words(shape[1:]))
-        geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
-        for values in ((cells[0], 1), (spacing, 1)):  # cells count along the slow axis
-            _child(geometry, "DataItem", _words(values), Dimensions="2", Format="XML")
-        for name in fields:
-            node = _child(grid, "Attribute", Name=f"{name} ({units[name]})", AttributeType="Scalar", Center="Node")
-            slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=_words(shape[1:]))
-            start, stride, count = (row, 0, 0), (1, 1, 1), (1, *shape[1:])
-            _child(slab, "DataItem", _words((*start, *stride, *count)), Dimensions="3 3", Format="XML")
-            about = {"Format": "HDF", "NumberType": "Float", "Precision": "8", "Dimensions": _words(shape)}
-            _child(slab, "DataItem", f"run.h5:/{name}", **about)
-    Xml.indent(root, " ")
-    write_text(folder / "run.xdmf", Xml.tostring(root, "unicode", xml_declaration=True) + "\n")
+    grid = Xml.Element("Grid", Name="sample {row}", GridType="Uniform")  # of every frame
+    _child(grid, "Time", Value="{time!r}")
+    _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=_words(shape[1:]))
+    geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
+    for values in ((cells[0], 1), (cells[1] - cells[0] if len(cells) > 1 else 1, 1)):  # cells along the slow axis
+        _child(geometry, "DataItem", _words(values), Dimensions="2", Format="XML")
+    for name in fields:
+        node = _child(grid, "Attribute", Name=f"{name} ({units[name]})", AttributeType="Scalar", Center="Node")
+        slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=_words(shape[1:]))
+        start_stride_count = f"{{row}} 0 0 1 1 1 1 {_words(shape[1:])}"
+        _child(slab, "DataItem", start_stride_count, Dimensions="3 3", Format="XML")
+        about = {"Format": "HDF", "NumberType": "Float", "Precision": "8", "Dimensions": _words(shape)}
+        _child(slab, "DataItem", f"run.h5:/{name}", **about)
+    Xml.indent(grid, " ")
+    frame, rows = Xml.tostring(grid, "unicode") + "\n", range(0, shape[0], -(-shape[0] // MOST_FRAMES))
+    write_text(folder / "run.xdmf", HEAD + "".join(frame.format(row=r, time=float(times[r])) for r in rows) + TAIL)
     return folder / "run.xdmf"
 
 
