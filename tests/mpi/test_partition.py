@@ -14,20 +14,24 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.observers import Observer
 from vipetsc.io.store import RunMemory
+from vipetsc.parallel import on_root
 
 
-def runs_alike(folder: Path, case: Case, **options) -> None:
+def runs_alike(folder: Path, case: Case) -> None:
     """Simulate ``case`` on all ranks and on rank 0 alone: every dataset has the same bits."""
-    comm = MPI.COMM_WORLD
-    together = simulate(case, folder / "together", comm, **options)
-    alone = simulate(case, folder / f"alone-{comm.rank}", MPI.COMM_SELF)
+    together = simulate(case, folder / "together")
     assert together.complete
-    assert alone.complete
-    first, second = datasets(folder / "together" / "run.h5"), datasets(folder / f"alone-{comm.rank}" / "run.h5")
-    assert_same_bits(first, second)
-    assert len(first["impacts/site"]) > 0
-    for name in ("episodes", "steps", "rejected", "landings", "switches", "ledger_error", "work", "dissipated"):
-        assert together.statistics[name] == alone.statistics[name], name
+
+    def compare() -> None:
+        alone = simulate(case, folder / "alone", MPI.COMM_SELF)
+        assert alone.complete
+        first, second = (datasets(folder / name / "run.h5") for name in ("together", "alone"))
+        assert_same_bits(first, second)
+        assert len(first["impacts/site"]) > 0
+        for name in ("episodes", "steps", "rejected", "landings", "switches", "ledger_error", "work", "dissipated"):
+            assert together.statistics[name] == alone.statistics[name], name
+
+    on_root(MPI.COMM_WORLD, compare)
 
 
 @pytest.mark.parallel([1, 2, 3, 4])
