@@ -13,9 +13,7 @@ from vipetsc.io.read import field_time, open_results, open_run
 MOST_FRAMES = 5000  # of a run with more samples, every n-th; a frame takes about 1 kB of the text
 MOST_ROWS = 1_000_000  # of a table
 FIELDS = "displacement", "velocity"
-HEAD = """<?xml version="1.0" encoding="utf-8"?>
-<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">
-"""
+HEAD = '<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
 TAIL = "</Grid></Domain></Xdmf>\n"
 
 
