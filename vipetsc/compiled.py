@@ -1,8 +1,8 @@
-"""Compiled kernels, kept between runs until the source of any of them changes: ``njit`` and ``cfunc`` as in numba.
+"""Compiled kernels, kept between runs until what they are made of changes: ``njit`` and ``cfunc`` as in numba.
 
 Numba's own cache looks at the file of a kernel alone: a kernel that calls a changed one of another file, or uses a
-constant of it, would go on with the old code. Here the folder of the cache bears a hash of all files with kernels,
-of the modules that they import and of the tables beside them: constants are frozen into compiled code.
+constant of it, would go on with the old code. Here the folder of the cache bears a hash of the kernel's file, of the
+modules from which it takes kernels or constants, and of the tables of numbers: constants are frozen into compiled code.
 """
 
 import ast
@@ -42,8 +42,8 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
 
     def decorate(function: Callable[..., Any]) -> Any:
         config: Any = numba.config
-        chosen = config.CACHE_DIR
-        config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, chosen))
+        chosen, file = config.CACHE_DIR, Path(function.__code__.co_filename)
+        config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, file, chosen))
         try:
             return compiler(*signature, cache=True, **options)(function)
         finally:
@@ -53,30 +53,46 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
 
 
 @cache
-def kernel_cache(package: Path, chosen: str = "") -> Path:
-    """The folder for the compiled kernels of ``package``, named by the hash of ``kernel_sources``.
+def kernel_cache(package: Path, file: Path, chosen: str = "") -> Path:
+    """The folder for the compiled kernels of a ``file`` of ``package``, named by the hash of ``kernel_sources``.
 
     It is in ``chosen``, else in the package, else (a package that may not be written to) in the user's cache.
     """
-    named = (str(path.relative_to(package)).encode() + b"\0" + path.read_bytes() for path in kernel_sources(package))
-    digest = hashlib.sha256(b"".join(named)).hexdigest()
+    digest = hashlib.sha256()
+    for path in sorted(kernel_sources(package, file)):
+        digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
     parent = package / "__pycache__" if os.access(package, os.W_OK) else Path.home() / ".cache" / package.name
-    return Path(chosen or parent) / f"kernels-{digest[:16]}"
+    return Path(chosen or parent) / f"kernels-{digest.hexdigest()[:16]}"
 
 
-def kernel_sources(package: Path) -> list[Path]:
-    """The files of ``package`` with kernels, those that they import from it, and its tables of numbers."""
-    sources = set(package.rglob("*.csv"))
-    for path in package.rglob("*.py"):
-        text = path.read_bytes()
-        if HAS_KERNELS.search(text):
-            sources.add(path)
-            for node in ast.walk(ast.parse(text)):
-                if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
-                    names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-                    files = (package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names)
-                    sources |= {file for file in files if file.exists()}
-    return sorted(sources)
+def kernel_sources(package: Path, file: Path) -> set[Path]:
+    """What the kernels of ``file`` are made of: itself, the files that it imports, and the tables of ``package``.
+
+    Of files with kernels among those, what they import, and so on.
+    """
+    sources, waiting = _tables(package), [file]
+    while waiting:
+        path = waiting.pop()
+        if path not in sources:
+            sources |= {path}
+            waiting += _imports(package, path)
+    return set(sources)
+
+
+@cache
+def _tables(package: Path) -> frozenset[Path]:
+    return frozenset(package.rglob("*.csv"))
+
+
+@cache
+def _imports(package: Path, path: Path) -> list[Path]:
+    """The files of ``package`` that a file with kernels imports; of another one, none."""
+    text, files = path.read_bytes(), []
+    for node in ast.walk(ast.parse(text)) if HAS_KERNELS.search(text) else ():
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            files += [package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names]
+    return [file for file in files if file.exists()]
 
 
 # Of functions that make no arrays but views: numba counts no references to theirs, which costs more than short sums do

@@ -16,7 +16,6 @@ import pytest
 
 import vipetsc as package
 from tests.conftest import clean_environment
-from vipetsc.compiled import kernel_cache
 
 ROOT = Path(package.__file__).parents[1]
 BUILD = "import sys; from setuptools.build_meta import build_sdist; print(build_sdist(sys.argv[1]))"
@@ -73,12 +72,11 @@ def bring_kernels(site: Path) -> None:
 
     The sources are the same; to compile them again takes minutes and tests nothing.
     """
-    ours, theirs = kernel_cache(ROOT / "vipetsc"), kernel_cache(site / "vipetsc")
-    assert ours.name == theirs.name
-    for folder in {Path(name).parent for name in tracked() if name.startswith("vipetsc/")}:
-        here, there = (cache_name(root / folder) for root in (ROOT, site))
-        if (ours / here).is_dir():
-            shutil.copytree(ours / here, theirs / there)
+    for ours in (ROOT / "vipetsc" / "__pycache__").glob("kernels-*"):
+        for folder in {Path(name).parent for name in tracked() if name.startswith("vipetsc/")}:
+            here, there = (cache_name(root / folder) for root in (ROOT, site))
+            if (ours / here).is_dir():
+                shutil.copytree(ours / here, site / "vipetsc" / "__pycache__" / ours.name / there)
 
 
 def cache_name(folder: Path) -> str:

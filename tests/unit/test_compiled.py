@@ -1,4 +1,4 @@
-"""Compiled kernels are kept until the source of any of them changes; importing the package changes nothing outside."""
+"""Compiled kernels are kept until what they are made of changes; importing the package changes nothing outside."""
 
 from __future__ import annotations
 
@@ -71,24 +71,27 @@ def package(tmp_path):
     return folder, ask
 
 
-def test_kernels_are_found_again_until_the_source_of_any_changes(package):
+def test_kernels_are_found_again_until_what_they_are_made_of_changes(package):
     folder, ask = package
     assert ask() == [[12.0, 7.0], [0, 0, 0], True]
     (folder / "plain.py").write_text("import scipy\n")
     assert ask() == [[12.0, 7.0], [1, 1, 1], True]
     (folder / "inner.py").write_text(INNER.replace("SCALE * x", "SCALE * x + 1.0"))
     assert ask() == [[15.0, 8.0], [0, 0, 0], True]
+    (folder / "outer.py").write_text(OUTER.replace("+ SHIFT", "+ SHIFT + 0.0"))
+    assert ask() == [[15.0, 8.0], [1, 0, 0], True]
     (folder / "constants.py").write_text(CONSTANTS.replace("2.0", "3.0"))
     assert ask() == [[31.0, 11.0], [0, 0, 0], True]
     (folder / "constants.csv").write_text("2.0")
     assert ask() == [[31.0, 12.0], [0, 0, 0], True]
-    assert len(list(folder.glob("__pycache__/kernels-*"))) == 4
+    assert len(list(folder.glob("__pycache__/kernels-*"))) == 4 + 5  # of inner.py and of outer.py
 
 
 def test_a_chosen_folder_holds_them(package, tmp_path):
     folder, _ = package
-    chosen = compiled.kernel_cache(folder, str(tmp_path / "chosen"))
-    assert chosen == tmp_path / "chosen" / compiled.kernel_cache(folder).name
+    file = folder / "outer.py"
+    chosen = compiled.kernel_cache(folder, file, str(tmp_path / "chosen"))
+    assert chosen == tmp_path / "chosen" / compiled.kernel_cache(folder, file).name
 
 
 def test_tables_of_numbers_come_with_the_package():
