@@ -1,9 +1,10 @@
-"""The guide in the README does what it says: its blocks are run as they stand."""
+"""The guide does what it says: the blocks of the README and of the chapters that go on with it, typed as they stand."""
 
 from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,66 +15,59 @@ import pytest
 import vipetsc as package
 from tests.conftest import clean_environment
 from vipetsc.case import Case, Sweep
+from vipetsc.case.every import load_every
 from vipetsc.case.nnm import NnmCase
+from vipetsc.cli.main import main
 from vipetsc.modes.system import System
 
 ROOT = Path(package.__file__).parents[1]
-HEADING = "## Your own lattice in ten minutes"
+MANUAL = ROOT / "vipetsc/manual"
+CHAPTERS = "own-lattice", "files", "measures", "engines", "python"
+GUIDE = [ROOT / "README.md", *(MANUAL / f"{name}.md" for name in CHAPTERS)]  # one session, in this order
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", flags=re.M | re.S)
 
 
-def guide() -> str:
-    """The README's first lattice and the manual's chapter that goes on with it."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert readme.count(HEADING) == 1
-    first = re.split(r"^## ", readme.split(HEADING)[1], flags=re.M)[0]
-    return first + (ROOT / "vipetsc/manual/own-lattice.md").read_text(encoding="utf-8")
-
-
-def blocks() -> list[tuple[str, str]]:
-    """Language and text of every code block of the guide, in order."""
-    return re.findall(r"^```(\w+)\n(.*?)^```$", guide(), flags=re.M | re.S)
+def session() -> str:
+    """All blocks in order as one script for bash; `scripts/test` alone, which would come back here, is left out."""
+    script = ["set -ex"]
+    for page in GUIDE:
+        for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
+            script.append(f": {page.name}")
+            if language == "toml":
+                name, added = re.match(r"# (\S+\.toml)(, added)?\n", text).groups()
+                script.append(f"cat {'>>' if added else '>'} {name} <<'END'\n{text}END")
+            elif language == "python":
+                script.append(f"python - <<'END'\n{text}END")
+            else:
+                assert language == "sh", language
+                script.append(re.sub(r"^scripts/test .*\n", "", text, flags=re.M))
+    return "\n".join(script)
 
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory) -> Path:
-    """A folder in which every block was executed, in order; each ended well."""
+    """A fresh clone in which all of it was typed, without a variable of MPI set, and ended well."""
     folder = tmp_path_factory.mktemp("guide")
-    for language, text in blocks():
-        if language == "toml":
-            name = re.match(r"# (\S+\.toml)(, added)?\n", text)
-            with (folder / name[1]).open("a" if name[2] else "w", encoding="utf-8") as file:
-                file.write(text)
-        elif language == "sh":
-            for line in text.splitlines():
-                if not line.startswith(". "):  # the environment is this interpreter's
-                    call(line, folder)
-        else:
-            assert language == "python"
-            run([sys.executable, "-c", text], folder)
+    shutil.copytree(ROOT / "scripts", folder / "scripts")
+    shutil.copytree(ROOT / "runs", folder / "runs", ignore=lambda _, names: {n for n in names if "." not in n})
+    outside = {name: value for name, value in clean_environment().items() if not name.startswith("OMPI_")}
+    environment = outside | {"PYTHONPATH": str(ROOT), "VIPETSC_PYTHON": sys.executable}
+    ended = subprocess.run(
+        ["bash", "-c", session()], cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert ended.returncode == 0, ended.stdout[-2000:] + ended.stderr[-4000:]
     return folder
 
 
-def call(line: str, folder: Path) -> None:
-    words = [sys.executable if word == "python" else word for word in shlex.split(line, comments=True)]
-    run([*words[:1], "--oversubscribe", *words[1:]] if words[0] == "mpirun" else words, folder)
-
-
-def run(command: list[str], folder: Path) -> None:
-    environment = clean_environment() | {"PYTHONPATH": str(ROOT)}
-    ended = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert ended.returncode == 0, f"{' '.join(command)}\n{ended.stdout}\n{ended.stderr}"
-
-
 @pytest.mark.mpirun
-def test_the_guide_has_bands_a_run_a_sweep_a_branch_and_python(desk):
-    commands = " ".join(text for language, text in blocks() if language == "sh")
-    assert {v for v in ("bands", "validate", "run", "sweep", "nnm") if f"vipetsc {v} " in commands} >= {"bands", "nnm"}
-    assert (desk / "my-lattice.toml").exists()
+def test_the_guide_leaves_runs_a_sweep_a_branch_and_pictures(desk):
     for name in (
+        "four-band/figures/dispersion.png",
+        "loud/figures/dispersion.pdf",
+        "loud/curves/energy.csv",
         "my-lattice-bands/bands.png",
         "my-lattice/figures/dispersion.png",
+        "my-lattice-12N/run.h5",
         "my-branch/branch-out-of-phase.csv",
     ):
         assert (desk / "runs" / name).stat().st_size > 1000, name
@@ -96,3 +90,39 @@ def test_what_the_guide_says_of_its_lattice_is_so(desk):
         assert ibtet[quiet] == pytest.approx(ibtet[0], rel=1e-12)
         assert ibtet.max() > 10 * ibtet[0]
     assert (desk / "runs/my-sweep/figures/ibtet-calibrated.png").exists()
+
+
+def commands() -> dict[str, list[str]]:
+    """Every call of the program in README and manual by where it stands, in blocks and in the text."""
+    found = {}
+    for page in [ROOT / "README.md", *sorted(MANUAL.glob("*.md"))]:
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        for number, line in enumerate(re.findall(r"python -m vipetsc *([^`\n]*)", text)):
+            found[f"{page.name}-{number}"] = shlex.split(line.partition(" -- ")[0].partition(">")[0], comments=True)
+    return found
+
+
+@pytest.mark.parametrize("words", commands().values(), ids=commands())
+def test_every_command_of_the_manual_is_understood(words, monkeypatch):
+    """By the program's own parser, with every case file there; what they do is tested elsewhere."""
+    asked = []
+    monkeypatch.setattr("vipetsc.cli.main._call", lambda options, petsc: asked.append(options) or 0)
+    assert main(words) == 0
+    case = getattr(asked[0], "case", None)
+    if case and case.endswith(".toml") and case not in ("CASE", "my-lattice.toml", "case.toml"):
+        assert (ROOT / case).exists()
+
+
+def sections() -> dict[str, str]:
+    """Every excerpt of a case file in the manual, but those that the session writes."""
+    pages = [page for page in sorted(MANUAL.glob("*.md")) if page not in GUIDE]
+    blocks = {page.stem: BLOCK.findall(page.read_text(encoding="utf-8")) for page in pages}
+    return {
+        f"{name}-{i}": text for name, found in blocks.items() for i, (kind, text) in enumerate(found) if kind == "toml"
+    }
+
+
+@pytest.mark.parametrize("text", sections().values(), ids=sections())
+def test_every_excerpt_of_a_case_file_is_valid(text, tmp_path):
+    (tmp_path / "case.toml").write_text(text, encoding="utf-8")
+    assert load_every(tmp_path / "case.toml")
