@@ -1,0 +1,160 @@
+"""The manual as pages: its chapters, every key of a case file, and the Python interface from the docstrings.
+
+    python scripts/manual_pages.py [FOLDER] [--python PACKAGE ...]
+
+Everything becomes Markdown in ``FOLDER/source``, which Sphinx reads through MyST; warnings are errors. The interface
+is read from the sources, not imported: compiled kernels, PETSc and names loaded late are no matter. Docstrings are
+Markdown as they stand: indented formulas are code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from sphinx.application import Sphinx
+from sphinx.util.docutils import docutils_namespace
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+import vipetsc
+from vipetsc.case.keys import chapter as all_keys
+
+PACKAGE, CHAPTERS = ROOT / "vipetsc", ROOT / "vipetsc/manual"
+START, KEYS, API = "start", "case-keys", "api"
+CONFIGURATION = {
+    "project": "vipetsc",
+    "release": vipetsc.__version__,
+    "html_title": f"vipetsc {vipetsc.__version__}",
+    "extensions": ["myst_parser"],
+    "html_theme": "furo",
+    "myst_enable_extensions": ["colon_fence"],
+    "myst_heading_anchors": 3,
+    "suppress_warnings": ["ref.python"],  # a name in a signature that two modules have
+    "smartquotes": False,  # w' is a velocity
+    "html_copy_source": False,
+    "html_show_sphinx": False,
+    "html_show_copyright": False,
+}
+Named = ast.ClassDef | ast.FunctionDef
+
+
+def write_sources(folder: Path, packages: list[str]) -> None:
+    """All pages as Markdown in ``folder``, with their pictures; the interface of ``packages``, all if there is none."""
+    folder.mkdir(parents=True)
+    index = (CHAPTERS / "index.md").read_text(encoding="utf-8")
+    names = re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", index, flags=re.M)
+    folders = sorted(path.parent for path in PACKAGE.rglob("__init__.py"))
+    pages = {dotted(path): interface(path) for path in folders if not packages or dotted(path) in packages}
+    put(folder / "index.md", index + contents("Chapters", [START, *names, KEYS]) + contents("Python", [API]), CHAPTERS)
+    start = (ROOT / "README.md").read_text(encoding="utf-8")
+    put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
+    put(folder / f"{KEYS}.md", all_keys(), CHAPTERS)
+    for name in names:
+        put(folder / f"{name}.md", (CHAPTERS / f"{name}.md").read_text(encoding="utf-8"), CHAPTERS)
+    put(folder / f"{API}.md", "# The Python interface\n" + contents("", list(pages), hidden=False), CHAPTERS)
+    for name, text in pages.items():
+        put(folder / f"{name}.md", text, CHAPTERS)
+
+
+def contents(caption: str, names: list[str], hidden: bool = True) -> str:
+    """A table of contents, beside the pages if ``hidden``."""
+    options = f":caption: {caption}\n" * bool(caption) + (":hidden:\n" if hidden else ":maxdepth: 1\n")
+    return f"\n```{{toctree}}\n{options}\n" + "\n".join(names) + "\n```\n"
+
+
+def put(path: Path, text: str, home: Path) -> None:
+    """Write a page whose links are those of a file in ``home``: chapters beside it, pictures copied there."""
+
+    def link(match: re.Match[str]) -> str:
+        target = (home / match[1]).resolve()
+        if target.parent == CHAPTERS or target == ROOT / "README.md":
+            return f"]({target.name if target.parent == CHAPTERS else START + '.md'}{match[2] or ''})"
+        shutil.copy(target, path.parent / target.name)  # raises where a link leads nowhere
+        return f"]({target.name})"
+
+    path.write_text(re.sub(r"\]\((?!https?:|#)([^)#\s]+)(#[^)\s]*)?\)", link, text), encoding="utf-8")
+
+
+def dotted(path: Path) -> str:
+    """The name of a folder or module as it is imported."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+def interface(package: Path) -> str:
+    """The page of a folder: what its modules say of themselves and of their public names."""
+    lines = [f"# {dotted(package)}", ""]
+    for path in [package / "__init__.py", *sorted(set(package.glob("*.py")) - {package / "__init__.py"})]:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        if path.name != "__init__.py":
+            lines += [f"## {dotted(path)}", ""]
+        lines += [f":::{{py:module}} {dotted(path) if path.stem != '__init__' else dotted(package)}", ":::", ""]
+        lines += [prose(tree), ""]
+        for node in public(tree):
+            lines += [*described(node), ""]
+    return "\n".join(lines) + "\n"
+
+
+def public(tree: ast.Module | ast.ClassDef) -> Iterator[Named]:
+    """Classes and functions of a module, methods of a class, that have a docstring and no leading underscore."""
+    seen = set()
+    for node in tree.body:
+        if isinstance(node, Named) and not node.name.startswith("_") and ast.get_docstring(node):
+            if node.name not in seen:  # setters
+                yield node
+            seen.add(node.name)
+
+
+def described(node: Named, depth: int = 6) -> Iterator[str]:
+    """A name with its signature and docstring as a directive, which others within it make longer."""
+    if isinstance(node, ast.ClassDef):
+        kind, signature = "class", node.name
+        inner = [line for method in public(node) for line in ["", *described(method, depth - 1)]]
+    else:
+        decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
+        kind = "property" if decorators & {"property", "cached_property"} else "function" if depth == 6 else "method"
+        returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+        signature, inner = f"{node.name}({ast.unparse(node.args)}){returns}", []
+        if kind == "property":
+            signature = node.name
+    yield f"{':' * depth}{{py:{kind}}} {signature}"
+    yield prose(node)
+    yield from inner
+    yield ":" * depth
+
+
+def prose(node: Named | ast.Module) -> str:
+    """A docstring as Markdown: its headings are bold words, what looks like a tag is text."""
+    text = re.sub(r"(?m)^(.+)\n-{3,}$", r"**\1**\n", ast.get_docstring(node) or "")
+    parts = re.split(r"(``.*?``|^ {4}.*$)", text.replace("::\n", ":\n"), flags=re.M | re.S)
+    escaped = (part if i % 2 else re.sub(r"([<*|])", r"\\\1", part.replace("**", "\0")) for i, part in enumerate(parts))
+    return "".join(escaped).replace("\0", "**")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Build the pages; returns 1 if there was a warning."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "runs/manual", help="runs/manual if left out")
+    parser.add_argument("--python", nargs="+", default=[], metavar="PACKAGE", help="of the interface only these")
+    options = parser.parse_args(arguments)
+    folder = options.folder.resolve()
+    source = folder / "source"
+    shutil.rmtree(source, ignore_errors=True)
+    write_sources(source, options.python)
+    with docutils_namespace():
+        app = Sphinx(
+            source, None, folder, folder / ".doctrees", "html", CONFIGURATION, status=None, warningiserror=True
+        )
+        app.build()
+    print(f"{folder / 'index.html'}: {len(app.env.found_docs)} pages, {app._warncount} warnings")
+    return int(app._warncount > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,140 @@
+"""Headless Chromium behind its driver, and what is measured of a page in it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NEEDED = pytest.mark.skipif(shutil.which("chromedriver") is None, reason="no chromedriver; scripts/test installs it")
+SCREENS = pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 900)])
+
+
+MEASURE = """
+const root = document.documentElement, images = [...document.images];
+return {
+  page: root.scrollWidth, window: window.innerWidth, images: images.length,
+  broken: images.filter(i => !i.complete || i.naturalWidth === 0).map(i => i.alt),
+  wide: [...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > window.innerWidth + 1
+      && !e.closest('.wide')).map(e => e.tagName + '.' + e.className),
+  linked: [...document.querySelectorAll('[src], link[href]')]
+      .map(e => e.src || e.href).filter(u => !u.startsWith('data:')),
+  dead: [...document.querySelectorAll('a[href^="#"]')].map(a => a.getAttribute('href'))
+      .filter(h => !document.querySelector(h)),
+};
+"""
+
+
+class Browser:
+    """Headless Chromium behind its driver, spoken to as the W3C protocol has it."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        self.home, self.base = folder, f"http://127.0.0.1:{port}"
+        log = (folder / "driver.log").open("w")
+        self.driver = subprocess.Popen(
+            ["chromedriver", f"--port={port}"], stdout=log, stderr=log, start_new_session=True
+        )
+        self.sessions: list[str] = []
+
+    def call(self, path: str, body: dict | None = None, method: str | None = None, patience: float = 30) -> Any:
+        """The ``value`` of the driver's answer; waits until the driver listens."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"}, method=method)
+        deadline = time.monotonic() + patience
+        while True:
+            try:
+                with urllib.request.urlopen(request, timeout=60) as answer:
+                    return json.load(answer)["value"]
+            except urllib.error.HTTPError:
+                raise
+            except OSError:
+                if time.monotonic() > deadline or self.driver.poll() is not None:
+                    raise
+                time.sleep(0.1)
+
+    def open(self, page: Path, width: int, height: int) -> str:
+        """A new session that shows ``page`` in a window of that size; returns its path."""
+        switches = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+                    "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
+                    f"--user-data-dir={self.home}/{width}"]  # fmt: skip
+        metrics = {"deviceMetrics": {"width": width, "height": height, "pixelRatio": 1.0, "mobile": width < 600}}
+        wanted = {
+            "browserName": "chrome",
+            "goog:chromeOptions": {"args": switches, "mobileEmulation": metrics},
+            "goog:loggingPrefs": {"browser": "ALL"},
+        }
+        answer = self.call("/session", {"capabilities": {"alwaysMatch": wanted}})
+        session = f"/session/{answer['sessionId']}"
+        self.sessions.append(session)
+        self.call(f"{session}/url", {"url": page.as_uri()})
+        return session
+
+    def ask(self, session: str, script: str) -> Any:
+        """What ``script`` returns in the page."""
+        return self.call(f"{session}/execute/sync", {"script": script, "args": []})
+
+    def measure(self, session: str) -> dict[str, Any]:
+        """What ``MEASURE`` finds in the page, and the errors of its console."""
+        log = self.call(f"{session}/se/log", {"type": "browser"})
+        return self.ask(session, MEASURE) | {"errors": [line for line in log if line["level"] == "SEVERE"]}
+
+    def drag(self, session: str, *places: tuple[float, float]) -> None:
+        """The pressed mouse from the first of ``places`` (x, y in the window) to the others; one place: no button."""
+        moves = [{"type": "pointerMove", "duration": 0, "x": round(x), "y": round(y)} for x, y in places]
+        down, up = [{"type": "pointerDown", "button": 0}], [{"type": "pointerUp", "button": 0}]
+        steps = moves if len(moves) == 1 else [moves[0], *down, *moves[1:], *up]
+        self.call(f"{session}/actions", {"actions": [{"type": "pointer", "id": "mouse", "actions": steps}]})
+
+    def processes(self) -> list[int]:
+        """Every process of the driver's session, and every browser with a profile in the folder."""
+        numbers = []
+        for path in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                zombie, session = (path / "stat").read_text().rpartition(")")[2].split()[0:4:3]
+                started_here = os.fsencode(self.home) in (path / "cmdline").read_bytes()
+                if zombie != "Z" and (int(session) == self.driver.pid or started_here):
+                    numbers.append(int(path.name))
+        return numbers
+
+    def close(self) -> None:
+        """Quit the browsers and their driver; what does not go by itself within seconds is killed."""
+        for session in self.sessions:
+            with suppress(OSError):
+                self.call(session, method="DELETE", patience=0)
+        self.driver.terminate()
+        deadline = time.monotonic() + 5
+        while self.processes() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        for number in self.processes():
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
+        self.driver.wait()
+
+
+@contextmanager
+def browsing(folder: Path) -> Iterator[Browser]:
+    """A browser with its profile in ``folder``, of which no process is left behind."""
+    opened = Browser(folder)
+    try:
+        yield opened
+    finally:
+        opened.close()
+    deadline = time.monotonic() + 5
+    while opened.processes() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert opened.processes() == []

@@ -1,0 +1,59 @@
+"""The manual's pages: built without a warning, and read in a browser."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import vipetsc
+from tests.cli.browser import NEEDED, SCREENS, browsing
+
+ROOT = Path(vipetsc.__file__).parents[1]
+CHAPTERS = {path.stem for path in (ROOT / "vipetsc/manual").glob("*.md")}
+pytestmark = pytest.mark.skipif(not find_spec("furo"), reason="no Sphinx with furo; scripts/test installs it")
+
+
+def build(folder: Path, *options: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, ROOT / "scripts/manual_pages.py", folder, *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory) -> Path:
+    """All chapters, and the interface of one package: the whole takes three times as long."""
+    folder = tmp_path_factory.mktemp("manual")
+    ended = build(folder, "--python", "vipetsc.contact")
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return folder
+
+
+def test_every_chapter_has_a_page_and_the_interface_its_signatures(pages):
+    assert {*CHAPTERS, "start", "case-keys", "vipetsc.contact"} <= {path.stem for path in pages.glob("*.html")}
+    page = (pages / "vipetsc.contact.html").read_text(encoding="utf-8")
+    assert 'id="vipetsc.contact.law.contact_force"' in page
+    assert "Force on the host in N and dissipated power in W" in page
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with browsing(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
+@NEEDED
+@SCREENS
+def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
+    for name in ("index", "start", "measures", "files", "case-keys", "performance", "paper", "vipetsc.contact"):
+        found = browser.measure(browser.open(pages / f"{name}.html", width, height))
+        assert (name, found["page"] <= width, found["broken"], found["dead"], found["errors"]) == (
+            name,
+            True,
+            [],
+            [],
+            [],
+        )
+        assert [url for url in found["linked"] if not url.startswith("file:")] == []
