@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from tests.unit.test_floquet import case
+from vipetsc.modes.branch import Branch
 from vipetsc.modes.follow import follow_all
-from vipetsc.modes.lattice_follow import LatticeBranch, LatticeFollower
+from vipetsc.modes.lattice_follow import LatticeFollower
 
 COMM = MPI.COMM_WORLD
 
@@ -19,7 +20,7 @@ def test_the_same_branch_on_any_number_of_ranks(folder):
     branches = follow_all(case(multipliers=2), folder, COMM, kind=LatticeFollower)
     assert len(branches) == (COMM.rank == 0)
     if COMM.rank == 0:
-        together = LatticeBranch.read(folder / "branch-breather-1600.h5")
+        together = Branch.read(folder / "branch-breather-1600.h5")
         (alone,) = follow_all(case(multipliers=2), folder, MPI.COMM_SELF, kind=LatticeFollower)
         assert len(together.points) == len(alone.points) == 3
         for a, b in zip(together.points, alone.points, strict=True):

@@ -11,9 +11,10 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
+from vipetsc.modes.branch import Branch
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.follow import follow_all
-from vipetsc.modes.lattice_follow import LatticeBranch, LatticeFollower
+from vipetsc.modes.lattice_follow import LatticeFollower
 from vipetsc.modes.lattice_shooting import LatticeShooting
 from vipetsc.modes.point import linear_start
 from vipetsc.modes.shooting import MAPS, Shooting
@@ -56,7 +57,7 @@ def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
     half = flow.arc(flow.share(np.append(point.x, 0 * point.x)), point.period / 2)
     map_ = flow.whole(half.move(flow.share(np.eye(2 * n)))).T
     all_of_them = np.linalg.eigvals(map_) ** 2
-    found = largest_multipliers(problem, point, 4)
+    found = largest_multipliers(flow, problem.system, True, point.x, point.period, 4)
     assert len(found) >= 2
     assert found[:, 1].real.max() < 1e-8
     for value in found[:, 0]:
@@ -100,7 +101,7 @@ def test_a_branch_is_stored_with_its_multipliers_and_gone_on_with(tmp_path):
     (branch,) = follow_all(case(multipliers=2), short, MPI.COMM_SELF, kind=LatticeFollower)
     assert branch.name == "breather-1600"
     assert branch.ending.startswith("2 points reached")
-    stored = LatticeBranch.read(short / "branch-breather-1600.h5")
+    stored = Branch.read(short / "branch-breather-1600.h5")
     assert [p.multiplier for p in stored.points] == [p.multiplier for p in branch.points]
     np.testing.assert_array_equal(stored.points[0].multipliers, branch.points[0].multipliers)
     assert min(p.multiplier for p in stored.points) > 1.3

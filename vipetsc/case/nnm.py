@@ -94,8 +94,8 @@ class NnmTable(Section):
     first. ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one, are
     stored beside those of the regions; ``compare`` corrects every fourth point with other flows; ``switch`` follows
     the branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting`` "krylov"
-    does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there so many of the
-    largest ``multipliers`` (true: 8) are found.
+    does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a condensed
+    lattice so many of the largest ``multipliers`` (true: 8) are found.
     """
 
     system: Literal["reduced", "chain", "own", "condensed"] = "reduced"
@@ -187,8 +187,9 @@ class NnmCase(CaseFile):
             if not site_cells(lattice, contacts):
                 problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
             problems += check_sites(lattice, contacts)
-        elif nnm.multipliers or nnm.shooting == "krylov":
-            problems.append(Problem("nnm.system", nnm.system, 'multipliers and "krylov" are for "chain"'))
+        elif nnm.shooting == "krylov" or (nnm.multipliers and nnm.system != "condensed"):
+            remedy = '"krylov" is for "chain", multipliers are for "chain" and "condensed"'
+            problems.append(Problem("nnm.system", nnm.system, remedy))
         if nnm.system == "condensed":
             return [*problems, *_check_condensed(lattice, contacts, nnm, valid)]
         if nnm.system == "reduced":
@@ -268,7 +269,11 @@ def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTab
         yield Problem("nnm.start_frequency", [], "name frequencies in rad/s, between the pass bands or above them")
     if outside := [n for n in nnm.start_sites if not 1 <= abs(n) <= len(sites)]:
         yield Problem("nnm.start_sites", outside, f"number the sites from 1 to {len(sites)}, with a sign")
-    bands = pass_bands(lattice.unit_cell()) if not check_cell(lattice)[1] else ()
+    sound = not check_cell(lattice)[1]
+    if nnm.multipliers and sound and (masses := lattice.unit_cell().dofs * lattice.cells) > MOST_OF_LATTICE:
+        remedy = f"need the motion of all {masses} masses, and are found up to {MOST_OF_LATTICE}"
+        yield Problem("nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs the sites alone")
+    bands = pass_bands(lattice.unit_cell()) if sound else ()
     inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
     if inside:
         told = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)

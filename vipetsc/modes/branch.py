@@ -2,7 +2,7 @@
 
 import json
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,6 +16,12 @@ from vipetsc.spectra import doubt, power_law
 
 KINDS = ("regular", "fold-energy", "fold-frequency", "branch-point", "symmetry-breaking", "period-doubling", "grazing")
 REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 not told"
+
+MULTIPLIERS = {
+    "multiplier": "largest Floquet multipliers, real part; NaN where fewer converged",
+    "multiplier_imaginary": "largest Floquet multipliers, imaginary part",
+    "multiplier_residual": "residual of the multiplier's vector over its size",
+}
 
 # Fraction of the time in contact from which the clearance counts as negligible (region IV).
 SMOOTH_LIMIT = 0.95
@@ -95,6 +101,7 @@ class Branch:
             "region": variable("point", self.regions().astype(np.int64), "1", REGION),
             "kind": variable("point", kinds, "1", "kind of point", **flags),
             **self.unknowns(),
+            **_multipliers(self.points),
         }
         for name, (stored, _, units, text) in QUANTITIES.items():
             data[stored] = variable("point", self.column(name), units, text)
@@ -133,7 +140,7 @@ class Branch:
         columns["tangent"] = np.column_stack([data["tangent"].values, data["tangent_period"].values])
         columns["half_traces"] = [c if np.any(c.imag != 0) else c.real for c in traces]
         points = [Point(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
-        return cls(dofs=data.sizes["dof"], points=points, **cls.told(about))
+        return cls(dofs=data.sizes["dof"], points=with_multipliers(points, data), **cls.told(about))
 
     @staticmethod
     def told(about: dict[Any, Any]) -> dict[str, Any]:
@@ -141,6 +148,30 @@ class Branch:
         named: dict[str, Any] = {key: str(about[key]) for key in ("name", "case", "ending")}
         named |= {"next_step": float(about["next_step"]), "complete": bool(about["complete"])}
         return named | {"findings": json.loads(about.get("warnings", "[]"))}
+
+
+def _multipliers(points: list[Point]) -> Variables:
+    """The largest multipliers of the points, if any point has some."""
+    most = max((len(p.multipliers) for p in points), default=0)
+    if not most:
+        return {}
+    largest = np.full((len(points), most, 2), np.nan, complex)
+    for row, p in zip(largest, points, strict=True):
+        row[: len(p.multipliers)] = p.multipliers
+    parts = largest[..., 0].real, largest[..., 0].imag, largest[..., 1].real
+    axes, numbers = ("point", "multiplier_number"), np.arange(1, most + 1)
+    data = {"multiplier_number": variable("multiplier_number", numbers, "1", "number of a multiplier, largest first")}
+    named = zip(parts, MULTIPLIERS.items(), strict=True)
+    return data | {name: variable(axes, part, "1", text) for part, (name, text) in named}
+
+
+def with_multipliers(points: list[Point], data: xr.Dataset) -> list[Point]:
+    """The points with the multipliers of their file."""
+    if "multiplier" not in data:
+        return points
+    real, imaginary, residual = (data[name].values for name in MULTIPLIERS)
+    rows = (row[np.isfinite(row[:, 0])] for row in np.stack([real + 1j * imaginary, residual], axis=-1))
+    return [replace(p, multipliers=row) for p, row in zip(points, rows, strict=True)]
 
 
 def tell_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, closed: np.ndarray) -> np.ndarray:

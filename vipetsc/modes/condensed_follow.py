@@ -1,6 +1,7 @@
 """Branches of condensed motions of a case: their starts, their files with harmonics and states of the lattice."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,10 +12,13 @@ from vipetsc.case.resolve import build_chain
 from vipetsc.io.netcdf import Variables, open_netcdf, variable
 from vipetsc.lattice import Compliance, DenseCompliance, pass_bands
 from vipetsc.lattice.moments import QuickCompliance
-from vipetsc.modes.branch import KINDS, Branch
+from vipetsc.modes.branch import KINDS, Branch, with_multipliers
 from vipetsc.modes.breather import CondensedContinuation, CondensedPoint, CondensedProblem, CondensedSegment
+from vipetsc.modes.floquet import judge
 from vipetsc.modes.follow import FAILURES, Follower
 from vipetsc.modes.harmonics import SiteForces
+from vipetsc.modes.hill import Hill
+from vipetsc.modes.lattice_flow import LatticeFlow
 from vipetsc.modes.point import QUANTITIES, Point
 from vipetsc.modes.system import System
 from vipetsc.parallel import StoppedError
@@ -33,11 +37,11 @@ class CondensedBranch(Branch):
     def to_csv(self) -> str:
         """The branch as CSV text, a row a point: w1 ... are the elongations in m at phase 0."""
         names = ["energy", "frequency", "period", *(f"w{i + 1}" for i in range(self.dofs))]
-        lines = [",".join([*names, "harmonics", "truncation", "slope", "contacts", "region", "kind"])]
+        lines = [",".join([*names, "harmonics", "truncation", "multiplier_max", "slope", "contacts", "region", "kind"])]
         for p, region in zip(self.points, self.regions(), strict=True):
             assert isinstance(p, CondensedPoint)
             numbers = [p.energy, p.frequency, p.period, *p.elongations.tolist()]
-            rest = [str(p.last), repr(p.truncation), repr(p.slope), str(p.episodes), str(region), p.kind]
+            rest = [*map(repr, (p.last, p.truncation, p.multiplier, p.slope, p.episodes)), str(region), p.kind]
             lines.append(",".join([*map(repr, numbers), *rest]))
         return "\n".join(lines) + "\n"
 
@@ -80,7 +84,7 @@ class CondensedBranch(Branch):
         columns["kind"] = [KINDS[kind] for kind in data["kind"].values]
         columns["elongations"] = data["elongation"].values
         step = 2 if data["order"].values[:1] == 1 else 1
-        points = []
+        points: list[Point] = []
         for i, row in enumerate(zip(*columns.values(), strict=True)):
             told = dict(zip(columns, row, strict=True))
             count = (told["last"] + 1) // 2 if step == 2 else told["last"] + 1
@@ -88,7 +92,8 @@ class CondensedBranch(Branch):
             rate = data["tangent_period"].values[i]
             tangent = np.append(tangent, rate) if np.isfinite(rate) else np.empty(0)
             points.append(CondensedPoint(x=x, tangent=tangent, half_traces=np.empty(0), **told))
-        return cls(dofs=data.sizes["place"], points=list[Point](points), **cls.told(about))
+        points = with_multipliers(points, data)
+        return cls(dofs=data.sizes["place"], points=points, **cls.told(about))
 
 
 class CondensedFollower(Follower):
@@ -125,6 +130,21 @@ class CondensedFollower(Follower):
         signs, numbers = np.zeros(self.problem.forces.pairs), self.options.start_sites or [1]
         signs[np.abs(numbers) - 1] = np.sign(numbers)
         return self.problem.from_gap(self.options.start_frequency[mode], signs)
+
+    def judged(self, point: Point) -> Point:
+        """The point with its largest multiplier by Hill's method, and with those of Floquet if they are asked for."""
+        assert isinstance(point, CondensedPoint)
+        problem, omega, wanted = self.problem, 2 * np.pi / point.period, self.options.multipliers
+        problem.select(point.last)
+        hill = Hill(problem.compliance, omega, point.last, problem.forces.odd, finite=True)
+        fastest = hill.fastest(problem.balance.series(point.x, omega))
+        if wanted:
+            chain, cells = self.chain, state_of(problem, point)
+            u = np.array([cells.get(cell, np.zeros(chain.cell.dofs)) for cell in range(chain.cells)]).ravel()
+            flow = LatticeFlow(chain, self.case.contact(), self.comm)
+            system = System.from_chain(chain, self.case.contact(), dense=False)
+            point = judge(flow, system, problem.forces.odd, point, u, wanted)
+        return replace(point, multiplier=np.nan if fastest is None else float(np.exp(2 * np.pi * fastest.real)))
 
     def monitored(self, problem: Any, control: NnmTable) -> Callable[[Point], str | None]:
         """No monitor: what it watches for needs the whole state."""

@@ -17,6 +17,8 @@ References
 G. W. Stewart, A Krylov-Schur algorithm for large eigenproblems, SIAM J. Matrix Anal. Appl. 23 (2001) 601-614.
 """
 
+import logging
+from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
@@ -25,13 +27,16 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.dynamics.eigen import load_slepc
-from vipetsc.modes.lattice_flow import LatticeArc
-from vipetsc.modes.lattice_shooting import LatticeShooting
+from vipetsc.modes.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.point import Point
+from vipetsc.modes.system import System
 
 POWER = 25
 # Tolerance and restarts of the Krylov-Schur method, and its vectors beyond three times those wanted.
 TOLERANCE, RESTARTS, VECTORS = 1e-10, 16, 16
+ONE_RANKS_OWN = 55  # PETSc's number of an error, lack of memory, that need not be met by all ranks
+
+logger = logging.getLogger(__name__)
 
 
 class Monodromy:
@@ -52,16 +57,34 @@ class Monodromy:
         y.setArray(block.ravel())
 
 
-def largest_multipliers(problem: LatticeShooting, point: Point, wanted: int) -> np.ndarray:
-    """The ``wanted`` largest multipliers of an orbit, or fewer, and their residuals: (number, 2), largest first.
+def judge(flow: LatticeFlow, system: System, odd: bool, point: Point, u: np.ndarray, wanted: bool | int) -> Point:
+    """The ``point``, at rest at the displacement ``u`` (n,), with its ``wanted`` largest multipliers; collective.
 
-    Raises FlowError where the orbit cannot be followed, CaseError without SLEPc; collective.
+    Where SLEPc fails it has none, ``multiplier`` is NaN, and the log says why.
     """
-    flow, comm, system, odd = problem.lattice_flow, problem.comm, problem.system, problem.map.quarter
-    start, omega = np.append(point.x, 0 * point.x), 2 * np.pi / point.period
-    arc = flow.arc(flow.share(start), point.period / (2 if odd else 1))
+    try:
+        largest = largest_multipliers(flow, system, odd, u, point.period, 8 if wanted is True else int(wanted))
+    except (PETSc.Error, np.linalg.LinAlgError) as error:
+        if getattr(error, "ierr", 0) == ONE_RANKS_OWN:
+            raise
+        if flow.comm.rank == 0:
+            why = "point %d (E = %.9g J) has no multipliers: SLEPc or what is made of its vectors failed: %s"
+            logger.warning(why, point.index, point.energy, " ".join(str(error).split()))
+        return replace(point, multiplier=np.nan)
+    return replace(point, multipliers=largest, multiplier=float(np.abs(largest[:, 0]).max(initial=1.0)))
+
+
+def largest_multipliers(
+    flow: LatticeFlow, system: System, odd: bool, u: np.ndarray, period: float, wanted: int
+) -> np.ndarray:
+    """The ``wanted`` largest multipliers of an orbit from rest at ``u``, or fewer, and their residuals: (number, 2).
+
+    The largest comes first. Raises FlowError where the orbit cannot be followed, CaseError without SLEPc; collective.
+    """
+    comm, start, omega = flow.comm, np.append(u, 0 * u), 2 * np.pi / period
+    arc = flow.arc(flow.share(start), period / (2 if odd else 1))
     scale = flow.share(np.sqrt(np.append(omega**2 * system.masses, system.masses)))
-    phase = flow.share(np.append(0 * point.x, -system.forces(point.x) / system.masses)) * scale
+    phase = flow.share(np.append(0 * u, -system.forces(u) / system.masses)) * scale
     phase /= np.sqrt(comm.allreduce(float(np.sum(phase**2))))
     noise = 1e-3 * np.random.default_rng(1).standard_normal(len(start))
     seed = flow.share(noise + np.tile(system.contact_rows.sum(axis=0), 2))

@@ -190,7 +190,8 @@ class Follower:
             for point in points:
                 sys.audit("vipetsc.step")
                 if self.options.locate:
-                    branch.points += self.located(problem, control, last, point, before, branch.findings)
+                    special = self.located(problem, control, last, point, before, branch.findings)
+                    branch.points += map(self.judged, special)
                 branch.points.append(point := self.judged(point))
                 branch.next_step = points.step
                 if self.listener is not None and self.comm.rank == 0:

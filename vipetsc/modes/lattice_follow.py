@@ -1,20 +1,16 @@
 """Follow branches of whole lattices, all ranks together, and judge their stability by their largest multipliers."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from pathlib import Path
-from typing import Self
 
 import numpy as np
 
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.case.resolve import build_chain
-from vipetsc.io.netcdf import Variables, open_netcdf, variable
 from vipetsc.modes.branch import Branch
 from vipetsc.modes.condensed_follow import CondensedFollower, stored_states
 from vipetsc.modes.continuation import ContinuationError
-from vipetsc.modes.floquet import largest_multipliers
+from vipetsc.modes.floquet import judge
 from vipetsc.modes.flow import FlowError
 from vipetsc.modes.follow import Follower
 from vipetsc.modes.lattice_shooting import LatticeShooting
@@ -23,52 +19,11 @@ from vipetsc.modes.shooting import MAPS, Shooting
 from vipetsc.modes.special import locate
 from vipetsc.modes.system import System
 
-MULTIPLIERS = {
-    "multiplier": "largest Floquet multipliers, real part",
-    "multiplier_imaginary": "largest Floquet multipliers, imaginary part",
-    "multiplier_residual": "residual of the multiplier's vector over its size",
-}
-
-
-class LatticeBranch(Branch):
-    """A branch with the largest multipliers of its points."""
-
-    def unknowns(self) -> Variables:
-        """As of ``Branch``, and the multipliers; NaN where fewer converged."""
-        most, data = max((len(p.multipliers) for p in self.points), default=0), super().unknowns()
-        if not most:
-            return data
-        largest = np.full((len(self.points), most, 2), np.nan, complex)
-        for row, p in zip(largest, self.points, strict=True):
-            row[: len(p.multipliers)] = p.multipliers
-        axes, values = (
-            ("point", "multiplier_number"),
-            (largest[..., 0].real, largest[..., 0].imag, largest[..., 1].real),
-        )
-        data["multiplier_number"] = variable(
-            "multiplier_number", np.arange(1, most + 1), "1", "number of a multiplier, the largest first"
-        )
-        for part, (name, text) in zip(values, MULTIPLIERS.items(), strict=True):
-            data[name] = variable(axes, part, "1", text)
-        return data
-
-    @classmethod
-    def read(cls, path: Path) -> Self:
-        """The branch in an HDF5 file."""
-        branch = super().read(path)
-        with open_netcdf(path, "branch", ("point",)) as file:
-            parts = [file[name].values for name in MULTIPLIERS if name in file]
-        if parts:
-            largest = np.stack([parts[0] + 1j * parts[1], parts[2]], axis=-1)
-            rows = (row[np.isfinite(row[:, 0])] for row in largest)
-            branch.points = [replace(p, multipliers=row) for p, row in zip(branch.points, rows, strict=True)]
-        return branch
-
 
 class LatticeFollower(Follower):
     """As ``Follower``, for a lattice on all ranks of ``comm``."""
 
-    branch_type, shared = LatticeBranch, True
+    shared = True
     # What all ranks meet together; anything else may be one rank's alone, and ends the program on all.
     failures = ContinuationError, FlowError, StartError
 
@@ -89,11 +44,10 @@ class LatticeFollower(Follower):
 
     def judged(self, point: Point) -> Point:
         """The point with its largest multipliers, if they are asked for."""
-        wanted = self.options.multipliers
+        wanted, lattice = self.options.multipliers, self.lattice
         if not wanted:
             return point
-        largest = largest_multipliers(self.lattice, point, 8 if wanted is True else int(wanted))
-        return replace(point, multipliers=largest, multiplier=float(np.abs(largest[:, 0]).max(initial=1.0)))
+        return judge(lattice.lattice_flow, self.system, lattice.map.quarter, point, point.x, wanted)
 
     def _start(self, mode: int) -> Point:
         gaps = self.options.start_frequency

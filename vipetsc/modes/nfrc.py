@@ -36,7 +36,7 @@ LAYOUT = {
     "largest": ("site", "m", "largest relative displacement"),
     "share": ("way", "1", "energy that leaves or is lost, over what comes in"),
     "unstable": ("", "1", "perturbations that grow (Hill's method); -1: not told"),
-    "growth": ("", "1", "largest real growth rate over the frequency, 0 if none"),
+    "growth": ("", "1", "largest growth rate over the frequency; 0 if none, NaN if not found"),
     "closed": ("site", "1", "share of the time in contact"),
     "episodes": ("", "1", "contact episodes a period"),
     "truncation": ("", "1", "estimated size of the harmonics left out, over those kept"),

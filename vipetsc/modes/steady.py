@@ -57,7 +57,7 @@ class SteadyStates:
         contact = case.contact(restitution)
         self.forces = SiteForces([(contact, clearance) for clearance in model.chain.clearances])
         self.balance = Balance(self.compliance, self.forces, last, options.symmetric, cosines=False)
-        self.count, self.hill = self.balance.size, Hill(self.compliance, 0.0, last, options.symmetric)
+        self.count, self.hill = self.balance.size, self._hill(0.0)
         self._known: dict[float, tuple[np.ndarray, IncidentWave | None]] = {}
         low, high = options.range
         self.scale = 1.0 if self.wave else float(self.clearance / np.abs(self.linear(case.frequency)[:, 1]).max())
@@ -137,15 +137,20 @@ class SteadyStates:
         padded = np.pad(z, ((0, 0), (0, 7 * z.shape[1]))) * np.where(np.arange(8 * z.shape[1]), 0.5, 1)
         moved = np.fft.irfft(padded, axis=1, norm="forward")
         if self.hill.omega != omega:
-            self.hill = Hill(self.compliance, omega, self.options.harmonics, self.options.symmetric)
+            self.hill = self._hill(omega)
         unstable = self.hill.unstable(series)
+        fastest = self.hill.fastest(series) if unstable else 0j
         shares = self._shares(omega, amplitude, series.forces[:, : z.shape[1]], float(series.loss.sum()))
         return {
             "frequency": omega, "amplitude": amplitude, "harmonics": z.real, "harmonics_imaginary": z.imag,
             "largest": np.abs(moved).max(axis=1),
-            "unstable": unstable, "growth": self.hill.growth(series) if unstable else 0.0, "share": shares,
+            "unstable": unstable, "growth": np.nan if fastest is None else fastest.real, "share": shares,
             "closed": series.closed, "episodes": len(series.episodes), "truncation": self.balance.truncation(x, omega),
         }  # fmt: skip
+
+    def _hill(self, omega: float) -> Hill:
+        options = self.options
+        return Hill(self.compliance, omega, options.harmonics, options.symmetric, finite=not options.infinite)
 
     def _shares(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
         """T, R, U and L over what comes in (4,); what leaves is not told of a finite lattice."""
