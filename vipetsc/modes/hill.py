@@ -60,14 +60,14 @@ class Hill:
             self._of = series, [self._eliminated(series, orders) for orders in self._blocks]
         out = np.ones(len(exponents), complex)
         for block, (orders, jacobian) in enumerate(zip(self._blocks, self._of[1], strict=True)):
-            kept = orders if jacobian is None else orders[np.abs(orders) <= KEPT]
+            low = orders if jacobian is None else orders[np.abs(orders) <= KEPT]
             new = [mu for mu in exponents.tolist() if (block, mu) not in self._known]
             if new:
-                g = self.compliance.at(((kept - 1j * np.array(new)[:, None]) * self.omega).ravel())
-                parts = g.reshape(len(new), len(kept), *g.shape[1:])
+                g = self.compliance.at(((low - 1j * np.array(new)[:, None]) * self.omega).ravel())
+                parts = g.reshape(len(new), len(low), *g.shape[1:])
                 self._known |= {(block, mu): part for mu, part in zip(new, parts, strict=True)}
             for i, mu in enumerate(exponents.tolist()):
-                matrix = _flat(series.jacobian(mu, kept)) if jacobian is None else jacobian
+                matrix = _flat(series.jacobian(mu, low)) if jacobian is None else jacobian
                 phase, log = np.linalg.slogdet(_plus_one(self._known[block, mu], matrix))
                 out[i] *= phase * np.exp(min(log, 300.0))
         return out
@@ -122,12 +122,12 @@ class Hill:
         sums = [-p * trapezoid((regular * np.exp(-1j * p * angle)).real, angle) / np.pi for p in range(1, count + 1)]
         for p in range(1, count + 1):  # Newton's identities
             monic.append(-sum(monic[p - j] * sums[j - 1] for j in range(1, p + 1)) / p)
-        found: list[complex] = []
+        zeros: list[complex] = []
         for guess in growth - np.log(np.roots(monic).astype(complex)) / (2 * np.pi):
-            mu = self._zero(series, complex(guess.real, abs(guess.imag)), found) if len(found) < count else None
+            mu = self._zero(series, complex(guess.real, abs(guess.imag)), zeros) if len(zeros) < count else None
             if mu is not None and mu.real > 0.9 * growth:
-                found += [mu, mu.conjugate()] if REAL < mu.imag < 0.5 - REAL else [mu.real + 0.5j * round(2 * mu.imag)]
-        return found if len(found) == count else None
+                zeros += [mu, mu.conjugate()] if REAL < mu.imag < 0.5 - REAL else [mu.real + 0.5j * round(2 * mu.imag)]
+        return zeros if len(zeros) == count else None
 
     def _zero(self, series: ForceSeries, guess: complex, known: list[complex]) -> complex | None:
         """A zero of D beside the ``known`` ones, Im in [0, 1/2], by the secant method."""
