@@ -60,7 +60,11 @@ def test_envelopes_of_bands_sum_to_the_energy_of_a_ring_and_are_where_the_wave_i
     packet = np.exp(-(((x - 90) / 12) ** 2) + 1j * kappa * x)[:, None] * wave.vectors[:, 2]
     for phase in (0.0, 0.7):
         turned = packet * np.exp(-1j * phase)
-        envelopes = band_envelopes(CELL, turned.real, (-1j * wave.frequency[2] * turned).real)
+        u, v = turned.real, (-1j * wave.frequency[2] * turned).real
+        envelopes = band_envelopes(CELL, u, v)
+        assert 2 * np.pi * np.fft.fftfreq(200)[wave_energies(CELL, u, v)[0][:, 2].argmax()] == pytest.approx(
+            1.2, abs=0.04
+        )
         assert envelopes[2].sum() > 0.999 * envelopes.sum()
         assert envelopes[2].argmax() in (89, 90, 91)
         assert envelopes[2, 60:120] == pytest.approx(
@@ -125,7 +129,7 @@ def test_an_mp4_is_made_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypa
     assert len(frames) == len(stage.content.time)
     assert np.array_equal(frames[3], stage.frame(3))
     before = path.stat()
-    program.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
+    program.write_text('#!/bin/sh\nfor last; do :; done\necho half > "$last"\necho no such codec >&2\nexit 1\n')
     with pytest.raises(OSError, match="no such codec"):
         movie.write_movie(stage, 3.0, [path])
     assert path.stat().st_mtime_ns == before.st_mtime_ns

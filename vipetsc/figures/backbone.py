@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from string import ascii_lowercase
 
@@ -26,6 +27,8 @@ MARKS = {
 }
 HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
 MOST_MARKS = 12  # with more special points, tongues are labelled by their resonance instead, at their highest fold
+FINE = 8  # points of the curve drawn for each step of a branch
+CORNERS, INSET, MARGIN = ((0.55, 0.1), (0.55, 0.5), (0.1, 0.1)), (0.41, 0.36), 0.09  # of axes; room for its labels
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
 
 
@@ -54,6 +57,8 @@ def backbone(paths: Sequence[Path]) -> Figure:
     for column, tag, branch in zip(columns, ascii_lowercase, branches, strict=False):
         upper, *lower = column.subfigures(1 + has_orbits, 1, squeeze=False, height_ratios=shares)[:, 0]
         panels = upper.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+        energy = branch["energy"].values
+        panels[0].set(xscale="log", xlim=(energy.min(), energy.max()))  # the inset looks for room in them
         for axes, draw in zip(panels, (frequency_energy, slope, flow_differences), strict=False):
             draw(axes, branch)
         # The reading is one of the paper's parameters only, not of a cell or system of one's own.
@@ -62,8 +67,7 @@ def backbone(paths: Sequence[Path]) -> Figure:
         law = table.get("contacts", {}).get("law", "") if len(branches) > 1 else ""
         heading = branch.attrs["name"], law, "" if custom else table.get("lattice", {}).get("reading", "")
         panels[0].set_title(f"({tag}) {', '.join(filter(None, heading))}")
-        energy = branch["energy"].values
-        panels[-1].set(xscale="log", xlim=(energy.min(), energy.max()), xlabel="energy (J)")
+        panels[-1].set(xlabel="energy (J)")
         if energy.max() < 10 * energy.min():  # labels of less than a decade
             panels[-1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             panels[-1].xaxis.set_minor_formatter(NullFormatter())
@@ -105,11 +109,22 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
 
 
 def slope(axes: Axes, branch: xr.Dataset) -> None:
-    """|df/dE| over energy at the regular points where contacts act, at all without contact."""
+    """|df/dE| over energy at the regular points where contacts act, at all without contact.
+
+    Where several states of the branch have one energy, all but that of the lowest frequency are pale.
+    """
     _shade(axes, branch)
     touches = branch["contacts"].values > 0
-    shown = branch.isel(point=(touches | (not touches.any())) & (branch["kind"].values == "regular"))
-    axes.loglog(shown["energy"], np.abs(shown["slope"]), lw=0.9)
+    some = (touches | (not touches.any())) & (branch["kind"].values == "regular")
+    energy, steepness, low = (
+        values[some] for values in (branch["energy"].values, np.abs(branch["slope"].values), lowest(branch))
+    )
+    if not low.all():
+        axes.loglog(energy, steepness, lw=0.4, color=style.SKY, label="other states at their energies")
+    label = None if low.all() else "lowest frequency at its energy"
+    axes.loglog(energy, np.where(low, steepness, np.nan), lw=1.1, color=style.BLUE, label=label)
+    if label:
+        axes.legend(loc="lower left", fontsize=5.5)
     axes.set_ylabel(r"|d$f$/d$E$| (Hz/J)")
 
 
@@ -151,10 +166,58 @@ def portraits(page: SubFigure, branch: xr.Dataset) -> None:
     page.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
 
 
+def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Energies and frequencies, ``FINE`` for each step: cubic Hermite curves through points and tangents.
+
+    Both are logarithms there, over their range; the chord's length is the parameter. Where a contact grazes a curve
+    ends and the next begins: the branch may have a corner.
+    """
+    energy, frequency = branch["energy"].values, branch["frequency"].values
+    points = np.log(np.column_stack([energy, frequency]))
+    if len(points) < 3 or "tangent_period" not in branch:
+        return energy, frequency
+    rate = -branch["tangent_period"].values * frequency**2  # df/ds; the slope is df/dE
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = np.column_stack([rate / branch["slope"].values / energy, rate / frequency])
+    size = np.ptp(points, axis=0)
+    points, along = points / np.where(size > 0, size, 1), along / np.where(size > 0, size, 1)
+    chords = np.diff(points, axis=0)
+    length = np.maximum(np.linalg.norm(chords, axis=1), 1e-300)[:, None]
+    along[~np.isfinite(along).all(axis=1) | ~along.any(axis=1)] = np.nan
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    along *= np.sign(np.nansum(along[:-1] * chords / length)) or 1.0
+    begin, end = along[:-1].copy(), along[1:].copy()
+    begin[branch["kind"].values[:-1] == "grazing"] = np.nan
+    end[branch["kind"].values[1:] == "grazing"] = np.nan
+    unit = chords / length
+    begin, end = (np.where(np.isnan(a), np.where(np.isnan(b), unit, 2 * unit - b), a)
+                  for a, b in ((begin, end), (end, begin)))  # fmt: skip
+    t = (np.arange(FINE) / FINE)[:, None, None]
+    cubic = points[:-1] + t**2 * (3 - 2 * t) * chords + length * (t * (1 - t) ** 2 * begin - t**2 * (1 - t) * end)
+    fine = np.vstack([cubic.swapaxes(0, 1).reshape(-1, 2), points[-1:]])
+    fine_energy, fine_frequency = np.exp(fine * np.where(size > 0, size, 1)).T
+    return fine_energy, fine_frequency
+
+
+def lowest(branch: xr.Dataset) -> np.ndarray:
+    """Whether no other state of the branch has the energy of a point and a lower frequency."""
+    energy, frequency = branch["energy"].values, branch["frequency"].values
+    order = np.argsort(energy)
+    least, ranks = frequency[order].copy(), np.searchsorted(energy[order], energy)
+    for i, (a, b) in enumerate(pairwise(ranks)):
+        between = slice(min(a, b) + 1, max(a, b))
+        ends = np.sort([i, i + 1])[np.argsort(energy[i : i + 2])]
+        others = np.interp(energy[order[between]], energy[ends], frequency[ends])
+        least[between] = np.minimum(least[between], others)
+    return frequency <= least[np.argsort(order)] * (1 + 1e-9)
+
+
 def _line(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
     """The branch, blue where stable and vermilion where not."""
-    energy, frequency = branch["energy"].values, branch["frequency"].values
+    energy, frequency = smooth(branch)
     unstable = branch["multiplier_max"].values > UNSTABLE
+    if len(energy) > len(unstable):
+        unstable = np.append(np.repeat(unstable[:-1] & unstable[1:], FINE), unstable[-1])
     axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label="stable")
     if unstable.any():
         line = {"color": style.VERMILION, "lw": 1.3 * width, "zorder": 3, "label": "unstable"}
@@ -169,7 +232,11 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
     last = min(max(last, first + 3), len(energy) - 1)
     near = branch.isel(point=slice(max(first - 1, 0), last + 1))
-    inset = axes.inset_axes([0.55, 0.1, 0.41, 0.36])
+    curve = axes.transAxes.inverted().transform(axes.transData.transform(np.column_stack(smooth(branch))))
+    covered = [
+        np.sum(np.all((curve > np.subtract(at, MARGIN)) & (curve < np.add(at, INSET)), axis=1)) for at in CORNERS
+    ]
+    inset = axes.inset_axes([*CORNERS[int(np.argmin(covered))], *INSET])
     _line(inset, near, 0.9)
     at = near["kind"].values == "fold-energy"
     inset.plot(near["energy"][at], near["frequency"][at], "o", ms=2.5, **HOLLOW)

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import Akima1DInterpolator, CubicHermiteSpline
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
@@ -20,7 +20,7 @@ CELLS = {
     "dispersion": ("All cells", style.BLACK),
 }
 LARGEST_RESIDUAL = 1e-8  # of the ledger, over the work of the drive
-REFINE = 4  # points of a phase portrait drawn for each sample
+REFINE = 10  # points of a phase portrait drawn for each sample
 
 
 def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
@@ -207,8 +207,7 @@ def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray,
     if len(time) < 2:
         return u, v, time
     fine = np.interp(np.arange((len(time) - 1) * REFINE + 1) / REFINE, np.arange(len(time)), time)
-    motion = CubicHermiteSpline(time, u, v, axis=0)
-    return motion(fine), motion(fine, 1), fine
+    return CubicHermiteSpline(time, u, v, axis=0)(fine), Akima1DInterpolator(time, v)(fine), fine
 
 
 def centre_axes(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
