@@ -21,15 +21,16 @@ def test_a_branch_is_drawn_through_its_points_along_its_tangents_and_keeps_a_cor
         fine_frequency[:: backbone.FINE], frequency
     )
     assert np.abs(np.hypot(np.log(fine_energy), np.log(fine_frequency / 100)) - 0.1).max() < 3e-4  # a chord: 6e-3
-    # Two straight lines that meet at a grazing point: no step of either leaves its line.
+    # Two straight lines that meet at a grazing point, whose tangent is that of either: no step leaves its line.
     level = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     frequency = np.where(level > 4, 100 * (level / 4) ** 2, 100.0)
-    slope = np.where(level > 4, 2 * frequency / level, 0.0)
-    columns = {"energy": level, "frequency": frequency, "slope": slope, "tangent_period": -slope / frequency**2}
-    columns["kind"] = np.array(["regular", "regular", "grazing", "regular", "regular"])
-    fine_energy, fine_frequency = backbone.smooth(xr.Dataset({n: ("point", v) for n, v in columns.items()}))
-    exact = np.where(fine_energy > 4, 100 * (fine_energy / 4) ** 2, 100.0)
-    assert fine_frequency == pytest.approx(exact, rel=1e-9)
+    for at_grazing in (1e-9, 50.0):
+        slope = np.where(level > 4, 2 * frequency / level, np.where(level < 4, 1e-12, at_grazing))
+        columns = {"energy": level, "frequency": frequency, "slope": slope, "tangent_period": -slope / frequency**2}
+        columns["kind"] = np.array(["regular", "regular", "grazing", "regular", "regular"])
+        fine_energy, fine_frequency = backbone.smooth(xr.Dataset({n: ("point", v) for n, v in columns.items()}))
+        exact = np.where(fine_energy > 4, 100 * (fine_energy / 4) ** 2, 100.0)
+        assert fine_frequency == pytest.approx(exact, rel=1e-9)
 
 
 def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_told():
