@@ -110,7 +110,7 @@ def test_everything_wrong_with_a_case_is_said_at_once(vipetsc, tmp_path, ranks):
         cels = 3
         [contacts]
         sites = [3, 3, 400]
-        clearance = 0.0
+        clearance = -1.0
         restitution = 1.5
         [drive]
         amplitude = "big"
@@ -123,7 +123,7 @@ def test_everything_wrong_with_a_case_is_said_at_once(vipetsc, tmp_path, ranks):
     assert ended.returncode == 2
     for text in (
         "lattice.preset = 'fourband'", "did you mean 'four-band'", "lattice.cels = 3", "did you mean lattice.cells",
-        "[400]", "named twice", "contacts.clearance = 0.0", "contacts.restitution = 1.5", "drive.amplitude = 'big'",
+        "[400]", "named twice", "contacts.clearance = -1.0", "contacts.restitution = 1.5", "drive.amplitude = 'big'",
         "drvie", "did you mean drive",
     ):  # fmt: skip
         assert ended.stderr.count(text) == 1, text

@@ -105,7 +105,7 @@ def test_a_check_that_rests_on_an_invalid_key_is_left_out():
     with pytest.raises(CaseError) as caught:
         Case.from_table(PLAIN | {"contacts": PLAIN["contacts"] | {"clearance": -1.0}})
     assert [p.key for p in caught.value.problems] == ["contacts.clearance"]
-    assert "greater than 0" in str(caught.value)
+    assert "greater than or equal to 0" in str(caught.value)
 
 
 def test_samples_are_counted_and_held_against_the_bands():

@@ -13,7 +13,7 @@ from vipetsc.modes.harmonics import SiteForces, arcs
 CONSERVATIVE = [Contact("bilinear", 3.0), Contact("hertz", 3.0)]
 DISSIPATIVE = [
     Contact("hertz", 3.0, 0.7),
-    Contact("hertz", 3.0, 0.8, exact=True),
+    Contact("hertz", 3.0, 0.8, factor="exact"),
     Contact("bilinear", 3.0, 0.3, "clip"),
     Contact("hertz", 3.0, 0.7, approach_floor=1.5),
 ]

@@ -247,7 +247,7 @@ def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
 )
 def test_the_effective_restitution_is_that_of_a_simulated_impact(law, asked, effective):
     """The paper's damping returns more than is asked, the exact one what is asked."""
-    for contact in (Contact(law, KC, asked), Contact(law, KC, asked or 0.1, exact=True)):
+    for contact in (Contact(law, KC, asked), Contact(law, KC, asked or 0.1, factor="exact")):
         contacts, mass, speed = create_contacts(contact, [D]), 0.003, 0.3
         contacts["mode"][0], contacts["approach"][0] = CLOSED, speed
 
@@ -265,7 +265,9 @@ def test_the_effective_restitution_is_that_of_a_simulated_impact(law, asked, eff
 
 def test_the_exact_damping_meets_every_restitution():
     asked = np.linspace(0.05, 1, 200)
-    assert [Contact("hertz", KC, r, exact=True).effective_restitution for r in asked] == pytest.approx(asked, abs=1e-7)
+    assert [Contact("hertz", KC, r, factor="exact").effective_restitution for r in asked] == pytest.approx(
+        asked, abs=1e-7
+    )
 
 
 def test_the_manual_tells_what_impacts_return():

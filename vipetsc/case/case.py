@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from vipetsc.case.contacts import Gaps, check_alike, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
 from vipetsc.case.initial import InitialTable, beginning_of, check_initial
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid, read_section
@@ -23,16 +24,8 @@ from vipetsc.case.resolve import (
     wave_speed,
     with_preset,
 )
-from vipetsc.case.schema import (
-    CONTACTS,
-    AnalysisTable,
-    ContactsTable,
-    DriveTable,
-    LatticeTable,
-    OutputTable,
-    PetscTable,
-    TimeTable,
-)
+from vipetsc.case.schema import CONTACTS, AnalysisTable, DriveTable, LatticeTable, OutputTable, PetscTable, TimeTable
+from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
@@ -45,7 +38,9 @@ class Model:
     """A case in the terms of ``vipetsc.lattice``: 0-based indices, seconds, newtons, everything decided.
 
     ``atol`` is the pair (displacement m, velocity m/s); ``scale`` the displacement in m of the drive's
-    linear wave or of the ``initial`` state, ``speed`` the group velocity in cells/s that ``traverse`` uses.
+    linear wave or of the ``initial`` state, ``speed`` the group velocity in cells/s that ``traverse`` uses. The law of
+    each site is in ``laws`` (() if all have ``contact``), its clearances in m on the sides + and - are in ``gaps`` (()
+    if the chain's are those of both).
     """
 
     chain: Chain
@@ -61,6 +56,8 @@ class Model:
     scale: float
     speed: float
     initial: InitialTable | None = None
+    laws: tuple[Contact, ...] = ()
+    gaps: Gaps = ()
 
     @property
     def samples(self) -> int:
@@ -121,6 +118,8 @@ class Case(CaseFile):
         initial, undriven = sections.get("initial", InitialTable.model_validate({})), sections["drive"].amplitude == 0
         if valid("initial.kind"):
             yield from check_initial(initial, lattice, cell, valid)
+        if cls is not Case and valid("contacts"):
+            yield from check_alike(contacts)
         if initial.moves and cls is not Case:
             yield Problem("initial.kind", initial.kind, "this verb is about a wave in a lattice at rest; leave it out")
         if undriven and not initial.moves and valid("initial"):
@@ -150,11 +149,9 @@ class Case(CaseFile):
             atol = small, small * drive.frequency
         else:
             atol = (1e-9 * abs(drive.amplitude) if time.atol == "paper" else time.atol,) * 2
-        exact = contacts.damping == "exact"
-        of_contact = contacts.restitution, contacts.adhesion, contacts.approach_floor, exact
         return Model(
             chain=chain,
-            contact=Contact(contacts.law, contacts.stiffness or 0.0, *of_contact),
+            contact=contact_of(contacts),
             drive=burst,
             drive_cell=drive.cell - 1,
             drive_mass=drive.mass - 1,
@@ -166,6 +163,8 @@ class Case(CaseFile):
             scale=scale,
             speed=wave_speed(chain.cell, drive.frequency),
             initial=self.initial,
+            laws=laws_of_sites(contacts, len(chain.sites)),
+            gaps=gaps_of_sites(contacts, list(chain.clearances)),
         )
 
     @property

@@ -11,8 +11,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from vipetsc.case.contacts import lists_of
 from vipetsc.case.reading import Problem, Section, Table
-from vipetsc.case.schema import CONTACTS, ContactsTable, LatticeTable, NotNegative
+from vipetsc.case.schema import CONTACTS, LatticeTable, NotNegative
+from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import UnitCell
 
 SEED = "disorder.seed"
@@ -71,9 +73,11 @@ def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Seque
     """The quantities of a resolved case by name, those it has not empty; ``modulus`` is what is proportional to it."""
     cell, sites, clearance = lattice.unit_cell(), contacts.sites, contacts.clearance
     assert isinstance(sites, list) and isinstance(clearance, list)
-    stiffness = [contacts.stiffness] if contacts.stiffness else []
+    each = lists_of(contacts)
+    stiffness = each.get("stiffness") or ([contacts.stiffness] if contacts.stiffness else [])
     of_sites: dict[str, Sequence[float]] = {"clearance": clearance, "sites": sites}
-    of_law = {"restitution": [contacts.restitution], "stiffness": stiffness, "modulus": stiffness}
+    of_law = {"restitution": each.get("restitution", [contacts.restitution]), "stiffness": stiffness}
+    of_law["modulus"] = [contacts.stiffness] if contacts.stiffness else []
     return of_sites | of_law | {"masses": cell.masses, "springs": [spring.stiffness for spring in cell.springs]}
 
 
@@ -110,7 +114,10 @@ def scatter(
         )
         return tables, problems if disorder.quantities() else [empty]
     law |= {name: drawn[name] for name in ("clearance",) if name in drawn}
-    law |= {name: drawn[name][0] for name in ("restitution", "stiffness") if name in drawn}
+    of_each = law.get("each", {})
+    law |= {name: drawn[name][0] for name in ("restitution", "stiffness") if name in drawn and name not in of_each}
+    if lists := {name: drawn[name] for name in ("restitution", "stiffness") if name in drawn and name in of_each}:
+        law["each"] = of_each | lists
     if "sites" in drawn:
         law["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
     if "modulus" in drawn and contacts.modulus:

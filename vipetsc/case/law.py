@@ -9,7 +9,8 @@ from pydantic import Field
 from vipetsc.case.case import Case
 from vipetsc.case.reading import Problem, Section, Table
 from vipetsc.case.resolve import with_preset
-from vipetsc.case.schema import PRESETS, ContactsTable, Positive
+from vipetsc.case.schema import PRESETS, Positive
+from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import max_group_velocity, waves_at
 from vipetsc.lattice.packet import packet_speeds
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from vipetsc.case.contacts import check_alike
 from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.resolve import (
     check_cell,
@@ -18,7 +19,8 @@ from vipetsc.case.resolve import (
     with_default_preset,
     with_preset,
 )
-from vipetsc.case.schema import ContactsTable, Finite, LatticeTable, Positive, once
+from vipetsc.case.schema import Finite, LatticeTable, Positive, once
+from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Contact, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import groups_of
 
@@ -166,7 +168,7 @@ class NnmCase(CaseFile):
         if not valid("lattice", "contacts", "nnm"):
             return []
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
-        problems, dofs, rigid = [*_check_options(nnm)], 2, 0
+        problems, dofs, rigid = [*_check_options(nnm), *check_alike(contacts)], 2, 0
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:
@@ -227,7 +229,7 @@ class NnmCase(CaseFile):
         given, stiffness = self.contacts, self.contacts.stiffness or 0.0
         if given.modulus and given.radius and given.poisson is not None:
             stiffness = contact_stiffness(given.modulus, given.radius, given.poisson)
-        return Contact(given.law, stiffness)
+        return Contact(given.law, stiffness, power=given.exponent)
 
 
 def _check_options(nnm: NnmTable) -> Iterator[Problem]:

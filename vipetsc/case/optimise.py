@@ -10,6 +10,7 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case
+from vipetsc.case.contacts import check_alike
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import Positive
@@ -120,6 +121,7 @@ class OptimiseCase(CaseFile):
         except CaseError as error:
             return {}, problems + error.problems
         wrong = list(_problems(options, base, "disorder" in table))
+        wrong += check_alike(base.contacts)
         if base.initial:
             wrong.append(Problem("initial.kind", base.initial.kind, "designs are compared in a lattice at rest"))
         invalid = tuple(problem.key for problem in problems)

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from vipetsc.case.contacts import check_each, resolved_each
 from vipetsc.case.initial import Beginning
 from vipetsc.case.reading import Problem, Table, Valid
-from vipetsc.case.schema import CONTACTS, PRESETS, ContactsTable, DriveTable, LatticeTable, Span, TimeTable
+from vipetsc.case.schema import CONTACTS, PRESETS, DriveTable, LatticeTable, TimeTable
+from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import cell_problems, groups_of
 
-LEAST_RESTITUTION = 0.05
 STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 # A key of a case file takes the place of these keys of the preset.
 REPLACES = {
@@ -138,10 +139,13 @@ def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid)
     """What is wrong with the sites of a run and with the law."""
     yield from check_sites(lattice, contacts)
     counted = isinstance(contacts.sites, int) and lattice.preset is None  # which needs a preset to place them
-    yield from check_stiffness(contacts, bool(contacts.sites) and not counted, valid)
-    if contacts.damping == "exact" and contacts.restitution < LEAST_RESTITUTION and valid("contacts.restitution"):
-        remedy = f"the exact damping grows without bound towards 0; at least {LEAST_RESTITUTION}"
-        yield Problem("contacts.restitution", contacts.restitution, remedy)
+    given = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
+    yield from check_stiffness(contacts, bool(contacts.sites) and not counted and not given, valid)
+    sites = [] if counted else site_cells(lattice, contacts)
+    placed = contacts.clearance is not None or lattice.preset is not None or not sites
+    gaps = clearances(lattice, contacts, len(sites)) if placed else []
+    if len(gaps) == len(sites):
+        yield from check_each(contacts, len(sites), gaps, valid)
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
@@ -163,6 +167,8 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
     if contacts.damping == "paper":
         del law["damping"]  # as if left out: the same case
     law |= {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
+    if each := resolved_each(contacts, len(sites)):
+        law["each"] = each
     if contacts.stiffness is None and law.keys() >= REPLACES["stiffness"]:
         law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law["radius"], law.pop("poisson")))
         if lattice.preset and law["radius"] == CONTACTS["radius"]:

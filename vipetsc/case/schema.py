@@ -150,41 +150,6 @@ class LatticeTable(Section):
         return PRESETS[str(self.preset)].cell(self.reading, **options)
 
 
-class Span(Section):
-    """``count`` sites evenly from cell ``first`` to cell ``last`` (1-based), or every ``spacing``-th from ``first``."""
-
-    first: int
-    last: int | None = None
-    spacing: int | None = Field(None, ge=1)
-    count: int = Field(ge=1, le=MOST_SITES)
-
-
-class ClearanceSpan(Section):
-    """Clearances in m, log-spaced from the leading to the last site."""
-
-    first: Positive
-    last: Positive
-
-
-class ContactsTable(Section):
-    """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances.
-
-    ``damping``: ``paper`` (if left out) is 3 (1 - restitution)/2, ``exact`` the one that gives the restitution asked.
-    """
-
-    law: Literal["hertz", "bilinear"] = "hertz"
-    modulus: Positive | None = None
-    radius: Positive | None = None
-    poisson: Annotated[float, Field(gt=-1, le=0.5)] | None = None
-    stiffness: Positive | None = None
-    restitution: Annotated[float, Field(ge=0, le=1)] = 1.0
-    damping: Literal["paper", "exact"] | None = None
-    sites: Annotated[int, Field(ge=0, le=MOST_SITES)] | list[int] | Span = 0
-    clearance: Positive | list[Positive] | ClearanceSpan | None = None
-    adhesion: Literal["allow", "clip"] = "allow"
-    approach_floor: Annotated[float, Field(ge=0)] = 0.0
-
-
 class DriveTable(Section):
     """A tone burst: ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``.
 

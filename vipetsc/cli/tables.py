@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, CaseError, CaseFile, DesignCase, LawCase, NnmCase, Problem, Sweep
+from vipetsc.case.contacts import stops_told
 from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
@@ -128,7 +129,7 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
 
     model = case.model()
     check_indices(model)
-    cell, chain, contact = model.chain.cell, model.chain, model.contact
+    cell, chain = model.chain.cell, model.chain
     bands, waves = pass_bands(cell), waves_at(cell, model.drive.frequency)
     columns = len(recorded_cells(case.output, chain.cells)) * cell.dofs * len(case.output.fields)
     size = 8 * (columns * -(-model.samples // case.output.stride) + len(chain.sites) * model.samples)
@@ -146,10 +147,9 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
                     f"reading {case.lattice.reading}"),
         ("pass bands", ", ".join(f"{b.low:.2f}-{b.high:.2f}" for b in bands) + " rad/s"),
         ("gaps", ", ".join(f"{a:.2f}-{b:.2f}" for a, b in gaps(bands)) + " rad/s" if gaps(bands) else "none"),
-        ("contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.exponent:g}, "
-                    f"restitution {contact.restitution:g}, effective {contact.effective_restitution:.3f}"),
+        ("contact", "; ".join(dict.fromkeys(map(str, model.laws[:8] or (model.contact,))))),
         ("sites", _first_few([c + 1 for c in chain.sites])),
-        ("clearance", _first_few([f"{1e3 * c:.4g}" for c in chain.clearances]) + " mm" if chain.sites else "none"),
+        ("clearance", _first_few(stops_told(model.gaps, chain.clearances)) + " mm" if chain.sites else "none"),
         ("begins with", initial_text(case)),
         ("drive", f"{model.drive.amplitude:g} N, {model.drive.cycles} cycles, Om = {model.drive.frequency:.4f} rad/s"),
         ("waves at Om", "; ".join(f"band {b}, kappa = {k / np.pi:.4f} pi, v_g = {v:.2f} cells/s" for b, k, v in waves)

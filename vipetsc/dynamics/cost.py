@@ -76,6 +76,7 @@ def expected_episodes(model: Model) -> float:
     for band, kappa, _ in waves:
         shape = bloch(cell, kappa).vectors[:, band - 1]
         shares.append(abs(shape[cell.resonator] - shape[cell.host]) / np.abs(shape).max())
-    z = model.scale * max(shares) / np.asarray(model.chain.clearances)
+    gaps = np.min(model.gaps, axis=1) if model.gaps else np.asarray(model.chain.clearances)
+    z = model.scale * max(shares) / np.maximum(gaps, 1e-300)
     above = np.where(z > 1, 1 - 2 / np.pi * np.arcsin(np.sqrt(1 / np.maximum(z, 1))), 0.0)
     return float(2 * drive.cycles * above.sum())

@@ -205,8 +205,10 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
 
 def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     """Free sites of dtype ``SITE``; a number of -1 is a site without stops."""
-    gaps = np.array([*model.chain.clearances, np.inf])[np.asarray(numbers, np.int64)]
-    return create_contacts(model.contact, gaps, model.chain.cell.reduced_mass, model.scale)
+    numbers = np.asarray(numbers, np.int64)
+    gaps = np.array(model.gaps or [(gap, gap) for gap in model.chain.clearances]).reshape(-1, 2)
+    laws = [model.laws[i] if i >= 0 else model.contact for i in numbers] if model.laws else model.contact
+    return create_contacts(laws, np.vstack([gaps, [[np.inf] * 2]])[numbers], model.chain.cell.reduced_mass, model.scale)
 
 
 @njit(error_model="numpy")

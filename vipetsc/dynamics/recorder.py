@@ -65,6 +65,8 @@ class Recorder(Observer):
             "sites/cell": np.array(chain.sites, np.int64) + 1,
             "sites/clearance": np.array(chain.clearances, float),
         }
+        if setup.model.gaps:
+            given["sites/clearance"], given["sites/clearance_minus"] = np.array(setup.model.gaps).T
         rows = -(-setup.model.samples // output.stride)
         setup.output.recording = Recording(given, tuple(output.fields), together, rows)
         self._columns = np.array([[first, stop] if together else [0, len(recorded)]])

@@ -164,7 +164,9 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     site = leading_site(run)
     if site is None:
         return empty_figure("Phase portraits: the lattice has no contact sites")
-    cell, clearance = int(run["sites/cell"][site]), 1e3 * float(run["sites/clearance"][site])
+    cell, gaps = int(run["sites/cell"][site]), [1e3 * float(run["sites/clearance"][site])] * 2
+    if "sites/clearance_minus" in run:
+        gaps[1] = 1e3 * float(run["sites/clearance_minus"][site])
     if cell not in run["cell"].values:
         return empty_figure(f"Phase portraits: cell {cell}, the first site, was not recorded")
     if "displacement" not in run or "velocity" not in run:
@@ -190,10 +192,11 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         axes.plot(*points[: before + 1].T, color=style.GREY, lw=0.4, rasterized=True)
         centre_axes(axes, points[:, 0], points[:, 1])
         axes.set(title=f"{title}, cell {cell}", xlabel=f"${symbol}$ (mm)", ylabel=rf"$\dot{{{symbol}}}$ (m/s)")
-    wide = max(axes.get_xlim()[1], 1.15 * clearance)
+    stops = [side * gap for side, gap in zip((1, -1), gaps, strict=True) if np.isfinite(gap)]
+    wide = max(axes.get_xlim()[1], *(1.15 * abs(stop) for stop in stops))
     axes.set_xlim(-wide, wide)
-    axes.vlines([-clearance, clearance], *axes.get_ylim(), color=style.VERMILION, lw=0.8, ls=style.DASHED)
-    panels.note(axes, "clearance", (clearance, 1), (-2, -2), xycoords=("data", "axes fraction"), ha="right", va="top",
+    axes.vlines(stops, *axes.get_ylim(), color=style.VERMILION, lw=0.8, ls=style.DASHED)
+    panels.note(axes, "clearance", (stops[0], 1), (-2, -2), xycoords=("data", "axes fraction"), ha="right", va="top",
                 color=style.VERMILION)  # fmt: skip
     if len(onsets):
         panels.colour_bar(after, grid, "Time (s)", extend="neither")

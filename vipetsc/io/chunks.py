@@ -51,6 +51,7 @@ GIVEN = {
     "site": ("site", "1", "contact site, from 1"),
     "sites/cell": ("site", "1", "cell of the site"),
     "sites/clearance": ("site", "m", "clearance of the site"),
+    "sites/clearance_minus": ("site", "m", "clearance on the side of negative relative displacement, if it differs"),
 }
 
 

@@ -1,4 +1,4 @@
-"""Vibro-impact contact: Hertz and bilinear laws on both sides of a clearance, with restitution.
+"""Vibro-impact contact: Hertz, bilinear and power laws on both sides of a clearance, with restitution.
 
 With w = u_resonator - u_host and clearance D, the contact force is
 F = kc [(w - D)_+^n - (-w - D)_+^n] g, restoring: -F on the resonator, +F on the host.
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-Law = Literal["hertz", "bilinear"]
+Law = Literal["hertz", "bilinear", "power"]
 Adhesion = Literal["allow", "clip"]
+Damping = Literal["paper", "exact", "hunt-crossley", "lankarani-nikravesh", "flores"]
+LEAST_RESTITUTION = 0.05  # where the damping grows without bound towards 0
 
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
@@ -33,8 +35,8 @@ class Contact:
     """A ``law`` F = kc x^n, its ``stiffness`` kc in N/m^n and its ``restitution`` r in [0, 1]; 1 conserves energy.
 
     ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
-    smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded. ``exact``: the damping is the one
-    whose impact has the restitution, and not its limit for r near 1, which is the paper's.
+    smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded. ``factor`` names the damping c in
+    g = 1 + c w'/w'_minus; ``power`` is n of the law "power".
     """
 
     law: Law
@@ -42,18 +44,33 @@ class Contact:
     restitution: float = 1.0
     adhesion: Adhesion = "allow"
     approach_floor: float = 0.0
-    exact: bool = False
+    factor: Damping = "paper"
+    power: float | None = None
+
+    def __str__(self) -> str:
+        about = f"restitution {self.restitution:g}, effective {self.effective_restitution:.3f}"
+        named = "" if self.factor == "paper" else f" ({self.factor})"
+        return f"{self.law}, {self.stiffness:.6g} N/m^{self.exponent:g}, {about}{named}"
 
     @property
     def exponent(self) -> float:
         """n of the law, for spheres in elastic contact (Hertz) or a linear stop; raises KeyError for another."""
-        return {"hertz": 1.5, "bilinear": 1.0}[self.law]
+        return {"hertz": 1.5, "bilinear": 1.0}[self.law] if self.power is None else self.power
 
     @property
     def damping(self) -> float:
-        """3 (1 - r) / 2, the factor of w'/w'_minus in g (Hunt and Crossley 1975), or the exact one."""
+        """The factor c of w'/w'_minus in g, by its name.
+
+        3 (1 - r)/2, the paper's: Hunt and Crossley, J. Appl. Mech. 42 (1975) 440. 3 (1 - r^2)/4: Lankarani and
+        Nikravesh, J. Mech. Des. 112 (1990) 369. 8 (1 - r)/(5 r): Flores, Machado, Silva and Martins, Multibody Syst.
+        Dyn. 25 (2011) 357. ``exact``: the one whose impact has the restitution r.
+        """
         e = self.restitution
-        if not self.exact or e > 1 - 1e-6:
+        if self.factor == "lankarani-nikravesh":
+            return 0.75 * (1 - e**2)
+        if self.factor == "flores":
+            return 1.6 * (1 - e) / e
+        if self.factor != "exact" or e > 1 - 1e-6:
             return 1.5 * (1 - e)
         return float(brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), (1 - 1e-12) / e, (e,)))
 

@@ -69,8 +69,8 @@ class Integrator(Engine):
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
         # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
         # as h^(5/2). The shares are those that the controller settles at.
-        hertz = model.contact.law == "hertz"
-        share, order = (1 / 200, 2.5) if hertz else (1 / 20, 8)
+        bends = any(law.exponent != 1 for law in model.laws or (model.contact,))
+        share, order = (1 / 200, 2.5) if bends else (1 / 20, 8)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
         self.observe(self.tracker.start)
 

@@ -1,0 +1,113 @@
+"""The laws and stops of the sites of a case: one for all, with lists over the sites where they differ."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from vipetsc.case.reading import Problem, Table, Valid
+from vipetsc.case.sites import ContactsTable
+from vipetsc.lattice import Contact, contact_stiffness
+from vipetsc.lattice.contact import LEAST_RESTITUTION
+
+MATERIAL = ("modulus", "radius", "poisson")
+SIDES = ("side", "clearance_minus")
+Gaps = tuple[tuple[float, float], ...]
+
+
+def lists_of(contacts: ContactsTable) -> dict[str, list[Any]]:
+    """The lists over sites, by key."""
+    return contacts.each.model_dump(exclude_none=True) if contacts.each else {}
+
+
+def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
+    """The value of a ``key`` of ``[contacts]`` at each of ``count`` sites."""
+    return lists_of(contacts).get(key) or [getattr(contacts, key)] * count
+
+
+def check_each(contacts: ContactsTable, count: int, gaps: list[float], valid: Valid) -> Iterator[Problem]:
+    """What is wrong with the laws and the stops of ``count`` sites with the clearances ``gaps`` in m."""
+    each, where = lists_of(contacts), lambda key: f"contacts.{'each.' if key in lists_of(contacts) else ''}{key}"
+    for key, values in each.items():
+        if len(values) != count:
+            yield Problem(f"contacts.each.{key}", values, f"one value for each of the {count} sites is needed")
+            return
+    if each.keys() & {*MATERIAL} and (contacts.stiffness is not None or "stiffness" in each):
+        yield Problem("contacts.stiffness", contacts.stiffness, "give it or the material of each site, not both")
+        return
+    if not valid("contacts"):
+        return
+    if each.keys() & {*MATERIAL} and (lacking := [k for k in MATERIAL if None in values_of_sites(contacts, k, count)]):
+        yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
+    laws = values_of_sites(contacts, "law", count) if count else [contacts.law]
+    exponents = values_of_sites(contacts, "exponent", max(count, 1))
+    if ("power" in laws) != (exponents != [None] * len(exponents)):
+        remedy = 'is for law = "power"' if "power" not in laws else 'missing; the law "power" needs it'
+        yield Problem(where("exponent"), each.get("exponent", contacts.exponent), remedy)
+    names, restitutions = (values_of_sites(contacts, key, count) for key in ("damping", "restitution"))
+    for name, asked in sorted(set(zip(names, restitutions, strict=True)), key=str) or [
+        (contacts.damping, contacts.restitution)
+    ]:
+        if name in ("exact", "flores") and asked < LEAST_RESTITUTION:
+            remedy = f"the {name} damping grows without bound towards 0; at least {LEAST_RESTITUTION}"
+            yield Problem(where("restitution"), asked, remedy)
+    stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
+    for number, (plus, minus) in enumerate(stops, 1):
+        if min(plus, minus) == 0 and max(plus, minus) < np.inf:
+            remedy = "a clearance of 0 needs a stop on one side alone: contacts.side"
+            yield Problem("contacts.clearance", 0.0, f"site {number}: {remedy}")
+            return
+
+
+def check_alike(contacts: ContactsTable) -> Iterator[Problem]:
+    """For a verb that knows one law and two equal stops a site: what a case has beyond that."""
+    told = {key: getattr(contacts, key) for key in ("each", *SIDES) if getattr(contacts, key) is not None}
+    for key in told:
+        remedy = "this verb knows one law for all sites, and equal stops on both sides; leave it out"
+        yield Problem(f"contacts.{key}", None if key == "each" else told[key], remedy)
+    if contacts.clearance == 0 or (isinstance(contacts.clearance, list) and 0 in contacts.clearance):
+        yield Problem("contacts.clearance", contacts.clearance, "must be positive for this verb")
+
+
+def resolved_each(contacts: ContactsTable, count: int) -> Table:
+    """The lists over sites, with a stiffness in place of a material."""
+    each = lists_of(contacts)
+    if each.keys() & {*MATERIAL}:
+        rows = zip(*(values_of_sites(contacts, key, count) for key in MATERIAL), strict=True)
+        each = {key: values for key, values in each.items() if key not in MATERIAL}
+        each["stiffness"] = [float(contact_stiffness(*row)) for row in rows]
+    return each
+
+
+def contact_of(contacts: ContactsTable) -> Contact:
+    """The law of all sites of a resolved case; the stiffness is 0 where none is given."""
+    about = contacts.restitution, contacts.adhesion, contacts.approach_floor, contacts.damping or "paper"
+    return Contact(contacts.law, contacts.stiffness or 0.0, *about, contacts.exponent)
+
+
+def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
+    """The law of each site of a resolved case; () if they are alike."""
+    each = lists_of(contacts)
+    if not each.keys() - {*SIDES}:
+        return ()
+    keys, laws = [key for key in each if key not in SIDES], []
+    for values in zip(*(each[key] for key in keys), strict=True):
+        of_site = contacts.model_copy(update=dict(zip(keys, values, strict=True)))
+        laws.append(contact_of(of_site.model_copy(update={} if of_site.law == "power" else {"exponent": None})))
+    return tuple(laws)
+
+
+def stops_told(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
+    """What is said of each site's stops, in mm."""
+    told = ({"+": plus, "-": minus} for plus, minus in gaps)
+    texts = [" ".join(f"{s}{1e3 * gap:.4g}" for s, gap in stops.items() if gap < np.inf) for stops in told]
+    return texts or [f"{1e3 * gap:.4g}" for gap in clearances]
+
+
+def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
+    """Clearances in m on the sides + and - of each site, inf without a stop; () if they are ``gaps`` on both."""
+    sides, minus = (values_of_sites(contacts, key, len(gaps)) for key in SIDES)
+    both = zip(gaps, minus, sides, strict=True)
+    rows = [(plus, plus if other is None else other, side) for plus, other, side in both]
+    stops = tuple((np.inf if s == "minus" else a, np.inf if s == "plus" else b) for a, b, s in rows)
+    return () if all(a == b for a, b in stops) else stops

@@ -1,0 +1,70 @@
+"""The section of a case about its contact sites: where they are, their laws and their stops."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from vipetsc.case.reading import Section
+from vipetsc.case.schema import MOST_SITES, NotNegative, Positive
+from vipetsc.lattice.contact import Damping, Law
+
+Side = Literal["both", "plus", "minus"]
+Restitution = Annotated[float, Field(ge=0, le=1)]
+Exponent = Annotated[float, Field(ge=1, le=10)]
+Poisson = Annotated[float, Field(gt=-1, le=0.5)]
+
+
+class Span(Section):
+    """``count`` sites evenly from cell ``first`` to cell ``last`` (1-based), or every ``spacing``-th from ``first``."""
+
+    first: int
+    last: int | None = None
+    spacing: int | None = Field(None, ge=1)
+    count: int = Field(ge=1, le=MOST_SITES)
+
+
+class ClearanceSpan(Section):
+    """Clearances in m, log-spaced from the leading to the last site."""
+
+    first: Positive
+    last: Positive
+
+
+class EachTable(Section):
+    """What differs from site to site: lists, one value a site, in place of the values of ``[contacts]``."""
+
+    law: list[Law] | None = None
+    exponent: list[Exponent] | None = None
+    modulus: list[Positive] | None = None
+    radius: list[Positive] | None = None
+    poisson: list[Poisson] | None = None
+    stiffness: list[Positive] | None = None
+    restitution: list[Restitution] | None = None
+    damping: list[Damping] | None = None
+    side: list[Side] | None = None
+    clearance_minus: list[NotNegative] | None = None
+
+
+class ContactsTable(Section):
+    """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances.
+
+    ``damping``: ``paper`` (if left out), which is ``hunt-crossley``, ``exact`` or another by name: see
+    ``vipetsc.lattice.Contact``. ``side``: on which side of w = u_resonator - u_host stops are; ``clearance_minus`` is
+    that of the side -, if it differs. ``each`` has lists over the sites.
+    """
+
+    law: Law = "hertz"
+    exponent: Exponent | None = None
+    modulus: Positive | None = None
+    radius: Positive | None = None
+    poisson: Poisson | None = None
+    stiffness: Positive | None = None
+    restitution: Restitution = 1.0
+    damping: Damping | None = None
+    sites: Annotated[int, Field(ge=0, le=MOST_SITES)] | list[int] | Span = 0
+    clearance: NotNegative | list[NotNegative] | ClearanceSpan | None = None
+    clearance_minus: NotNegative | None = None
+    side: Side | None = None
+    each: EachTable | None = None
+    adhesion: Literal["allow", "clip"] = "allow"
+    approach_floor: Annotated[float, Field(ge=0)] = 0.0
