@@ -24,7 +24,7 @@ from vipetsc.modes.continuation import ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.follow import claim_branches, follow_all
 from vipetsc.modes.harmonics import SiteForces
-from vipetsc.modes.point import Point
+from vipetsc.modes.point import Point, resonance
 from vipetsc.modes.shooting import MAPS, Relative, Shooting
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
@@ -304,3 +304,25 @@ def test_branches_shot_with_dense_matrices_have_no_start_frequency():
         text = BREATHER.format(omega=4000.0, points=3, cells=3, site=2).replace("condensed", system)
         with pytest.raises(CaseError, match=r"nnm.start_frequency"):
             NnmCase.from_toml(text)
+
+
+def test_the_tongues_of_the_in_phase_mode_are_followed():
+    """Kerschen's 3:1 and 5:1: a harmonic balance passes their tips, and shooting from it finds the same orbits."""
+    problem, points = branch(KERSCHEN, 0, 1.0, truncation=1e-7, points=130, largest_step=0.15)
+    energy = np.array([p.energy for p in points])
+    tips = 1 + np.nonzero((energy[1:-1] > energy[:-2]) & (energy[1:-1] > energy[2:]))[0]
+    assert energy[tips] == pytest.approx([4679, 2100, 107310], rel=1e-2)
+    shooting, counts = Shooting(Dop853Flow(KERSCHEN), MAPS["quarter"], 1e-12), []
+    for i in (*tips, *(tips + 4)):
+        point, u, before = points[i], displacement(problem, points[i]), displacement(problem, points[i - 1])
+        chart = Relative(KERSCHEN, u, point.period)
+        xi = chart.encode(u, point.period)
+        row = xi - chart.encode(before, points[i - 1].period)  # at the same length along the branch
+        attempt = shooting.solve(chart, xi, row / np.linalg.norm(row), row @ xi / np.linalg.norm(row))
+        orbit = Point.of(shooting, attempt, chart)
+        assert attempt.converged
+        assert orbit.frequency == pytest.approx(point.frequency, rel=1e-8)
+        assert orbit.energy == pytest.approx(point.energy, rel=1e-6)
+        counts.append(resonance(shooting, orbit))
+    assert counts[:3] == [3, 3, 5]
+    assert max(p.last for p in points) < 100

@@ -64,9 +64,13 @@ class CondensedProblem:
 
     def prepare(self, point: CondensedPoint) -> np.ndarray:
         """Choose the harmonics for motions near ``point``, and give its unknowns (n,) with so many."""
-        share, last = max(point.truncation / self.control.truncation, 1e-3), point.last
-        if not FEWER < share < MORE:
-            last = max(int(last * min((share / AIM) ** (1 / 3), 2.0)) // 2 * 2 + 1, FEWEST)
+        allowed, last = self.control.truncation, point.last
+        if point.truncation >= MORE * allowed:
+            last = int(last * min((point.truncation / allowed / AIM) ** (1 / 3), 2.0)) // 2 * 2 + 1
+        elif point.truncation <= FEWER * allowed:
+            sizes = np.abs(point.x.reshape(self.forces.pairs, -1))
+            needed = (sizes[:, ::-1].cumsum(axis=1)[:, ::-1] > AIM * allowed * sizes.sum(axis=1).max()).any(axis=0)
+            last = max(min(int(needed.sum()) * (1 + self.forces.odd) // 2 * 2 + 1, last), FEWEST)
         self.select(min(last, self.control.harmonics), 2 * np.pi / point.period)
         return self.resized(point.x, self.balance.last)
 
