@@ -15,26 +15,23 @@ from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.engine import Stretch
 from vipetsc.dynamics.layout import Burst, Layout, create_record
 from vipetsc.dynamics.propagator.collocation import (
-    EXIT,
     HISTORY,
-    NODES,
-    ONSET,
-    PLAIN,
     SUBSTEP_STATE,
     Cluster,
     Substep,
     Trial,
     accumulate_moments,
     collocate,
-    collocation,
     create_trial,
     error_ratio,
     update_taylor,
 )
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
-from vipetsc.dynamics.propagator.series import StepSeries, apply_impulses, evaluate, expand_free_motion, shift
+from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
+from vipetsc.dynamics.propagator.series import StepSeries, evaluate, shift
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.propagator.tables import apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.tape import create_tape
 from vipetsc.dynamics.samples import Samples
 from vipetsc.dynamics.vectors import LANES

@@ -11,7 +11,7 @@ from tests.conftest import StopAt, assert_same_bits, datasets, small_case
 from vipetsc.case import Case
 from vipetsc.contact.law import create_contacts
 from vipetsc.dynamics import simulate
-from vipetsc.dynamics.propagator.collocation import collocation
+from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries, first_onset
 from vipetsc.lattice import Contact, pass_bands
 from vipetsc.lattice.chain import Chain
@@ -245,7 +245,7 @@ def test_rows_near_an_end_turn_into_the_stencil(interval):
     far = Chain(chain.cell, 200, "fixed")
     interior = StepSeries(far, interval, 1e-14).interior()
     r = series.reach
-    end = series.stencil(series.rows(r - 1, 0, 2 * r))
+    end = series.stencil(series.cut(*series.rows([r - 1]), 1 - r, 2 * r))
     # The last of the end's cells meets the wall only in its farthest entries.
     np.testing.assert_allclose(end[:, :, r:], interior[:, :, r + 1 :][:, :, :r], rtol=1e-9, atol=1e-9)
 

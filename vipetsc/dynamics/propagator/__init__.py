@@ -51,7 +51,20 @@ so that one exchange of ``HaloRegions`` a step is all that ranks must say to eac
 against the size of its clusters. Its loop over a block of samples is compiled as a whole: ranks agree on requests and
 failures at a block's end, to which a rank that cannot follow its contacts goes on without them.
 
-**7. Variations** of the state beside an orbit move by P and by one small matrix a step in contact: ``variations``.
+**7. Dashpots.** With M u'' = -K u - C u' + f free motion has all powers of s, and with P_0 = 1, Q_0 = 0 (``rows``)
+
+    u(s) = sum_k s^k/k! (P_k u_0 + Q_k H u'_0),   P_(k+1) = -Q_k H^2 M^-1 K,   Q_(k+1) = P_k - Q_k H M^-1 C.
+
+In the norm of the energy the state turns by no more than [gamma + (gamma^2 + 4 omega_max^2)^1/2]/2, gamma from
+Gershgorin's circles of M^-1/2 C M^-1/2: H times that is theta in the bounds of 1. M p^2 + C p + K is symmetric, so is
+its inverse, and Q_k M^-1: in 3 and 5, where G has all powers, M^-1 (c Q_k)^T is the motion after an impulse.
+
+**8. Cells that differ** have rows of their own, with the masses, springs and dashpots of the cells up to r + 1 away;
+what those beyond would change took a way out there and back, and counts as entries left out once more. Cells with equal
+ones around them share their rows. omega_max and gamma are the largest of all cells; r and the truncation are those of a
+lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude that any cell's has.
+
+**9. Variations** of the state beside an orbit move by P and by one small matrix a step in contact: ``variations``.
 
 References
 ----------

@@ -10,10 +10,6 @@ from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.law import CLOSED, FREE, contact_force, gap_of
 from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.dynamics.propagator.collocation import (
-    EXIT,
-    NODES,
-    ONSET,
-    PLAIN,
     Cluster,
     Substep,
     Trial,
@@ -23,6 +19,7 @@ from vipetsc.dynamics.propagator.collocation import (
     evaluate_site_motion,
     update_taylor,
 )
+from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, or without progress.

@@ -1,26 +1,21 @@
 """Collocation of the forces in a substep of a cluster, and what they leave: motion, error estimate, moments.
 
-Sec. 3 and 5 of the derivation in the package's docstring. With Hertz's law a force begins and ends as the power 3/2 of
-time. Nodes laid out evenly in the root of the time since the onset, or before the separation, see a smooth function:
-``ONSET`` and ``EXIT`` beside ``PLAIN``.
+Sec. 3 and 5 of the derivation in the package's docstring.
 """
 
 from collections import namedtuple
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss, legval
 from scipy.special import binom
 
-from vipetsc.compiled import kernel
+from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.layout import Burst, drive_force
+from vipetsc.dynamics.propagator.nodes import NODES, Collocation
 from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
 from vipetsc.dynamics.propagator.tape import Tape
 
-NODES = 8
-PLAIN, ONSET, EXIT = range(3)
 MOST_SWEEPS = 60
 # Responses smaller than this, beside the first one, are left out.
 SMALLEST_RESPONSE = 1e-18
@@ -39,50 +34,13 @@ HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation
 """A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
 
 
-class Collocation(NamedTuple):
-    """Nodes of a substep of unit length; leading axes are the three kinds.
-
-    ``share`` (3, node) and ``weight`` (3, node) integrate over it; ``powers`` (3, power, node k, node j): the
-    integral from 0 to node j of (share_j - s)^power times node k's Lagrange polynomial; ``tail`` (2, node): the
-    last two Legendre coefficients of a function from its values at the nodes.
-    """
-
-    share: np.ndarray
-    weight: np.ndarray
-    powers: np.ndarray
-    tail: np.ndarray
-
-
-def _lay_out(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Share of the substep (3, ...) at ``x`` in [0, 1] for each kind of nodes, and its slope."""
-    return np.stack([x, x * x, x * (2 - x)]), np.stack([np.ones_like(x), 2 * x, 2 - 2 * x])
-
-
-@lru_cache
-def collocation(powers: int) -> Collocation:
-    """Tables for the powers 0 to ``powers`` - 1."""
-    # The finer ones are exact for all products: degree 2 powers + NODES + 1.
-    rules = leggauss(NODES), leggauss(powers + NODES)
-    (x, w), (fine, fine_weight) = (((1 + at) / 2, weight / 2) for at, weight in rules)
-    at = x[:, None] * fine  # (node j, fine)
-    (share, slope), (share_at, slope_at) = _lay_out(x), _lay_out(at)
-    lagrange = np.stack([np.prod([(at - a) / (b - a) for a in x if a != b], axis=0) for b in x])  # (node k, j, fine)
-    integrand = lagrange * (slope_at * fine_weight * x[:, None])[:, None]
-    lag = share[:, :, None] - share_at
-    power, table = np.ones_like(lag), []
-    for _ in range(powers):
-        table.append(np.einsum("tjf,tkjf->tkj", power, integrand))
-        power = power * lag
-    tail = np.stack([(2 * k + 1) * w * legval(2 * x - 1, np.eye(NODES)[k]) for k in (NODES - 2, NODES - 1)])
-    return Collocation(share, w * slope, np.stack(table, axis=1), tail)
-
-
 class Cluster(NamedTuple):
     """A cluster, or all that a rank feels one after another: constants, and what changes as it is advanced.
 
     The DoFs of a cluster are its sites, those of ``contacts``, and where it is in reach the driven mass with the
     ``burst``. ``response`` (dof, dof of the same cluster, term) is the motion of one after an impulse on another, times
-    H; ``interval`` is H in s, ``atol`` in m/s; a contact begins with the share ``first_substep`` of its duration.
+    H, in powers 2 m + 1 of s, with dashpots m + 1 (2 term - 1 of them); ``interval`` is H in s, ``atol`` in m/s; a
+    contact begins with the share ``first_substep`` of its duration.
     ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``site_motion`` (dof, 3) w,
     w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
     ``energy`` (dof,) in J what sites dissipated and the work of the drive; ``history`` (dof,) is of dtype ``HISTORY``,
@@ -140,7 +98,8 @@ def create_trial(dofs: int, terms: int) -> Trial:
     """Room for a substep of ``dofs`` DoFs, all of which are active."""
     numbers, taylor, (force, w, v) = np.arange(dofs), np.zeros((dofs, 2 * terms)), np.zeros((3, dofs, NODES))
     pairs = *np.zeros((2, dofs, NODES)), *np.zeros((2, dofs, dofs, NODES, NODES)), np.zeros((dofs, dofs), bool)
-    rest = *np.zeros((2, NODES)), np.zeros(dofs), np.zeros(2 * terms), np.zeros((terms, 2 * terms)), np.zeros((2, 6))
+    series = np.zeros((2 * terms, 2 * terms))
+    rest = *np.zeros((2, NODES)), np.zeros(dofs), np.zeros(2 * terms), series, np.zeros((2, 6))
     return Trial(numbers, numbers.copy(), force, w, v, taylor, np.zeros((dofs, 3)), Sums(*pairs, *rest))
 
 
@@ -161,22 +120,31 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
         out[i, 2] = acceleration / (h * h)
 
 
+@inlined
+def has_all_powers(cluster: Cluster) -> bool:
+    """Whether responses have all powers of time, not odd ones alone: whether there are dashpots."""
+    return 2 * cluster.response.shape[2] > cluster.taylor.shape[1]
+
+
 @kernel
 def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
     """Fill (node k, node) with what DoF ``j``'s force at node k adds to w, w' of DoF ``i``; whether it reaches it."""
     to_w[:] = to_v[:] = 0.0
-    power, size, reaches = substep.length, 1.0, False
+    size, reaches, all_powers = 1.0, False, has_all_powers(cluster)
+    power, ratio = substep.length, substep.length if all_powers else substep.length * substep.length
     for m in range(cluster.response.shape[2]):
+        p = m + 1 if all_powers else 2 * m + 1
         g = cluster.response[i, j, m]
         if g != 0.0:
             reaches = True
-            by_w, by_v = g * power * substep.length, g * power * (2 * m + 1) / cluster.interval
+            by_w, by_v = g * power * substep.length, g * power * p / cluster.interval
             for k in range(NODES):
                 for node in range(NODES):
-                    to_w[k, node] += by_w * cluster.nodes.powers[substep.kind, 2 * m + 1, k, node]
-                    to_v[k, node] += by_v * cluster.nodes.powers[substep.kind, 2 * m, k, node]
-        power *= substep.length * substep.length
-        size *= (cluster.omega_max_h * substep.length) ** 2 / ((2 * m + 2) * (2 * m + 3))
+                    to_w[k, node] += by_w * cluster.nodes.powers[substep.kind, p, k, node]
+                    to_v[k, node] += by_v * cluster.nodes.powers[substep.kind, p - 1, k, node]
+        power *= ratio
+        turned = cluster.omega_max_h * substep.length
+        size *= turned / (p + 1) if all_powers else turned**2 / ((2 * m + 2) * (2 * m + 3))
         if size < SMALLEST_RESPONSE:
             break
     return reaches
@@ -246,22 +214,23 @@ def update_taylor(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """The series of all DoFs' free motion after a substep in which the forces of ``trial`` acted, into ``trial``."""
     shift(cluster.taylor, substep.length, trial.taylor)
     (dofs, _, terms), moments, series = cluster.response.shape, trial.sums.moments, trial.sums.series
+    by, coefficients = 1 if has_all_powers(cluster) else 2, cluster.taylor.shape[1]
     for source in trial.active:
         moments[:] = 0.0
         for node in range(NODES):
             amount = substep.length * cluster.nodes.weight[substep.kind, node] * trial.force[source, node]
             lag = substep.length * (1.0 - cluster.nodes.share[substep.kind, node])
-            for k in range(2 * terms):
+            for k in range(coefficients):
                 moments[k] += amount
                 amount *= lag
         for m in range(terms):
-            for k in range(2 * m + 2):
-                series[m, k] = BINOMIALS[2 * m + 1, k] * moments[2 * m + 1 - k]
+            for k in range(by * m + 2):
+                series[m, k] = BINOMIALS[by * m + 1, k] * moments[by * m + 1 - k]
         for i in range(dofs):
             for m in range(terms):
                 g = cluster.response[i, source, m]
                 if g != 0.0:
-                    for k in range(2 * m + 2):
+                    for k in range(by * m + 2):
                         trial.taylor[i, k] += g * series[m, k]
 
 

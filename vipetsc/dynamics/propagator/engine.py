@@ -17,8 +17,9 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.collocation import Cluster
 from vipetsc.dynamics.propagator.forces import Forces, follow_contacts, group_dofs
-from vipetsc.dynamics.propagator.series import DofTables, StepSeries, apply_impulses, expand_free_motion
+from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.propagator.tables import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.parallel import StopRequest
 
@@ -147,9 +148,7 @@ class Propagator(Engine):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """Dashpots, cells that differ, a lattice shorter than P's band, or too many sites close to one another."""
-        if model.chain.is_damped or not model.chain.is_uniform():
-            return "the lattice has dashpots or cells that differ"
+        """A lattice shorter than P's band, or too many sites that feel one another within a step."""
         series = step_series(model)
         if series is None:
             shortest = StepSeries(model.chain, model.sample_interval / MOST_PARTS, model.rtol)

@@ -4,7 +4,6 @@ Sec. 5 and 6 of the derivation in the package's docstring.
 """
 
 from collections.abc import Mapping, Sequence
-from math import factorial
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -18,9 +17,11 @@ from vipetsc.contact.law import FREE, impact_time
 from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, switch_sites, update_episode, with_room
 from vipetsc.dynamics.layout import Layout, create_burst, join, site_records
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
-from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, collocation, create_trial
-from vipetsc.dynamics.propagator.series import DofTables, StepSeries
+from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, create_trial
+from vipetsc.dynamics.propagator.nodes import collocation
+from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
+from vipetsc.dynamics.propagator.tables import DofTables, owned_cells
 from vipetsc.dynamics.propagator.tape import create_tape, select_tape
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
@@ -240,32 +241,28 @@ class Forces:
         self.tracker.restore(tables["sites"])
 
 
-def _owned_cells(cells: np.ndarray, reach: int, layout: Layout) -> np.ndarray:
-    """Local numbers (dof, 2 reach + 1) of what lies within ``reach`` of ``cells`` (dof,), -1 where nothing is owned."""
-    around = cells[:, None] + np.arange(-reach, reach + 1)
-    around = around % layout.cells if layout.periodic else around
-    return np.where((around >= layout.start) & (around < layout.stop), around - layout.start, -1)
-
-
 def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> DofTables:
     """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
     numbers, dofs, r = groups.numbers, contact_dofs(model)[groups.numbers], series.reach
-    # DoFs away from the ends share their rows.
-    kinds = 2 * np.where(series.is_interior(dofs["cell"]), -1, dofs["cell"]) + (numbers < 0)
-    _, examples, table = np.unique(kinds, return_index=True, return_inverse=True)
-    rows = []
-    for dof in dofs[examples]:
-        around = series.rows(int(dof["cell"]), int(dof["cell"]) - r, 2 * r + 1).astype(float)
-        rows.append(np.einsum("i,imjc->jcm", dof["form"], around))
+    # DoFs share their rows where the cells around them do.
+    kinds = np.column_stack([series.like(dofs["cell"]), dofs["form"]])
+    kinds, table = np.unique(kinds, axis=0, return_inverse=True)
+    cells, forms = kinds[:, 0].astype(np.int64), kinds[:, 1:]
+    rows = [
+        np.einsum("i,imjc->jcm", form, series.cut(around, -r, 2 * r + 1).astype(float))
+        for form, around in zip(forms, series.rows(cells), strict=True)
+    ]
+    masses = [model.chain.coefficients(cell - r, cell + r + 1).masses.T for cell in cells.tolist()]
+    halves = 1 + series.is_damped
     places = np.full(len(model.chain.sites) + 1, -1)
     places[numbers] = np.arange(len(numbers))
     return DofTables(
         column=halo.add(dofs["cell"] - r, 2 * r + 1),
-        owned=_owned_cells(dofs["cell"], r, layout),
+        owned=owned_cells(dofs["cell"], r, layout),
         table=table,
-        rows=np.array(rows).reshape(len(rows), layout.dofs, 2 * r + 1, series.terms),
-        factors=np.array([series.interval ** (k % 2) / factorial(k) for k in range(2 * series.terms)]),
-        inverse_masses=1 / np.asarray(model.chain.cell.masses),
+        rows=np.array(rows).reshape(len(rows), halves * layout.dofs, 2 * r + 1, halves * series.terms),
+        factors=series.factors(),
+        inverse_masses=1 / np.array(masses).reshape(len(rows), layout.dofs, 2 * r + 1),
         # An onset within rounding of the clearance is one.
         clearance=dofs["clearance"] * (1 - 1e-9),
         driven=int(places[-1]),
@@ -275,16 +272,17 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
 
 
 def _responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
-    """Motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H, in powers 2 m + 1 of s."""
+    """Motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H: ``Cluster.response``."""
     dofs, n, (first, r) = contact_dofs(model), model.chain.cells, (groups.first, series.reach)
-    factors, cells = tables.factors[1::2] * series.interval, dofs["cell"][groups.numbers]
-    # After an impulse on a site, on the driven mass: (source, table, cell, term).
-    weights = tables.inverse_masses * dofs["form"][[0, -1]]
-    of_source = [
-        [[factors * (weight @ rows[:, c]) for c in range(2 * r + 1)] for rows in tables.rows] for weight in weights
-    ]
+    cells, d, damped = dofs["cell"][groups.numbers], model.chain.cell.dofs, series.is_damped
+    # From velocities: (table, mass, cell, term).
+    rows, factors = tables.rows[:, -d:, :, damped:], tables.factors[1::2] * series.interval
+    if damped:
+        factors = tables.factors[2 * series.terms + 1 :] * series.interval
+    _, examples = np.unique(tables.table, return_index=True)
+    weights = tables.inverse_masses[:, :, r] * dofs["form"][groups.numbers[examples]]
     sizes = np.diff(first)
-    response = np.zeros((len(cells), max(sizes, default=0), series.terms))
+    response = np.zeros((len(cells), max(sizes, default=0), rows.shape[-1]))
     for j in range(response.shape[1]):
         targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
         sources = np.repeat(first[:-1], sizes)[targets] + j
@@ -293,6 +291,8 @@ def _responses(groups: Groups, tables: DofTables, model: Model, series: StepSeri
             offsets = (offsets + n // 2) % n - n // 2
         near = np.abs(offsets) <= r
         targets, sources, offsets = targets[near], sources[near], offsets[near]
-        is_driven = (groups.numbers[sources] < 0).astype(np.int64)
-        response[targets, j] = np.array(of_source)[is_driven, tables.table[targets], r + offsets]
+        pairs = np.column_stack([tables.table[targets], tables.table[sources], r + offsets])
+        pairs, which = np.unique(pairs, axis=0, return_inverse=True)
+        of_pairs = [factors * (weights[source] @ rows[target, :, at]) for target, source, at in pairs.tolist()]
+        response[targets, j] = np.reshape(of_pairs, (-1, rows.shape[-1]))[which]
     return response

@@ -1,24 +1,26 @@
-"""The Taylor series of free motion: the rows of the powers of -H^2 M^-1 K, how many count, and how far they reach.
+"""The Taylor series of free motion: how many powers count, how far they reach, which cells share their rows.
 
-With them, the free motion of the contact DoFs and, by Maxwell's reciprocity, what impulses on these leave in the
-lattice: sec. 1, 2 and 5 of the derivation in the package's docstring.
+Sec. 1, 2, 7 and 8 of the derivation in the package's docstring.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache, cached_property
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import factorial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.compiled import kernel, njit
+from vipetsc.compiled import kernel
 from vipetsc.contact.changes import LANDED_W
 from vipetsc.contact.law import gap_of
+from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, power_rows, turns_around
 from vipetsc.lattice.chain import Chain
 
 MOST_TERMS = 24
+# Cells whose rows are computed together.
+BATCH = 64
 # Shares of a step below this are rounding.
 ROUNDING = 1e-15
 
@@ -28,8 +30,9 @@ class StepSeries:
     """Series of the motion of ``chain`` over a step of ``interval`` H in s, to a relative ``tolerance``.
 
     Rows are arrays (..., term, dof, cell): what a displacement's coefficients take from the displacements around
-    it; the same rows, times H, give those of the velocities. A chain that is not periodic must have more than
-    2 ``reach`` cells.
+    it; the same rows, times H, give those of the velocities. With dashpots (..., 2 term, 2 dof, cell): what the
+    coefficient of each power of time takes from displacements and from H times velocities. A chain that is not
+    periodic must have more than 2 ``reach`` cells.
     """
 
     chain: Chain
@@ -37,18 +40,23 @@ class StepSeries:
     tolerance: float
 
     @cached_property
+    def bounds(self) -> Bounds:
+        """What no cell exceeds."""
+        return bounds_of(self.chain)
+
+    @property
+    def is_damped(self) -> bool:
+        """Whether there is a dashpot."""
+        return self.bounds.damping > 0
+
+    @property
     def omega_max_h(self) -> float:
-        """Bound on omega H of the modes of any lattice of this cell, by Gershgorin's circles."""
-        cell = self.chain.cell
-        root = 1 / np.sqrt(np.asarray(cell.masses))
-        rows = np.zeros(cell.dofs)
-        for mass, _, other, stiffness, *_ in cell.couplings():
-            rows[mass] += stiffness * root[mass] * (root[mass] + root[other])
-        return float(np.sqrt(rows.max())) * self.interval
+        """Bound on omega H of the modes of any lattice of these cells; with dashpots on the norm of what turns them."""
+        return self.bounds.rate * self.interval
 
     @cached_property
     def terms(self) -> int:
-        """Number of powers of K in the series, the zeroth included."""
+        """Number of powers of K in the series, the zeroth included; with dashpots half the powers of time."""
         return next((m for m in range(1, MOST_TERMS) if self._remainder(m) <= self.tolerance / 4), MOST_TERMS)
 
     def _remainder(self, terms: int) -> float:
@@ -58,37 +66,49 @@ class StepSeries:
 
     @property
     def _width(self) -> int:
-        """Cells each way that no power of K in the series reaches."""
-        return self.terms + 1
+        """Cells each way that no power in the series reaches."""
+        return (1 + self.is_damped) * self.terms + 1
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        """The zeroth power's rows (1, dof, dof, cell) over all cells within ``_width``."""
+        n = self.chain.cell.dofs
+        rows = np.zeros((1, n, n, 2 * self._width + 1), np.longdouble)
+        rows[..., self._width] = np.eye(n)
+        return rows
 
     @cached_property
     def _interior(self) -> np.ndarray:
         """Rows (dof, term, dof, cell) of an interior cell over all cells within ``_width``."""
-        return self._powers()
+        alone = replace(self.chain, variation=None)
+        turns = turns_around(alone, self.interval, np.zeros(1, int), np.ones((1, 2 * self._width + 1), bool), 0)
+        return power_rows(self._first, self.terms, turns)[0]
 
-    @cached_property
-    def _near_end(self) -> Callable[[int], np.ndarray]:
-        """As ``_interior``, of a cell near an end; each is computed once."""
-
-        def powers(cell: int) -> np.ndarray:
-            cells = np.arange(cell - self._width, cell + self._width + 1)
-            return self._powers((cells >= 0) & (cells < self.chain.cells))
-
-        return cache(powers)
-
-    @cached_property
-    def _share(self) -> np.ndarray:
+    def _magnitudes(self, rows: np.ndarray) -> np.ndarray:
         """Magnitudes of P's entries (2 dof, 2 dof, cell) for it, a velocity counted as omega times a displacement."""
         n, omega = self.chain.cell.dofs, self.omega_max_h / self.interval
-        share = np.abs(self.stencil(self._interior))
+        share = np.abs(self.stencil(rows))
         share[:n, n:] *= omega
         share[n:, :n] /= omega
         return share
 
+    @cached_property
+    def _share(self) -> np.ndarray:
+        """Those of an interior cell."""
+        return self._magnitudes(self._interior)
+
+    @cached_property
+    def _largest_share(self) -> np.ndarray:
+        """Those that no cell's exceed."""
+        if self.chain.variation is None:
+            return self._share
+        return self._magnitudes(power_rows(self._first, self.terms, self.bounds.turns(self.interval))[0])
+
     def _beyond(self, distance: int) -> float:
-        """Largest sum of these magnitudes over the cells further away than ``distance``."""
+        """Largest sum of these magnitudes over the cells further away than ``distance``; twice where cells differ."""
         is_beyond = np.abs(np.arange(-self._width, self._width + 1)) > distance
-        return float(self._share.sum(axis=1)[:, is_beyond].sum(axis=1).max())
+        left_out = float(self._largest_share.sum(axis=1)[:, is_beyond].sum(axis=1).max())
+        return left_out * (1 if self.chain.variation is None else 2)
 
     @cached_property
     def reach(self) -> int:
@@ -102,129 +122,84 @@ class StepSeries:
         small = float(np.where(self.interior() == 0.0, share, 0.0).sum(axis=(1, 2)).max())
         return self._beyond(self.reach) + small + self._remainder(self.terms)
 
-    def _powers(self, exists: np.ndarray | bool = True) -> np.ndarray:
-        """Rows (dof, term, dof, 2 width + 1) of a cell's masses; which of the cells around it ``exists``."""
-        unit, width = self.chain.cell, self._width
-        masses = np.asarray(unit.masses, np.longdouble)[:, None]
-        squared = np.longdouble(self.interval) ** 2
-        rows = [np.zeros((unit.dofs, unit.dofs, 2 * width + 1), np.longdouble)]
-        rows[0][:, :, width] = np.eye(unit.dofs)
-        for _ in range(self.terms - 1):
-            u, form = rows[-1] / masses, np.zeros_like(rows[0])
-            for mass, offset, other, stiffness, *_ in unit.couplings():
-                # No power reaches the last cells: what is rolled past them is zero.
-                force = np.roll(u[:, other], -offset, axis=-1) - u[:, mass]
-                acts = exists & np.roll(exists, -offset) if self.chain.ends == "free" else exists
-                form[:, mass] += squared * np.longdouble(stiffness) * np.where(acts, force, 0)
-            rows.append(form)
-        return np.stack(rows, axis=1)
+    def rows(self, cells: ArrayLike) -> Iterator[np.ndarray]:
+        """Rows (dof, term, dof, 2 width + 1) of the masses of each of ``cells``, centred on it.
 
-    def rows(self, cell: int, first: int, count: int) -> np.ndarray:
-        """Rows (dof, term, dof, count) of the masses of ``cell`` over ``count`` cells from ``first`` on.
-
-        Cells beyond an end of the chain get zeros; those of a periodic chain count on beyond it.
+        Computed in batches, to the same bits in any. Cells beyond an end of the chain get zeros; those of a periodic
+        chain count on beyond it.
         """
-        powers = self._interior if self.is_interior(cell) else self._near_end(int(cell))
-        begin = first - cell + self._width + count
-        return np.pad(powers, [(0, 0), (0, 0), (0, 0), (count, count)])[..., begin : begin + count]
+        cells, around = np.asarray(cells, np.int64), np.arange(-self._width, self._width + 1)
+        for part in np.split(cells, range(BATCH, len(cells), BATCH)):
+            beside = part[:, None] + around
+            exists = (beside >= 0) & (beside < self.chain.cells) | ~self._is_near_end(part)[:, None]
+            turns = turns_around(self.chain, self.interval, part, exists, self.reach + 1)
+            yield from power_rows(np.repeat(self._first, len(part), axis=0), self.terms, turns)
+
+    def cut(self, rows: np.ndarray, first: int, count: int) -> np.ndarray:
+        """The part of ``rows`` over ``count`` cells from the one ``first`` cells away on, zero where they end."""
+        begin = first + self._width + count
+        return np.pad(rows, [(0, 0), (0, 0), (0, 0), (count, count)])[..., begin : begin + count]
+
+    def factors(self) -> np.ndarray:
+        """Those of the tables: H^(k mod 2)/k!; with dashpots 1/k! for displacements, then H/k! for velocities."""
+        h, powers = self.interval, range(2 * self.terms)
+        if self.is_damped:
+            return np.array([h**i / factorial(k) for i in range(2) for k in powers])
+        return np.array([h ** (k % 2) / factorial(k) for k in powers])
+
+    def _is_near_end(self, cells: ArrayLike) -> np.ndarray:
+        """Whether an end lies within the reach of each of ``cells``."""
+        beyond = np.asarray(cells) - self.reach
+        return ((beyond < 0) | (beyond >= self.chain.cells - 2 * self.reach)) & (self.chain.ends != "periodic")
+
+    @cached_property
+    def _differing(self) -> np.ndarray:
+        """How many cells differ from the reference cell before each one, from ``reach`` + 1 before the first on."""
+        near, differs = self.reach + 1, self.chain.differs.astype(int)
+        around = np.pad(differs, near, mode="wrap") if self.chain.ends == "periodic" else np.pad(differs, near)
+        return np.append(0, np.cumsum(around))
 
     def is_interior(self, cells: ArrayLike) -> np.ndarray:
-        """Whether the ends lie outside the reach of each of ``cells``."""
-        beyond = np.asarray(cells) - self.reach
-        return (beyond >= 0) & (beyond < self.chain.cells - 2 * self.reach) | (self.chain.ends == "periodic")
+        """Whether each of ``cells`` has no end within its reach, and no cell that differs there or one further."""
+        cells = np.asarray(cells, np.int64)
+        is_far = ~self._is_near_end(cells)
+        if self.chain.variation is None:
+            return is_far
+        return is_far & (self._differing[cells + 2 * self.reach + 3] == self._differing[cells])
+
+    def like(self, cells: ArrayLike) -> np.ndarray:
+        """For each of ``cells`` the first one of them that has the same rows."""
+        cells, near, first = np.array(cells, np.int64), self.reach + 1, dict[bytes, int]()
+        interior = self.is_interior(cells)
+        cells[interior] = cells[interior][:1]
+        for i in np.flatnonzero(~interior & ~self._is_near_end(cells)):
+            around = self.chain.coefficients(cells[i] - near, cells[i] + near + 1)
+            cells[i] = first.setdefault(b"".join(array.tobytes() for array in around), int(cells[i]))
+        return cells
 
     def stencil(self, rows: np.ndarray) -> np.ndarray:
         """P's rows (2 dof, 2 dof, cell), displacements before velocities, of masses with ``rows``.
 
         ``rows`` are (dof, term, dof, cell).
         """
-        n, terms = rows.shape[0], rows.shape[1]
+        n, terms = rows.shape[0], self.terms
         inverse = 1 / np.array([factorial(k) for k in range(2 * terms)], np.longdouble)
         even, odd, h = inverse[::2], inverse[1::2], np.longdouble(self.interval)
         p = np.zeros((2 * n, 2 * n, rows.shape[-1]), np.longdouble)
-        p[:n, :n] = p[n:, n:] = np.einsum("m,imjc->ijc", even, rows)
-        p[:n, n:] = h * np.einsum("m,imjc->ijc", odd, rows)
-        p[n:, :n] = np.einsum("m,imjc->ijc", odd[:-1], rows[:, 1:]) / h
+        if rows.shape[1] > terms:
+            p[:n] = np.einsum("m,imjc->ijc", inverse, rows)
+            p[n:] = np.einsum("m,imjc->ijc", inverse[:-1], rows[:, 1:]) / h
+            p[:, n:] *= h
+        else:
+            p[:n, :n] = p[n:, n:] = np.einsum("m,imjc->ijc", even, rows)
+            p[:n, n:] = h * np.einsum("m,imjc->ijc", odd, rows)
+            p[n:, :n] = np.einsum("m,imjc->ijc", odd[:-1], rows[:, 1:]) / h
         return p.astype(float)
 
     def interior(self) -> np.ndarray:
         """P's rows (2 dof, 2 dof, 2 reach + 1) of a cell at least ``reach`` from both ends; small entries are zero."""
         entries = np.where(self._share > 1e-3 * self.tolerance, self.stencil(self._interior), 0.0)
         return entries[:, :, self._width - self.reach : self._width + self.reach + 1]
-
-
-class DofTables(NamedTuple):
-    """The contact DoFs of a rank, cluster by cluster, and what joins them to the dofs.
-
-    ``column`` (dof,) is the first column in the halo of the cells that a DoF reaches, ``owned`` (dof, cell) which of
-    the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
-    mass, cell, term); ``factors`` (2 term,) are H^(k mod 2)/k!; ``inverse_masses`` (mass,) are in 1/kg. ``clearance``
-    (dof,) in m is that of a site, inf for the DoF ``driven``, the driven mass (-1 where it is out of reach). The DoFs
-    of cluster c are ``first[c]`` to ``first[c + 1]``, those with an energy in the rank's ledger are in ``ledger``.
-    """
-
-    column: np.ndarray
-    owned: np.ndarray
-    table: np.ndarray
-    rows: np.ndarray
-    factors: np.ndarray
-    inverse_masses: np.ndarray
-    clearance: np.ndarray
-    driven: int
-    first: np.ndarray
-    ledger: np.ndarray
-
-
-@njit(error_model="numpy")
-def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
-    """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a site may reach its clearance.
-
-    Coefficients in m go into ``taylor`` (dof, 2 term); ``columns`` (2 mass, column) hold the lattice's state at the
-    beginning of the step.
-    """
-    _, masses, width, terms = dofs.rows.shape
-    even, odd, may_touch = np.empty(terms), np.empty(terms), False
-    for i in range(dofs.first[c], dofs.first[c + 1]):
-        rows, first, bound = dofs.rows[dofs.table[i]], dofs.column[i], 0.0
-        even[:] = odd[:] = 0.0
-        for j in range(masses):
-            for k in range(width):
-                u, v = columns[j, first + k], columns[masses + j, first + k]
-                row = rows[j, k]
-                for m in range(terms):
-                    even[m] += u * row[m]
-                    odd[m] += v * row[m]
-        for m in range(terms):
-            taylor[i, 2 * m] = even[m] * dofs.factors[2 * m]
-            taylor[i, 2 * m + 1] = odd[m] * dofs.factors[2 * m + 1]
-            bound += abs(taylor[i, 2 * m]) + abs(taylor[i, 2 * m + 1])
-        may_touch |= not bound < dofs.clearance[i]
-    return may_touch
-
-
-@njit(error_model="numpy")
-def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
-    """Add to the owned cells ``out`` (2 mass, cell) what forces within the step leave there at its end.
-
-    Row i of ``moments`` (dof, 2 term) belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt.
-    """
-    masses, width, terms = dofs.rows.shape[1:]
-    for i in range(moments.shape[0]):
-        if not moments[i].any():
-            continue
-        dof = first + i
-        for k in range(width):
-            c = dofs.owned[dof, k]
-            if c < 0:
-                continue
-            for j in range(masses):
-                u = v = 0.0
-                row = dofs.rows[dofs.table[dof], j, k]
-                for m in range(terms):
-                    v += row[m] * dofs.factors[2 * m] * moments[i, 2 * m]
-                    u += row[m] * dofs.factors[2 * m + 1] * moments[i, 2 * m + 1]
-                out[j, c] += u * dofs.inverse_masses[j]
-                out[masses + j, c] += v * dofs.inverse_masses[j]
 
 
 @kernel

@@ -93,15 +93,14 @@ def exchange(halo: Halo, which: int, state: np.ndarray) -> int:
 class Stencil(NamedTuple):
     """P(H) on the cells of one rank, as ``apply_propagator`` reads it.
 
-    The ``interior`` owned cells from ``first`` on see only owned ones, far from the ends: output rows are summed four
-    at a time, ``blocks`` (block, 4), of which one may be there twice. The terms of block b are ``starts[b]`` to
-    ``starts[b + 1]``: ``values`` (term, 4) times the row ``rows`` at the cell ``offsets`` away. ``borders`` (cell,
-    2 dof, 2 reach + 1, 2 dof) are dense rows of the other cells; ``border_cells`` (cell, 2) has the halo's first
-    column for each and the owned cell that it is.
+    Owned cells in the ranges ``interior`` (range, 2), half open, see only owned ones, far from the ends and from cells
+    that differ: output rows are summed four at a time, ``blocks`` (block, 4), of which one may be there twice. The
+    terms of block b are ``starts[b]`` to ``starts[b + 1]``: ``values`` (term, 4) times the row ``rows`` at the cell
+    ``offsets`` away. ``borders`` (table, 2 dof, 2 reach + 1, 2 dof) are dense rows of the other cells; ``border_cells``
+    (cell, 3) has the halo's first column for each, the owned cell that it is and its table.
     """
 
-    first: int
-    interior: int
+    interior: np.ndarray
     blocks: np.ndarray
     starts: np.ndarray
     rows: np.ndarray
@@ -112,38 +111,61 @@ class Stencil(NamedTuple):
 
 
 def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Stencil:
-    """P(H) on the cells of ``layout``; adds to ``halo`` the cells around the rank's borders and at the ends."""
+    """P(H) on the cells of ``layout``; adds to ``halo`` what borders, ends and cells that differ need around them."""
     r, n, start, stop, entries = series.reach, layout.cells, layout.start, layout.stop, series.interior()
     first, last = (start, stop) if layout.periodic else (max(start, r), min(stop, n - r))
-    left, right = max(first, start + r), min(last, stop - r)
-    if right - left < LANES:
-        left = right = last
-    borders, border_cells = [], []
-    for a, b in ((first, left), (right, last)):
-        at = int(halo.add(a - r, b - a + 2 * r if a < b else 0))
-        borders += [entries.transpose(1, 2, 0)] * (b - a)
-        border_cells += [(at + cell - a, cell - start) for cell in range(a, b)]
+    inner = np.arange(first, max(first, last))
+    interior = _ranges(series.is_interior(inner) & (inner >= start + r) & (inner < stop - r), first)
+    interior = interior[interior @ [-1, 1] >= LANES]
+    is_border, columns = np.ones(len(inner), bool), [np.zeros(0, np.int64)]
+    for a, b in interior - first:
+        is_border[a:b] = False
+    for a, b in _ranges(is_border, first).tolist():
+        columns.append(int(halo.add(a - r, b - a + 2 * r)) + np.arange(b - a))
+    ends = []
     for begin, a, b in ((0, start, min(stop, first)), (n - 2 * r, max(start, last), stop)):
-        at = int(halo.add(begin, 2 * r + 1 if a < b else 0))
-        of_cells = [series.stencil(series.rows(cell, begin, 2 * r)) for cell in range(a, b)]
-        borders += [np.pad(rows, [(0, 0), (0, 0), (0, 1)]).transpose(1, 2, 0) for rows in of_cells]
-        border_cells += [(at, cell - start) for cell in range(a, b)]
+        columns.append(np.repeat(halo.add(begin, 2 * r + 1 if a < b else 0), max(b - a, 0)))
+        ends += [(begin, cell) for cell in range(a, b)]
+    borders, table = _dense_rows(series, inner[is_border], ends)
+    cells = np.append(inner[is_border], [cell for _, cell in ends]).astype(np.int64)
     # A mass's displacement and velocity together: they read almost the same cells.
     masses = np.minimum(np.arange(layout.dofs + layout.dofs % 2), layout.dofs - 1)
     blocks = np.column_stack([masses, masses + layout.dofs]).reshape(-1, 4)
     terms = [np.nonzero(entries[block].any(axis=0)) for block in blocks]
-    rows, columns = np.hstack(terms)
+    rows, offsets = np.hstack(terms)
     return Stencil(
-        left - start,
-        right - left,
+        interior - start,
         blocks,
         np.cumsum([0, *(len(of_block) for of_block, _ in terms)]),
         rows,
-        columns - r,
+        offsets - r,
         np.hstack([entries[block][:, *term] for block, term in zip(blocks, terms, strict=True)]).T.copy(),
-        np.array(borders).reshape(-1, 2 * layout.dofs, 2 * r + 1, 2 * layout.dofs),
-        np.array(border_cells, np.int64).reshape(-1, 2),
+        borders,
+        np.column_stack([np.concatenate(columns), cells - start, table]),
     )
+
+
+def _ranges(is_in: np.ndarray, first: int) -> np.ndarray:
+    """Ranges (range, 2), half open, of the numbers from ``first`` on that are in."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], is_in, [False]]))).reshape(-1, 2) + first
+
+
+def _dense_rows(series: StepSeries, cells: np.ndarray, ends: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Tables of P's rows (table, 2 dof, 2 reach + 1, 2 dof) and which of them is that of each cell.
+
+    ``cells`` have the cells around them, ``ends`` are (first cell of those it has, cell).
+    """
+    r, d = series.reach, series.chain.cell.dofs
+    examples, table = np.unique(series.like(cells), return_inverse=True)
+    tables = np.zeros((len(examples) + len(ends), 2 * d, 2 * r + 1, 2 * d))
+    is_shared = series.is_interior(examples)
+    tables[: len(examples)][is_shared] = series.interior().transpose(1, 2, 0)
+    for i, rows in zip(np.flatnonzero(~is_shared), series.rows(examples[~is_shared]), strict=True):
+        tables[i] = series.stencil(series.cut(rows, -r, 2 * r + 1)).transpose(1, 2, 0)
+    for i, rows in enumerate(series.rows([cell for _, cell in ends])):
+        begin, cell = ends[i]
+        tables[len(examples) + i, :, : 2 * r] = series.stencil(series.cut(rows, begin - cell, 2 * r)).transpose(1, 2, 0)
+    return tables, np.append(table, len(examples) + np.arange(len(ends)))
 
 
 @njit(error_model="numpy")
@@ -151,25 +173,26 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
     """``out`` (2 dof, owned cell) = P(H) times the lattice's ``state``, whose halo is ``columns``."""
     cells, x, y, values = state.shape[1], state.reshape(-1), out.reshape(-1), stencil.values
     to, places = stencil.blocks * cells, stencil.rows * cells + stencil.offsets
-    for a in range(0, stencil.interior, LANES):
-        # The last vector overlaps the one before.
-        i = stencil.first + min(a, stencil.interior - LANES)
-        for b in range(to.shape[0]):
-            for k in range(4):
-                prefetch(x, to[b, k] + i + 2 * LANES)
-            sum0 = sum1 = sum2 = sum3 = zeros()
-            for t in range(stencil.starts[b], stencil.starts[b + 1]):
-                sum0 = add_product(sum0, values[t, 0], x, places[t] + i)
-                sum1 = add_product(sum1, values[t, 1], x, places[t] + i)
-                sum2 = add_product(sum2, values[t, 2], x, places[t] + i)
-                sum3 = add_product(sum3, values[t, 3], x, places[t] + i)
-            store(sum0, y, to[b, 0] + i)
-            store(sum1, y, to[b, 1] + i)
-            store(sum2, y, to[b, 2] + i)
-            store(sum3, y, to[b, 3] + i)
+    for first, stop in stencil.interior:
+        for a in range(first, stop, LANES):
+            # The last vector overlaps the one before.
+            i = min(a, stop - LANES)
+            for b in range(to.shape[0]):
+                for k in range(4):
+                    prefetch(x, to[b, k] + i + 2 * LANES)
+                sum0 = sum1 = sum2 = sum3 = zeros()
+                for t in range(stencil.starts[b], stencil.starts[b + 1]):
+                    sum0 = add_product(sum0, values[t, 0], x, places[t] + i)
+                    sum1 = add_product(sum1, values[t, 1], x, places[t] + i)
+                    sum2 = add_product(sum2, values[t, 2], x, places[t] + i)
+                    sum3 = add_product(sum3, values[t, 3], x, places[t] + i)
+                store(sum0, y, to[b, 0] + i)
+                store(sum1, y, to[b, 1] + i)
+                store(sum2, y, to[b, 2] + i)
+                store(sum3, y, to[b, 3] + i)
     total = np.empty(out.shape[0])
-    for cell in range(stencil.borders.shape[0]):
-        rows, (column, at) = stencil.borders[cell], stencil.border_cells[cell]
+    for column, at, table in stencil.border_cells:
+        rows = stencil.borders[table]
         total[:] = 0.0
         for row in range(rows.shape[0]):
             for k in range(rows.shape[1]):

@@ -8,10 +8,10 @@ from vipetsc.case import Model
 from vipetsc.contact.law import CLOSED
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout, create_record
-from vipetsc.dynamics.propagator.collocation import NODES
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.series import expand_free_motion
+from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
+from vipetsc.dynamics.propagator.tables import expand_free_motion
 from vipetsc.dynamics.propagator.tape import create_tape
 from vipetsc.dynamics.propagator.variations import Variations, linearise, move_variations
 from vipetsc.dynamics.samples import Samples

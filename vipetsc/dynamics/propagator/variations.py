@@ -1,6 +1,6 @@
-r"""Compiled motion of variations beside an orbit, by the same exact steps: sec. 7 of the derivation.
+r"""Compiled motion of variations beside an orbit, by the same exact steps: sec. 9 of the derivation.
 
-**7. Variations.** A step takes the lattice's state y to P y plus what the forces leave, their moments mu (sec. 5), and
+**9. Variations.** A step takes the lattice's state y to P y plus what the forces leave, their moments mu (sec. 5), and
 mu depends on y through the few coefficients a of the free motion of a cluster alone. A variation therefore moves by
 
     dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2),
@@ -19,7 +19,6 @@ import numpy as np
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.law import CLIPPED, elastic_force_and_slope, gap_of
 from vipetsc.dynamics.propagator.collocation import (
-    NODES,
     Cluster,
     Substep,
     Trial,
@@ -28,8 +27,10 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.forces import select_cluster
-from vipetsc.dynamics.propagator.series import DofTables, apply_impulses, copy, expand_free_motion, shift
+from vipetsc.dynamics.propagator.nodes import NODES
+from vipetsc.dynamics.propagator.series import copy, shift
 from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
+from vipetsc.dynamics.propagator.tables import DofTables, apply_impulses, expand_free_motion
 
 
 @kernel

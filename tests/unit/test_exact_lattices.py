@@ -1,0 +1,112 @@
+"""Exact steps of lattices with dashpots and cells that differ, against the matrix exponential of the whole lattice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from tests.conftest import small_case
+from vipetsc.case import Model
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
+from vipetsc.dynamics.propagator.series import StepSeries, evaluate
+from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.propagator.tables import apply_impulses, expand_free_motion
+from vipetsc.lattice import Chain, Variation
+
+VARIED = ("all", "some", "none")
+
+
+def lattice(ends: str, cells: int, varied: str, damped: bool) -> Model:
+    """Cells of which all, every sixth, or none differ from the reference cell, with or without dashpots."""
+    model = small_case(lattice={"ends": ends, "cells": cells}, contacts={"sites": [1, 12, cells]}).model()
+    cell = model.chain.cell
+    if damped:
+        springs = tuple(replace(spring, damping=2.0 + i) for i, spring in enumerate(cell.springs))
+        cell = replace(cell, springs=springs, grounding=(0.5, 1.0, 0.0, 2.0))
+    chain, random = replace(model.chain, cell=cell), np.random.default_rng(7)
+    every = {"all": np.ones(cells, bool), "some": np.arange(cells) % 6 == 0, "none": np.zeros(cells, bool)}[varied]
+    of_cells = [
+        np.where(every[:, None], array * random.uniform(0.7, 1.3, array.shape if varied == "all" else 1), array)
+        for array in chain.coefficients(0, cells)
+    ]
+    return replace(model, chain=chain if varied == "none" else replace(chain, variation=Variation(*of_cells)))
+
+
+def exponential(chain: Chain, t: float) -> np.ndarray:
+    """The exact P(t), states ordered as (2 dof, cell)."""
+    n, size = chain.cells, chain.cells * chain.cell.dofs
+    order = np.arange(size).reshape(n, -1).T.ravel()  # mass by mass
+    system, inverse = np.zeros((2 * size, 2 * size)), -1 / chain.masses()[order][:, None]
+    system[:size, size:] = np.eye(size)
+    system[size:, :size] = inverse * chain.stiffness_matrix().toarray()[np.ix_(order, order)]
+    system[size:, size:] = inverse * chain.damping_rows(0, n).toarray()[np.ix_(order, order)]
+    return expm(system * t)
+
+
+EVERY = pytest.mark.parametrize(
+    ("ends", "varied", "damped"),
+    [
+        ("fixed", "all", False),
+        ("free", "all", True),
+        ("periodic", "all", True),
+        ("periodic", "some", False),
+        ("free", "some", True),
+        ("fixed", "some", False),
+        ("fixed", "none", True),
+    ],
+)
+
+
+@EVERY
+def test_a_step_is_the_exponential_within_its_bound(ends, varied, damped):
+    model = lattice(ends, 24, varied, damped)
+    layout = Layout(model, MPI.COMM_SELF)
+    for interval, tolerance in ((1.5e-4, 1e-15), (3e-4, 1e-7)):
+        series, halo = StepSeries(model.chain, interval, tolerance), HaloRegions(layout)
+        stencil = create_stencil(series, layout, halo)
+        records, rows, n = halo.bind_columns([]), 2 * layout.dofs, layout.cells
+        matrix = np.empty((rows * n, rows * n))
+        for column, unit in enumerate(np.eye(rows * n)):
+            state, out = unit.reshape(rows, n), np.empty((rows, n))
+            exchange(records, 0, state)
+            apply_propagator(stencil, state, records.columns, out)
+            matrix[:, column] = out.ravel()
+        # A velocity counts as omega u.
+        scale = np.repeat([series.omega_max_h / interval, 1.0], rows * n // 2)
+        error = np.abs(matrix - exponential(model.chain, interval)) * scale[:, None] / scale
+        assert error.sum(axis=1).max() <= series.truncation + 2e-14
+        assert series.truncation < tolerance
+
+
+@EVERY
+def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped):
+    model = lattice(ends, 24, varied, damped)
+    layout, series = Layout(model, MPI.COMM_SELF), StepSeries(model.chain, 2e-4, 1e-15)
+    groups, halo = group_dofs(model, series.reach), HaloRegions(layout)
+    tables = create_dof_tables(groups, model, layout, series, halo)
+    records, d, n = halo.bind_columns([]), layout.dofs, layout.cells
+    state = np.random.default_rng(5).normal(size=(2 * d, n)) * np.repeat([1e-4, 0.1], d)[:, None]
+    exchange(records, 0, state)
+    dofs = contact_dofs(model)[groups.numbers]
+    taylor = np.zeros((len(dofs), 2 * series.terms))
+    for c in range(len(groups.first) - 1):
+        expand_free_motion(tables, c, records.columns, taylor)
+    exact = (exponential(series.chain, 0.7 * series.interval) @ state.ravel()).reshape(2 * d, n)
+    masses = model.chain.masses().reshape(n, d)
+    for i, dof in enumerate(dofs):
+        w, rate = evaluate(taylor[i], 0.7)
+        assert w == pytest.approx(np.dot(dof["form"], exact[:d, dof["cell"]]), rel=1e-11, abs=1e-17)
+        assert rate / series.interval == pytest.approx(np.dot(dof["form"], exact[d:, dof["cell"]]), rel=1e-11)
+        # An impulse on the DoF at .3 of the step.
+        moments, out, impulse = 0.7 ** np.arange(2 * series.terms)[None], np.zeros((2 * d, n)), np.zeros((2 * d, n))
+        apply_impulses(tables, i, moments, out)
+        impulse[d:, dof["cell"]] = dof["form"] / masses[dof["cell"]]
+        left = exponential(model.chain, 0.7 * series.interval) @ impulse.ravel()
+        for part, expected in zip(out.reshape(2, -1), left.reshape(2, -1), strict=True):
+            np.testing.assert_allclose(part, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
