@@ -22,13 +22,13 @@ from vipetsc.lattice import Chain, Variation
 VARIED = ("all", "some", "none")
 
 
-def lattice(ends: str, cells: int, varied: str, damped: bool) -> Model:
-    """Cells of which all, every sixth, or none differ from the reference cell, with or without dashpots."""
+def lattice(ends: str, cells: int, varied: str, damped: float) -> Model:
+    """Cells of which all, every sixth, or none differ from the reference cell, with dashpots of so much."""
     model = small_case(lattice={"ends": ends, "cells": cells}, contacts={"sites": [1, 12, cells]}).model()
     cell = model.chain.cell
     if damped:
-        springs = tuple(replace(spring, damping=2.0 + i) for i, spring in enumerate(cell.springs))
-        cell = replace(cell, springs=springs, grounding=(0.5, 1.0, 0.0, 2.0))
+        springs = tuple(replace(spring, damping=damped * (2.0 + i)) for i, spring in enumerate(cell.springs))
+        cell = replace(cell, springs=springs, grounding=(0.5 * damped, damped, 0.0, 2 * damped))
     chain, random = replace(model.chain, cell=cell), np.random.default_rng(7)
     every = {"all": np.ones(cells, bool), "some": np.arange(cells) % 6 == 0, "none": np.zeros(cells, bool)}[varied]
     of_cells = [
@@ -110,3 +110,26 @@ def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped):
         left = exponential(model.chain, 0.7 * series.interval) @ impulse.ravel()
         for part, expected in zip(out.reshape(2, -1), left.reshape(2, -1), strict=True):
             np.testing.assert_allclose(part, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("band", [0, 1, 3])
+def test_a_bloch_wave_decays_as_the_complex_dispersion_says(band):
+    model = lattice("periodic", 16, "none", 0.02)
+    chain, layout, d = model.chain, Layout(model, MPI.COMM_SELF), model.chain.cell.dofs
+    kappa, series, halo = 2 * np.pi * 3 / 16, StepSeries(chain, 2e-4, 1e-15), HaloRegions(layout)
+    # (s^2 M + s C(kappa) + K(kappa)) u = 0 as a linear problem.
+    inverse, zero, one = np.diag(1 / np.array(chain.cell.masses)), np.zeros((d, d)), np.eye(d)
+    blocks = [[zero, one], [-inverse @ chain.cell.stiffness_matrix(kappa), -inverse @ chain.cell.damping_matrix(kappa)]]
+    rates, vectors = np.linalg.eig(np.block(blocks))
+    number = np.argsort(np.where(rates.imag > 0, rates.imag, np.inf))[band]
+    rate, shape = rates[number], vectors[:, number, None] * np.exp(1j * kappa * np.arange(16))
+    steps = int(4 / (-rate.real * series.interval))
+    assert 100 < steps < 6000
+    stencil = create_stencil(series, layout, halo)
+    records, state, out = halo.bind_columns([]), shape.real.copy(), np.empty_like(shape.real)
+    for _ in range(steps):
+        exchange(records, 0, state)
+        apply_propagator(stencil, state, records.columns, out)
+        state, out = out, state
+    exact = (shape * np.exp(rate * steps * series.interval)).real
+    np.testing.assert_allclose(state, exact, rtol=0, atol=1e-10 * np.abs(exact).max())

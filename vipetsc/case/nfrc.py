@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.reading import Problem, Section, Table, Valid
-from vipetsc.case.resolve import check_stiffness
+from vipetsc.case.resolve import check_stiffness, check_undamped
 from vipetsc.case.schema import Positive, once
 from vipetsc.lattice import Contact, UnitCell, waves_at
 
@@ -75,6 +75,8 @@ class NfrcCase(Case):
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """What is wrong between keys."""
         yield from super().check(sections, valid)
+        if valid("lattice"):
+            yield from check_undamped(sections["lattice"], "steady states are those of a lattice")
         if not valid("nfrc"):
             return
         nfrc = sections["nfrc"]

@@ -14,6 +14,7 @@ from vipetsc.case.resolve import (
     check_cell,
     check_sites,
     check_stiffness,
+    check_undamped,
     clearances,
     site_cells,
     with_default_preset,
@@ -176,7 +177,7 @@ class NnmCase(CaseFile):
                 rigid = len(set(group)) - 1
         else:
             cell, wrong = check_cell(lattice)
-            problems += wrong
+            problems += [*wrong, *check_undamped(lattice, "normal modes are those of a lattice")]
         if nnm.system == "chain":
             dofs = cell.dofs * lattice.cells if cell else 2
             rigid = int(lattice.ends != "fixed")

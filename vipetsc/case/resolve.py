@@ -113,6 +113,14 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     return cell, problems
 
 
+def check_undamped(lattice: LatticeTable, what: str) -> Iterator[Problem]:
+    """Dashpots, where ``what`` is made of a lattice without."""
+    if check_cell(lattice)[1] == [] and lattice.unit_cell().is_damped:
+        yield Problem(
+            "lattice", "damped", f"{what} without dashpots; leave [lattice.damping] and those of the cell out"
+        )
+
+
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
     """What is wrong with where the contacts are, and with their clearances."""
     sites, clearance = contacts.sites, contacts.clearance

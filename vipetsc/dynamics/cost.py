@@ -18,11 +18,15 @@ from vipetsc.lattice import bloch, pass_bands, waves_at
 STEP, MASS, RESOLVED, EPISODE_STEPS = 3.7e-5, 1.3e-7, 0.37, 60.0
 # Of the propagator, in s: what it begins with, a linear step, a cell in it, an episode.
 BEGIN, LINEAR_STEP, CELL, EPISODE = 0.06, 2e-5, 6.5e-8, 3.5e-4
+# Of cells with rows of their own, in s: a number of these in a step, what it takes to make one.
+OWN_NUMBER, MAKE_NUMBER = 1e-9, 1e-6
 
 
 @dataclass(frozen=True)
 class Cost:
-    """The ``engine`` that makes a run, and why it is not the one asked for; contact ``episodes``; CPU times in s.
+    """The ``engine`` that makes a run, and a note on it; contact ``episodes``; CPU times in s.
+
+    The ``note`` says why it is not the engine asked for, or how many cells have rows of their own.
 
     ``seconds`` of this engine on each of the ranks, of which ``contacts`` for the episodes; ``propagator``: those of
     the engine that takes linear steps, None where it does not suit.
@@ -57,8 +61,14 @@ def estimate(case: Case, ranks: int = 1) -> Cost:
     linear, exact = None, (0.0, 0.0)
     if not case.petsc and Propagator.refusal(model) is None and (series := step_series(model)):
         count = model.samples * round(model.sample_interval / series.interval)
-        exact = BEGIN + count * (LINEAR_STEP + CELL * model.chain.cells / ranks), EPISODE * episodes
+        own, tables = series.own_rows()
+        numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1) / ranks
+        step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * own * numbers
+        begin = BEGIN + MAKE_NUMBER * tables * numbers
+        exact = begin + count * step, EPISODE * episodes
         linear = sum(exact)
+        if own and kind is Propagator:
+            note = f"{own} cells have rows of their own, {tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
     free, contacts = by_ts if kind.name == "ts" else exact
     return Cost(kind.name, note if engine != "ts" else None, episodes, free + contacts, contacts, linear)
 

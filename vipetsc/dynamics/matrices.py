@@ -30,16 +30,18 @@ class LatticeMatrices:
     def __init__(self, chain: Chain, comm: MPI.Comm) -> None:
         self.chain, self.comm = chain, comm
         self.start, self.stop = cell_cuts(chain.cells, comm.size)[comm.rank : comm.rank + 2]
-        masses, rows = np.tile(chain.cell.masses, self.stop - self.start), chain.cells * chain.cell.dofs
-        most, entries = int(np.iinfo(PETSc.IntType).max), len(chain.cell.couplings()) * 2 * (self.stop - self.start)
+        coefficients, count = chain.coefficients(self.start - 1, self.stop), self.stop - self.start
+        masses, rows = coefficients.masses[1:], chain.cells * chain.cell.dofs
+        most, entries = int(np.iinfo(PETSc.IntType).max), len(chain.cell.couplings()) * 2 * count
         if comm.allreduce(max(rows, entries), MPI.MAX) > most:
             remedy = "more rows or entries than the indices of this PETSc count; it needs one --with-64-bit-indices"
             raise CaseError([Problem("lattice.cells", chain.cells, f"makes matrices of {remedy}")])
         self.stiffness = self._matrix(on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop)))
-        shift, couplings = self.start * chain.cell.dofs, chain.cell.couplings()
-        self.rows, circles = rows, np.bincount([c[0] for c in couplings], [2 * c[3] for c in couplings])
-        self.largest = float(np.max(circles / np.asarray(chain.cell.masses)))
-        self.mass = self._matrix(diags([masses], [shift], (len(masses), rows), format="csr"))
+        self.rows, circles, shift = rows, np.zeros_like(masses), self.start * chain.cell.dofs
+        for mass, offset, _, _, _, spring in chain.cell.couplings():
+            circles[:, mass] += 2 * coefficients.stiffness[1 + min(offset, 0) :][:count, spring]
+        self.largest = comm.allreduce(float(np.max(circles / masses, initial=0.0)), MPI.MAX)
+        self.mass = self._matrix(diags([masses.ravel()], [shift], (masses.size, rows), format="csr"))
 
     def _matrix(self, rows: csr_matrix) -> PETSc.Mat:
         """The matrix of which this rank has the ``rows``, allocated for exactly their entries."""

@@ -43,6 +43,8 @@ class Modes:
     def amplitudes(self, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Amplitudes z (t, mode) in sqrt(J) of fields (t, cell, dof) in m and m/s."""
         root, nt = np.sqrt(self.chain.cell.masses), len(velocity)
+        if self.vectors.ndim == 2:
+            root = np.sqrt(self.chain.masses()).reshape(self.chain.cells, -1)
         fields = np.concatenate([velocity * root, displacement * root])
         if self.vectors.ndim == 2:
             parts = fields.reshape(2 * nt, -1) @ self.vectors
@@ -60,7 +62,7 @@ class Modes:
 
     def force(self, cell: int, mass: int) -> np.ndarray:
         """What 1 N on a ``mass`` of a ``cell`` (0-based) adds to z' (mode), in 1/sqrt(kg)."""
-        root = np.sqrt(self.chain.cell.masses[mass])
+        root = np.sqrt(self.chain.coefficients(cell, cell + 1).masses[0, mass])
         if self.vectors.ndim == 2:
             return np.asarray(self.vectors[cell * self.chain.cell.dofs + mass] / root)
         k = np.arange(len(self.vectors))
@@ -89,18 +91,23 @@ class Modes:
 
 
 def modes_of(chain: Chain) -> Modes:
-    """The modes of ``chain`` without its sites, computed once: 1200 DoFs take about a second and 12 MB."""
+    """The modes of ``chain`` without its sites and dashpots, computed once: 1200 DoFs take about a second and 12 MB.
+
+    Raises ValueError for more than ``MOST_DOFS`` of a lattice whose cells differ: no wave is a mode of that.
+    """
     return _modes(replace(chain, sites=(), clearances=()))
 
 
 @lru_cache(maxsize=4)
 def _modes(chain: Chain) -> Modes:
-    ring = chain.ends == "periodic"
-    if ring or chain.cells * chain.cell.dofs > MOST_DOFS:
+    ring, many = chain.ends == "periodic", chain.cells * chain.cell.dofs > MOST_DOFS
+    if chain.is_uniform() and (ring or many):
         return _ring(chain, chain.cells + (chain.ends == "fixed"), ring)
+    if many:
+        raise ValueError(f"modes of {chain.cells} cells that differ, more than {MOST_DOFS} masses")
     root = diags(1 / np.sqrt(chain.masses()))
     matrix = csc_matrix(root @ chain.stiffness_matrix() @ root)
-    squared, vectors = _near_diagonal(matrix)
+    squared, vectors = eigh(matrix.toarray(), driver="evr") if ring else _near_diagonal(matrix)
     x = np.random.default_rng(0).standard_normal((2, len(squared)))
     if np.any(np.abs(np.sum((x @ vectors) ** 2, axis=1) / np.sum(x**2, axis=1) - 1) > ORTHONORMAL):
         squared, vectors = eigh(matrix.toarray(), driver="evr")

@@ -40,7 +40,11 @@ def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection
         missing = f"{chain.cells - len(record.cells)} cells were" if recorded else "the displacement was"
         record.left_out.append(f"upper_share_at_end, bands/modal_energy: {missing} not recorded")
         return {}
-    parts = ModalParts.of(chain)
+    try:
+        parts = ModalParts.of(chain)
+    except ValueError as error:
+        record.left_out.append(f"upper_share_at_end, bands/modal_energy: {error}")
+        return {}
     names = parts.parts.names
     kind = "of the lattice" if parts.modes.exact else f"of a ring of {parts.modes.cells} cells"
     record.attributes["bands/modal_energy"] = {"parts": list(names), "modes": kind}
