@@ -61,14 +61,14 @@ def estimate(case: Case, ranks: int = 1) -> Cost:
     linear, exact = None, (0.0, 0.0)
     if not case.petsc and Propagator.refusal(model) is None and (series := step_series(model)):
         count = model.samples * round(model.sample_interval / series.interval)
-        own, tables = series.own_rows()
+        differing, tables = series.own_rows()
         numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1) / ranks
-        step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * own * numbers
+        step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * differing * numbers
         begin = BEGIN + MAKE_NUMBER * tables * numbers
         exact = begin + count * step, EPISODE * episodes
         linear = sum(exact)
-        if own and kind is Propagator:
-            note = f"{own} cells have rows of their own, {tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
+        if differing and kind is Propagator:
+            note = f"{differing} cells have rows of their own, {tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
     free, contacts = by_ts if kind.name == "ts" else exact
     return Cost(kind.name, note if engine != "ts" else None, episodes, free + contacts, contacts, linear)
 

@@ -120,13 +120,13 @@ def _bounds(chain: Chain, start: int, stop: int) -> tuple[float, float, np.ndarr
         np.zeros((2, 3, chain.cell.dofs, chain.cell.dofs)),
     )
     for values, ground, passed in zip((stiffness, damping), (0 * grounding, grounding), entries, strict=True):
-        own = ground[1:-1] / masses[1:-1]
-        rows = own.copy()
+        diagonal = ground[1:-1] / masses[1:-1]
+        rows = diagonal.copy()
         for mass, offset, other, _, _, spring in chain.cell.couplings():
             value, near = values[1 + min(offset, 0) :][:n, spring], slice(1 + offset, n + 1 + offset)
             rows[:, mass] += value * root[1:-1, mass] * (root[1:-1, mass] + root[near, other])
-            own[:, mass] += value / masses[1:-1, mass]
+            diagonal[:, mass] += value / masses[1:-1, mass]
             passed[1 + offset, mass, other] += (value / masses[near, other]).max()
-        passed[1] += np.diag(own.max(axis=0))
+        passed[1] += np.diag(diagonal.max(axis=0))
         circles.append(float(rows.max()))
     return *circles, *entries

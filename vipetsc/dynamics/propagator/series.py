@@ -180,8 +180,8 @@ class StepSeries:
     def own_rows(self) -> tuple[int, int]:
         """How many cells have rows of their own since cells differ, and how many tables these are."""
         every = np.arange(0 if self.chain.variation is None else self.chain.cells)
-        own = every[~self.is_interior(every)]
-        return len(own), len(np.unique(self.like(own)))
+        differing = every[~self.is_interior(every)]
+        return len(differing), len(np.unique(self.like(differing)))
 
     def stencil(self, rows: np.ndarray) -> np.ndarray:
         """P's rows (2 dof, 2 dof, cell), displacements before velocities, of masses with ``rows``.
