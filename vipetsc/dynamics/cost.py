@@ -68,7 +68,8 @@ def estimate(case: Case, ranks: int = 1) -> Cost:
         exact = begin + count * step, EPISODE * episodes
         linear = sum(exact)
         if differing and kind is Propagator:
-            note = f"{differing} cells have rows of their own, {tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
+            size = f"{tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
+            note = f"{differing} cells have rows of their own, {size}"
     free, contacts = by_ts if kind.name == "ts" else exact
     return Cost(kind.name, note if engine != "ts" else None, episodes, free + contacts, contacts, linear)
 
