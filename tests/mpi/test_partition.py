@@ -44,6 +44,13 @@ def test_same_bits_with_sites_on_the_borders(folder, ends, law):
     runs_alike(folder, case)
 
 
+@pytest.mark.parallel([2, 3, 4])
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+def test_same_bits_with_dashpots(folder, ends):
+    case = small_case(lattice={"ends": ends, "damping": {"mass": 10.0, "stiffness": 1e-5}}, time={"end": 0.04})
+    runs_alike(folder, case)
+
+
 @pytest.mark.parallel([2, 3])
 def test_same_bits_diatomic_and_driven_in_the_middle(folder):
     table = {

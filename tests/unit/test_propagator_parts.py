@@ -60,7 +60,7 @@ def parts(ends: str, interval: float, tolerance: float, sites=(5, 6, 12)):
 def no_samples(model, layout, number: int) -> Samples:
     """Room for no sample from the ``number`` on."""
     none, fields = np.zeros(0), (np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1)
-    sums = np.zeros((0, 4, 2), np.int64)
+    sums = np.zeros((0, 5, 2), np.int64)
     return Samples(number, sums, none, none.reshape(0, 0), *fields, create_record(model, layout), 1.0)
 
 

@@ -16,7 +16,7 @@ from vipetsc.dynamics.samples import Block
 
 def block(work: list[float], total: list[float], dissipated: float = 0.0) -> Block:
     none = np.zeros(len(work))
-    energies = Energies(np.array(total), none, none, np.array(work), none + dissipated)
+    energies = Energies(np.array(total), none, none, np.array(work), none + dissipated, none)
     return Block(0, np.arange(len(work)) * 1.0, energies, None, None)
 
 

@@ -220,7 +220,9 @@ def run_table(result: "Result", faster: str = "") -> str:
     energy = ""
     if s.get("work"):
         share = f"dissipated {100 * s['dissipated'] / s['work']:.4g} %"
-        energy = f"work {s['work']:.6g} J, {share}, ledger closes to {s['ledger_error']:.2g} of the work"
+        energy, damped = f"work {s['work']:.6g} J, {share}", s.get("dissipated_by_damping", 0.0)
+        energy += f" in contacts and {100 * damped / s['work']:.4g} % in dashpots" if damped else ""
+        energy += f", ledger closes to {s['ledger_error']:.2g} of the work" if s["ledger_error"] is not None else ""
     rows = [
         ("energy", energy),
         ("impacts", f"{s['episodes']} episodes, {s['landings']} landings"),

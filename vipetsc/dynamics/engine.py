@@ -33,6 +33,7 @@ class Engine(ABC):
     """
 
     name: ClassVar[str]
+    dashpots: ClassVar[bool] = False  # whether what they dissipate is integrated, as ``Layout`` says
     state: PETSc.Vec
     time: float
 

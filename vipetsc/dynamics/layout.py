@@ -1,9 +1,10 @@
 """The partition of cells over ranks, the order of a rank's part of the state, and its ghosts; the records of kernels.
 
 A rank's part of the state holds, one after another: displacements by mass (all owned cells of mass 1, then of
-mass 2, ...), velocities likewise, then its ledger components (work of the drive if it owns the driven cell,
-dissipated energy of each owned site). Behind them lie the ghosts: displacements of the neighbouring cell on
-the left, then on the right. Mass by mass keeps every inner loop contiguous.
+mass 2, ...), velocities likewise, then its ledger components (where an engine integrates it, what the dashpots of each
+owned cell have dissipated; work of the drive if it owns the driven cell; dissipated energy of each owned site). Behind
+them lie the ghosts: displacements of the neighbouring cell on the left, with velocities where there are dashpots to
+integrate, then on the right. Mass by mass keeps every inner loop contiguous.
 
 Compiled kernels see a rank's part as a ``LatticeRecord``: tables of masses, springs and sites, and the drive.
 """
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike
 from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.law import create_contacts
-from vipetsc.lattice import ToneBurst
+from vipetsc.lattice import Chain, ToneBurst
 
 
 class Layout:
@@ -29,24 +30,28 @@ class Layout:
 
     Cells come in equal blocks, the first ranks have one more where they do not divide; a rank may be empty. ``ranges``
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
-    ``size`` components; that of the first owned site's dissipated energy is ``dissipated``.
+    ``size`` components; that of the first owned site's dissipated energy is ``dissipated``. A cell has ``rows`` of them
+    and ``ghost_rows`` as a ghost: with ``dashpots``, of an engine that integrates what these dissipate, one and its
+    velocities more in a damped lattice.
     """
 
-    def __init__(self, model: Model, comm: MPI.Comm) -> None:
+    def __init__(self, model: Model, comm: MPI.Comm, dashpots: bool = False) -> None:
         chain = model.chain
         self.comm, self.cells, self.dofs = comm, chain.cells, chain.cell.dofs
         self.periodic = chain.ends == "periodic"
         cuts = cell_cuts(self.cells, comm.size)
         self.ranges = np.array([*pairwise(cuts)])
         of_ledger, _ = np.histogram([model.drive_cell, *chain.sites], cuts)
-        sizes = 2 * self.dofs * np.diff(cuts) + of_ledger
+        self.damped = dashpots and chain.is_damped
+        self.rows, self.ghost_rows = 2 * self.dofs + self.damped, self.dofs * (1 + self.damped)
+        sizes = self.rows * np.diff(cuts) + of_ledger
         self.offsets = np.append(0, np.cumsum(sizes))
         self.start, self.stop = self.ranges[comm.rank].tolist()
         self.owned, self.size = self.stop - self.start, int(sizes[comm.rank])
         sites = np.array(chain.sites, np.int64)
         self.sites = tuple(np.flatnonzero((sites >= self.start) & (sites < self.stop)).tolist())
         self.owns_drive = self.start <= model.drive_cell < self.stop
-        self.dissipated = 2 * self.dofs * self.owned + self.owns_drive
+        self.dissipated = self.rows * self.owned + self.owns_drive
 
     def neighbours(self) -> tuple[int | None, int | None]:
         """Cells to the left and to the right of this rank's; None beyond an end, or on an empty rank."""
@@ -66,20 +71,26 @@ class Layout:
         return ((self.offsets[rank] + cells - a)[:, None] + of_mass).astype(PETSc.IntType)
 
     def create_vector(self, array: np.ndarray | None = None) -> PETSc.Vec:
-        """A zero state with ghosts for the neighbouring cells' displacements, in ``array`` if one is given."""
-        indices = self.state_indices([cell for cell in self.neighbours() if cell is not None])[:, : self.dofs].ravel()
+        """A zero state with ghosts for the neighbouring cells, in ``array`` if one is given."""
+        indices = self.state_indices([cell for cell in self.neighbours() if cell is not None])
+        indices = indices[:, : self.ghost_rows].ravel()
         array = np.zeros(self.size + indices.size) if array is None else array
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
     def place(self, cells: np.ndarray, work: float, y: np.ndarray) -> None:
         """Fill this rank's part ``y`` of the state with its ``cells`` (cell, 2 dofs) and the ``work`` in J."""
         y[: 2 * self.dofs * self.owned] = cells.T.ravel()
-        y[2 * self.dofs * self.owned : self.dissipated] = work
+        y[2 * self.dofs * self.owned : self.rows * self.owned] = 0.0
+        y[self.rows * self.owned : self.dissipated] = work
+
+    def motion(self, y: np.ndarray) -> np.ndarray:
+        """Displacements and velocities (cell, 2 dofs) of the part ``y`` of the state."""
+        return y[: 2 * self.dofs * self.owned].reshape(2 * self.dofs, self.owned).T.copy()
 
     def checkpoint(self, y: np.ndarray) -> dict[str, np.ndarray]:
-        """The part ``y`` of the state in natural order: ``cells`` (cell, 2 dofs), and the ledger."""
-        motion, ledger = y[: 2 * self.dofs * self.owned], y[2 * self.dofs * self.owned : self.size]
-        cells = motion.reshape(2 * self.dofs, self.owned).T
+        """The part ``y`` of the state in natural order: ``cells`` (cell, rows), and the ledger."""
+        motion, ledger = y[: self.rows * self.owned], y[self.rows * self.owned : self.size]
+        cells = motion.reshape(self.rows, self.owned).T
         losses = np.zeros(len(self.sites), LOSS)
         losses["site"], losses["loss"] = self.sites, ledger[self.owns_drive :]
         return {"cells": cells.copy(), "work": ledger[: self.owns_drive].copy(), "losses": losses}
@@ -90,11 +101,11 @@ class Layout:
         for share in shares:  # one after the other: no rank holds all cells
             first, stop = max(self.start, at), min(self.stop, at + len(share["cells"]))
             if first < stop:
-                motion = y[: 2 * self.dofs * self.owned].reshape(2 * self.dofs, self.owned)
+                motion = y[: self.rows * self.owned].reshape(self.rows, self.owned)
                 motion[:, first - self.start : stop - self.start] = share["cells"][first - at : stop - at].T
             at += len(share["cells"])
         ledger = tables["work"][: self.owns_drive], tables["losses"]["loss"][list(self.sites)]
-        y[2 * self.dofs * self.owned : self.size] = np.concatenate(ledger)
+        y[self.rows * self.owned : self.size] = np.concatenate(ledger)
 
 
 def cell_cuts(cells: int, ranks: int) -> list[int]:
@@ -112,8 +123,8 @@ LOSS = np.dtype([("site", np.int64), ("loss", np.float64)])
 """A site's number, from 0, and its dissipated energy in J."""
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
-COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64)])
-"""A spring as one of its masses sees it: cells to the other mass, that mass, N/m."""
+COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64), ("spring", np.int64)])
+"""A spring as one of its masses sees it: cells to the other mass, that mass, N/m, the spring's number."""
 SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int64), ("stiffness", np.float64)])
 """A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
 
@@ -123,8 +134,9 @@ class Shape(NamedTuple):
 
     ``owned`` and ``ghosted`` count the state's components without and with ghosts, ``exchange`` tells whether ghosts
     must be fetched. ``left_ghost`` and ``right_ghost`` are the first components of the neighbouring cells,
-    ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``driven``, ``work`` and
-    ``dissipated`` are the components of the driven mass's velocity, the work, the first site's dissipated energy.
+    ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``driven``, ``work``, ``dissipated``
+    and ``damping`` are the components of the driven mass's velocity, the work, the energies that the first site and the
+    first cell's dashpots have dissipated.
     """
 
     cells: int
@@ -141,6 +153,7 @@ class Shape(NamedTuple):
     driven: int
     work: int
     dissipated: int
+    damping: int
 
 
 class Burst(NamedTuple):
@@ -153,7 +166,12 @@ class Burst(NamedTuple):
 
 
 class LatticeRecord(NamedTuple):
-    """A rank's part of a lattice: sizes, tables of the dtypes above, the sites' local cells, the drive."""
+    """A rank's part of a lattice: sizes, tables of the dtypes above, the sites' local cells, the drive.
+
+    Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
+    ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where dashpots are integrated
+    ``grounding`` (dof, cell) and ``damping`` (spring, 1 + cell) in N s/m; else these are empty.
+    """
 
     shape: Shape
     masses: np.ndarray
@@ -162,6 +180,13 @@ class LatticeRecord(NamedTuple):
     site_cells: np.ndarray
     contacts: np.ndarray
     burst: Burst
+    inverse_masses: np.ndarray
+    grounding: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+
+COEFFICIENTS = LatticeRecord._fields[-4:]
 
 
 def create_burst(drive: ToneBurst) -> Burst:
@@ -179,15 +204,16 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         host=cell.host,
         resonator=cell.resonator,
         owned=layout.size,
-        ghosted=layout.size + d * ((left is not None) + (right is not None)),
+        ghosted=layout.size + layout.ghost_rows * ((left is not None) + (right is not None)),
         exchange=layout.comm.size > 1 or layout.periodic,
         left_ghost=-1 if left is None else layout.size,
-        right_ghost=-1 if right is None else layout.size + d * (left is not None),
+        right_ghost=-1 if right is None else layout.size + layout.ghost_rows * (left is not None),
         left_free=chain.ends == "free" and left is None,
         right_free=chain.ends == "free" and right is None,
         driven=(d + model.drive_mass) * n + model.drive_cell - layout.start if layout.owns_drive else -1,
-        work=2 * d * n if layout.owns_drive else -1,
+        work=layout.rows * n if layout.owns_drive else -1,
         dissipated=layout.dissipated,
+        damping=2 * d * n if layout.damped else -1,
     )
     couplings = cell.couplings()
     rows = np.searchsorted([c[0] for c in couplings], np.arange(d + 1)).tolist()
@@ -195,11 +221,12 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
     return LatticeRecord(
         shape,
         np.array(masses, MASS),
-        np.array([c[1:4] for c in couplings], COUPLING),
+        np.array([(c.offset, c.other, c.stiffness, c.spring) for c in couplings], COUPLING),
         np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
         np.array([chain.sites[i] for i in layout.sites], np.int64) - layout.start,
         site_records(model, layout.sites),
         create_burst(model.drive),
+        *_coefficients(chain, layout),
     )
 
 
@@ -209,6 +236,16 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     gaps = np.array(model.gaps or [(gap, gap) for gap in model.chain.clearances]).reshape(-1, 2)
     laws = [model.laws[i] if i >= 0 else model.contact for i in numbers] if model.laws else model.contact
     return create_contacts(laws, np.vstack([gaps, [[np.inf] * 2]])[numbers], model.chain.cell.reduced_mass, model.scale)
+
+
+def _coefficients(chain: Chain, layout: Layout) -> list[np.ndarray]:
+    """The arrays ``COEFFICIENTS`` of a rank's cells."""
+    if chain.is_uniform() and not layout.damped:
+        return [np.zeros(0)] * 4
+    masses, grounding, stiffness, damping = chain.coefficients(layout.start - 1, layout.stop)
+    stop = None if layout.damped else 0
+    arrays = 1 / masses[1:], grounding[1:][:stop], stiffness, damping[:stop]
+    return [array.T.flatten() for array in arrays]
 
 
 @njit(error_model="numpy")

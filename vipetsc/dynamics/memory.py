@@ -39,13 +39,16 @@ def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) ->
     chain, recorded = model.chain, recorded_cells(output, model.chain.cells)
     owned, per_cell = -(-chain.cells // ranks), len(output.fields) * chain.cell.dofs
     own_sites = int(np.histogram(chain.sites, np.append(np.arange(0, chain.cells, owned), chain.cells))[0].max())
+    of_cell = 2 * chain.cell.dofs + (engine == "ts" and chain.is_damped)
+    tables = 0 if chain.is_uniform() and not chain.is_damped else 2 * (chain.cell.dofs + len(chain.cell.springs))
+    varied = sum(array.nbytes for _, array in chain.variation.items()) if chain.variation else 0
     states = 2 * STAGES[model.method] + STATES_BESIDE_STAGES if engine == "ts" else PROPAGATOR_STATES
     local, every = min(owned, len(recorded)) * per_cell + own_sites, len(recorded) * per_cell + len(chain.sites)
     together = ranks == 1 or written_together(model, output, ranks)
     rows = min(chunk_samples(8 * (local if together else every)), model.samples)
     chunk = 8 * rows * (COPIES * local + (0 if together else GATHERED * every))
     return {
-        "lattice.cells": states * 16 * chain.cell.dofs * owned,
+        "lattice.cells": (states * of_cell + 2 * tables) * 8 * owned + varied,
         "contacts.sites": SITE_BYTES * len(chain.sites) + OWN_SITE_BYTES * own_sites,
         "output.window": chunk,
         "time.sample_interval": model.samples * SAMPLE_BYTES,
@@ -67,7 +70,7 @@ def memory_available() -> int:
 def check_indices(model: Model) -> None:
     """Raise CaseError if the state has more components than this PETSc's indices count."""
     chain, most = model.chain, int(np.iinfo(PETSc.IntType).max)
-    size = 2 * chain.cells * chain.cell.dofs + len(chain.sites) + 1
+    size = chain.cells * (2 * chain.cell.dofs + chain.is_damped) + len(chain.sites) + 1
     if size > most:
         remedy = f"makes a state of {size} numbers, more than the {most} that the indices of this PETSc count"
         build = "one configured --with-64-bit-indices counts more (Debian: python3-petsc4py-64-real)"

@@ -10,17 +10,17 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.case.schema import OutputTable
-from vipetsc.dynamics.energies import Energies
+from vipetsc.dynamics.energies import PARTS, Energies
 from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.samples import Block, Samples
-from vipetsc.io.chunks import LOSSES, Recording, ranges
+from vipetsc.io.chunks import DAMPED, LOSSES, Recording, ranges
 from vipetsc.io.store import GATHER_LIMIT
 
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
 CHUNK_SAMPLES = 256
 CHUNK_BYTES = 64 * 2**20
 # Names in the file.
-ENERGIES = {part.name: f"energy/{part.name}" for part in fields(Energies)}
+ENERGIES = {part.name: f"energy/{part.name}" for part in fields(Energies) if part.name != "balanced"}
 
 
 def recorded_cells(output: OutputTable, cells: int) -> range:
@@ -68,7 +68,9 @@ class Recorder(Observer):
         if setup.model.gaps:
             given["sites/clearance"], given["sites/clearance_minus"] = np.array(setup.model.gaps).T
         rows = -(-setup.model.samples // output.stride)
-        setup.output.recording = Recording(given, tuple(output.fields), together, rows)
+        self._energies = [part for part, name in ENERGIES.items() if name != DAMPED or chain.is_damped]
+        sampled = ("time", "field_time", *(ENERGIES[part] for part in self._energies))
+        setup.output.recording = Recording(given, tuple(output.fields), together, rows, sampled)
         self._columns = np.array([[first, stop] if together else [0, len(recorded)]])
         numbers = len(output.fields) * layout.dofs * local.size + len(layout.sites)
         self._length = chunk_samples(8 * layout.comm.allreduce(numbers, MPI.MAX if together else MPI.SUM))
@@ -80,9 +82,9 @@ class Recorder(Observer):
 
     def _begin_chunk(self) -> None:
         n, self._held, self._rows, self._number = self._length, 0, 0, 0
-        self._sums, self._work = np.zeros((n, 4, 2), np.int64), np.zeros(n)
+        self._sums, self._work = np.zeros((n, PARTS, 2), np.int64), np.zeros(n)
         self._losses = np.zeros((n, len(self.setup.layout.sites)))
-        self._kept = {name: np.zeros(n) for name in ("time", *ENERGIES.values())}
+        self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[part] for part in self._energies))}
         self._fields = self.setup.output.room(self._shape)
 
     def room(self, number: int, most: int) -> Samples:
@@ -95,8 +97,8 @@ class Recorder(Observer):
     def observe(self, block: Block) -> None:
         here = slice(self._held, self._held + len(block))
         self._kept["time"][here] = block.times
-        for part, name in ENERGIES.items():
-            self._kept[name][here] = getattr(block.energies, part)
+        for part in self._energies:
+            self._kept[ENERGIES[part]][here] = getattr(block.energies, part)
         self._number = block.first - self._held
         self._held, self._rows = here.stop, self._rows + block.share.rows(len(block))
 

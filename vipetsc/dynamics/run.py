@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,8 +13,7 @@ from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case import Case, CaseError, Model
-from vipetsc.case.reading import Problem
+from vipetsc.case import Case, Model
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine
@@ -104,12 +103,10 @@ def simulate(
     case = with_database(case)
     check_options(case)
     model = case.model()
-    if model.chain.is_damped or not model.chain.is_uniform():
-        raise CaseError([Problem("lattice", None, "dashpots and cells that differ are not simulated yet")])
     kind, refusal = select_engine(case, model)
     check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
     watching: list[type[Observer]] = [Guard, *observers, Ledger, *([ProgressReport] if progress else [])]
-    make = partial(_simulate, case, model, partial(kind, stop=stop), refusal, watching)
+    make = partial(_simulate, case, model, kind, stop, refusal, watching)
     if isinstance(folder, RunOutput):
         return make(folder)
     with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
@@ -130,7 +127,8 @@ def result_of(told: Mapping[str, Any], resumable: bool, folder: Path | None) -> 
 def _simulate(
     case: Case,
     model: Model,
-    create: Callable[[Model, Layout], Engine],
+    kind: type[Engine],
+    stop: StopRequest | None,
     refusal: str | None,
     watching: Sequence[type[Observer]],
     output: RunOutput,
@@ -140,8 +138,8 @@ def _simulate(
     output.begin(case.to_toml())
     sys.audit("vipetsc.set-up", case.name)
     with log.SET_UP, petsc_options(options_of(case)):
-        layout = Layout(model, output.comm)
-        engine = create(model, layout)
+        layout = Layout(model, output.comm, kind.dashpots)
+        engine = kind(model, layout, stop)
     with released(engine, output.comm):
         run = Run(Setup(case, model, layout, EnergyMeter(model, layout), engine, output), watching)
         shares = output.last_state()
@@ -268,7 +266,7 @@ class Run:
         about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
         attributes = comm.bcast(provenance(comm) | about)  # what rank 0 tells counts
         if ending == COMPLETE and isinstance(output, RunMemory):
-            shares = comm.gather(self.setup.layout.checkpoint(engine.state.array_r)["cells"])
+            shares = comm.gather(self.setup.layout.motion(engine.state.array_r))
             output.end = np.concatenate(shares) if shares else None
         if ending != STOPPED:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})

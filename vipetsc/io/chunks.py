@@ -27,6 +27,8 @@ SAMPLED = {
     "energy/work": ("time", "J", "work done by the drive"),
     "energy/dissipated": ("time", "J", "energy dissipated in contacts"),
 }
+DAMPED = "energy/dissipated_by_damping"
+OF_DAMPED = {DAMPED: ("time", "J", "energy dissipated in dashpots")}
 # Fields, losses and the log of contacts, of which ranks that write together hold their own alone.
 LOSSES = "energy/dissipated_by_site"
 LARGE = {
@@ -61,12 +63,14 @@ class Recording:
 
     ``given``: the arrays of ``GIVEN``; ``fields``: names of those that are recorded; ``together``: whether all ranks
     write into one file that they share, instead of rank 0 alone; ``rows``: samples in a field of the whole run.
+    ``sampled``: what rank 0 has of every sample, of ``SAMPLED`` and ``OF_DAMPED``.
     """
 
     given: Arrays
     fields: tuple[str, ...]
     together: bool
     rows: int
+    sampled: Collection[str] = tuple(SAMPLED)
 
 
 class Chunks(Protocol):
@@ -95,10 +99,10 @@ def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
 
 def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
     """What is known of a run from the beginning, and what rank 0 keeps of every sample."""
-    arrays = {**joined(output, SAMPLED), **output.recording.given}
+    arrays = {**joined(output, output.recording.sampled), **output.recording.given}
     if len(arrays["field_time"]) == len(arrays["time"]):
         del arrays["field_time"]
-    return xr.Dataset(tabulated(SAMPLED | GIVEN, arrays), attrs={"case": output.case, **attributes})
+    return xr.Dataset(tabulated(SAMPLED | OF_DAMPED | GIVEN, arrays), attrs={"case": output.case, **attributes})
 
 
 def described(name: str, data: xr.Dataset) -> tuple[list[str], dict[str, str]]:

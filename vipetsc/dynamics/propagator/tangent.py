@@ -58,7 +58,7 @@ class TangentPropagator(Propagator):
         """Go on to the sample of that number from the start; the cells there. Raises StalledError on all ranks."""
         model, layout, none = self._model, self._layout, np.zeros(0)
         fields = np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1
-        sums, losses, record = np.zeros((0, 4, 2), np.int64), none.reshape(0, 0), create_record(model, layout)
+        sums, losses, record = np.zeros((0, 5, 2), np.int64), none.reshape(0, 0), create_record(model, layout)
         stretch = self.fill(Samples(samples + 1, sums, none, losses, *fields, record, 1.0))
         needed = layout.comm.allreduce(int(self._forces.clusters.tape.used.max(initial=0)), max)
         if stretch.stalled or needed > MOST_ROWS:

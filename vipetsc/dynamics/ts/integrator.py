@@ -47,7 +47,7 @@ class Integrator(Engine):
     ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
     """
 
-    name = "ts"
+    name, dashpots = "ts", True
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         self.comm, self.layout = layout.comm, layout

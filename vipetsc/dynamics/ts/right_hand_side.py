@@ -1,7 +1,6 @@
 """Compiled right-hand side of the lattice, also as a C function that PETSc calls without entering Python.
 
-A cell's sums run over its springs in the cell's order, whichever rank owns it and wherever in the loop it falls: the
-result does not depend on the partition, to the last bit.
+Springs and dashpots are ``springs``; a site and the drive add to single masses.
 """
 
 import ctypes
@@ -16,37 +15,9 @@ from numba.core.ccallback import CFunc
 from vipetsc.compiled import cfunc, njit
 from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
-from vipetsc.dynamics.layout import COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape, drive_force
+from vipetsc.dynamics.layout import COEFFICIENTS, COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape, drive_force
 from vipetsc.dynamics.native import pointer
-
-# Cells in one pass: what a pass touches stays in the first-level cache.
-CHUNK = 512
-
-
-@njit(error_model="numpy", forceinline=True)
-def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall."""
-    shape = lattice.shape
-    if cell < 0:
-        return y[shape.left_ghost + mass] if shape.left_ghost >= 0 else 0.0
-    if cell >= shape.cells:
-        return y[shape.right_ghost + mass] if shape.right_ghost >= 0 else 0.0
-    return y[mass * shape.cells + cell]
-
-
-@njit(error_model="numpy", forceinline=True)
-def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Acceleration in m/s^2 of one mass by its springs; the same sums as the chunked loop, bit for bit."""
-    shape = lattice.shape
-    here = y[mass * shape.cells + cell]
-    total = 0.0
-    for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
-        coupling = lattice.couplings[s]
-        c = cell + coupling.offset
-        if (c < 0 and shape.left_free) or (c >= shape.cells and shape.right_free):
-            continue
-        total += coupling.stiffness * (displacement(y, lattice, c, coupling.other) - here)
-    return total * lattice.masses[mass].inverse_mass
+from vipetsc.dynamics.ts.springs import damping_powers, inverse_mass, spring_acceleration, spring_accelerations
 
 
 @njit(error_model="numpy", forceinline=True)
@@ -61,10 +32,10 @@ def relative_motion(y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[floa
 @njit(error_model="numpy")
 def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int, force: float) -> float:
     """Acceleration of one mass by its springs, a contact ``force`` and the drive."""
-    inverse_mass = lattice.masses[mass].inverse_mass
-    acceleration = spring_acceleration(y, lattice, cell, mass) + force * inverse_mass
+    per_mass = inverse_mass(lattice, cell, mass)
+    acceleration = spring_acceleration(y, lattice, cell, mass) + force * per_mass
     if lattice.shape.driven == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:
-        acceleration += drive_force(lattice.burst, t) * inverse_mass
+        acceleration += drive_force(lattice.burst, t) * per_mass
     return acceleration
 
 
@@ -81,58 +52,32 @@ def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray)
 
 
 @njit(error_model="numpy")
-def _add_spring(out: np.ndarray, other: np.ndarray, here: np.ndarray, stiffness: float) -> None:
-    for i in range(out.size):
-        out[i] += stiffness * (other[i] - here[i])
-
-
-@njit(error_model="numpy", forceinline=True)
-def _spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acceleration: np.ndarray) -> None:
-    """Accelerations (cells,) of a mass by its springs, in chunks of cells whose neighbours are all owned."""
-    n = acceleration.size
-    here = y[mass * n : (mass + 1) * n]
-    row, inverse_mass = lattice.masses[mass], lattice.masses[mass].inverse_mass
-    for a in range(1, n - 1, CHUNK):
-        b = min(a + CHUNK, n - 1)
-        out = acceleration[a:b]
-        out[:] = 0.0
-        for s in range(row.first, row.last):
-            coupling = lattice.couplings[s]
-            first = coupling.other * n + coupling.offset
-            _add_spring(out, y[first + a : first + b], here[a:b], coupling.stiffness)
-        for i in range(out.size):
-            out[i] *= inverse_mass
-    if n > 0:
-        acceleration[0] = spring_acceleration(y, lattice, 0, mass)
-    if n > 1:
-        acceleration[n - 1] = spring_acceleration(y, lattice, n - 1, mass)
-
-
-@njit(error_model="numpy")
 def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
     """Time derivative ``f`` (owned,) of the state ``y`` (ghosted,): velocities, accelerations, powers."""
-    shape, masses = lattice.shape, lattice.masses
+    shape = lattice.shape
     n, d, host, resonator = shape.cells, shape.dofs, shape.host, shape.resonator
     f[: d * n] = y[d * n : 2 * d * n]
     for mass in range(d):
-        _spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
+        spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
     for i in range(lattice.site_cells.size):
         power = 0.0
         if lattice.contacts[i].mode != FREE:
             cell = lattice.site_cells[i]
             w, rate = relative_motion(y, lattice, i)
             force, power = contact_force(lattice.contacts, i, w, rate)
-            f[(d + host) * n + cell] += force * masses[host].inverse_mass
-            f[(d + resonator) * n + cell] -= force * masses[resonator].inverse_mass
+            f[(d + host) * n + cell] += force * inverse_mass(lattice, cell, host)
+            f[(d + resonator) * n + cell] -= force * inverse_mass(lattice, cell, resonator)
         f[shape.dissipated + i] = power
     driven = shape.driven
     if driven >= 0:
         force = drive_force(lattice.burst, t)
-        f[driven] += force * masses[driven // n - d].inverse_mass
+        f[driven] += force * inverse_mass(lattice, driven % n, driven // n - d)
         f[shape.work] = force * y[driven]
+    if shape.damping >= 0:
+        damping_powers(y, lattice, f[shape.damping : shape.damping + n])
 
 
-_TABLES = ("masses", "couplings", "springs", "site_cells", "contacts")
+_TABLES = ("masses", "couplings", "springs", "site_cells", "contacts", *COEFFICIENTS)
 
 
 def _c_struct(record: type) -> np.dtype:
@@ -173,6 +118,10 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.site_cells), (size.site_cells,), np.int64),
         carray(pointer(at.contacts), (size.contacts,), SITE),
         context.burst,
+        carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
+        carray(pointer(at.grounding), (size.grounding,), np.float64),
+        carray(pointer(at.stiffness), (size.stiffness,), np.float64),
+        carray(pointer(at.damping), (size.damping,), np.float64),
     )
     rate = carray(pointer(context.array), (shape.owned,), np.float64)
     right_hand_side(t, carray(pointer(state), (shape.ghosted,), np.float64), rate, lattice)
