@@ -32,7 +32,7 @@ from vipetsc.modes.harmonics import ForceSeries
 LEAST, LEAST_OF_FINITE, LINES = 1e-4, 1.6e-3, (0.1, 0.02)
 COARSE, FINEST = 24, 14  # intervals of half a strip; halvings of one in which D turns by more than TURN
 TURN = 0.7  # rad
-KEPT = 32  # orders of perturbations that are kept where nothing dissipates
+KEPT = 48  # orders of perturbations that are kept where nothing dissipates
 # Steps, first step and accuracy, over Om, of the secant method; |Im lambda| of what is no pair is nearer to 0 or 1/2.
 MOST_STEPS, STEP, ACCURACY, REAL = 30, 1e-4, 1e-10, 1e-7
 
