@@ -34,10 +34,12 @@ CONFIGURATION = {
     "html_title": f"vipetsc {vipetsc.__version__}",
     "extensions": ["myst_parser"],
     "html_theme": "furo",
+    "highlight_language": "none",  # of formulas
     "myst_enable_extensions": ["colon_fence"],
     "myst_heading_anchors": 3,
     "suppress_warnings": ["ref.python"],  # a name in a signature that two modules have
     "smartquotes": False,  # w' is a velocity
+    "html_use_index": False,
     "html_copy_source": False,
     "html_show_sphinx": False,
     "html_show_copyright": False,
@@ -50,6 +52,7 @@ def write_sources(folder: Path, packages: list[str]) -> None:
     folder.mkdir(parents=True)
     index = (CHAPTERS / "index.md").read_text(encoding="utf-8")
     names = re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", index, flags=re.M)
+    names += sorted({path.stem for path in CHAPTERS.glob("*.md")} - {"index", *names})
     folders = sorted(path.parent for path in PACKAGE.rglob("__init__.py"))
     pages = {dotted(path): interface(path) for path in folders if not packages or dotted(path) in packages}
     put(folder / "index.md", index + contents("Chapters", [START, *names, KEYS]) + contents("Python", [API]), CHAPTERS)

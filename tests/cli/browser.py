@@ -32,7 +32,7 @@ return {
   linked: [...document.querySelectorAll('[src], link[href]')]
       .map(e => e.src || e.href).filter(u => !u.startsWith('data:')),
   dead: [...document.querySelectorAll('a[href^="#"]')].map(a => a.getAttribute('href'))
-      .filter(h => !document.querySelector(h)),
+      .filter(h => h.length > 1 && !document.getElementById(decodeURIComponent(h.slice(1)))),
 };
 """
 
@@ -71,8 +71,11 @@ class Browser:
         """A new session that shows ``page`` in a window of that size; returns its path."""
         switches = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
                     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
-                    f"--user-data-dir={self.home}/{width}"]  # fmt: skip
-        metrics = {"deviceMetrics": {"width": width, "height": height, "pixelRatio": 1.0, "mobile": width < 600}}
+                    f"--user-data-dir={self.home}/{len(self.sessions)}"]  # fmt: skip
+        phone = width < 600  # whose mouse is a finger
+        metrics = {
+            "deviceMetrics": {"width": width, "height": height, "pixelRatio": 1.0, "mobile": phone, "touch": phone}
+        }
         wanted = {
             "browserName": "chrome",
             "goog:chromeOptions": {"args": switches, "mobileEmulation": metrics},
@@ -81,8 +84,12 @@ class Browser:
         answer = self.call("/session", {"capabilities": {"alwaysMatch": wanted}})
         session = f"/session/{answer['sessionId']}"
         self.sessions.append(session)
-        self.call(f"{session}/url", {"url": page.as_uri()})
+        self.show(session, page)
         return session
+
+    def show(self, session: str, page: Path) -> None:
+        """Another page in the same window."""
+        self.call(f"{session}/url", {"url": page.as_uri()})
 
     def ask(self, session: str, script: str) -> Any:
         """What ``script`` returns in the page."""

@@ -64,7 +64,7 @@ def test_the_guide_leaves_runs_a_sweep_a_branch_and_pictures(desk):
     for name in (
         "four-band/figures/dispersion.png",
         "loud/figures/dispersion.pdf",
-        "loud/curves/energy.csv",
+        "loud/curves/run-time.csv",
         "my-lattice-bands/bands.png",
         "my-lattice/figures/dispersion.png",
         "my-lattice-12N/run.h5",
@@ -126,3 +126,9 @@ def sections() -> dict[str, str]:
 def test_every_excerpt_of_a_case_file_is_valid(text, tmp_path):
     (tmp_path / "case.toml").write_text(text, encoding="utf-8")
     assert load_every(tmp_path / "case.toml")
+
+
+def test_every_file_that_the_manual_names_is_there():
+    for page in [ROOT / "README.md", *MANUAL.glob("*.md")]:
+        for path in re.findall(r"`((?:vipetsc|scripts|tests)/[\w/.-]*[\w/])`", page.read_text(encoding="utf-8")):
+            assert (ROOT / path).exists(), f"{page.name}: {path}"

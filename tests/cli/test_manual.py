@@ -44,11 +44,19 @@ def browser(tmp_path_factory):
         yield opened
 
 
+WIDE = """
+return [...document.querySelectorAll('article *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1
+    && !e.closest('.table-wrapper, .highlight')).map(e => e.tagName + e.textContent.slice(0, 40));
+"""  # but for what scrolls by itself
+
+
 @NEEDED
 @SCREENS
 def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
+    session = browser.open(pages / "index.html", width, height)
     for name in ("index", "start", "measures", "files", "case-keys", "performance", "paper", "vipetsc.contact"):
-        found = browser.measure(browser.open(pages / f"{name}.html", width, height))
+        browser.show(session, pages / f"{name}.html")
+        found = browser.measure(session)
         assert (name, found["page"] <= width, found["broken"], found["dead"], found["errors"]) == (
             name,
             True,
@@ -56,4 +64,5 @@ def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
             [],
             [],
         )
+        assert browser.ask(session, WIDE) == []
         assert [url for url in found["linked"] if not url.startswith("file:")] == []

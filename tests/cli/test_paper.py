@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import json
-import os
 import re
-import shutil
-import signal
-import socket
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 
+from tests.cli.browser import NEEDED, SCREENS, browsing
 from tests.cli.tiny_paper import DRAWN, drawing, tiny_plan
 from tests.conftest import clean_environment
 from vipetsc.figures.study import Files
@@ -73,7 +66,7 @@ def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(made):
     assert make(made) == {"made": [], "drawn": 0, "complete": True}
     assert {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.is_file()} == before
     (made / "figures" / "fig10-reduced-model-printed.pdf").unlink()
-    assert len(make_paper(drawing(tiny_plan()), made).drawn) == 2
+    assert len(make_paper(drawing(tiny_plan()), made).drawn) == 3
 
 
 @pytest.mark.mpirun
@@ -87,7 +80,7 @@ def test_every_figure_of_the_paper_is_offered(made):
     assert {stem.partition("-")[0] for stem in stems} == {figure.id for figure in PAPER_FIGURES}
     drawn = {path.name for path in (made / "figures").iterdir()}
     ours = [stem for stem in stems if stem.partition("-")[0] in DRAWN]
-    assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf")}
+    assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf", "json")}
 
 
 @pytest.mark.mpirun
@@ -152,114 +145,17 @@ def test_quick_and_full_do_not_mix(in_process, tmp_path):
     assert "holds the paper on the full grid; choose another --out for the quick one" in mixed.stderr
 
 
-class Browser:
-    """Headless Chromium behind its driver, spoken to as the W3C protocol has it."""
-
-    def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        self.home, self.base = folder, f"http://127.0.0.1:{port}"
-        log = (folder / "driver.log").open("w")
-        self.driver = subprocess.Popen(
-            ["chromedriver", f"--port={port}"], stdout=log, stderr=log, start_new_session=True
-        )
-        self.sessions: list[str] = []
-
-    def call(self, path: str, body: dict | None = None, method: str | None = None, patience: float = 30) -> object:
-        """The ``value`` of the driver's answer; waits until the driver listens."""
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"}, method=method)
-        deadline = time.monotonic() + patience
-        while True:
-            try:
-                with urllib.request.urlopen(request, timeout=60) as answer:
-                    return json.load(answer)["value"]
-            except urllib.error.HTTPError:
-                raise
-            except OSError:
-                if time.monotonic() > deadline or self.driver.poll() is not None:
-                    raise
-                time.sleep(0.1)
-
-    def open(self, page: Path, width: int, height: int) -> str:
-        """A new session that shows ``page`` in a window of that size; returns its path."""
-        switches = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-                    "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
-                    f"--user-data-dir={self.home}/{width}"]  # fmt: skip
-        metrics = {"deviceMetrics": {"width": width, "height": height, "pixelRatio": 1.0, "mobile": width < 600}}
-        wanted = {
-            "browserName": "chrome",
-            "goog:chromeOptions": {"args": switches, "mobileEmulation": metrics},
-            "goog:loggingPrefs": {"browser": "ALL"},
-        }
-        answer = self.call("/session", {"capabilities": {"alwaysMatch": wanted}})
-        session = f"/session/{answer['sessionId']}"
-        self.sessions.append(session)
-        self.call(f"{session}/url", {"url": page.as_uri()})
-        return session
-
-    def processes(self) -> list[int]:
-        """Every process of the driver's session, and every browser with a profile in the folder."""
-        numbers = []
-        for path in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                zombie, session = (path / "stat").read_text().rpartition(")")[2].split()[0:4:3]
-                started_here = os.fsencode(self.home) in (path / "cmdline").read_bytes()
-                if zombie != "Z" and (int(session) == self.driver.pid or started_here):
-                    numbers.append(int(path.name))
-        return numbers
-
-    def close(self) -> None:
-        """Quit the browsers and their driver; what does not go by itself within seconds is killed."""
-        for session in self.sessions:
-            with suppress(OSError):
-                self.call(session, method="DELETE", patience=0)
-        self.driver.terminate()
-        deadline = time.monotonic() + 5
-        while self.processes() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        for number in self.processes():
-            with suppress(ProcessLookupError):
-                os.kill(number, signal.SIGKILL)
-        self.driver.wait()
-
-
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    opened = Browser(tmp_path_factory.mktemp("browser"))
-    yield opened
-    opened.close()
-    deadline = time.monotonic() + 5
-    while opened.processes() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert opened.processes() == []
-
-
-MEASURE = """
-const root = document.documentElement, images = [...document.images];
-return {
-  page: root.scrollWidth, window: window.innerWidth, images: images.length,
-  broken: images.filter(i => !i.complete || i.naturalWidth === 0).map(i => i.alt),
-  wide: [...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > window.innerWidth + 1
-      && !e.closest('.wide')).map(e => e.tagName + '.' + e.className),
-  linked: [...document.querySelectorAll('[src], link[href]')]
-      .map(e => e.src || e.href).filter(u => !u.startsWith('data:')),
-  dead: [...document.querySelectorAll('a[href^="#"]')].map(a => a.getAttribute('href'))
-      .filter(h => !document.querySelector(h)),
-};
-"""
+    with browsing(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
 
 
 @pytest.mark.mpirun
-@pytest.mark.skipif(shutil.which("chromedriver") is None, reason="no chromedriver; scripts/test installs it")
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 900)])
-def test_the_report_fits_a_phone_and_a_desk(made, browser, tmp_path, width, height):
-    session = browser.open(made / "report.html", width, height)
-    found = browser.call(f"{session}/execute/sync", {"script": MEASURE, "args": []})
-    errors = [line for line in browser.call(f"{session}/se/log", {"type": "browser"}) if line["level"] == "SEVERE"]
-    picture = base64.b64decode(browser.call(f"{session}/screenshot"))
-    assert picture[:4] == b"\x89PNG"
+@NEEDED
+@SCREENS
+def test_the_report_fits_a_phone_and_a_desk(made, browser, width, height):
+    found = browser.measure(browser.open(made / "report.html", width, height))
     assert found["window"] == width
     assert found["page"] <= width
     assert found["wide"] == []
@@ -267,7 +163,51 @@ def test_the_report_fits_a_phone_and_a_desk(made, browser, tmp_path, width, heig
     assert found["broken"] == []
     assert found["linked"] == []
     assert found["dead"] == []
-    assert errors == []
+    assert found["errors"] == []
+
+
+LOOK = """
+const figure = [...document.querySelectorAll('figure')].find(f => f.querySelector('img').alt.includes('%s'));
+const box = e => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; };
+const choice = figure.querySelector('select'), image = figure.querySelector('img');
+"""
+
+
+@pytest.mark.mpirun
+@NEEDED
+def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser):
+    session = browser.open(made / "report.html", 1280, 900)
+    look = LOOK % "Transferred energy against amplitude"
+    left, top, width, height = browser.ask(
+        session, look + "image.scrollIntoView({block: 'center'}); return box(image);"
+    )
+    axes = json.loads(browser.ask(session, look + "return figure.querySelector('script').textContent;"))
+    (first,) = [a for a in axes if a["curves"]][:1]
+    curve, (west, north, east, south) = first["curves"][0], first["box"]
+    with h5py.File(made / "interband/ensemble.h5") as file:  # the numbers are those of the results
+        assert curve["x"] == pytest.approx(list(file["amplitude"][...][: len(curve["x"])]), rel=1e-4)
+    browser.drag(session, (left + (west + east) / 2 * width, top + (north + south) / 2 * height))
+    told = browser.ask(session, look + "return figure.querySelector('output').textContent;")
+    assert first["x"]["label"] in told and first["y"]["label"] in told
+
+    draw = (
+        "choice.value = 0; choice.dispatchEvent(new Event('change')); const plot = figure.querySelector('.plot svg');"
+    )
+    left, top, width, height = browser.ask(
+        session, look + draw + "plot.scrollIntoView({block: 'center'}); return box(plot);"
+    )
+    count = (
+        look + "return [figure.querySelectorAll('.plot path').length, figure.querySelector('.plot svg').textContent];"
+    )
+    paths, ticks = browser.ask(session, count)
+    assert paths == sum(curve["joined"] for curve in first["curves"])
+    browser.drag(session, (left + 0.3 * width, top + 0.3 * height), (left + 0.5 * width, top + 0.6 * height))
+    assert browser.ask(session, count)[1] != ticks
+    browser.ask(session, look + "figure.querySelector('.legend .reset').click();")
+    assert browser.ask(session, count) == [paths, ticks]
+    browser.ask(session, look + "figure.querySelector('.legend button').click();")
+    assert browser.ask(session, count)[0] < paths
+    assert browser.measure(session)["errors"] == []
 
 
 @pytest.mark.mpirun
@@ -276,4 +216,4 @@ def test_the_report_says_what_it_must(made):
     assert "quick: coarse grid" in page
     for words in ("calibrated", "printed", "holds", "minus sign", "Hermitian", "ledger", "petsc", "Two engines"):
         assert words in page
-    assert len(page) < 20e6
+    assert len(page) < 5e6

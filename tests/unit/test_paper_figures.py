@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 from pathlib import Path
 
@@ -89,6 +90,43 @@ def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
     assert made == [figure]
     (axes,) = figure.axes
     assert len(axes.yaxis.get_minorticklocs()) <= 2 * 6 + 2
+
+
+def test_what_a_picture_shows_is_told_as_numbers(tmp_path):
+    x = np.array([1.0, 10.0, np.nan, np.nan, 100.0])
+    wave = np.linspace(1, 100, 2001), 100 + 50 * np.sin(np.linspace(0, 20, 2001))
+    with rc_style():
+        figure = new_figure(4, 2)
+        left, right, table = figure.subplots(1, 3)
+        left.errorbar(x, 2 * x, 0.1 * x, fmt="o-", color="#0072B2", label="measured")
+        left.plot([0, 1], [0, 1], transform=left.transAxes)  # is no curve of the data
+        left.plot(*wave, label="_many")
+        left.set(xscale="log", xlabel="Amplitude $A$ (N)", title="")
+        right.pcolormesh(np.eye(3))
+        right.plot([0, 2], [0, 2])
+        table.axis("off")
+        path = save(figure, tmp_path / "plain.json")
+        noted = json.loads(save(figure, tmp_path / "noted.json", "coarse").read_text())
+    axes, image = json.loads(path.read_text())
+    assert axes["x"] | {"low": 0, "high": 0} == {"low": 0, "high": 0, "log": True, "label": "Amplitude A (N)"}
+    assert axes["y"]["log"] is False
+    curve, many = axes["curves"]
+    assert many["label"] == "" and len(many["x"]) < 400
+    assert np.interp(wave[0], many["x"], many["y"]) == pytest.approx(wave[1], abs=3)
+    assert curve["label"] == "measured" and curve["colour"] == "#0072b2" and curve["joined"]
+    assert curve["x"] == [1, 10, None, 100] and curve["y"] == [2, 20, None, 200]
+    assert image["curves"] == []
+    with rc_style():
+        figure = new_figure(4, 2)
+        _, right = figure.subfigures(1, 2)
+        right.supxlabel("time (s)")
+        right.subplots().inset_axes((0.5, 0.5, 0.4, 0.4)).plot([0, 1])
+        outer, inset = json.loads(save(figure, tmp_path / "parts.json").read_text())
+    assert 0.5 < outer["box"][0] < inset["box"][0] < inset["box"][2] < outer["box"][2] <= 1
+    assert outer["x"]["label"] == "time (s)" and len(inset["curves"]) == 1
+    west, north, east, south = axes["box"]
+    assert 0 <= west < east <= image["box"][0] and 0 < north < south < 1
+    assert noted[0]["box"][3] == pytest.approx(south * 2 / (2 + NOTE), abs=1e-4)  # of the picture with its strip
 
 
 def test_every_claim_has_a_figure_that_shows_it():

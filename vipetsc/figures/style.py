@@ -1,5 +1,6 @@
 """Sizes, type and colours of all pictures; an empty figure; how figures become files, and which rank draws which."""
 
+import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -13,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator
 from matplotlib.transforms import Bbox
 
-from vipetsc.io.atomic import atomic_write
+from vipetsc.figures.drawn import drawn
+from vipetsc.io.atomic import atomic_write, write_text
 
 COLUMN, PAGE = 3.4, 7.0  # widths of one and of two journal columns in inches
 NOTE = 0.165  # height in inches of the strip that a line of a note takes below a picture
@@ -52,7 +54,7 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     """Write ``figure`` to ``path`` in the format of its suffix, atomically, with a ``note`` in a strip below it.
 
     The figure's label stands there as well, in lines of the figure's width. What has been laid out for one format stays
-    so for the next.
+    so for the next. A JSON file holds what the picture shows as numbers: ``vipetsc.figures.drawn``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine():
@@ -60,6 +62,9 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     width, height = figure.get_size_inches()
     sentences = [*note.splitlines(), *figure.get_label().splitlines()]
     lines = [line for sentence in sentences for line in wrap(sentence, int(LETTERS * width))]
+    if path.suffix == ".json":
+        write_text(path, json.dumps(drawn(figure, NOTE * len(lines)), separators=(",", ":"), allow_nan=False))
+        return path
     strip, note = Bbox([[0, -NOTE * len(lines)], [width, height]]) if lines else None, "\n".join(lines)
     text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=GREY)
     with atomic_write(path) as partial_path:

@@ -8,8 +8,8 @@ from vipetsc.io.atomic import write_text
 from vipetsc.paper.plan import read_json
 
 MADE = "made.json"
-FORMATS = ("png", "pdf")
-LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".html": b"</html>"}  # what such files end with
+FORMATS = ("png", "pdf", "json")
+LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".json": b"]", ".html": b"</html>"}  # what such files end with
 
 Made = dict[str, Any]
 """Hashes of inputs of "claims" and "report", of "figures" by id with the stems of their pictures.

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib.resources import files
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -20,7 +21,8 @@ from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.paper.figures import READINGS, PaperFigure, describe
 from vipetsc.studies.engines import COMPARED
 
-COLOURS = 256  # of a picture in the page
+COLOURS = 64  # of a picture of lines in the page
+WIDTH, QUALITY = 1000, 60  # of a picture of maps, in pixels and of WebP
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
 VERDICTS = HOLDS, IN_PART, FAILS, UNMEASURED
 
@@ -64,20 +66,30 @@ def write_report(
         checks={name.removesuffix("-ts"): row["agreement"] for name, row in statistics.items() if "agreement" in row},
         bounds=COMPARED,
         cpu=cpu,
+        script=(files("vipetsc.paper") / "explore.js").read_text(encoding="utf-8"),
     )
     write_text(path, page)
 
 
-def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str]:
-    """Width and height in pixels, a hash of the file, and the picture as a data URI, ``encoded`` or made now."""
+def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str, str]:
+    """Width and height in pixels, a hash of the file, the data URI, ``encoded`` or made now, and its axes."""
     data = path.read_bytes()
-    key, out = hashlib.sha256(data).hexdigest(), io.BytesIO()
+    key = hashlib.sha256(data).hexdigest()
     with Image.open(io.BytesIO(data)) as image:
-        if key not in encoded:
-            indexed = image.convert("RGB").quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-            indexed.save(out, "png")
-        uri = encoded.get(key) or "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
-        return image.width, image.height, key, uri
+        uri = encoded.get(key) or "data:image/webp;base64," + base64.b64encode(small(image.convert("RGB"))).decode()
+        shown = path.with_suffix(".json")
+        axes = shown.read_text(encoding="utf-8") if shown.exists() else "[]"
+        return image.width, image.height, key, uri, axes.replace("<", "\\u003c")
+
+
+def small(image: Image.Image) -> bytes:
+    """The picture as WebP: with all pixels in few colours, or, where that is larger, narrower and with losses."""
+    lines, maps = io.BytesIO(), io.BytesIO()
+    few = image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    few.convert("RGB").save(lines, "webp", lossless=True, quality=60, method=4)
+    narrow = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
+    (narrow if image.width > WIDTH else image).save(maps, "webp", quality=QUALITY, method=4)
+    return min(lines.getvalue(), maps.getvalue(), key=len)
 
 
 def numbers(named: Mapping[str, float | None]) -> list[str]:
