@@ -64,6 +64,9 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
     with atomic_write(path) as aside, aside.open("wb") as file:
         header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
         npy.write_array_header_2_0(file, header)
+        file.seek(6)
+        file.write(b"\3")  # version 3, in UTF-8: headers of the others numpy takes apart into tokens first
+        file.seek(0, 2)
         # Through ``write``, which says what is wrong where numpy's own way of writing to disk does not.
         for values in arrays.values():
             file.write(np.ascontiguousarray(values).data)
