@@ -53,7 +53,7 @@ def small_case(**sections) -> Case:
         "lattice": {"preset": "four-band", "cells": 24},
         "contacts": {"sites": [6, 12, 13], "clearance": 2e-4},
         "drive": {"amplitude": 24.33, "cycles": 6},
-        "time": {"end": 0.08},
+        "time": {"end": 0.05},
     }
     for name, values in sections.items():
         table[name] = table.get(name, {}) | values

@@ -243,7 +243,7 @@ def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
 def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_path, ranks):
     """Explicit Euler without step control feeds energy in: the guard ends the run and keeps what is good."""
     out = tmp_path / "out"
-    euler = ("--", "-ts_rk_type", "1fe", "-ts_adapt_type", "none")
+    euler = ("--", "-ts_rk_type", "1fe", "-ts_adapt_type", "none", "-ts_dt", "1e-5")
     sets = ("--set", "lattice.cells=40", "--set", "contacts.sites=[10]", "--set", "time.end=0.5")
     ended = vipetsc(ranks, "run", "--out", out, *sets, *QUICK, *euler)
     assert ended.returncode == 1, ended.stdout + ended.stderr

@@ -15,7 +15,7 @@ from vipetsc.modes.lattice_follow import LatticeFollower
 COMM = MPI.COMM_WORLD
 
 
-@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parallel([2, 3])
 def test_the_same_branch_on_any_number_of_ranks(folder):
     branches = follow_all(case(multipliers=2), folder, COMM, kind=LatticeFollower)
     assert len(branches) == (COMM.rank == 0)

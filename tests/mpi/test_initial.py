@@ -11,7 +11,7 @@ PACKET = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width"
 MODE = {"kind": "mode", "number": 40, "energy": 0.5}
 
 
-@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 @pytest.mark.parametrize(("initial", "ends"), [(PACKET, "periodic"), (PACKET, "fixed"), (MODE, "free")])
 def test_same_bits_with_closed_contacts_across_borders(folder, engine, initial, ends):

@@ -14,7 +14,7 @@ from vipetsc.modes.lattice_flow import LatticeFlow
 COMM = MPI.COMM_WORLD
 
 
-@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("restitution", [1.0, 0.7])
 def test_variations_have_the_same_bits(restitution):
     """Clusters lie across the borders: 18 cells are cut after 9 or after 6 and 12."""

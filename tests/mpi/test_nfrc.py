@@ -12,7 +12,7 @@ from vipetsc.modes.nfrc import follow_curves
 from vipetsc.parallel import on_root
 
 
-@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parallel([2, 3])
 def test_curves_are_the_same_on_any_number_of_ranks(folder):
     comm, of = MPI.COMM_WORLD, case(harmonics=5, restitutions=[1.0, 0.7], points=8)
     on_root(comm, lambda: [(folder / name).mkdir() for name in ("shared", "alone")] and None)

@@ -34,7 +34,7 @@ def runs_alike(folder: Path, case: Case) -> None:
     on_root(MPI.COMM_WORLD, compare)
 
 
-@pytest.mark.parallel([1, 2, 3, 4])
+@pytest.mark.parallel([2, 3, 4])
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_same_bits_with_sites_on_the_borders(folder, ends, law):

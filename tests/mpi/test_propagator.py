@@ -9,7 +9,7 @@ from tests.mpi.test_partition import runs_alike
 from vipetsc.case import Case
 
 
-@pytest.mark.parallel([1, 2, 3, 4])
+@pytest.mark.parallel([2, 3, 4])
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_same_bits_with_clusters_across_borders(folder, ends, law):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 from mpi4py import MPI
 
@@ -20,28 +21,34 @@ from vipetsc.studies.analysis import analyse
 from vipetsc.studies.reanalysis import is_measured, measure_run, reanalyse_folders
 
 
-def test_every_file_opens_in_xarray_with_units(folder):
-    simulate(small_case(), folder / "run")
-    measure_run(folder / "run")
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder of the small case's run and its analysis."""
+    run = tmp_path_factory.mktemp("made") / "run"
+    simulate(small_case(), run)
+    measure_run(run)
+    return run
+
+
+def test_every_file_opens_in_xarray_with_units(made):
     groups = {"run.h5": [None, "energy", "sites", "impacts"], "analysis.h5": [None, "bands"]}
     for name, members in groups.items():
         for group in members:
-            with xarray.open_dataset(folder / "run" / name, engine="h5netcdf", group=group) as data:
+            with xarray.open_dataset(made / name, engine="h5netcdf", group=group) as data:
                 assert data.variables
                 for key, variable in data.variables.items():
                     assert variable.attrs.get("units"), (name, group, key)
-    with xarray.open_dataset(folder / "run" / "run.h5", engine="h5netcdf") as run:
+    with xarray.open_dataset(made / "run.h5", engine="h5netcdf") as run:
         assert run.velocity.dims == ("time", "cell", "dof")
         assert run.velocity.sel(cell=24, dof=4).sizes == {"time": run.sizes["time"]}
         assert Case.from_toml(run.attrs["case"]) == small_case()
         assert {"vipetsc_version", "petsc_version", "mpi_version", "ranks", "command", "status"} <= run.attrs.keys()
 
 
-def test_windows_and_strides_are_parts_of_the_whole(folder):
-    simulate(small_case(), folder / "whole")
+def test_windows_and_strides_are_parts_of_the_whole(made, folder):
     output = {"window": [3, 17], "every": 4, "stride": 5, "fields": ["velocity"]}
     simulate(small_case(output=output), folder / "part")
-    whole, part = (datasets(folder / name / "run.h5") for name in ("whole", "part"))
+    whole, part = (datasets(path / "run.h5") for path in (made, folder / "part"))
     assert part["cell"].tolist() == [3, 7, 11, 15]
     np.testing.assert_array_equal(part["velocity"], whole["velocity"][::5, 2:17:4])
     np.testing.assert_array_equal(part["field_time"], whole["time"][::5])
@@ -49,9 +56,8 @@ def test_windows_and_strides_are_parts_of_the_whole(folder):
     assert "displacement" not in part
 
 
-def test_impact_log_is_complete_and_ordered(folder):
-    simulate(small_case(), folder / "run")
-    run = datasets(folder / "run" / "run.h5")
+def test_impact_log_is_complete_and_ordered(made):
+    run = datasets(made / "run.h5")
     log = {k.split("/")[1]: v for k, v in run.items() if k.startswith("impacts/")}
     assert np.all(np.diff(log["onset"]) >= 0)
     ended = np.isfinite(log["separation"])
@@ -103,10 +109,9 @@ def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
     assert np.isfinite(run["displacement"]).all()
 
 
-def test_another_analysis_of_the_same_run(folder):
+def test_another_analysis_of_the_same_run(made, folder):
     """It is measured anew, not refused and not simulated; anything else is another case."""
-    simulate(small_case(), folder / "run")
-    measure_run(folder / "run")
+    shutil.copytree(made, folder / "run")
     assert is_measured(folder / "run")
     finer = small_case(analysis={"cell_stride": 1})
     assert simulate(finer, folder / "run").complete

@@ -75,7 +75,7 @@ def test_transfers_close_the_ledger_of_every_cluster(builtin):
 
 def test_work_of_the_drive_is_no_transfer():
     """Sites that the burst's front meets while it is still on, too far from the driven cell to tell it in time."""
-    run = run_of(small_case(time={"engine": "propagator"}))
+    run = run_of(small_case(time={"engine": "propagator", "end": 0.08}))
     model, analysis = Case.of(run).model(), analyse(run, ("modal", "transfers"))
     time, work = run["time"].values, run["energy/work"].values
     begin, end = (analysis[f"bands/cluster_{name}"].values for name in ("begin", "end"))
@@ -90,7 +90,7 @@ def test_work_of_the_drive_is_no_transfer():
 
 
 def test_without_contacts_all_is_work_of_the_drive():
-    run = run_of(small_case(contacts={"sites": 0}, time={"engine": "propagator"}))
+    run = run_of(small_case(contacts={"sites": 0}, time={"engine": "propagator", "end": 0.08}))
     model, analysis = Case.of(run).model(), analyse(run, ("modal", "transfers"))
     parts = ModalParts.of(model.chain)
     rest, span = np.zeros(len(parts.part), complex), np.array([0.0, model.drive.duration])
@@ -114,7 +114,7 @@ def test_a_run_in_memory_ends_with_the_state_of_its_last_sample(engine):
 
 
 def test_a_long_lattice_says_what_its_ends_make_of_it(monkeypatch):
-    run = run_of(small_case(lattice={"cells": 60}, time={"engine": "propagator"}))
+    run = run_of(small_case(lattice={"cells": 60}, time={"engine": "propagator", "end": 0.08}))
     exact = analyse(run, ("modal", "transfers"))
     modes._modes.cache_clear()
     monkeypatch.setattr(modes, "MOST_DOFS", 100)

@@ -69,7 +69,7 @@ def test_a_record_that_ends_early(folder, petsc_options):
     result = simulate(small_case(contacts={"sites": []}), folder / "run")
     assert not result.complete
     warning = told(result)[-1]
-    assert warning.startswith(f"the record ends at sample {result.statistics['samples']} of 401: the energy runs away")
+    assert warning.startswith(f"the record ends at sample {result.statistics['samples']} of 251: the energy runs away")
 
 
 def test_what_an_exception_leaves_behind_is_freed(folder, monkeypatch):
