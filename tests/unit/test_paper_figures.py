@@ -101,6 +101,8 @@ def test_what_a_picture_shows_is_told_as_numbers(tmp_path):
         left.errorbar(x, 2 * x, 0.1 * x, fmt="o-", color="#0072B2", label="measured")
         left.plot([0, 1], [0, 1], transform=left.transAxes)  # is no curve of the data
         left.plot(*wave, label="_many")
+        left.scatter([2, 3], [4, 5], c=[0.1, 0.9], label="by colour")
+        left.scatter([2], [4], facecolors="none", edgecolors="k")
         left.set(xscale="log", xlabel="Amplitude $A$ (N)", title="")
         right.pcolormesh(np.eye(3))
         right.plot([0, 2], [0, 2])
@@ -110,7 +112,8 @@ def test_what_a_picture_shows_is_told_as_numbers(tmp_path):
     axes, image = json.loads(path.read_text())
     assert axes["x"] | {"low": 0, "high": 0} == {"low": 0, "high": 0, "log": True, "label": "Amplitude A (N)"}
     assert axes["y"]["log"] is False
-    curve, many = axes["curves"]
+    curve, many, points = axes["curves"]
+    assert points["label"] == "by colour" and points["x"] == [2, 3] and not points["joined"]
     assert many["label"] == "" and len(many["x"]) < 400
     assert np.interp(wave[0], many["x"], many["y"]) == pytest.approx(wave[1], abs=3)
     assert curve["label"] == "measured" and curve["colour"] == "#0072b2" and curve["joined"]

@@ -72,7 +72,7 @@ def _curves(axes: Axes) -> list[dict[str, Any]]:
         if line not in caps and all(line.get_transform().contains_branch_seperately(axes.transData))
     ]
     shapes += [
-        (points.get_label(), points.get_facecolor()[:1] or "black", False, np.ma.filled(points.get_offsets(), np.nan))
+        (points.get_label(), points.get_facecolor()[0], False, np.ma.filled(points.get_offsets(), np.nan))
         for points in axes.collections
         if isinstance(points, PathCollection) and len(points.get_facecolor())
     ]

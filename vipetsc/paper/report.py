@@ -21,7 +21,7 @@ from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.paper.figures import READINGS, PaperFigure, describe
 from vipetsc.studies.engines import COMPARED
 
-COLOURS = 64  # of a picture of lines in the page
+COLOURS = 256  # of a picture of lines in the page
 WIDTH, QUALITY = 1000, 60  # of a picture of maps, in pixels and of WebP
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
 VERDICTS = HOLDS, IN_PART, FAILS, UNMEASURED
