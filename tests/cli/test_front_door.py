@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+import h5py
 import pytest
 
 from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
@@ -214,6 +215,24 @@ def test_bands_as_json_and_picture(in_process, tmp_path):
     assert edges == [(0.0, 836.47), (947.07, 1414.21), (2331.09, 3162.28), (3271.55, 3669.65)]
     assert len(table["gaps"]) == 3
     assert (tmp_path / "bands" / "bands.png").stat().st_size > 5000
+
+
+def test_bands_with_modes_of_the_finite_lattice(in_process, tmp_path):
+    asked = "bands", "--set", "lattice.cells=40", "--out", tmp_path / "bands"
+    told = in_process(*asked, "--modes", "2", "--near", "2034")
+    assert told.returncode == 0, told.stderr
+    rows = [line.split() for line in told.stdout.splitlines() if line.endswith("edge")]
+    assert [row[:3] for row in rows] == [["1", "2034.825055", "gap"], ["2", "2034.825055", "gap"]]
+    with h5py.File(tmp_path / "bands" / "modes.h5") as file:
+        assert file["shape"].shape == (2, 40, 4)
+    as_json = in_process(*asked, "--modes", "3", "--near", "2034", "--json")
+    assert len(json.loads(as_json.stdout)["bands"]) == 4  # nothing else is printed
+    with h5py.File(tmp_path / "bands" / "modes.h5") as file:
+        assert file["shape"].shape == (3, 40, 4)
+    for wrong in (("--near", "2034"), ("--modes", "161"), ("--modes", "2", "--near", "-1")):
+        refused = in_process(*asked[:-1], tmp_path / "none", *wrong)
+        assert refused.returncode == 2 and wrong[-2] in refused.stderr
+        assert not (tmp_path / "none" / "modes.h5").exists()
 
 
 @pytest.mark.mpirun

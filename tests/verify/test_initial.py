@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from tests.conftest import StopAt, assert_same_bits, datasets
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.dynamics import simulate
 from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import bloch
 from vipetsc.lattice.modes import frequencies, modes_of
+from vipetsc.modes.condensed_follow import CondensedFollower
+from vipetsc.modes.follow import follow_all
 from vipetsc.spectra.modal import ModalParts
 
 ENGINES = ("ts", "propagator")
@@ -167,3 +171,22 @@ def test_a_file_that_changes_is_noticed(tmp_path):
     assert Case.from_toml(case.to_toml()) == case
     with pytest.raises(CaseError, match=r"initial\.path"):
         simulate(case, RunMemory())
+
+
+def test_a_breather_comes_back_after_its_period_on_both_engines(tmp_path):
+    """From the file of a condensed branch, whose harmonics left out are 1e-8 of the motion."""
+    lattice = {"preset": "four-band", "reading": "calibrated", "cells": 14}
+    contacts = {"law": "hertz", "sites": [6], "clearance": 10**-2.75, "restitution": 1.0}
+    nnm = {"system": "condensed", "start_frequency": [1600.0], "truncation": 1e-8, "tolerance": 1e-12, "points": 1}
+    case = NnmCase.from_table({"name": "b", "lattice": lattice, "contacts": contacts, "nnm": nnm})
+    follow_all(case, tmp_path, MPI.COMM_SELF, kind=CondensedFollower)
+    period = 2 * np.pi / 1600
+    initial = {"kind": "file", "path": str(tmp_path / "branch-breather-1600.h5"), "orbit": 1}
+    for engine in ENGINES:
+        time = {"engine": engine, "end": period, "sample_interval": period / 16, "rtol": 1e-13}
+        data = run(moving(initial, lattice=lattice, contacts=contacts, time=time))
+        u, w = data["displacement"].values, np.abs(np.diff(data["displacement"].values[:, 5, 1:3])).max()
+        assert w == pytest.approx(1.286 * 10**-2.75, rel=1e-3)
+        assert len(data["impacts/onset"]) == 3  # closed at the start, the other side, and closed again
+        assert np.abs(u[-1] - u[0]).max() < 1e-7 * np.abs(u[0]).max()
+        assert np.abs(u[8] + u[0]).max() < 1e-7 * np.abs(u[0]).max()
