@@ -39,7 +39,7 @@ class TangentPropagator(Propagator):
     def place(self, cells: np.ndarray, speed: float) -> None:
         """Begin at ``cells``; ``speed`` in m/s is that of relative motion, for the accuracy of closed contacts.
 
-        Raises ValueError, on all ranks, for a closed contact that dissipates.
+        Raises StalledError, on all ranks, for a closed contact that dissipates.
         """
         here, clusters, dofs = self._components[0], self._forces.clusters, self._forces.dofs
         here[: cells.size] = cells.ravel()
@@ -49,7 +49,7 @@ class TangentPropagator(Propagator):
         w, sites, history = clusters.taylor[:, 0], clusters.contacts, clusters.history
         closed = np.where(w < 0, -w - sites["clearance_minus"], w - sites["clearance"]) > 0
         if self._layout.comm.allreduce(bool((closed & (sites["damping"] != 0)).any())):
-            raise ValueError("a contact that dissipates is closed at the beginning")
+            raise StalledError("a contact that dissipates is closed at the beginning")
         sites["mode"] = np.where(closed, np.sign(w) * CLOSED, 0)
         sites["approach"] = np.where(closed, np.sign(w) * speed, 1.0)
         history["onset"], history["duration"] = -np.inf, 1.0
