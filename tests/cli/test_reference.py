@@ -14,8 +14,8 @@ import pytest
 
 import vipetsc as package
 from vipetsc.case import keys
+from vipetsc.case.drive import DriveTable
 from vipetsc.case.reading import SECTIONS, CaseError, read_section
-from vipetsc.case.schema import DriveTable
 from vipetsc.cli.main import VERBS
 
 ROOT = Path(package.__file__).parents[1]

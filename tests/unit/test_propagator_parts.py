@@ -12,8 +12,9 @@ from scipy.linalg import expm
 from tests.conftest import small_case
 from vipetsc.case import Case
 from vipetsc.contact.law import CLOSED, create_contacts
+from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.engine import Stretch
-from vipetsc.dynamics.layout import Burst, Layout, create_record
+from vipetsc.dynamics.layout import Layout, create_record
 from vipetsc.dynamics.propagator.collocation import (
     HISTORY,
     SUBSTEP_STATE,
@@ -60,8 +61,8 @@ def parts(ends: str, interval: float, tolerance: float, sites=(5, 6, 12)):
 def no_samples(model, layout, number: int) -> Samples:
     """Room for no sample from the ``number`` on."""
     none, fields = np.zeros(0), (np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1)
-    sums = np.zeros((0, 5, 2), np.int64)
-    return Samples(number, sums, none, none.reshape(0, 0), *fields, create_record(model, layout), 1.0)
+    sums, work, losses = np.zeros((0, 5, 2), np.int64), none.reshape(0, 1), none.reshape(0, 0)
+    return Samples(number, sums, work, losses, *fields, create_record(model, layout), 1.0, 1.0)
 
 
 def as_lists(groups) -> list[list[int]]:
@@ -221,10 +222,10 @@ def oscillator(damping: float = 0.0) -> tuple[Cluster, float]:
     contacts = create_contacts(contact, [1.0])
     contacts["mode"], contacts["approach"], contacts["stiffness"] = CLOSED, speed, mass * rate**2
     contacts["exponent"], contacts["damping"], contacts["floor"] = 1.0, damping, 0.0
-    burst = Burst(0.0, 1.0, 1.0, 0.0)
+    drives = create_drives((), [])
     response = np.full((1, 1, 1), h**2 / mass)
     cluster = Cluster(
-        contacts, burst, response, collocation(2), h, 1.0, 1e-10, 1e-12, 1.0,
+        contacts, drives, response, collocation(2), h, 1.0, 1e-10, 1e-12, 1.0,
         taylor=np.array([[1.0, speed * h]]), site_motion=np.zeros((1, 3)), moments=np.zeros((1, 2)),
         energy=np.zeros(1), history=np.zeros(1, HISTORY), state=np.zeros(1, SUBSTEP_STATE), trial=create_trial(1, 1),
         tape=create_tape(0, 0),

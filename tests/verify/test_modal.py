@@ -94,7 +94,7 @@ def test_without_contacts_all_is_work_of_the_drive():
     model, analysis = Case.of(run).model(), analyse(run, ("modal", "transfers"))
     parts = ModalParts.of(model.chain)
     rest, span = np.zeros(len(parts.part), complex), np.array([0.0, model.drive.duration])
-    expected = parts.driven_change(rest, model.drive, parts.modes.force(0, 0), span)
+    expected = parts.driven_change(rest, model.drives, span)
     assert analysis["bands/drive_work"].values == pytest.approx(expected, abs=1e-9 * expected.sum())
     assert analysis["bands/transfer"].shape == (0, 8)
 

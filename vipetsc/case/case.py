@@ -5,64 +5,27 @@ A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from vipetsc.case.contacts import Gaps, check_alike, contact_of, gaps_of_sites, laws_of_sites
+from vipetsc.case.contacts import check_alike, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
+from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
 from vipetsc.case.initial import InitialTable, beginning_of, check_initial
+from vipetsc.case.model import Model
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid, read_section
-from vipetsc.case.resolve import (
-    build_chain,
-    check_cell,
-    check_contacts,
-    check_wave,
-    driven_wave,
-    resolved,
-    wave_speed,
-    with_preset,
-)
-from vipetsc.case.schema import CONTACTS, AnalysisTable, DriveTable, LatticeTable, OutputTable, PetscTable, TimeTable
+from vipetsc.case.resolve import build_chain, check_cell, check_contacts, resolved, with_preset
+from vipetsc.case.samples import with_samples
+from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.lattice import Chain, Contact, ToneBurst, UnitCell, pass_bands, waves_at
+from vipetsc.case.warnings import warnings_of
+from vipetsc.lattice import UnitCell, pass_bands
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
 MOST_SAMPLES = 1e9
-
-
-@dataclass(frozen=True)
-class Model:
-    """A case in the terms of ``vipetsc.lattice``: 0-based indices, seconds, newtons, everything decided.
-
-    ``atol`` is the pair (displacement m, velocity m/s); ``scale`` the displacement in m of the drive's
-    linear wave or of the ``initial`` state, ``speed`` the group velocity in cells/s that ``traverse`` uses. The law of
-    each site is in ``laws`` (() if all have ``contact``), its clearances in m on the sides + and - are in ``gaps`` (()
-    if the chain's are those of both).
-    """
-
-    chain: Chain
-    contact: Contact
-    drive: ToneBurst
-    drive_cell: int
-    drive_mass: int
-    end: float
-    sample_interval: float
-    method: str
-    rtol: float
-    atol: tuple[float, float]
-    scale: float
-    speed: float
-    initial: InitialTable | None = None
-    laws: tuple[Contact, ...] = ()
-    gaps: Gaps = ()
-
-    @property
-    def samples(self) -> int:
-        """Number of uniform samples, the one at t = 0 included."""
-        return int(np.floor(self.end / self.sample_interval * (1 + 1e-12))) + 1
 
 
 class Case(CaseFile):
@@ -82,13 +45,15 @@ class Case(CaseFile):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
-        sections, problems = super().read(with_preset(table))
+        table, unread = with_samples(with_preset(table))
+        sections, problems = super().read(table)
+        problems = unread + [p for p in problems if not unread or ".samples" not in p.key]
         disorder, wrong = read_section(DisorderTable, table.get("disorder", {}), "disorder")
         if problems := problems + wrong:
             return sections, problems
         beginning, drive = None, sections["drive"]
         if (initial := sections.get("initial")) and initial.moves:
-            frequency = driven_wave(sections["lattice"].unit_cell(), drive)[0] if _ways(drive) else None
+            frequency = driven_wave(sections["lattice"].unit_cell(), drive)[0] if drive.ways else None
             beginning, problems = beginning_of(initial, sections["lattice"], frequency)
             if problems:
                 return sections, problems
@@ -126,10 +91,12 @@ class Case(CaseFile):
             yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
         if undriven and sections["time"].atol == "paper":
             yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
-        of_drive = list(_check_drive(sections["drive"], length, cell, valid))
+        of_drive, drive = list(check_drives(sections["drive"], lattice, cell, length, valid)), sections["drive"]
         yield from of_drive
-        if cell and not of_drive and _ways(sections["drive"]) and valid("lattice", "drive", "time.end"):
-            yield from check_wave(cell, sections["drive"], sections["time"])
+        if (drive.kind != "burst" or drive.end or drive.more) and cls is not Case:
+            yield Problem("drive.waveform", drive.kind, "this verb is about one burst on a mass; run takes all others")
+        if cell and not of_drive and drive.ways and valid("lattice", "drive", "time.end"):
+            yield from check_wave(cell, drive, sections["time"])
         yield from _check_sampling(sections["time"], cell, valid)
         window = sections["output"].window
         if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
@@ -140,8 +107,9 @@ class Case(CaseFile):
         contacts, drive, time = self.contacts, self.drive, self.time
         assert drive.frequency is not None and time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
-        burst = ToneBurst(drive.amplitude, drive.frequency, drive.cycles, drive.envelope)
-        scale = chain.wave_scale(burst, drive.cell - 1, drive.mass - 1) if drive.amplitude else 0.0
+        drives, scale = build_drives(drive, chain), 0.0
+        for one in drives if drive.amplitude else ():
+            scale += chain.wave_scale(one.waveform, one.cell, one.mass) * (one.stiffness or 1.0)
         if self.initial:
             scale = max(scale, self.initial.amplitude or 0.0)
         if time.atol == "scaled":
@@ -152,16 +120,14 @@ class Case(CaseFile):
         return Model(
             chain=chain,
             contact=contact_of(contacts),
-            drive=burst,
-            drive_cell=drive.cell - 1,
-            drive_mass=drive.mass - 1,
+            drives=drives,
             end=time.end,
             sample_interval=time.sample_interval,
             method=time.method,
             rtol=time.rtol,
             atol=atol,
             scale=scale,
-            speed=wave_speed(chain.cell, drive.frequency),
+            speed=packet_speed(chain.cell, drive),
             initial=self.initial,
             laws=laws_of_sites(contacts, len(chain.sites)),
             gaps=gaps_of_sites(contacts, list(chain.clearances)),
@@ -174,47 +140,7 @@ class Case(CaseFile):
 
     def warnings(self) -> list[str]:
         """What is allowed but likely not meant, one sentence each."""
-        model, output = self.model(), self.output
-        drive, sites, top = model.drive, model.chain.sites, pass_bands(model.chain.cell)[-1].high
-        interval, (first, last) = output.stride * model.sample_interval, output.window or (1, model.chain.cells)
-        outside = f"drive.frequency = {drive.frequency:.6g} rad/s lies in no pass band"
-        coarse = f"fields kept every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
-        sparse = f"fields of one cell in {output.every} do not resolve waves shorter than {2 * output.every} cells"
-        checks = [
-            (drive.amplitude and not waves_at(model.chain.cell, drive.frequency),
-             f"{outside}, so the wave is evanescent; see the verb `bands`"),
-            (model.end <= drive.duration, f"time.end = {model.end:.6g} s comes before the burst is over"),
-            # In the words of the analysis, so that each is said once.
-            (output.fields and interval >= np.pi / top, f"{coarse}: dispersion, bands and ibtet are not measured"),
-            (output.fields and output.every > 1,
-             f"{sparse}: wavenumber_content, dispersion, partition and entropy are not measured"),
-            (output.fields and sites and not any(first <= site + 1 <= last for site in sites),
-             f"output.window = [{first}, {last}] holds none of the contact sites"),
-        ]  # fmt: skip
-        return [sentence for applies, sentence in checks if applies]
-
-
-def _check_drive(drive: DriveTable, length: int | None, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
-    """The frequency is given in one way, and the driven mass exists."""
-    if valid("drive"):
-        by_band = drive.wavenumber is not None or drive.at is not None
-        ways = _ways(drive)
-        remedy = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
-        if len(ways) != 1 and (ways or drive.amplitude != 0):
-            yield Problem("drive.frequency", drive.frequency, remedy)
-        elif by_band != (drive.band is not None):
-            yield Problem("drive.band", drive.band, remedy)
-        if cell and drive.band is not None and drive.band > cell.dofs:
-            yield Problem("drive.band", drive.band, f"the cell has {cell.dofs} bands")
-    if length is not None and drive.cell > length:
-        yield Problem("drive.cell", drive.cell, f"outside the lattice; cells count from 1 to {length}")
-    if cell and drive.mass > cell.dofs:
-        yield Problem("drive.mass", drive.mass, f"the cell has {cell.dofs} masses")
-
-
-def _ways(drive: DriveTable) -> list[Any]:
-    """The frequency as it is given, in how many ways it is."""
-    return [way for way in (drive.frequency, drive.wavenumber, drive.at) if way is not None]
+        return warnings_of(self.model(), self.output, self.petsc.model_extra or {} if self.petsc else {})
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

@@ -44,7 +44,8 @@ def _within(annotation: Any) -> Iterator[type[Section]]:
 @cache
 def texts() -> dict[str, dict[str, list[str]]]:
     """Unit and text of every key, by the name of its class."""
-    return tomllib.loads((files("vipetsc.case") / "keys.toml").read_text(encoding="utf-8"))
+    told = tomllib.loads((files("vipetsc.case") / "keys.toml").read_text(encoding="utf-8"))
+    return told | {"OneDrive": {key: text for key, text in told["DriveTable"].items() if key != "more"}}
 
 
 def told(name: str, key: str) -> tuple[str, str]:

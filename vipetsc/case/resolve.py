@@ -2,20 +2,19 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from vipetsc.case.contacts import check_each, resolved_each
+from vipetsc.case.drive import SINES, DriveTable, packet_speed, resolved_drive, waveform_of
 from vipetsc.case.initial import Beginning
 from vipetsc.case.reading import Problem, Table, Valid
-from vipetsc.case.schema import CONTACTS, PRESETS, DriveTable, LatticeTable, TimeTable
+from vipetsc.case.schema import CONTACTS, PRESETS, LatticeTable
 from vipetsc.case.sites import ContactsTable, Span
-from vipetsc.lattice import Chain, UnitCell, bloch, contact_stiffness, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import cell_problems, groups_of
 
-STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 # A key of a case file takes the place of these keys of the preset.
 REPLACES = {
     "stiffness": {"modulus", "radius", "poisson"},
@@ -51,6 +50,9 @@ def with_preset(table: Table) -> Table:
         if isinstance(given, dict):
             if given.get("amplitude") == 0:
                 defaults = {}  # of an initial state alone
+            if given.get("waveform", "burst") != "burst":  # of the paper's burst, but for where its wave is
+                waves = REPLACES["frequency"] if given["waveform"] in SINES else ()
+                defaults = {key: value for key, value in defaults.items() if key in waves}
             replaced = {key for choice in given.keys() & REPLACES.keys() for key in REPLACES[choice]}
             table[name] = {k: v for k, v in defaults.items() if k not in replaced} | given
     return table
@@ -182,17 +184,18 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
         if lattice.preset and law["radius"] == CONTACTS["radius"]:
             del law["radius"]  # it goes without saying
     told = beginning if beginning and drive.amplitude == 0 else None
-    frequency = told.frequency if told else driven_wave(cell, drive)[0]
+    tables["drive"] = resolved_drive(drive, cell, lattice.cells, told.frequency if told else None)
+    if drive.more:
+        tables["drive"]["more"] = [resolved_drive(more, cell, lattice.cells) for more in drive.more]
     end, interval = time.end, time.sample_interval
     if end == "traverse":
-        burst = 0.0 if told else 2 * np.pi * drive.cycles / frequency
-        end = burst + lattice.cells / wave_speed(cell, frequency)
+        told_drive = DriveTable(**tables["drive"])
+        end = max(waveform_of(one).settled for _, one in told_drive.every)
+        end += lattice.cells / packet_speed(cell, told_drive)
     if time.samples is not None:
         interval = end / (time.samples - 1)
     elif interval == "auto":
         interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
-    tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in REPLACES["frequency"]}
-    tables["drive"]["frequency"] = frequency
     tables.pop("initial", None)
     tables |= {"initial": beginning.table} if beginning else {}
     if told and "cell" not in drive.model_fields_set:
@@ -200,33 +203,6 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
     tables["time"] |= {"sample_interval": float(interval), "end": float(end)}
     tables["time"].pop("samples", None)
     return tables
-
-
-@lru_cache
-def driven_wave(cell: UnitCell, drive: DriveTable) -> tuple[float, float]:
-    """Frequency in rad/s and |group velocity| in cells/s of the wave that a valid ``drive`` makes."""
-    if drive.wavenumber is not None and drive.band is not None:
-        point = bloch(cell, drive.wavenumber)
-        return float(point.frequency[drive.band - 1]), float(abs(point.group_velocity[drive.band - 1]))
-    frequency = drive.frequency or max_group_velocity(cell, drive.band or 1)[1]
-    return frequency, wave_speed(cell, frequency)
-
-
-def check_wave(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
-    """What is wrong with a valid drive that is to make a wave, and with a wave that is to cross the lattice."""
-    frequency, speed = driven_wave(cell, drive)
-    key = "frequency" if drive.frequency else "wavenumber" if drive.wavenumber else "band"
-    if not frequency > 0:
-        yield Problem(f"drive.{key}", getattr(drive, key), "the frequency there is 0; drive another wavenumber or band")
-    elif time.end == "traverse" and not speed > STANDING * wave_speed(cell, np.inf):
-        remedy = f"the wave at {frequency:.6g} rad/s stands (group velocity 0) and never crosses the lattice"
-        yield Problem(f"drive.{key}", getattr(drive, key), f"{remedy}; give time.end in s, or another wavenumber")
-
-
-def wave_speed(cell: UnitCell, frequency: float) -> float:
-    """Group velocity in cells/s of the fastest wave at ``frequency``; in a gap, the cell's fastest."""
-    speed = max((wave[2] for wave in waves_at(cell, frequency)), default=0.0)
-    return speed or max(max_group_velocity(cell, band + 1)[2] for band in range(cell.dofs))
 
 
 def _round_down(value: float) -> float:

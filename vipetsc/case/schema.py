@@ -150,23 +150,6 @@ class LatticeTable(Section):
         return PRESETS[str(self.preset)].cell(self.reading, **options)
 
 
-class DriveTable(Section):
-    """A tone burst: ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``.
-
-    With an initial state ``amplitude`` may be 0; then ``frequency`` and ``cell`` are by default those of its motion.
-    """
-
-    amplitude: Finite = 1.0
-    cycles: int = Field(30, ge=1)
-    envelope: Literal["paper", "hann"] = "paper"
-    frequency: Positive | None = None
-    wavenumber: Wavenumber | None = None
-    band: Annotated[int, Field(ge=1)] | None = None
-    at: Literal["max-group-velocity"] | None = None
-    cell: int = Field(1, ge=1)
-    mass: int = Field(1, ge=1)
-
-
 class TimeTable(Section):
     """End in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
 

@@ -151,10 +151,10 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
         ("sites", _first_few([c + 1 for c in chain.sites])),
         ("clearance", _first_few(stops_told(model.gaps, chain.clearances)) + " mm" if chain.sites else "none"),
         ("begins with", initial_text(case)),
-        ("drive", f"{model.drive.amplitude:g} N, {model.drive.cycles} cycles, Om = {model.drive.frequency:.4f} rad/s"),
+        *(("drive", drive.told()) for _, drive in case.drive.every),
         ("waves at Om", "; ".join(f"band {b}, kappa = {k / np.pi:.4f} pi, v_g = {v:.2f} cells/s" for b, k, v in waves)
                         or "none: in a gap"),
-        ("burst, end", f"{model.drive.duration:.6g} s, {model.end:.6g} s"),
+        ("burst, end", f"{max(drive.waveform.duration for drive in model.drives):.6g} s, {model.end:.6g} s"),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("engine", cost.engine + (f": {cost.note}" if cost.note else "")),

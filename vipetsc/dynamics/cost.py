@@ -90,4 +90,5 @@ def expected_episodes(model: Model) -> float:
     gaps = np.min(model.gaps, axis=1) if model.gaps else np.asarray(model.chain.clearances)
     z = model.scale * max(shares) / np.maximum(gaps, 1e-300)
     above = np.where(z > 1, 1 - 2 / np.pi * np.arcsin(np.sqrt(1 / np.maximum(z, 1))), 0.0)
-    return float(2 * drive.cycles * above.sum())
+    endless = model.end * drive.frequency / (2 * np.pi)
+    return float(2 * (drive.cycles if np.isfinite(drive.duration) else endless) * above.sum())

@@ -103,9 +103,15 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
     return sums
 
 
+@njit(error_model="numpy")
+def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
+    """Add an ``energy`` in J to the springs' in the ``sums`` of ``measure``."""
+    _add(sums, _SPRING, np.array([energy]), unit)
+
+
 @dataclass(frozen=True)
 class Energies:
-    """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drive, dissipated.
+    """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drives, dissipated.
 
     The work begins with the energy of the initial state. ``dissipated`` is that of contacts; that of dashpots is
     ``balanced`` where it is what the other energies leave, which then no residual tells anything of.
@@ -142,23 +148,27 @@ class EnergyMeter:
         self.lattice = create_record(model, layout)
         speed = model.scale * model.drive.frequency
         # Cells that the packet covers; of an initial state, perhaps all.
-        burst = model.chain.cells if model.initial else model.drive.duration * model.speed
+        burst = (
+            model.chain.cells
+            if model.initial
+            else min(max(drive.waveform.duration for drive in model.drives), model.end) * model.speed
+        )
         scale = sum(model.chain.cell.masses) * speed**2 * max(burst, 1.0)
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
         self.largest = self.unit * LARGEST  # energy in J from which on the sums saturate
 
     def total(self, sums: np.ndarray, work: np.ndarray) -> Energies:
-        """Energies of all ranks' shares: ``sums`` (sample, part, 2) of ``measure``, ``work`` (sample,) in J.
+        """Energies of all ranks' shares: ``sums`` (sample, part, 2) of ``measure``, ``work`` (sample, drive) in J.
 
         All ranks must call it.
         """
         whole, fine = sums.T  # (part, sample) each
         # Carrying leaves every number below 2^53: their sums over ranks, as floats, are exact.
         carried = fine >> 40
-        total = np.vstack([whole + carried, fine - (carried << 40), work])
+        total = np.vstack([whole + carried, fine - (carried << 40), work.T])
         self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         *stored, lost, damping = total[:PARTS] * self.unit + total[PARTS : 2 * PARTS] * (self.unit / _FINE)
-        kinetic, spring, contact, work = *stored, total[2 * PARTS]
+        kinetic, spring, contact, work = *stored, total[2 * PARTS :].sum(axis=0)
         if self._balanced:
             damping = work - lost - (kinetic + spring + contact)
         return Energies(kinetic, spring, contact, work, lost, damping, self._balanced)

@@ -33,7 +33,7 @@ def set_in_motion(setup: Setup) -> None:
     motion = np.zeros((len(setup.model.chain.sites), 2))
     for numbers, theirs in layout.comm.allgather((layout.sites, rows)):
         motion[list(numbers)] = np.reshape(theirs, (-1, 2))
-    energy = float(meter.total(sums[None], np.zeros(1)).total[0])
+    energy = float(meter.total(sums[None], np.zeros((1, 1))).total[0])
     setup.engine.begin(layout.motion(state.array_r), motion, energy)
     state.destroy()
 

@@ -2,11 +2,11 @@
 
 A rank's part of the state holds, one after another: displacements by mass (all owned cells of mass 1, then of
 mass 2, ...), velocities likewise, then its ledger components (where an engine integrates it, what the dashpots of each
-owned cell have dissipated; work of the drive if it owns the driven cell; dissipated energy of each owned site). Behind
+owned cell have dissipated; work of each drive whose cell it owns; dissipated energy of each owned site). Behind
 them lie the ghosts: displacements of the neighbouring cell on the left, with velocities where there are dashpots to
 integrate, then on the right. Mass by mass keeps every inner loop contiguous.
 
-Compiled kernels see a rank's part as a ``LatticeRecord``: tables of masses, springs and sites, and the drive.
+Compiled kernels see a rank's part as a ``LatticeRecord``: tables of masses, springs, sites and drives.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.case import Model
-from vipetsc.compiled import njit
 from vipetsc.contact.law import create_contacts
-from vipetsc.lattice import Chain, ToneBurst
+from vipetsc.dynamics.drives import Drives, create_drives
+from vipetsc.lattice import Chain
 
 
 class Layout:
@@ -41,7 +41,8 @@ class Layout:
         self.periodic = chain.ends == "periodic"
         cuts = cell_cuts(self.cells, comm.size)
         self.ranges = np.array([*pairwise(cuts)])
-        of_ledger, _ = np.histogram([model.drive_cell, *chain.sites], cuts)
+        driven = np.array([drive.cell for drive in model.drives], np.int64)
+        of_ledger, _ = np.histogram([*driven, *chain.sites], cuts)
         self.damped = dashpots and chain.is_damped
         self.rows, self.ghost_rows = 2 * self.dofs + self.damped, self.dofs * (1 + self.damped)
         sizes = self.rows * np.diff(cuts) + of_ledger
@@ -50,8 +51,8 @@ class Layout:
         self.owned, self.size = self.stop - self.start, int(sizes[comm.rank])
         sites = np.array(chain.sites, np.int64)
         self.sites = tuple(np.flatnonzero((sites >= self.start) & (sites < self.stop)).tolist())
-        self.owns_drive = self.start <= model.drive_cell < self.stop
-        self.dissipated = self.rows * self.owned + self.owns_drive
+        self.drives = tuple(np.flatnonzero((driven >= self.start) & (driven < self.stop)).tolist())
+        self.dissipated = self.rows * self.owned + len(self.drives)
 
     def neighbours(self) -> tuple[int | None, int | None]:
         """Cells to the left and to the right of this rank's; None beyond an end, or on an empty rank."""
@@ -78,10 +79,10 @@ class Layout:
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
     def place(self, cells: np.ndarray, work: float, y: np.ndarray) -> None:
-        """Fill this rank's part ``y`` of the state with its ``cells`` (cell, 2 dofs) and the ``work`` in J."""
+        """Fill this rank's part ``y`` of the state: ``cells`` (cell, 2 dofs), ``work`` in J of the first drive."""
         y[: 2 * self.dofs * self.owned] = cells.T.ravel()
         y[2 * self.dofs * self.owned : self.rows * self.owned] = 0.0
-        y[self.rows * self.owned : self.dissipated] = work
+        y[self.rows * self.owned : self.dissipated] = np.where(np.array(self.drives) == 0, work, 0.0)
 
     def motion(self, y: np.ndarray) -> np.ndarray:
         """Displacements and velocities (cell, 2 dofs) of the part ``y`` of the state."""
@@ -90,22 +91,22 @@ class Layout:
     def checkpoint(self, y: np.ndarray) -> dict[str, np.ndarray]:
         """The part ``y`` of the state in natural order: ``cells`` (cell, rows), and the ledger."""
         motion, ledger = y[: self.rows * self.owned], y[self.rows * self.owned : self.size]
-        cells = motion.reshape(self.rows, self.owned).T
-        losses = np.zeros(len(self.sites), LOSS)
-        losses["site"], losses["loss"] = self.sites, ledger[self.owns_drive :]
-        return {"cells": cells.copy(), "work": ledger[: self.owns_drive].copy(), "losses": losses}
+        rows = np.zeros(len(ledger), LEDGER)
+        rows["number"], rows["energy"] = (*self.drives, *self.sites), ledger
+        works, losses = np.split(rows, [len(self.drives)])
+        return {"cells": motion.reshape(self.rows, self.owned).T.copy(), "work": works, "losses": losses}
 
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]], y: np.ndarray) -> None:
         """Fill this rank's part ``y`` of the state, given the checkpoints of all ranks that there were."""
-        tables, at = join(shares, {"work": None, "losses": "site"}), 0
+        tables, at = join(shares, {"work": "number", "losses": "number"}), 0
         for share in shares:  # one after the other: no rank holds all cells
             first, stop = max(self.start, at), min(self.stop, at + len(share["cells"]))
             if first < stop:
                 motion = y[: self.rows * self.owned].reshape(self.rows, self.owned)
                 motion[:, first - self.start : stop - self.start] = share["cells"][first - at : stop - at].T
             at += len(share["cells"])
-        ledger = tables["work"][: self.owns_drive], tables["losses"]["loss"][list(self.sites)]
-        y[self.rows * self.owned : self.size] = np.concatenate(ledger)
+        ledger = tables["work"][list(self.drives)], tables["losses"][list(self.sites)]
+        y[self.rows * self.owned : self.size] = np.concatenate(ledger)["energy"]
 
 
 def cell_cuts(cells: int, ranks: int) -> list[int]:
@@ -119,8 +120,8 @@ def join(shares: Sequence[Mapping[str, np.ndarray]], keys: Mapping[str, str | No
     return {name: tables[name][np.argsort(tables[name][key])] if key else tables[name] for name, key in keys.items()}
 
 
-LOSS = np.dtype([("site", np.int64), ("loss", np.float64)])
-"""A site's number, from 0, and its dissipated energy in J."""
+LEDGER = np.dtype([("number", np.int64), ("energy", np.float64)])
+"""A drive or a site, from 0, and its work or its dissipated energy in J."""
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
 COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64), ("spring", np.int64)])
@@ -134,9 +135,9 @@ class Shape(NamedTuple):
 
     ``owned`` and ``ghosted`` count the state's components without and with ghosts, ``exchange`` tells whether ghosts
     must be fetched. ``left_ghost`` and ``right_ghost`` are the first components of the neighbouring cells,
-    ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``driven``, ``work``, ``dissipated``
-    and ``damping`` are the components of the driven mass's velocity, the work, the energies that the first site and the
-    first cell's dashpots have dissipated.
+    ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``work``, ``dissipated`` and
+    ``damping`` are the components of the first drive's work, of the energies that the first site and the first cell's
+    dashpots have dissipated.
     """
 
     cells: int
@@ -150,23 +151,13 @@ class Shape(NamedTuple):
     right_ghost: int
     left_free: bool
     right_free: bool
-    driven: int
     work: int
     dissipated: int
     damping: int
 
 
-class Burst(NamedTuple):
-    """A tone burst: factor before 1 - cos in N, frequency in rad/s, cycles, duration in s."""
-
-    amplitude: float
-    frequency: float
-    cycles: float
-    duration: float
-
-
 class LatticeRecord(NamedTuple):
-    """A rank's part of a lattice: sizes, tables of the dtypes above, the sites' local cells, the drive.
+    """A rank's part of a lattice: sizes, tables of the dtypes above, the sites' local cells, its drives.
 
     Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
     ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where dashpots are integrated
@@ -179,7 +170,7 @@ class LatticeRecord(NamedTuple):
     springs: np.ndarray
     site_cells: np.ndarray
     contacts: np.ndarray
-    burst: Burst
+    drives: Drives
     inverse_masses: np.ndarray
     grounding: np.ndarray
     stiffness: np.ndarray
@@ -187,11 +178,6 @@ class LatticeRecord(NamedTuple):
 
 
 COEFFICIENTS = LatticeRecord._fields[-4:]
-
-
-def create_burst(drive: ToneBurst) -> Burst:
-    """The record of a tone burst."""
-    return Burst(drive.window_amplitude, drive.frequency, float(drive.cycles), drive.duration)
 
 
 def create_record(model: Model, layout: Layout) -> LatticeRecord:
@@ -210,14 +196,17 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         right_ghost=-1 if right is None else layout.size + layout.ghost_rows * (left is not None),
         left_free=chain.ends == "free" and left is None,
         right_free=chain.ends == "free" and right is None,
-        driven=(d + model.drive_mass) * n + model.drive_cell - layout.start if layout.owns_drive else -1,
-        work=layout.rows * n if layout.owns_drive else -1,
+        work=layout.rows * n,
         dissipated=layout.dissipated,
         damping=2 * d * n if layout.damped else -1,
     )
     couplings = cell.couplings()
     rows = np.searchsorted([c[0] for c in couplings], np.arange(d + 1)).tolist()
     masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
+    drives = create_drives(model.drives, layout.drives)
+    for row, drive in zip(drives.rows, (model.drives[i] for i in layout.drives), strict=True):
+        row["target"] = (d + drive.mass) * n + drive.cell - layout.start
+        row["inverse"] = 1 / chain.coefficients(drive.cell, drive.cell + 1).masses[0, drive.mass]
     return LatticeRecord(
         shape,
         np.array(masses, MASS),
@@ -225,14 +214,14 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
         np.array([chain.sites[i] for i in layout.sites], np.int64) - layout.start,
         site_records(model, layout.sites),
-        create_burst(model.drive),
+        drives,
         *_coefficients(chain, layout),
     )
 
 
 def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
-    """Free sites of dtype ``SITE``; a number of -1 is a site without stops."""
-    numbers = np.asarray(numbers, np.int64)
+    """Free sites of dtype ``SITE``; a number below 0 is a site without stops."""
+    numbers = np.maximum(np.asarray(numbers, np.int64), -1)
     gaps = np.array(model.gaps or [(gap, gap) for gap in model.chain.clearances]).reshape(-1, 2)
     laws = [model.laws[i] if i >= 0 else model.contact for i in numbers] if model.laws else model.contact
     return create_contacts(laws, np.vstack([gaps, [[np.inf] * 2]])[numbers], model.chain.cell.reduced_mass, model.scale)
@@ -246,12 +235,3 @@ def _coefficients(chain: Chain, layout: Layout) -> list[np.ndarray]:
     stop = None if layout.damped else 0
     arrays = 1 / masses[1:], grounding[1:][:stop], stiffness, damping[:stop]
     return [array.T.flatten() for array in arrays]
-
-
-@njit(error_model="numpy")
-def drive_force(burst: Burst, t: float) -> float:
-    """Force in N of the tone burst at time t in s, Eq. (3)."""
-    if t <= 0.0 or t >= burst.duration:
-        return 0.0
-    phase = burst.frequency * t
-    return burst.amplitude * (1.0 - np.cos(phase / burst.cycles)) * np.sin(phase)

@@ -82,7 +82,8 @@ class Recorder(Observer):
 
     def _begin_chunk(self) -> None:
         n, self._held, self._rows, self._number = self._length, 0, 0, 0
-        self._sums, self._work = np.zeros((n, PARTS, 2), np.int64), np.zeros(n)
+        shape = n, len(self.setup.model.drives)
+        self._sums, self._work = np.zeros((n, PARTS, 2), np.int64), np.zeros(shape)
         self._losses = np.zeros((n, len(self.setup.layout.sites)))
         self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[part] for part in self._energies))}
         self._fields = self.setup.output.room(self._shape)
@@ -92,7 +93,8 @@ class Recorder(Observer):
         meter, output = self.setup.meter, self.setup.case.output
         here = slice(self._held, self._held + most)
         arrays = self._sums[here], self._work[here], self._losses[here], self._fields[:, self._rows :], self._moving
-        return Samples(number, *arrays, self._first, output.every, output.stride, meter.lattice, meter.unit)
+        of_lattice = meter.lattice, meter.unit, self.setup.model.sample_interval
+        return Samples(number, *arrays, self._first, output.every, output.stride, *of_lattice)
 
     def observe(self, block: Block) -> None:
         here = slice(self._held, self._held + len(block))

@@ -8,17 +8,18 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.compiled import njit
-from vipetsc.dynamics.energies import LARGEST, Energies, measure
+from vipetsc.dynamics.drives import wall_energy
+from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, measure
 from vipetsc.dynamics.layout import LatticeRecord
 
 
 class Samples(NamedTuple):
     """Room for consecutive samples of a rank, the first of which has the ``number``; empty arrays take nothing.
 
-    Energies: ``sums`` (sample, part, 2) as ``measure`` gives them, ``work`` (sample,) and ``losses`` (sample, owned
-    site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose numbers ``stride``
-    divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from ``first_cell`` on,
-    n = ``every``.
+    Energies: ``sums`` (sample, part, 2) as ``measure`` gives them, ``work`` (sample, drive) of all drives and
+    ``losses`` (sample, owned site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose
+    numbers ``stride`` divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from
+    ``first_cell`` on, n = ``every``. ``interval`` in s is that of all samples.
     """
 
     number: int
@@ -32,6 +33,7 @@ class Samples(NamedTuple):
     stride: int
     lattice: LatticeRecord
     unit: float
+    interval: float
 
     def rows(self, samples: int) -> int:
         """Number of the first so many ``samples`` whose fields are recorded."""
@@ -43,8 +45,14 @@ def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
     """Put the rank's part ``y`` of the state, ghosts up to date, in as sample ``k``; False if it is not finite."""
     shape, number = samples.lattice.shape, samples.number + k
     samples.sums[k] = measure(y, samples.lattice, samples.unit)
-    if shape.work >= 0:
-        samples.work[k] = y[shape.work]
+    drives, time = samples.lattice.drives, number * samples.interval
+    for i in range(drives.rows.size):
+        drive = drives.rows[i]
+        samples.work[k, drive.number] = y[shape.work + i]
+        if drive.stiffness > 0.0:
+            energy = wall_energy(drives, i, time, y[drive.target - shape.dofs * shape.cells])
+            samples.work[k, drive.number] += energy
+            add_energy(samples.sums[k], energy, samples.unit)
     samples.losses[k] = y[shape.dissipated : shape.owned]
     if number % samples.stride == 0:
         row, n = number // samples.stride - (samples.number + samples.stride - 1) // samples.stride, shape.cells
@@ -53,7 +61,7 @@ def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
                 out, first = samples.fields[i, row, j], (j + shape.dofs * samples.moving[i]) * n + samples.first_cell
                 for c in range(out.size):
                     out[c] = y[first + c * samples.every]
-    return samples.sums[k, :, 0].max() < LARGEST and abs(samples.work[k]) < np.inf
+    return samples.sums[k, :, 0].max() < LARGEST and np.abs(samples.work[k]).max() < np.inf
 
 
 @dataclass(frozen=True)

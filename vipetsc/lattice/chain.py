@@ -1,4 +1,4 @@
-"""A finite lattice: its cells, its ends, its contact sites, the tone burst that drives it, its linear response."""
+"""A finite lattice: its cells, its ends, its contact sites, its linear response."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,50 +10,12 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.drive import Waveform
 from vipetsc.lattice.variation import Coefficients, Variation
 
 Ends = Literal["fixed", "free", "periodic"]
-Envelope = Literal["paper", "hann"]
 
 LONGEST = 400  # cells whose linear response is solved for
-
-
-@dataclass(frozen=True)
-class ToneBurst:
-    """The drive of one mass, Eq. (3) of the paper: F(t) = A [1 - cos(Om t/Nc)] sin(Om t) for 0 < t < 2 pi Nc/Om.
-
-    ``amplitude`` A in N, ``frequency`` Om in rad/s, ``cycles`` Nc. The paper's envelope peaks at 2A; the
-    authors' code has a factor 1/2 before it, here ``envelope = "hann"``.
-    """
-
-    amplitude: float
-    frequency: float
-    cycles: int
-    envelope: Envelope = "paper"
-
-    @property
-    def duration(self) -> float:
-        """Length of the burst in s; 0 of none."""
-        return 2 * np.pi * self.cycles / self.frequency if self.amplitude else 0.0
-
-    @property
-    def window_amplitude(self) -> float:
-        """The factor in N before 1 - cos."""
-        return self.amplitude if self.envelope == "paper" else self.amplitude / 2
-
-    def force(self, t: ArrayLike) -> np.ndarray:
-        """Force in N at time t in s."""
-        t = np.asarray(t, float)
-        phase = self.frequency * t
-        burst = self.window_amplitude * (1 - np.cos(phase / self.cycles)) * np.sin(phase)
-        return np.where((t > 0) & (t < self.duration), burst, 0.0)
-
-    def spectrum(self, frequency: ArrayLike) -> np.ndarray:
-        """Fourier transform in N s at ``frequency`` w in rad/s: the integral of F(t) exp(-i w t)."""
-        w = np.asarray(frequency, float) * (1 + 1e-7j)  # off the poles, which the first factor cancels
-        lines = {self.frequency * (1 + k / self.cycles): 1 - 1.5 * abs(k) for k in (-1, 0, 1)}
-        sines = sum(factor * line / (line**2 - w**2) for line, factor in lines.items())
-        return self.window_amplitude * (1 - np.exp(-1j * w * self.duration)) * np.asarray(sines)
 
 
 @dataclass(frozen=True)
@@ -158,7 +120,7 @@ class Chain:
         """Masses (cells dofs,) in kg, ordered cell by cell."""
         return self.coefficients(0, self.cells).masses.ravel()
 
-    def wave_scale(self, drive: ToneBurst, cell: int = 0, mass: int = 0) -> float:
+    def wave_scale(self, drive: Waveform, cell: int = 0, mass: int = 0) -> float:
         """Displacement amplitude in m of the linear wave that ``drive`` makes; velocity is Om times that.
 
         The largest steady response to the burst's peak force at the complex frequency Om (1 - i/Nc), whose
@@ -172,7 +134,7 @@ class Chain:
         force = np.zeros(cut.cells * self.cell.dofs, complex)
         force[driven * self.cell.dofs + mass] = 1.0
         response = float(np.abs(spsolve(dynamic.tocsc(), force)).max())
-        return response * 2 * abs(drive.window_amplitude)
+        return response * drive.peak
 
 
 def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:

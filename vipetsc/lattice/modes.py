@@ -17,7 +17,8 @@ from scipy.linalg import eigh, eigvals_banded, lapack
 from scipy.sparse import csc_matrix, diags
 
 from vipetsc.lattice.bands import bloch
-from vipetsc.lattice.chain import Chain, ToneBurst
+from vipetsc.lattice.chain import Chain
+from vipetsc.lattice.drive import Waveform
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size
 CLOSE = 1e-3  # modes nearer than this share of the largest Om^2 are made orthogonal one by one
@@ -74,20 +75,9 @@ class Modes:
         """Free ``amplitudes`` (mode) after an ``interval`` in s."""
         return np.asarray(amplitudes * np.exp(1j * self.frequency * interval))
 
-    def driven(self, drive: ToneBurst, start: float, stop: float) -> np.ndarray:
-        """What ``drive`` adds from ``start`` to ``stop`` (s) to the amplitudes (mode) at ``stop``, for ``force`` 1.
-
-        The integral of exp(i Om (stop - s)) F(s), whose F is a sum of three sines, in closed form.
-        """
-        end = min(max(stop, 0.0), drive.duration)
-        begin = min(max(start, 0.0), end)
-        middle, length, total = (begin + end) / 2, end - begin, np.zeros(len(self.frequency), complex)
-        for share, factor in ((1.0, 1.0), (-0.5, 1 + 1 / drive.cycles), (-0.5, 1 - 1 / drive.cycles)):
-            for sign in (1, -1):
-                detuning = sign * factor * drive.frequency - self.frequency
-                wave = np.exp(1j * (self.frequency * stop + detuning * middle))
-                total += sign * share / 2j * wave * np.sinc(detuning * length / (2 * np.pi))
-        return total * drive.window_amplitude * length
+    def driven(self, drive: Waveform, start: float, stop: float) -> np.ndarray:
+        """What ``drive`` adds from ``start`` to ``stop`` (s) to the amplitudes (mode) at ``stop``, for ``force`` 1."""
+        return drive.response(self.frequency, start, stop)
 
 
 def modes_of(chain: Chain) -> Modes:

@@ -7,13 +7,14 @@ import numpy as np
 
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.cell import UnitCell
-from vipetsc.lattice.chain import Chain, ToneBurst
+from vipetsc.lattice.chain import Chain
+from vipetsc.lattice.drive import Waveform
 
 WAVENUMBERS = np.linspace(0, np.pi, 8001)[1:-1]
 
 
 @lru_cache
-def packet_speeds(cell: UnitCell, burst: ToneBurst, mass: int, beyond: float = 1e-3) -> tuple[int, float, float]:
+def packet_speeds(cell: UnitCell, burst: Waveform, mass: int, beyond: float = 1e-3) -> tuple[int, float, float]:
     """Band (from 0) that takes most of the energy, and the speeds in cells/s of its slow and of its fast waves.
 
     A force F on one ``mass`` (0-based) gives the Bloch wave of frequency w and mass-normalised vector u an energy in

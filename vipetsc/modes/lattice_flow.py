@@ -22,7 +22,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
-from vipetsc.lattice import Chain, Contact, ToneBurst
+from vipetsc.lattice import Chain, Contact, Drive, ToneBurst
 from vipetsc.modes.flow import FlowError
 
 # Errors allowed in a contact's substep, relative to its speed.
@@ -59,7 +59,8 @@ class LatticeFlow:
     def _model(self, duration: float, samples: int) -> Model:
         """The lattice at rest, undriven, for so many samples."""
         still, interval = ToneBurst(0.0, 1e-3 / duration, 1), duration / samples
-        return Model(self.chain, self.contact, still, 0, 0, duration, interval, "8vr", RTOL, (0.0, 0.0), 1.0, 1.0)
+        of_time = duration, interval, "8vr", RTOL, (0.0, 0.0), 1.0, 1.0
+        return Model(self.chain, self.contact, (Drive(still, 0, 0),), *of_time)
 
     def arc(self, start: np.ndarray, duration: float) -> LatticeArc:
         """The orbit from the block ``start`` over ``duration`` seconds; raises FlowError on all ranks."""

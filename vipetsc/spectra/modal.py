@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from vipetsc.lattice import Chain, ToneBurst, pass_bands
+from vipetsc.lattice import Chain, Drive, Waveform, pass_bands
 from vipetsc.lattice.modes import Modes, modes_of
 from vipetsc.spectra.bands import Parts
 from vipetsc.spectra.pooling import blocks
@@ -59,13 +59,16 @@ class ModalParts:
             parts.append(self.sums(0.5 * np.abs(self.modes.amplitudes(u, v)) ** 2))
         return np.concatenate(parts, axis=-1)
 
-    def driven_change(self, state: np.ndarray, drive: ToneBurst, force: np.ndarray, span: np.ndarray) -> np.ndarray:
-        """What ``drive`` changes in the energies (part) in J of a lattice without contacts within a ``span`` in s.
+    def driven_change(self, state: np.ndarray, drives: Sequence[Drive], span: np.ndarray) -> np.ndarray:
+        """What ``drives`` change in the energies (part) in J of a lattice without contacts within a ``span`` in s.
 
-        ``state`` are the amplitudes (mode) at its begin, ``force`` is ``Modes.force`` of the driven mass. Exact.
+        ``state`` are the amplitudes (mode) at its begin. Exact.
         """
         begin, end = span
-        later = self.modes.later(state, end - begin) + force * self.modes.driven(drive, begin, end)
+        later = self.modes.later(state, end - begin)
+        for drive in drives:
+            force = self.modes.force(drive.cell, drive.mass) * (drive.stiffness or 1.0)
+            later += force * self.modes.driven(drive.waveform, begin, end)
         return np.asarray(self.sums(0.5 * (np.abs(later) ** 2 - np.abs(state) ** 2)[None]).sum(axis=(1, 2)))
 
 
@@ -93,7 +96,7 @@ def _index(edges: np.ndarray, frequency: np.ndarray) -> np.ndarray:
     return np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, len(edges) - 2)
 
 
-def upper_share(chain: Chain, drive: ToneBurst, displacement: np.ndarray, velocity: np.ndarray, work: float) -> float:
+def upper_share(chain: Chain, drive: Waveform, displacement: np.ndarray, velocity: np.ndarray, work: float) -> float:
     """Energy of the pass bands above the driven one over the drive's ``work`` in J, at one instant.
 
     Fields (cell, dof) in m and m/s are of all cells. NaN if there is no such band, or no work.

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from vipetsc.case import Model
-from vipetsc.lattice import Compliance, bloch
+from vipetsc.lattice import Compliance, ToneBurst, bloch
 from vipetsc.studies.response import DECAY, SiteResponse, in_contact, power_per_area, self_response
 
 WIDTH = 14  # of the burst's line, half of what is followed around a frequency
@@ -43,13 +43,14 @@ class Network:
 
     def __init__(self, model: Model) -> None:
         self.model, chain, drive = model, model.chain, model.drive
+        assert isinstance(drive, ToneBurst)
         self.cell, self.om, self.clearance = chain.cell, drive.frequency, np.array(chain.clearances)
         length, half = 2 * model.end, min(WIDTH * 2 * np.pi / drive.duration, 0.45 * drive.frequency)
         most = int(np.ceil(half * length / (2 * np.pi)))
         self.offset = 2 * np.pi * np.arange(-most, most + 1) / length
         self.time = np.arange(len(self.offset)) * length / len(self.offset)
         self.decay, self.during = DECAY / length, self.time <= model.end
-        force = model.drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
+        force = drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
         pulse = self._forward(np.where(self.time < drive.duration, -1j * force, 0))
         response, g = self._responses(self.om)
         self.linear = self._backward(response[:, :, -1].T * pulse)

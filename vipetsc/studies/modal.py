@@ -74,11 +74,10 @@ def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict
     energy = parts.energies(*fields, rows, record.memory)
     by_part = energy.sum(axis=1)
     transfer = np.diff(by_part.T[np.searchsorted(rows, bounds)], axis=1)[:, 0]
-    force = parts.modes.force(model.drive_cell, model.drive_mass)
-    for c in np.flatnonzero(time[bounds[:, 0]] < model.drive.duration):
+    for c in np.flatnonzero(time[bounds[:, 0]] < max(drive.waveform.duration for drive in model.drives)):
         u, v = (np.asarray(field[bounds[c, :1]]) for field in fields)
         state = parts.modes.amplitudes(u, v)[0]
-        transfer[c] -= parts.driven_change(state, model.drive, force, time[bounds[c]])
+        transfer[c] -= parts.driven_change(state, model.drives, time[bounds[c]])
     expected = (run["energy/kinetic"] + run["energy/spring"]).values[np.searchsorted(run["time"].values, time[rows])]
     error = np.abs(by_part.sum(axis=0) - expected).max() / max(expected.max(), 1e-300)
     record.attributes["bands/modal_energy"] |= {"modal_stride": record.options.modal_stride, "error": error}

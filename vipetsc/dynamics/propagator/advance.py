@@ -9,6 +9,7 @@ from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.law import CLOSED, FREE, contact_force, gap_of
 from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
+from vipetsc.dynamics.drives import drive_end
 from vipetsc.dynamics.propagator.collocation import (
     Cluster,
     Substep,
@@ -60,14 +61,18 @@ def _advance_freely(cluster: Cluster) -> int:
 
 @inlined
 def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
-    """The next substep: as long as its error allows, not beyond the drive's end, short while a contact is young."""
+    """The next substep: as long as its error allows, to where a drive is not smooth, short while a contact is young."""
     state, sites = cluster.state[0], cluster.contacts
-    fastest = cluster.omega_max_h
-    if cluster.taylor.shape[0] > sites.size:
-        fastest += cluster.burst.frequency * (1.0 + 1.0 / cluster.burst.cycles) * cluster.interval
+    highest = 0.0
+    for i in range(sites.size, cluster.taylor.shape[0]):
+        highest = max(highest, cluster.drives.rows[i].highest)
+    fastest = cluster.omega_max_h + highest * cluster.interval
     length = min(1.0 - state.position, state.length, (SEARCHED if sites.size > 0 else DRIVEN) / fastest)
-    if trial.active.size > trial.closed.size:
-        length = min(length, state.drive_end - state.position)
+    for j in range(trial.closed.size, trial.active.size):
+        length = min(
+            length,
+            drive_end(cluster.drives, trial.active[j], state.begin, cluster.interval, state.position) - state.position,
+        )
     longest = length
     for i in trial.closed:
         # A young contact's force goes as the root of its age.
@@ -204,10 +209,13 @@ def _select_active(cluster: Cluster) -> Trial:
         if sites[i].mode != FREE:
             room.active[closed] = room.closed[closed] = i
             closed += 1
-    room.active[closed:] = sites.size
-    is_driven = cluster.taylor.shape[0] > sites.size and state.position < state.drive_end
+    count = closed
+    for i in range(sites.size, cluster.taylor.shape[0]):
+        if state.position < drive_end(cluster.drives, i, state.begin, cluster.interval, state.position):
+            room.active[count] = i
+            count += 1
     values = room.force, room.w, room.v, room.taylor, room.site_motion, room.sums
-    return Trial(room.active[: closed + is_driven], room.closed[:closed], *values)
+    return Trial(room.active[:count], room.closed[:closed], *values)
 
 
 @kernel

@@ -11,7 +11,7 @@ from scipy.special import binom
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import contact_force
-from vipetsc.dynamics.layout import Burst, drive_force
+from vipetsc.dynamics.drives import Drives, drive_force
 from vipetsc.dynamics.propagator.nodes import NODES, Collocation
 from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
 from vipetsc.dynamics.propagator.tape import Tape
@@ -25,10 +25,10 @@ BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 
 COUNTS = ("substeps", "rejected", "landings", "switches")
 SUBSTEP_STATE = np.dtype(
-    [(name, float) for name in ("begin", "position", "length", "drive_end")] + [(name, np.int64) for name in COUNTS]
+    [(name, float) for name in ("begin", "position", "length")] + [(name, np.int64) for name in COUNTS]
 )
-"""Where a cluster stands: the step's begin in s; in shares of the step the position, the next substep's length and the
-end of the drive; counts of substeps, of rejected ones, of landings and of switches of a site's mode."""
+"""Where a cluster stands: the step's begin in s; in shares of the step the position and the next substep's
+length; counts of substeps, of rejected ones, of landings and of switches of a site's mode."""
 
 HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
 """A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
@@ -37,18 +37,18 @@ HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation
 class Cluster(NamedTuple):
     """A cluster, or all that a rank feels one after another: constants, and what changes as it is advanced.
 
-    The DoFs of a cluster are its sites, those of ``contacts``, and where it is in reach the driven mass with the
-    ``burst``. ``response`` (dof, dof of the same cluster, term) is the motion of one after an impulse on another, times
-    H, in powers 2 m + 1 of s, with dashpots m + 1 (2 term - 1 of them); ``interval`` is H in s, ``atol`` in m/s; a
-    contact begins with the share ``first_substep`` of its duration.
+    The DoFs of a cluster are its sites, those of ``contacts``, and the driven masses in reach with their ``drives``, in
+    which sites have rows that drive nothing. ``response`` (dof, dof of the same cluster, term) is the motion of one
+    after an impulse on another, times H, in powers 2 m + 1 of s, with dashpots m + 1 (2 term - 1 of them); ``interval``
+    is H in s, ``atol`` in m/s; a contact begins with the share ``first_substep`` of its duration.
     ``taylor`` (dof, 2 term) holds the series of the free motion about the present position, ``site_motion`` (dof, 3) w,
     w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
-    ``energy`` (dof,) in J what sites dissipated and the work of the drive; ``history`` (dof,) is of dtype ``HISTORY``,
+    ``energy`` (dof,) in J what sites dissipated and the work of drives; ``history`` (dof,) is of dtype ``HISTORY``,
     ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is room for a substep of the largest, ``tape`` a log.
     """
 
     contacts: np.ndarray
-    burst: Burst
+    drives: Drives
     response: np.ndarray
     nodes: Collocation
     interval: float
@@ -111,8 +111,8 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
     for i in range(sites):
         out[i, 0], out[i, 1] = taylor[i, 0], taylor[i, 1] / h
         forces[i] = -contact_force(cluster.contacts, i, out[i, 0], out[i, 1])[0]
-    if forces.size > sites:
-        forces[sites] = drive_force(cluster.burst, state.begin + state.position * h)
+    for i in range(sites, forces.size):
+        forces[i] = drive_force(cluster.drives, i, state.begin + state.position * h)
     for i in range(sites):
         acceleration = 2.0 * taylor[i, 2]
         for j in range(forces.size):
@@ -164,8 +164,9 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
             at = substep.length * cluster.nodes.share[substep.kind, node]
             free_w[a, node], slope = evaluate(cluster.taylor[active[a]], at)
             free_v[a, node] = slope / h
-            if active[a] == contacts.size:
-                trial.force[active[a], node] = drive_force(cluster.burst, state.begin + (state.position + at) * h)
+            if active[a] >= contacts.size:
+                time = state.begin + (state.position + at) * h
+                trial.force[active[a], node] = drive_force(cluster.drives, active[a], time)
     for a in range(n):
         for b in range(n):
             reaches[a, b] = node_responses(cluster, substep, active[a], active[b], to_w[a, b], to_v[a, b])

@@ -21,6 +21,7 @@ from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.tables import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.samples import Samples, take_sample
+from vipetsc.lattice import ToneBurst
 from vipetsc.parallel import StopRequest
 
 # Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
@@ -40,7 +41,8 @@ def step_series(model: Model) -> StepSeries | None:
     Long steps are few, but sites that feel one another within a step must be followed together.
     """
     tolerance = max(1e-4 * model.rtol, 1e-15)
-    fastest = model.drive.frequency * (1 + 1 / model.drive.cycles)
+    bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
+    fastest = max(bursts, default=0.0)
     best, least = None, np.inf
     for parts in range(1, MOST_PARTS + 1):
         cost = parts * (STEP_COST + CELL_COST * model.chain.cells)
@@ -105,8 +107,9 @@ def take_steps(
         apply_propagator(stencil, cells, halo.columns, next_cells)
         for c in range(0 if failed else clusters.state.size):
             may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
-            is_driven = dofs.first[c + 1] - 1 == dofs.driven and begin < clusters.burst.duration
-            if may_touch or is_driven:
+            for i in range(dofs.first[c] + dofs.sites[c], dofs.first[c + 1]):
+                may_touch |= begin < clusters.drives.rows[i].duration
+            if may_touch:
                 going, tracks = follow_contacts(clusters, dofs, c, tracks, begin)
                 if not going:
                     progress.failed, progress.cluster = steps, c

@@ -1,4 +1,4 @@
-"""Clusters: contact sites, and the driven mass, that feel one another within one linear step; their records and log.
+"""Clusters: contact sites, and driven masses, that feel one another within one linear step; their records and log.
 
 Sec. 5 and 6 of the derivation in the package's docstring.
 """
@@ -15,7 +15,8 @@ from vipetsc.compiled import njit
 from vipetsc.contact.changes import Extremes
 from vipetsc.contact.law import FREE, impact_time
 from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, switch_sites, update_episode, with_room
-from vipetsc.dynamics.layout import Layout, create_burst, join, site_records
+from vipetsc.dynamics.drives import Drives, create_drives
+from vipetsc.dynamics.layout import Layout, join, site_records
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, create_trial
 from vipetsc.dynamics.propagator.nodes import collocation
@@ -29,27 +30,28 @@ FIRST_SUBSTEP = 0.1
 # Changes of one cluster in one step beyond which it counts as stalled.
 MOST_CHANGES = 5_000
 FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY), ("cluster", SUBSTEP_STATE)])
-"""A DoF of ``contact_dofs`` in a checkpoint: its number, -1 for the driven mass, and what its cluster's record has."""
+"""A DoF of ``contact_dofs`` in a checkpoint: its number, below 0 of a drive, and what its cluster's record has."""
 
 
 def contact_dofs(model: Model) -> np.ndarray:
-    """The relative displacements of the contact sites and, as the last one, the displacement of the driven mass.
+    """The relative displacements of the contact sites and the displacements of driven masses, the first drive's last.
 
-    Each has its ``cell``, the weights ``form`` (mass,) of the displacements there and its ``clearance`` in m.
+    A site has its number, the n-th drive -n. Each has its ``cell``, the weights ``form`` (mass,) of the displacements
+    there and its ``clearance`` in m.
     """
-    lattice, unit = model.chain, np.eye(model.chain.cell.dofs)
-    dofs = np.zeros(len(lattice.sites) + 1, [("cell", int), ("form", float, len(unit)), ("clearance", float)])
-    dofs["cell"] = *lattice.sites, model.drive_cell
+    lattice, unit, drives = model.chain, np.eye(model.chain.cell.dofs), model.drives[::-1]
+    dofs = np.zeros(len(lattice.sites) + len(drives), [("cell", int), ("form", float, len(unit)), ("clearance", float)])
+    dofs["cell"] = *lattice.sites, *(drive.cell for drive in drives)
     dofs["form"] = unit[lattice.cell.resonator] - unit[lattice.cell.host]
-    dofs["form"][-1] = unit[model.drive_mass]
-    dofs["clearance"] = *lattice.clearances, np.inf
+    dofs["form"][len(lattice.sites) :] = unit[[drive.mass for drive in drives]]
+    dofs["clearance"] = *lattice.clearances, *[np.inf] * len(drives)
     return dofs
 
 
 class Groups(NamedTuple):
     """Groups of ``contact_dofs``: the ``numbers`` (dof,) of group g are ``first[g]`` to ``first[g + 1]``.
 
-    In each group the sites' numbers come first, in their own order, then -1 for the driven mass.
+    In each group the sites' numbers come first, in their own order, then -1 for the first drive, -2 for the second.
     """
 
     numbers: np.ndarray
@@ -59,14 +61,14 @@ class Groups(NamedTuple):
 def group_dofs(model: Model, reach: int) -> Groups:
     """Groups of ``contact_dofs`` of which each is within ``reach`` cells of another, in the lattice's order."""
     lattice = model.chain
-    cells = np.array([*lattice.sites, model.drive_cell])
-    numbers = np.append(np.arange(len(lattice.sites)), -1)
+    cells = contact_dofs(model)["cell"]
+    numbers = np.append(np.arange(len(lattice.sites)), np.arange(-len(model.drives), 0))
     order, group = np.argsort(cells), np.zeros(len(cells), np.int64)
     group[order[1:]] = np.cumsum(np.diff(cells[order]) > reach)
     if lattice.ends == "periodic" and cells.min() + lattice.cells - cells.max() <= reach:
         group[group == group.max()] = 0
     first = np.append(0, np.cumsum(np.bincount(group)))
-    return Groups(numbers[np.lexsort((numbers, numbers < 0, group))], first)
+    return Groups(numbers[np.lexsort((np.abs(numbers), numbers < 0, group))], first)
 
 
 def _reaching(groups: Groups, cells: np.ndarray, reach: int, layout: Layout) -> Groups:
@@ -82,10 +84,10 @@ def _reaching(groups: Groups, cells: np.ndarray, reach: int, layout: Layout) -> 
 def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
     """Cluster ``c`` of all: the same constants, views of its arrays."""
     first, stop = dofs.first[c], dofs.first[c + 1]
-    sites = stop - 1 if stop - 1 == dofs.driven else stop
+    sites = first + dofs.sites[c]
     return Cluster(
         clusters.contacts[first:sites],
-        clusters.burst,
+        Drives(clusters.drives.rows[first:stop], clusters.drives.pieces),
         clusters.response[first:stop],
         clusters.nodes,
         clusters.interval,
@@ -140,7 +142,6 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
     cluster = select_cluster(clusters, dofs, c)
     state, first = cluster.state[0], dofs.first[c]
     state.begin, state.position = begin, 0.0
-    state.drive_end = (clusters.burst.duration - begin) / clusters.interval
     cluster.moments[:] = 0.0
     for _ in range(MOST_CHANGES):
         outcome = advance_cluster(cluster)
@@ -168,7 +169,7 @@ class Forces:
         count, terms = len(dofs), series.terms
         self.clusters = Cluster(
             contacts=site_records(model, groups.numbers),
-            burst=create_burst(model.drive),
+            drives=create_drives(model.drives, np.where(groups.numbers < 0, -1 - groups.numbers, -1).tolist()),
             response=_responses(groups, self.dofs, model, series),
             nodes=collocation(2 * terms),
             interval=series.interval,
@@ -196,7 +197,7 @@ class Forces:
     def begin(self, motion: np.ndarray, energy: float) -> None:
         """Begin with w and w' of all sites as ``motion`` (site, 2), and so much ``energy`` in J as work."""
         clusters = self.clusters
-        clusters.energy[self._numbers < 0] = energy
+        clusters.energy[self._numbers == -1] = energy
         for i in self.tracker.begin(motion).tolist():
             # As if the contact were old: its force is smooth.
             duration = impact_time(clusters.contacts[i], abs(clusters.contacts["approach"][i]))
@@ -235,7 +236,7 @@ class Forces:
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go back to a checkpoint; all ranks that a cluster reaches go on from the same numbers."""
         tables = join(shares, {"forces": "number", "sites": "number"})
-        mine = tables["forces"][self._numbers + 1]  # from -1, the driven mass
+        mine = tables["forces"][np.searchsorted(tables["forces"]["number"], self._numbers)]
         self.clusters.energy[:], self.clusters.history[:] = mine["energy"], mine["history"]
         self.clusters.state[:] = mine["cluster"][self.dofs.first[:-1]]
         self.tracker.restore(tables["sites"])
@@ -254,7 +255,7 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     ]
     masses = [model.chain.coefficients(cell - r, cell + r + 1).masses.T for cell in cells.tolist()]
     halves = 1 + series.is_damped
-    places = np.full(len(model.chain.sites) + 1, -1)
+    places = np.full(len(contact_dofs(model)), -1)
     places[numbers] = np.arange(len(numbers))
     return DofTables(
         column=halo.add(dofs["cell"] - r, 2 * r + 1),
@@ -265,9 +266,9 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
         inverse_masses=1 / np.array(masses).reshape(len(rows), layout.dofs, 2 * r + 1),
         # An onset within rounding of the clearance is one.
         clearance=dofs["clearance"] * (1 - 1e-9),
-        driven=int(places[-1]),
+        sites=np.add.reduceat(numbers >= 0, groups.first[:-1], dtype=np.int64) if len(numbers) else numbers[:0],
         first=groups.first,
-        ledger=places[[*(-1,) * layout.owns_drive, *layout.sites]],
+        ledger=places[[*(-1 - i for i in layout.drives), *layout.sites]],
     )
 
 

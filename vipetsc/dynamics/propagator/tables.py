@@ -25,7 +25,7 @@ class DofTables(NamedTuple):
     the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
     mass, cell, term) and the masses there in ``inverse_masses`` (table, mass, cell) in 1/kg; ``factors`` (2 term,) are
     H^(k mod 2)/k!. With dashpots rows are (table, 2 mass, cell, 2 term), ``factors`` 1/k! and then H/k!. ``clearance``
-    (dof,) in m is that of a site, inf for the DoF ``driven``, the driven mass (-1 where it is out of reach). The DoFs
+    (dof,) in m is that of a site, inf for a driven mass; so many ``sites`` (cluster,) come before these. The DoFs
     of cluster c are ``first[c]`` to ``first[c + 1]``, those with an energy in the rank's ledger are in ``ledger``.
     """
 
@@ -36,7 +36,7 @@ class DofTables(NamedTuple):
     factors: np.ndarray
     inverse_masses: np.ndarray
     clearance: np.ndarray
-    driven: int
+    sites: np.ndarray
     first: np.ndarray
     ledger: np.ndarray
 

@@ -32,7 +32,8 @@ class TangentPropagator(Propagator):
         super().__init__(model, layout)
         self._model, forces, clusters = model, self._forces, self._forces.clusters
         tape = create_tape(len(clusters.state), MOST_ROWS, NODES)
-        forces.clusters = clusters._replace(burst=clusters.burst._replace(duration=0.0), tape=tape)
+        clusters.drives.rows["duration"] = 0.0
+        forces.clusters = clusters._replace(tape=tape)
         self._linear: tuple[np.ndarray, np.ndarray] | None = None
         self._moved: tuple[Variations, Halo, list] | None = None
 
@@ -59,7 +60,7 @@ class TangentPropagator(Propagator):
         model, layout, none = self._model, self._layout, np.zeros(0)
         fields = np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1
         sums, losses, record = np.zeros((0, 5, 2), np.int64), none.reshape(0, 0), create_record(model, layout)
-        stretch = self.fill(Samples(samples + 1, sums, none, losses, *fields, record, 1.0))
+        stretch = self.fill(Samples(samples + 1, sums, losses, losses, *fields, record, 1.0, 1.0))
         needed = layout.comm.allreduce(int(self._forces.clusters.tape.used.max(initial=0)), max)
         if stretch.stalled or needed > MOST_ROWS:
             raise StalledError(stretch.stalled or f"an orbit needs {needed} substeps in contact, of {MOST_ROWS}")

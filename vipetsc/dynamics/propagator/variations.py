@@ -148,7 +148,7 @@ class Variations(NamedTuple):
 def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, number: int, cells: np.ndarray) -> None:
     """Add to ``cells`` (2 dof, cell) what the forces' variation ``j`` of a cluster leaves there; its series is made."""
     first, stop, terms = dofs.first[c], dofs.first[c + 1], variations.taylor.shape[1]
-    sites = stop - 1 - first if stop - 1 == dofs.driven else stop - first
+    sites = dofs.sites[c]
     size = (stop - first) * terms
     before = np.concatenate((variations.taylor[first:stop].flatten(), variations.approach[j, first : first + sites]))
     after, matrix = np.zeros(before.size), variations.matrices[number]

@@ -17,6 +17,7 @@ from vipetsc.contact.changes import Change, first_change, switching
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
+from vipetsc.dynamics.drives import select_piece
 from vipetsc.dynamics.engine import Engine, StalledError, Stretch
 from vipetsc.dynamics.layout import Layout, create_record, join
 from vipetsc.dynamics.samples import Samples, take_sample
@@ -64,6 +65,7 @@ class Integrator(Engine):
         self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
         self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
         self._interval = model.sample_interval
+        self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
         self._stop = stop or StopRequest()
         self._any_open = False
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
@@ -132,10 +134,15 @@ class Integrator(Engine):
 
         Raises StalledError, on all ranks, where no step can be taken.
         """
-        # The drive's end is a kink of its third derivative: a step ends there.
-        burst_end = self.lattice.burst.duration
-        if self.time < burst_end < target and not self.advance(burst_end):
-            return False
+        # The end of a drive or of a piece of one is a kink: a step ends there.
+        first, last = np.searchsorted(self._breaks, self.time, "right"), np.searchsorted(self._breaks, target)
+        return all(self._reach(time) for time in (*self._breaks[first:last].tolist(), target))
+
+    def _reach(self, target: float) -> bool:
+        """As ``advance``, without a kink on the way."""
+        drives = self.lattice.drives
+        for i in range(len(drives.rows)):
+            select_piece(drives, i, self.time)
         trials, stopped = 0, False
         while self.time < target:
             if trials > self._most_trials:
@@ -151,7 +158,7 @@ class Integrator(Engine):
         if remaining <= shortest:
             self.time = target
             return True
-        # The burst rises as t^3: steps that grow with t keep even the first samples' ledger small beside the work.
+        # A burst rises as t^3: steps that grow with t keep even the first samples' ledger small beside the work.
         step = min(STRETCH * self.step, self._first_step + 0.25 * self.time)
         count = np.ceil(remaining / step)
         h = remaining / count

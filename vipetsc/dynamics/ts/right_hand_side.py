@@ -15,9 +15,11 @@ from numba.core.ccallback import CFunc
 from vipetsc.compiled import cfunc, njit
 from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
-from vipetsc.dynamics.layout import COEFFICIENTS, COUPLING, MASS, SPRING, Burst, LatticeRecord, Shape, drive_force
+from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
+from vipetsc.dynamics.layout import COEFFICIENTS, COUPLING, MASS, SPRING, LatticeRecord, Shape
 from vipetsc.dynamics.native import pointer
 from vipetsc.dynamics.ts.springs import damping_powers, inverse_mass, spring_acceleration, spring_accelerations
+from vipetsc.lattice.drive import PIECE
 
 
 @njit(error_model="numpy", forceinline=True)
@@ -31,11 +33,12 @@ def relative_motion(y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[floa
 
 @njit(error_model="numpy")
 def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int, force: float) -> float:
-    """Acceleration of one mass by its springs, a contact ``force`` and the drive."""
+    """Acceleration of one mass by its springs, a contact ``force`` and the drives."""
     per_mass = inverse_mass(lattice, cell, mass)
     acceleration = spring_acceleration(y, lattice, cell, mass) + force * per_mass
-    if lattice.shape.driven == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:
-        acceleration += drive_force(lattice.burst, t) * per_mass
+    for i in range(lattice.drives.rows.size):
+        if lattice.drives.rows[i].target == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:
+            acceleration += drive_force(lattice.drives, i, t) * per_mass
     return acceleration
 
 
@@ -68,16 +71,15 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
             f[(d + host) * n + cell] += force * inverse_mass(lattice, cell, host)
             f[(d + resonator) * n + cell] -= force * inverse_mass(lattice, cell, resonator)
         f[shape.dissipated + i] = power
-    driven = shape.driven
-    if driven >= 0:
-        force = drive_force(lattice.burst, t)
-        f[driven] += force * inverse_mass(lattice, driven % n, driven // n - d)
-        f[shape.work] = force * y[driven]
+    for i in range(lattice.drives.rows.size):
+        drive, force = lattice.drives.rows[i], drive_force(lattice.drives, i, t)
+        f[drive.target] += force * drive.inverse
+        f[shape.work + i] = force * y[drive.target]
     if shape.damping >= 0:
         damping_powers(y, lattice, f[shape.damping : shape.damping + n])
 
 
-_TABLES = ("masses", "couplings", "springs", "site_cells", "contacts", *COEFFICIENTS)
+_TABLES = ("masses", "couplings", "springs", "site_cells", "contacts", "rows", "pieces", *COEFFICIENTS)
 
 
 def _c_struct(record: type) -> np.dtype:
@@ -89,7 +91,6 @@ CONTEXT = np.dtype(
     [
         ("array", np.int64),  # receives the address of a vector's array; first, so that its address is the context's
         ("shape", _c_struct(Shape)),
-        ("burst", _c_struct(Burst)),
         ("address", np.dtype([(name, np.int64) for name in _TABLES])),
         ("length", np.dtype([(name, np.int64) for name in _TABLES])),
     ],
@@ -117,7 +118,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.springs), (size.springs,), SPRING),
         carray(pointer(at.site_cells), (size.site_cells,), np.int64),
         carray(pointer(at.contacts), (size.contacts,), SITE),
-        context.burst,
+        Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
         carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
         carray(pointer(at.grounding), (size.grounding,), np.float64),
         carray(pointer(at.stiffness), (size.stiffness,), np.float64),
@@ -144,8 +145,8 @@ def compile_callback() -> CFunc:
 def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
     """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``."""
     callback, context = compile_callback(), np.zeros(1, CONTEXT)
-    tables = lattice._asdict()
-    context["shape"], context["burst"] = lattice.shape, lattice.burst
+    tables = lattice._asdict() | lattice.drives._asdict()
+    context["shape"] = lattice.shape
     context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
     context["length"] = tuple(tables[name].size for name in _TABLES)
     ts.setAttr("callback", (callback, context, lattice))  # PETSc holds bare pointers: all must live as long as ts

@@ -1,0 +1,40 @@
+"""The same bits on any number of ranks under several drives, each on the rank that has its cell, and a moved end."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.conftest import StopAt, assert_same_bits, datasets, small_case
+from tests.mpi.test_partition import runs_alike
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.observers import Observer
+
+DRIVES = [
+    {"waveform": "impulse", "amplitude": 2e-2, "duration": 3e-4, "cell": 20, "mass": 3},
+    {"waveform": "chirp", "amplitude": 8.0, "frequency": 900.0, "bandwidth": 500.0, "duration": 0.02, "cell": 11},
+    {"waveform": "step", "amplitude": 1e-4, "ramp": 2e-3, "end": "right"},
+]
+
+
+class InParts(Observer):
+    """Has engines stop after every ten samples."""
+
+    name = "in-parts"
+    longest = 10
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_same_bits_under_several_drives(folder, engine):
+    runs_alike(folder, small_case(drive={"more": DRIVES}, time={"end": 0.03, "engine": engine}))
+
+
+@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_a_run_goes_on_amid_its_drives(folder, engine):
+    case = small_case(drive={"more": DRIVES}, time={"end": 0.02, "engine": engine})
+    simulate(case, folder / "whole", observers=[InParts])
+    looks = 31 if engine == "ts" else 2
+    assert simulate(case, folder / "parts", stop=StopAt(looks), observers=[InParts]).resumable
+    assert simulate(case, folder / "parts", resume=True, observers=[InParts]).complete
+    assert_same_bits(datasets(folder / "whole/run.h5"), datasets(folder / "parts/run.h5"))

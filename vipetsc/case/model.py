@@ -1,0 +1,59 @@
+"""A case in the terms of ``vipetsc.lattice``: what engines simulate."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vipetsc.case.contacts import Gaps
+from vipetsc.case.initial import InitialTable
+from vipetsc.lattice import Chain, Contact, Drive, Waveform
+
+
+@dataclass(frozen=True)
+class Model:
+    """A case in the terms of ``vipetsc.lattice``: 0-based indices, seconds, newtons, everything decided.
+
+    ``atol`` is the pair (displacement m, velocity m/s); ``scale`` the displacement in m of the drive's
+    linear wave or of the ``initial`` state, ``speed`` the group velocity in cells/s that ``traverse`` uses. The law of
+    each site is in ``laws`` (() if all have ``contact``), its clearances in m on the sides + and - are in ``gaps`` (()
+    if the chain's are those of both).
+    """
+
+    chain: Chain
+    contact: Contact
+    drives: tuple[Drive, ...]
+    end: float
+    sample_interval: float
+    method: str
+    rtol: float
+    atol: tuple[float, float]
+    scale: float
+    speed: float
+    initial: InitialTable | None = None
+    laws: tuple[Contact, ...] = ()
+    gaps: Gaps = ()
+
+    @property
+    def drive(self) -> Waveform:
+        """The waveform of the first drive, by which frequency, wave and times are judged."""
+        return self.drives[0].waveform
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether the first drive drives."""
+        return self.drive.amplitude != 0
+
+    @property
+    def drive_cell(self) -> int:
+        """The cell (0-based) of the first drive."""
+        return self.drives[0].cell
+
+    @property
+    def drive_mass(self) -> int:
+        """The mass (0-based) of the first drive."""
+        return self.drives[0].mass
+
+    @property
+    def samples(self) -> int:
+        """Number of uniform samples, the one at t = 0 included."""
+        return int(np.floor(self.end / self.sample_interval * (1 + 1e-12))) + 1

@@ -1,0 +1,117 @@
+"""What a run of a case would do that is likely not meant: one sentence each, with numbers and what helps.
+
+Waves are those of the first drive, at its group velocity; what contacts send into other bands may be faster.
+"""
+
+from collections.abc import Iterator, Mapping
+from math import gamma, pi, sqrt
+
+import numpy as np
+
+from vipetsc.case.model import Model
+from vipetsc.case.schema import OutputTable
+from vipetsc.lattice import Contact, max_group_velocity, pass_bands, waves_at
+
+SLOW = 0.1  # of the band's fastest group velocity
+WAVELENGTHS = 4.0  # that a lattice should hold
+BRIEF, STEPS = 0.1, 10.0  # a contact over the sample interval; fixed steps that a contact should take
+
+
+def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> list[str]:
+    """The sentences about a run of ``model`` of which ``output`` is kept, with these options of PETSc."""
+    return [*_of_waves(model), *_of_ends(model, output), *_of_fields(model, output), *_of_contacts(model, petsc)]
+
+
+def _of_waves(model: Model) -> Iterator[str]:
+    """Evanescent, slow or long waves; a run that ends before its drive."""
+    cell, drive, cells = model.chain.cell, model.drive, model.chain.cells
+    waves, frequency = waves_at(cell, drive.frequency), f"drive.frequency = {drive.frequency:.6g} rad/s"
+    if model.is_driven and not waves:
+        yield f"{frequency} lies in no pass band, so the wave is evanescent; see the verb `bands`"
+    elif model.is_driven:
+        band, kappa, speed = max(waves, key=lambda wave: wave[2])
+        _, best, fastest = max_group_velocity(cell, band)
+        if speed < SLOW * fastest:
+            yield (
+                f"{frequency} lies at an edge of band {band}: its waves make {speed:.3g} of {fastest:.3g} cells/s"
+                f" and spread; the fastest are at {best:.6g} rad/s"
+            )
+        wavelength = 2 * pi / max(min(kappa, 2 * pi - kappa), 1e-300)
+        if wavelength * WAVELENGTHS > cells:
+            yield (
+                f"lattice.cells = {cells} hold {cells / wavelength:.3g} wavelengths of {wavelength:.4g} cells, and"
+                f" wavenumbers are told apart by {2 * pi / cells:.3g} rad/cell; {WAVELENGTHS * wavelength:.0f} cells or"
+                " more resolve the wave"
+            )
+    if model.end <= drive.settled:
+        yield f"time.end = {model.end:.6g} s comes before the burst is over"
+
+
+def _of_ends(model: Model, output: OutputTable) -> Iterator[str]:
+    """A wave that comes back from an end to what is measured: to the sites, else to the window or the drive."""
+    chain, drive, at = model.chain, model.drive, model.drive_cell
+    if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
+        return
+    window = [cell - 1 for cell in output.window or (at + 1,)]
+    measured, name = (chain.sites, "site in cell") if chain.sites else (window, "cell")
+    for end, cell in (("left", 0), ("right", chain.cells - 1)):
+        there = abs(cell - at) / model.speed
+        if there <= drive.settled / 2:  # what comes back is part of what the drive sends out
+            continue
+        nearest = min(measured, key=lambda site: abs(site - cell))
+        back = there + abs(nearest - cell) / model.speed
+        if back < model.end:
+            yield (
+                f"the wave ({model.speed:.4g} cells/s) meets the {end} end at {there:.4g} s and is back at the {name}"
+                f" {nearest + 1} at {back:.4g} s, before time.end = {model.end:.4g} s: more lattice.cells or an earlier"
+                " end keep the reflection out of what is measured"
+            )
+
+
+def _of_fields(model: Model, output: OutputTable) -> Iterator[str]:
+    """Fields that do not resolve the waves, in the words of the analysis, so that each is said once."""
+    chain, top = model.chain, pass_bands(model.chain.cell)[-1].high
+    interval, (first, last) = output.stride * model.sample_interval, output.window or (1, chain.cells)
+    if output.fields and interval >= np.pi / top:
+        coarse = f"fields kept every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
+        yield f"{coarse}: dispersion, bands and ibtet are not measured"
+    if output.fields and output.every > 1:
+        sparse = f"fields of one cell in {output.every} do not resolve waves shorter than {2 * output.every} cells"
+        yield f"{sparse}: wavenumber_content, dispersion, partition and entropy are not measured"
+    if output.fields and chain.sites and not any(first <= site + 1 <= last for site in chain.sites):
+        yield f"output.window = [{first}, {last}] holds none of the contact sites"
+    highest = max(drive.waveform.highest for drive in model.drives)
+    if model.is_driven and highest > np.pi / model.sample_interval:
+        interval = np.pi / highest
+        yield (
+            f"the drive's {highest:.5g} rad/s are beyond the {np.pi / model.sample_interval:.5g} rad/s of samples every"
+            f" {model.sample_interval:.3g} s: fields and energies alias it; time.sample_interval below {interval:.3g} s"
+            " does not"
+        )
+
+
+def contact_time(contact: Contact, mass: float, speed: float) -> float:
+    """Duration in s of an impact of a reduced ``mass`` in kg at ``speed`` in m/s without dissipation."""
+    power = contact.exponent + 1
+    deepest = float(power * mass * speed**2 / (2 * contact.stiffness)) ** (1 / power)
+    return 2 * deepest / speed * sqrt(pi) * gamma(1 + 1 / power) / gamma(0.5 + 1 / power)
+
+
+def _of_contacts(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
+    """Contacts that samples, or steps of fixed length, do not see."""
+    speed = model.scale * model.drive.frequency
+    if not model.chain.sites or not speed:
+        return
+    time = contact_time(model.contact, model.chain.cell.reduced_mass, speed)
+    step = float(petsc.get("ts_dt", 0.05 / model.drive.frequency))
+    if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:
+        yield (
+            f"ts takes fixed steps of {step:.3g} s, and a contact at {speed:.3g} m/s lasts {time:.3g} s: ts_dt ="
+            f" {time / STEPS:.2g} or less, steps of varied length or the propagator follow it"
+        )
+    elif time < BRIEF * model.sample_interval:
+        yield (
+            f"a contact at {speed:.3g} m/s lasts {time:.3g} s, {time / model.sample_interval:.2g} of a sample interval:"
+            " both engines step through it, but samples show it as a jump; its force stands in the log of impacts,"
+            f" and a time.sample_interval of {time:.1g} s shows it"
+        )

@@ -1,0 +1,266 @@
+r"""What drives a lattice: forces on masses, and motion of the walls that its ends are tied to.
+
+A waveform F(t), in N or in m, is a tone burst, or pieces one after another; x being the time since a piece's start,
+
+    F = (c_0 + c_1 x + ... + c_5 x^5) sin(p + w x + r x^2/2).
+
+Ramps are 10 s^3 - 15 s^4 + 6 s^5, s from 0 to 1: two derivatives are continuous. Samples are joined by the cubic
+spline without a knot at the second and the last but one (``not-a-knot``), whose error falls with the fourth power of
+their distance. A wall that moves by U(t) acts on the mass at the other end of a spring k as the force k U would.
+"""
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import Literal, Self
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+Envelope = Literal["paper", "hann"]
+COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
+PIECE = np.dtype([(name, float) for name in ("start", *COEFFICIENTS, "phase", "frequency", "rate")])
+"""A piece of a waveform: its start in s, c_k in N/s^k, and of its sine p in rad, w in rad/s, r in rad/s^2."""
+SMOOTH = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
+NODES, PANEL = 16, 4.0  # of a quadrature; its panels in rad of what is integrated
+
+
+@dataclass(frozen=True)
+class ToneBurst:
+    """The drive of one mass, Eq. (3) of the paper: F(t) = A [1 - cos(Om t/Nc)] sin(Om t) for 0 < t < 2 pi Nc/Om.
+
+    ``amplitude`` A in N, ``frequency`` Om in rad/s, ``cycles`` Nc. The paper's envelope peaks at 2A; the
+    authors' code has a factor 1/2 before it, here ``envelope = "hann"``.
+    """
+
+    amplitude: float
+    frequency: float
+    cycles: int
+    envelope: Envelope = "paper"
+
+    @property
+    def duration(self) -> float:
+        """Length of the burst in s; 0 of none."""
+        return 2 * np.pi * self.cycles / self.frequency if self.amplitude else 0.0
+
+    @property
+    def settled(self) -> float:
+        """Time in s from which on nothing new comes."""
+        return self.duration
+
+    @property
+    def window_amplitude(self) -> float:
+        """The factor in N before 1 - cos."""
+        return self.amplitude if self.envelope == "paper" else self.amplitude / 2
+
+    @property
+    def peak(self) -> float:
+        """The largest force in N."""
+        return 2 * abs(self.window_amplitude)
+
+    @property
+    def highest(self) -> float:
+        """The highest angular frequency in rad/s of its sines."""
+        return self.frequency * (1.0 + 1.0 / self.cycles)
+
+    @property
+    def breaks(self) -> np.ndarray:
+        """Times in s at which it is not smooth, behind the beginning."""
+        return np.array([self.duration])
+
+    def force(self, t: ArrayLike) -> np.ndarray:
+        """Force in N at time t in s."""
+        t = np.asarray(t, float)
+        phase = self.frequency * t
+        burst = self.window_amplitude * (1 - np.cos(phase / self.cycles)) * np.sin(phase)
+        return np.where((t > 0) & (t < self.duration), burst, 0.0)
+
+    def spectrum(self, frequency: ArrayLike) -> np.ndarray:
+        """Fourier transform in N s at ``frequency`` w in rad/s: the integral of F(t) exp(-i w t)."""
+        w = np.asarray(frequency, float) * (1 + 1e-7j)  # off the poles, which the first factor cancels
+        lines = {self.frequency * (1 + k / self.cycles): 1 - 1.5 * abs(k) for k in (-1, 0, 1)}
+        sines = sum(factor * line / (line**2 - w**2) for line, factor in lines.items())
+        return self.window_amplitude * (1 - np.exp(-1j * w * self.duration)) * np.asarray(sines)
+
+    def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
+        """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), in closed form."""
+        end = min(max(stop, 0.0), self.duration)
+        begin = min(max(start, 0.0), end)
+        middle, length, total = (begin + end) / 2, end - begin, np.zeros(len(frequency), complex)
+        for share, factor in ((1.0, 1.0), (-0.5, 1 + 1 / self.cycles), (-0.5, 1 - 1 / self.cycles)):
+            for sign in (1, -1):
+                detuning = sign * factor * self.frequency - frequency
+                wave = np.exp(1j * (frequency * stop + detuning * middle))
+                total += sign * share / 2j * wave * np.sinc(detuning * length / (2 * np.pi))
+        return total * self.window_amplitude * length
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """A waveform of pieces: ``table`` (piece,) of dtype ``PIECE``, scaled by ``amplitude`` already.
+
+    It begins with the first piece and is over at ``duration`` in s, which may be inf. ``frequency`` in rad/s is the one
+    that it is about, ``cycles`` the length over which it lasts or rises in its periods. Equal are those of one digest.
+    """
+
+    amplitude: float
+    frequency: float
+    duration: float
+    cycles: float
+    table: np.ndarray = field(compare=False, repr=False)
+    digest: str = ""
+
+    @classmethod
+    def of(cls, amplitude: float, frequency: float, duration: float, table: np.ndarray) -> Self:
+        """The waveform of a ``table`` in which the amplitude is one."""
+        table = table.copy()
+        for name in COEFFICIENTS:
+            table[name] *= amplitude
+        length = duration if np.isfinite(duration) else table["start"][-1]
+        cycles = max(frequency * length / (2 * np.pi), 1.0)
+        return cls(amplitude, frequency, duration, cycles, table, hashlib.sha256(table.tobytes()).hexdigest())
+
+    @property
+    def settled(self) -> float:
+        """Time in s from which on nothing new comes: its end, or that of the ramp of one that does not end."""
+        return self.duration if np.isfinite(self.duration) else float(self.table["start"][-1])
+
+    @property
+    def breaks(self) -> np.ndarray:
+        """Times in s at which it is not smooth, behind the beginning."""
+        times = np.append(self.table["start"], self.duration)
+        return times[(times > 0) & np.isfinite(times)]
+
+    @cached_property
+    def highest(self) -> float:
+        """The highest angular frequency in rad/s of its sines; 0 of polynomials."""
+        ends = np.append(self.table["start"][1:], min(self.duration, self.settled))
+        w, rate = self.table["frequency"], self.table["rate"]
+        return float(np.max([np.abs(w), np.abs(w + rate * (ends - self.table["start"]))]))
+
+    @cached_property
+    def peak(self) -> float:
+        """The largest force in N, at twenty instants a piece, and twenty a period."""
+        starts, end = self.table["start"], max(self.settled, float(self.table["start"][0]))
+        rest = 2 * np.pi / (self.highest or self.frequency)
+        times = [np.linspace(a, b, 20) for a, b in zip(starts, np.append(starts[1:], end + rest), strict=True)]
+        if (end - starts[0]) / rest < 1e5:
+            times.append(np.arange(starts[0], end + rest, rest / 20))
+        return float(np.abs(self.force(np.concatenate(times))).max())
+
+    def force(self, t: ArrayLike) -> np.ndarray:
+        """Force in N at time t in s."""
+        t = np.asarray(t, float)
+        number = np.searchsorted(self.table["start"], t, side="right") - 1
+        piece = self.table[np.maximum(number, 0)]
+        x, value = t - piece["start"], np.zeros_like(t)
+        for name in reversed(COEFFICIENTS):
+            value = value * x + piece[name]
+        value = value * np.sin(piece["phase"] + x * (piece["frequency"] + 0.5 * piece["rate"] * x))
+        return np.where((number >= 0) & (t < self.duration), value, 0.0)
+
+    def spectrum(self, frequency: ArrayLike) -> np.ndarray:
+        """As that of a burst, by quadrature; raises ValueError for a waveform that does not end."""
+        if not np.isfinite(self.duration):
+            raise ValueError("a waveform that does not end has no spectrum; give it a duration")
+        w = np.asarray(frequency, float)
+        values = self.response(w.ravel(), 0.0, self.duration).reshape(w.shape)
+        return np.asarray(values * np.exp(-1j * w * self.duration))
+
+    def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
+        """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), by Gauss's quadrature."""
+        starts, total = self.table["start"], np.zeros(len(frequency), complex)
+        end = min(max(stop, 0.0), self.duration)
+        begin = min(max(start, float(starts[0])), end)
+        cuts = np.unique([begin, *starts[(starts > begin) & (starts < end)], end])
+        at, weight = leggauss(NODES)
+        fastest = float(np.abs(frequency).max(initial=0.0)) + self.highest
+        for a, b in pairwise(cuts):
+            edges = np.linspace(a, b, int(fastest * (b - a) / PANEL) + 2)
+            half = np.diff(edges)[:, None] / 2
+            s = edges[:-1, None] + half * (1 + at)
+            for times, values in zip(s, self.force(s) * weight * half, strict=True):
+                total += np.exp(1j * np.multiply.outer(frequency, stop - times)) @ values
+        return total
+
+
+Waveform = ToneBurst | Pieces
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A ``waveform`` that acts on a ``mass`` of a ``cell`` (0-based): a force in N.
+
+    With a ``stiffness`` in N/m it is k U: of a wall whose motion is U, through a spring to that mass.
+    """
+
+    waveform: Waveform
+    cell: int
+    mass: int
+    stiffness: float = 0.0
+
+
+def _table(starts: ArrayLike) -> np.ndarray:
+    table = np.zeros(np.size(starts), PIECE)
+    table["start"], table["phase"] = starts, np.pi / 2
+    return table
+
+
+def _set(row: np.ndarray, coefficients: np.ndarray) -> None:
+    for name, value in zip(COEFFICIENTS, coefficients, strict=False):
+        row[name] = value
+
+
+def ramped(
+    amplitude: float, frequency: float, ramp: float, duration: float = np.inf, sweep: float | None = 0.0
+) -> Pieces:
+    """A sine of ``frequency`` in rad/s that rises over ``ramp`` s and falls likewise before ``duration``, if it ends.
+
+    With a ``sweep`` its frequency goes linearly from half of that below to half of it above; without one (None) it is
+    no sine, but a step. ``ramp`` is at most half the duration.
+    """
+    ends = np.isfinite(duration)
+    table = _table([0.0, ramp, duration - ramp] if ends else [0.0, ramp])
+    rise = SMOOTH / ramp ** np.arange(6)
+    _set(table[0], rise)
+    table["c0"][1] = 1.0
+    if ends:
+        _set(table[2], np.eye(6)[0] - rise)
+    if sweep is not None:
+        first, rate, x = frequency - sweep / 2, sweep / duration if ends else 0.0, table["start"]
+        table["phase"], table["frequency"], table["rate"] = x * (first + 0.5 * rate * x), first + rate * x, rate
+    return Pieces.of(amplitude, frequency, duration, table)
+
+
+def impulse(amplitude: float, duration: float) -> Pieces:
+    """Half a sine of ``duration`` s whose integral is ``amplitude``, in N s."""
+    table = _table([0.0])
+    table["phase"], table["frequency"], table["c0"] = 0.0, np.pi / duration, np.pi / (2 * duration)
+    return Pieces.of(amplitude, np.pi / duration, duration, table)
+
+
+def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: float, hold: bool = False) -> Pieces:
+    """``amplitude`` times the cubic spline through ``values`` at ``times`` in s, from 0 on; 0 before and behind.
+
+    ``hold``: behind the last one it stays at its value.
+    """
+    times, values = np.asarray(times, float), np.asarray(values, float)
+    hold &= bool(values[-1] != 0)
+    table = _table(times if hold else times[:-1])
+    for k, column in enumerate(CubicSpline(times, values).c[::-1]):
+        table[COEFFICIENTS[k]][: len(times) - 1] = column
+    if hold:
+        table["c0"][-1] = values[-1]
+    return Pieces.of(amplitude, frequency, np.inf if hold else float(times[-1]), table)
+
+
+def main_frequency(times: ArrayLike, values: ArrayLike) -> float:
+    """The angular frequency in rad/s at which the spectrum of samples is largest, but for 0."""
+    times, values = np.asarray(times, float), np.asarray(values, float)
+    count = int(min(max((times[-1] - times[0]) / np.diff(times).min(), 16), 2**20)) + 1
+    even = np.linspace(times[0], times[-1], count)
+    content = np.abs(np.fft.rfft(CubicSpline(times, values)(even), 4 * count))
+    return float(2 * np.pi * (1 + np.argmax(content[1:])) / (4 * count * (even[1] - even[0])))
