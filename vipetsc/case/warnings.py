@@ -55,14 +55,14 @@ def _of_ends(model: Model, output: OutputTable) -> Iterator[str]:
     window = [cell - 1 for cell in output.window or (at + 1,)]
     measured, name = (chain.sites, "site in cell") if chain.sites else (window, "cell")
     for end, cell in (("left", 0), ("right", chain.cells - 1)):
-        there = abs(cell - at) / model.speed
-        if there <= drive.settled / 2:  # what comes back is part of what the drive sends out
+        arrival = abs(cell - at) / model.speed
+        if arrival <= drive.settled / 2:  # what comes back is part of what the drive sends out
             continue
         nearest = min(measured, key=lambda site: abs(site - cell))
-        back = there + abs(nearest - cell) / model.speed
+        back = arrival + abs(nearest - cell) / model.speed
         if back < model.end:
             yield (
-                f"the wave ({model.speed:.4g} cells/s) meets the {end} end at {there:.4g} s and is back at the {name}"
+                f"the wave ({model.speed:.4g} cells/s) meets the {end} end at {arrival:.4g} s and is back at the {name}"
                 f" {nearest + 1} at {back:.4g} s, before time.end = {model.end:.4g} s: more lattice.cells or an earlier"
                 " end keep the reflection out of what is measured"
             )
