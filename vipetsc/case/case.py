@@ -10,13 +10,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vipetsc.case.contacts import check_alike, contact_of, gaps_of_sites, laws_of_sites
+from vipetsc.case.contacts import check_alike, check_pairs, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
 from vipetsc.case.initial import InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid, read_section
-from vipetsc.case.resolve import build_chain, check_cell, check_contacts, resolved, with_preset
+from vipetsc.case.resolve import (
+    build_chain,
+    check_cell,
+    check_contacts,
+    check_unsprung,
+    resolved,
+    site_cells,
+    with_preset,
+)
 from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
@@ -79,6 +87,8 @@ class Case(CaseFile):
         yield from problems
         if valid("lattice.cells", "contacts.sites"):
             yield from check_contacts(lattice, contacts, valid)
+            if cell and valid("contacts"):
+                yield from check_pairs(lattice, contacts, cell, site_cells(lattice, contacts))
         length = lattice.cells if valid("lattice.cells") else None
         initial, undriven = sections.get("initial", InitialTable.model_validate({})), sections["drive"].amplitude == 0
         if valid("initial.kind"):
@@ -97,6 +107,9 @@ class Case(CaseFile):
             yield Problem("drive.waveform", drive.kind, "this verb is about one burst on a mass; run takes all others")
         if cell and not of_drive and drive.ways and valid("lattice", "drive", "time.end"):
             yield from check_wave(cell, drive, sections["time"])
+        if cell and not cell.springs and valid("drive", "time"):
+            yield from check_unsprung(sections["drive"], sections["time"])
+            cell = None
         yield from _check_sampling(sections["time"], cell, valid)
         window = sections["output"].window
         if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
@@ -158,7 +171,8 @@ def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Ite
 
 def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
     """The problem of samples every ``interval`` s, asked for by ``key``, beyond the top band's Nyquist interval."""
-    nyquist = np.pi / pass_bands(cell)[-1].high
+    top = pass_bands(cell)[-1].high
+    nyquist = np.pi / top if top else np.inf
     if interval < nyquist:
         return []
     given = "" if interval == value else f"an interval of {interval:.4g} s is "

@@ -1,17 +1,21 @@
 """The laws and stops of the sites of a case: one for all, with lists over the sites where they differ."""
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from vipetsc.case.reading import Problem, Table, Valid
+from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.lattice import Contact, contact_stiffness
+from vipetsc.lattice import Contact, UnitCell, contact_stiffness
+from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.contact import LEAST_RESTITUTION
 
 MATERIAL = ("modulus", "radius", "poisson")
-SIDES = ("side", "clearance_minus")
+SIDES = ("side", "clearance_minus", "precompression")
+JOINS = ("pair", "next_cell")
 Gaps = tuple[tuple[float, float], ...]
 
 
@@ -53,15 +57,19 @@ def check_each(contacts: ContactsTable, count: int, gaps: list[float], valid: Va
             yield Problem(where("restitution"), asked, remedy)
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     for number, (plus, minus) in enumerate(stops, 1):
-        if min(plus, minus) == 0 and max(plus, minus) < np.inf:
-            remedy = "a clearance of 0 needs a stop on one side alone: contacts.side"
-            yield Problem("contacts.clearance", 0.0, f"site {number}: {remedy}")
+        if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
+            remedy = "contacts that touch or are pressed have a stop on one side alone: contacts.side"
+            yield Problem("contacts.clearance", min(plus, minus), f"site {number}: {remedy}")
+            return
+        if min(plus, minus) < 0 and restitutions[number - 1] < 1:
+            remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
+            yield Problem(where("precompression"), -min(plus, minus), f"site {number}: {remedy}")
             return
 
 
 def check_alike(contacts: ContactsTable) -> Iterator[Problem]:
     """For a verb that knows one law and two equal stops a site: what a case has beyond that."""
-    told = {key: getattr(contacts, key) for key in ("each", *SIDES) if getattr(contacts, key) is not None}
+    told = {key: getattr(contacts, key) for key in ("each", *SIDES, *JOINS) if getattr(contacts, key) is not None}
     for key in told:
         remedy = "this verb knows one law for all sites, and equal stops on both sides; leave it out"
         yield Problem(f"contacts.{key}", None if key == "each" else told[key], remedy)
@@ -88,9 +96,9 @@ def contact_of(contacts: ContactsTable) -> Contact:
 def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
     """The law of each site of a resolved case; () if they are alike."""
     each = lists_of(contacts)
-    if not each.keys() - {*SIDES}:
+    keys, laws = [key for key in each if key not in SIDES + JOINS], []
+    if not keys:
         return ()
-    keys, laws = [key for key in each if key not in SIDES], []
     for values in zip(*(each[key] for key in keys), strict=True):
         of_site = contacts.model_copy(update=dict(zip(keys, values, strict=True)))
         laws.append(contact_of(of_site.model_copy(update={} if of_site.law == "power" else {"exponent": None})))
@@ -104,10 +112,40 @@ def stops_told(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
     return texts or [f"{1e3 * gap:.4g}" for gap in clearances]
 
 
+def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:
+    """What each site joins; () if it is the cell's pair at all, and each in a cell of its own."""
+    cell_pair = [cell.host + 1, cell.resonator + 1]
+    values = (values_of_sites(contacts, key, count) for key in JOINS)
+    pairs = [Pair((a or cell_pair)[0] - 1, (a or cell_pair)[1] - 1, bool(b)) for a, b in zip(*values, strict=True)]
+    sites = contacts.sites if isinstance(contacts.sites, list) else []
+    plain = set(pairs) <= {Pair(cell.host, cell.resonator)} and len(set(sites)) == len(sites)
+    return () if plain else tuple(pairs)
+
+
+def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
+    """What is wrong with what contacts join, in the ``cells`` (1-based) with sites."""
+    pairs = pairs_of_sites(contacts, cell, len(cells)) or [Pair(cell.host, cell.resonator)] * len(cells)
+    for number, (at, pair) in enumerate(zip(cells, pairs, strict=True), 1):
+        what = f"site {number} joins masses {pair.host + 1} and {pair.resonator + 1}"
+        if max(pair.host, pair.resonator) >= cell.dofs or pair.resonator < 0:
+            remedy = f"{what}; the cell's count from 1 to {cell.dofs}, and 0 as the first one is the ground"
+            yield Problem("contacts.pair", [pair.host + 1, pair.resonator + 1], remedy)
+            return
+        if pair.host == pair.resonator and not pair.next_cell:
+            yield Problem("contacts.pair", [pair.host + 1] * 2, f"{what}; did you mean next_cell = true?")
+            return
+        if pair.next_cell and (pair.host < 0 or (at == lattice.cells and lattice.ends != "periodic")):
+            yield Problem("contacts.next_cell", True, f"site {number} in cell {at} has no next cell to touch")
+            return
+    if twice := [at for (at, _), times in Counter(zip(cells, pairs, strict=True)).items() if times > 1]:
+        yield Problem("contacts.sites", twice, "named twice with the same contact pair")
+    if not cell.springs and cells and not any(pair.next_cell for pair in pairs):
+        yield Problem("lattice.cell.springs", None, "neither springs nor contacts (contacts.next_cell) join the cells")
+
+
 def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
     """Clearances in m on the sides + and - of each site, inf without a stop; () if they are ``gaps`` on both."""
-    sides, minus = (values_of_sites(contacts, key, len(gaps)) for key in SIDES)
-    both = zip(gaps, minus, sides, strict=True)
-    rows = [(plus, plus if other is None else other, side) for plus, other, side in both]
+    both = zip(gaps, *(values_of_sites(contacts, key, len(gaps)) for key in SIDES), strict=True)
+    rows = [(a - (by or 0.0), (a if b is None else b) - (by or 0.0), side) for a, side, b, by in both]
     stops = tuple((np.inf if s == "minus" else a, np.inf if s == "plus" else b) for a, b, s in rows)
     return () if all(a == b for a, b in stops) else stops

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from vipetsc.case.contacts import check_each, resolved_each
+from vipetsc.case.contacts import check_each, pairs_of_sites, resolved_each
 from vipetsc.case.drive import SINES, DriveTable, packet_speed, resolved_drive, waveform_of
 from vipetsc.case.initial import Beginning
 from vipetsc.case.reading import Problem, Table, Valid
-from vipetsc.case.schema import CONTACTS, PRESETS, LatticeTable
+from vipetsc.case.schema import CONTACTS, PRESETS, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import cell_problems, groups_of
@@ -91,7 +91,9 @@ def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
     """The lattice with its contact sites."""
     sites = site_cells(lattice, contacts)
     gaps = clearances(lattice, contacts, len(sites))
-    return Chain(lattice.unit_cell(), lattice.cells, lattice.ends, tuple(c - 1 for c in sites), tuple(gaps))
+    cell = lattice.unit_cell()
+    pairs = pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites))
+    return Chain(cell, lattice.cells, lattice.ends, tuple(c - 1 for c in sites), tuple(gaps), pairs=pairs)
 
 
 def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
@@ -107,6 +109,8 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     if problems:
         return None, problems
     cell = lattice.unit_cell()
+    if not cell.springs:
+        return cell, problems
     next_cell = tuple((0, s.start + 1) for s in cell.springs if s.next_cell)
     group = groups_of(cell.dofs + 1, (*next_cell, *((s.start + 1, s.end + 1) for s in cell.springs)))
     if loose := [str(mass) for mass, number in enumerate(group) if number != group[0]]:
@@ -135,7 +139,8 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
         yield Problem("contacts.sites", outside, f"outside the lattice; cells count from 1 to {lattice.cells}")
     if isinstance(sites, Span) and None not in (sites.last, sites.spacing):
         yield Problem("contacts.sites.spacing", None, "give last or spacing, not both")
-    if twice := sorted(cell for cell, times in Counter(cells).items() if times > 1):
+    plain = contacts.pair is None and (contacts.each is None or contacts.each.pair is None)
+    if plain and (twice := sorted(cell for cell, times in Counter(cells).items() if times > 1)):
         yield Problem("contacts.sites", twice, "named twice; a cell carries one contact pair")
     if isinstance(sites, int) and sites > 0 and lattice.preset is None:
         yield Problem("contacts.sites", sites, "a count needs a preset; list the cells or give {first, last, count}")
@@ -203,6 +208,17 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
     tables["time"] |= {"sample_interval": float(interval), "end": float(end)}
     tables["time"].pop("samples", None)
     return tables
+
+
+def check_unsprung(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
+    """A lattice that contacts alone join has no bands from which times could follow."""
+    remedy = "missing; without springs there are no bands that it follows from"
+    if drive.frequency is None:
+        yield Problem("drive.frequency", None, remedy)
+    if time.end == "traverse":
+        yield Problem("time.end", time.end, remedy)
+    if time.sample_interval == "auto" and time.samples is None:
+        yield Problem("time.sample_interval", time.sample_interval, remedy)
 
 
 def _round_down(value: float) -> float:

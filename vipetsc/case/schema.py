@@ -95,11 +95,11 @@ class SpringTable(Section):
 
 
 class CellTable(Section):
-    """A unit cell; ``contact`` names the host and the resonator (1-based masses), ``grounding`` dashpots to ground."""
+    """A unit cell; ``contact`` names host and resonator (1-based; 1 and 2), ``grounding`` dashpots to ground."""
 
-    masses: list[Finite] = Field(min_length=2)
-    springs: list[SpringTable] = Field(min_length=1)
-    contact: list[int] = Field(min_length=2, max_length=2)
+    masses: list[Finite] = Field(min_length=1)
+    springs: list[SpringTable] = Field([])
+    contact: list[int] | None = Field(None, min_length=2, max_length=2)
     grounding: list[Finite] | None = None
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
@@ -107,7 +107,8 @@ class CellTable(Section):
         springs = tuple(
             Spring(s.start - 1, s.end - 1, s.stiffness, s.next_cell, s.damping or 0.0) for s in self.springs
         )
-        return tuple(self.masses), springs, self.contact[0] - 1, self.contact[1] - 1, tuple(self.grounding or ())
+        host, resonator = self.contact or (1, min(2, len(self.masses)))
+        return tuple(self.masses), springs, host - 1, resonator - 1, tuple(self.grounding or ())
 
 
 class RayleighTable(Section):

@@ -8,6 +8,7 @@ from vipetsc.case.reading import Section
 from vipetsc.case.schema import MOST_SITES, NotNegative, Positive
 from vipetsc.lattice.contact import Damping, Law
 
+Ends = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 Side = Literal["both", "plus", "minus"]
 Restitution = Annotated[float, Field(ge=0, le=1)]
 Exponent = Annotated[float, Field(ge=1, le=10)]
@@ -41,6 +42,9 @@ class EachTable(Section):
     stiffness: list[Positive] | None = None
     restitution: list[Restitution] | None = None
     damping: list[Damping] | None = None
+    pair: list[Ends] | None = None
+    next_cell: list[bool] | None = None
+    precompression: list[NotNegative] | None = None
     side: list[Side] | None = None
     clearance_minus: list[NotNegative] | None = None
 
@@ -50,7 +54,8 @@ class ContactsTable(Section):
 
     ``damping``: ``paper`` (if left out), which is ``hunt-crossley``, ``exact`` or another by name: see
     ``vipetsc.lattice.Contact``. ``side``: on which side of w = u_resonator - u_host stops are; ``clearance_minus`` is
-    that of the side -, if it differs. ``each`` has lists over the sites.
+    that of the side -, if it differs. ``pair``: host (0 is ground) and resonator, in the next cell if ``next_cell``;
+    ``precompression``: static indentation in m, from which displacements count. ``each`` has lists over the sites.
     """
 
     law: Law = "hertz"
@@ -65,6 +70,9 @@ class ContactsTable(Section):
     clearance: NotNegative | list[NotNegative] | ClearanceSpan | None = None
     clearance_minus: NotNegative | None = None
     side: Side | None = None
+    pair: Ends | None = None
+    next_cell: bool | None = None
+    precompression: Positive | None = None
     each: EachTable | None = None
     adhesion: Literal["allow", "clip"] = "allow"
     approach_floor: Annotated[float, Field(ge=0)] = 0.0

@@ -26,6 +26,8 @@ def _of_waves(model: Model) -> Iterator[str]:
     """Evanescent, slow or long waves; a run that ends before its drive."""
     cell, drive, cells = model.chain.cell, model.drive, model.chain.cells
     waves, frequency = waves_at(cell, drive.frequency), f"drive.frequency = {drive.frequency:.6g} rad/s"
+    if model.is_driven and not cell.springs:
+        return
     if model.is_driven and not waves:
         yield f"{frequency} lies in no pass band, so the wave is evanescent; see the verb `bands`"
     elif model.is_driven:
@@ -72,7 +74,7 @@ def _of_fields(model: Model, output: OutputTable) -> Iterator[str]:
     """Fields that do not resolve the waves, in the words of the analysis, so that each is said once."""
     chain, top = model.chain, pass_bands(model.chain.cell)[-1].high
     interval, (first, last) = output.stride * model.sample_interval, output.window or (1, chain.cells)
-    if output.fields and interval >= np.pi / top:
+    if output.fields and interval * top >= np.pi:
         coarse = f"fields kept every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
         yield f"{coarse}: dispersion, bands and ibtet are not measured"
     if output.fields and output.every > 1:
@@ -102,7 +104,8 @@ def _of_contacts(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     speed = model.scale * model.drive.frequency
     if not model.chain.sites or not speed:
         return
-    time = contact_time(model.contact, model.chain.cell.reduced_mass, speed)
+    laws = {*(model.laws or (model.contact,))}
+    time = min(contact_time(law, model.chain.cell.reduced_mass, speed) for law in laws)
     step = float(petsc.get("ts_dt", 0.05 / model.drive.frequency))
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:
         yield (

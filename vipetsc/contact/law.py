@@ -14,7 +14,7 @@ from vipetsc.compiled import kernel
 from vipetsc.lattice import Contact
 
 # Modes of a site; the sign is the side.
-FREE, CLOSED, CLIPPED = 0, 1, 2
+FREE, CLOSED, CLIPPED, LASTING = 0, 1, 2, 3
 
 _LAW = ("stiffness", "exponent", "damping", "floor")
 _TIMES = ("inertia", "power", "root", "factor")
@@ -23,7 +23,7 @@ SITE = np.dtype(
         ("mode", np.int64),
         *((name, np.float64) for name in ("clearance", "clearance_minus", "scale", "approach", *_LAW)),
         ("clip", bool),
-        *((name, np.float64) for name in _TIMES),
+        *((name, np.float64) for name in (*_TIMES, "preload")),
     ],
     align=True,
 )
@@ -32,7 +32,8 @@ landings are measured by, the signed approach velocity w'_minus in m/s.
 
 Its law F = ``stiffness`` x^``exponent`` g, in N/m^n; ``damping`` c; ``floor``: smallest |w'_minus| in m/s; ``clip``:
 whether g is kept from becoming negative. An isolated impact at speed v without loss takes ``factor`` depth/v, its depth
-is (``inertia`` v^``power``/``stiffness``)^``root``; ``power`` is 2 (Johnson 1985, sec. 11.4).
+is (``inertia`` v^``power``/``stiffness``)^``root``; ``power`` is 2 (Johnson 1985, sec. 11.4). ``preload`` in N is its
+force at w = 0, which a static load balances.
 """
 
 
@@ -61,6 +62,18 @@ def create_contacts(
     integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
     sites["inertia"], sites["root"], sites["factor"] = (n + 1) / 2 * np.asarray(reduced_mass), 1 / (n + 1), 2 * integral
     return sites
+
+
+def hold(sites: np.ndarray, which: np.ndarray, speed: float) -> None:
+    """Let the sites ``which`` act without changes of mode: no loss, and touching at w = 0 or pressed there.
+
+    ``speed`` in m/s is that of relative motion, for what is small beside it.
+    """
+    side = np.where(sites["clearance"] < sites["clearance_minus"], 1, -1)
+    pressed = np.maximum(-np.minimum(sites["clearance"], sites["clearance_minus"]), 0.0)
+    load = side * sites["stiffness"] * pressed ** sites["exponent"]
+    sites["mode"][which], sites["preload"][which] = (side * LASTING)[which], load[which]
+    sites["approach"][which] = side[which] * speed
 
 
 @kernel
@@ -115,7 +128,10 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
     if site.mode == FREE:
         return 0.0, 0.0
     side = 1.0 if site.mode > 0 else -1.0
-    elastic = elastic_force(site, side * w - gap_of(site, side))
+    x = side * w - gap_of(site, side)
+    if abs(site.mode) == LASTING:
+        return side * elastic_force(site, max(x, 0.0)), 0.0
+    elastic = elastic_force(site, x)
     g = 0.0
     if abs(site.mode) != CLIPPED:
         g = 1.0 + site.damping * rate / site.approach

@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, SITE, elastic_force, impact_time
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, LASTING, SITE, contact_force, elastic_force, gap_of, impact_time
 
 # Limits of the contact law, of which it is counted how often they acted.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
@@ -57,7 +57,12 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
 def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> None:
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     for i in range(contacts.size):
-        if contacts[i].mode != FREE:
+        side = 1 if contacts[i].mode > 0 else -1
+        if abs(contacts[i].mode) == LASTING and not side * start[i, 1] > 0.0 > side * end[i, 1]:  # no turn inside
+            episode = tracks.sites[i].episode
+            episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
+            episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
+        elif contacts[i].mode != FREE:
             update_episode(contacts, tracks, i, extremes(contacts, i, start, end, h))
 
 
@@ -115,6 +120,9 @@ class ImpactTracker:
         self.contacts, sites = contacts, np.zeros(len(numbers), TRACKED)
         self.start, self.end = np.zeros((2, len(sites), 3))
         sites["number"] = numbers
+        held = np.flatnonzero(np.abs(contacts["mode"]) == LASTING)
+        sites["episode"]["site"][held], sites["episode"]["separation"][held] = sites["number"][held], np.nan
+        sites["episode"]["side"][held] = np.sign(contacts["mode"][held])
         self.tracks = Tracks(sites, np.zeros(2 * len(sites), EPISODE), np.zeros(1, np.int64))
 
     def begin(self, motion: np.ndarray) -> np.ndarray:
@@ -127,7 +135,8 @@ class ImpactTracker:
         (w, rate), near = motion[self.tracks.sites["number"][mine]].T, LANDED_W * sites["scale"][mine]
         depths = w - sites["clearance"][mine], -w - sites["clearance_minus"][mine]
         side, deep = np.where(depths[0] < depths[1], -1, 1), np.maximum(*depths)
-        closed = (deep > near) | ((deep >= -near) & (side * rate > 0))
+        touching = (deep > near) | ((deep >= -near) & (side * rate > 0))
+        closed = touching & (sites["mode"][mine] == FREE)
         some, side, deep, rate = mine[closed], side[closed], np.maximum(deep[closed], 0.0), rate[closed]
         law = sites[some]
         # kc x^(n+1)/(n+1) over mu/2, of which a site knows (n+1)/2 times mu.
@@ -155,7 +164,8 @@ class ImpactTracker:
     def contact_time(self) -> float:
         """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
         sites = self.contacts
-        return min((impact_time(sites[i], abs(sites[i]["approach"])) for i in self._lasting), default=np.inf)
+        touching = np.flatnonzero(np.isin(np.abs(sites["mode"]), (CLOSED, CLIPPED)))
+        return min((impact_time(sites[i], abs(sites[i]["approach"])) for i in touching), default=np.inf)
 
     def accept_step(self, h: float) -> None:
         """Take the step of ``h`` seconds as done: update the open episodes; its end is the next one's start."""

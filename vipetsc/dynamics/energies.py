@@ -83,8 +83,8 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
 @njit(error_model="numpy")
 def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
     """Kinetic, spring, contact energy, that dissipated in contacts and in dashpots, (5, 2): see ``_add``."""
-    shape, contacts, sites = lattice.shape, lattice.contacts, lattice.site_cells.size
-    sums, elastic = np.zeros((PARTS, 2), np.int64), np.empty(sites)
+    shape, contacts, sites = lattice.shape, lattice.contacts, 0
+    sums, elastic = np.zeros((PARTS, 2), np.int64), np.empty(lattice.places.size)
     energies = np.empty(min(CHUNK, shape.cells))
     for first in range(0, shape.cells, CHUNK):
         of_cells = energies[: shape.cells - first]
@@ -92,11 +92,15 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
         _add(sums, _KINETIC, of_cells, unit)
         _spring_energies(y, lattice, first, of_cells)
         _add(sums, _SPRING, of_cells, unit)
-    for i in range(sites):
-        w, _ = relative_motion(y, lattice, i)
-        site = contacts[i]
-        elastic[i] = elastic_energy(site, max(w - site.clearance, -w - site.clearance_minus))
-    _add(sums, _CONTACT, elastic, unit)
+    for i in range(lattice.places.size):
+        if lattice.places[i].ledger < 0:
+            continue
+        w, site = relative_motion(y, lattice, i)[0], contacts[i]
+        elastic[sites] = elastic_energy(site, max(w - site.clearance, -w - site.clearance_minus))
+        if site.preload != 0.0:  # beyond that of the static state, under the load that holds it
+            elastic[sites] -= elastic_energy(site, -min(site.clearance, site.clearance_minus)) + site.preload * w
+        sites += 1
+    _add(sums, _CONTACT, elastic[:sites], unit)
     _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + sites], unit)
     if shape.damping >= 0:
         _add(sums, _DAMPING, y[shape.damping : shape.damping + shape.cells], unit)

@@ -29,9 +29,9 @@ def set_in_motion(setup: Setup) -> None:
     with state.localForm() as local:
         y, lattice = local.array, meter.lattice
         sums = measure(y, lattice, meter.unit)
-        rows = [relative_motion(y, lattice, i) for i in range(len(layout.sites))]
+        rows = [relative_motion(y, lattice, i) for i in range(len(layout.contacts))]
     motion = np.zeros((len(setup.model.chain.sites), 2))
-    for numbers, theirs in layout.comm.allgather((layout.sites, rows)):
+    for numbers, theirs in layout.comm.allgather((layout.contacts, rows)):
         motion[list(numbers)] = np.reshape(theirs, (-1, 2))
     energy = float(meter.total(sums[None], np.zeros((1, 1))).total[0])
     setup.engine.begin(layout.motion(state.array_r), motion, energy)

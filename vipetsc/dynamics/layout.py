@@ -4,7 +4,7 @@ A rank's part of the state holds, one after another: displacements by mass (all 
 mass 2, ...), velocities likewise, then its ledger components (where an engine integrates it, what the dashpots of each
 owned cell have dissipated; work of each drive whose cell it owns; dissipated energy of each owned site). Behind
 them lie the ghosts: displacements of the neighbouring cell on the left, with velocities where there are dashpots to
-integrate, then on the right. Mass by mass keeps every inner loop contiguous.
+integrate or contacts with the next cell, then on the right. Mass by mass keeps every inner loop contiguous.
 
 Compiled kernels see a rank's part as a ``LatticeRecord``: tables of masses, springs, sites and drives.
 """
@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.case import Model
-from vipetsc.contact.law import create_contacts
 from vipetsc.dynamics.drives import Drives, create_drives
+from vipetsc.dynamics.places import PLACE, site_records, sites_within
 from vipetsc.lattice import Chain
 
 
@@ -30,7 +30,8 @@ class Layout:
 
     Cells come in equal blocks, the first ranks have one more where they do not divide; a rank may be empty. ``ranges``
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
-    ``size`` components; that of the first owned site's dissipated energy is ``dissipated``. A cell has ``rows`` of them
+    ``size`` components; that of the first owned site's dissipated energy is ``dissipated``. ``sites`` are
+    the numbers of those it owns, ``contacts`` of all that act on its masses. A cell has ``rows`` of them
     and ``ghost_rows`` as a ghost: with ``dashpots``, of an engine that integrates what these dissipate, one and its
     velocities more in a damped lattice.
     """
@@ -44,13 +45,12 @@ class Layout:
         driven = np.array([drive.cell for drive in model.drives], np.int64)
         of_ledger, _ = np.histogram([*driven, *chain.sites], cuts)
         self.damped = dashpots and chain.is_damped
-        self.rows, self.ghost_rows = 2 * self.dofs + self.damped, self.dofs * (1 + self.damped)
+        self.rows, self.ghost_rows = 2 * self.dofs + self.damped, self.dofs * (1 + (self.damped or chain.is_joined))
         sizes = self.rows * np.diff(cuts) + of_ledger
         self.offsets = np.append(0, np.cumsum(sizes))
         self.start, self.stop = self.ranges[comm.rank].tolist()
         self.owned, self.size = self.stop - self.start, int(sizes[comm.rank])
-        sites = np.array(chain.sites, np.int64)
-        self.sites = tuple(np.flatnonzero((sites >= self.start) & (sites < self.stop)).tolist())
+        self.sites, self.contacts = sites_within(chain, self.start, self.stop)
         self.drives = tuple(np.flatnonzero((driven >= self.start) & (driven < self.stop)).tolist())
         self.dissipated = self.rows * self.owned + len(self.drives)
 
@@ -77,6 +77,12 @@ class Layout:
         indices = indices[:, : self.ghost_rows].ravel()
         array = np.zeros(self.size + indices.size) if array is None else array
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
+
+    def losses(self, y: np.ndarray) -> np.ndarray:
+        """What the ``contacts`` have dissipated in J in the part ``y`` of the state; 0 of those of other ranks."""
+        losses = np.zeros(len(self.contacts))
+        losses[np.isin(self.contacts, self.sites)] = y[self.dissipated : self.size]
+        return losses
 
     def place(self, cells: np.ndarray, work: float, y: np.ndarray) -> None:
         """Fill this rank's part ``y`` of the state: ``cells`` (cell, 2 dofs), ``work`` in J of the first drive."""
@@ -134,7 +140,8 @@ class Shape(NamedTuple):
     """Sizes and indices of a rank's part of the lattice; an index is -1 where the rank has no such thing.
 
     ``owned`` and ``ghosted`` count the state's components without and with ghosts, ``exchange`` tells whether ghosts
-    must be fetched. ``left_ghost`` and ``right_ghost`` are the first components of the neighbouring cells,
+    must be fetched, ``paired`` whether contacts join other masses than the cell's pair. ``left_ghost`` and
+    ``right_ghost`` are the first components of the neighbouring cells,
     ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``work``, ``dissipated`` and
     ``damping`` are the components of the first drive's work, of the energies that the first site and the first cell's
     dashpots have dissipated.
@@ -142,8 +149,7 @@ class Shape(NamedTuple):
 
     cells: int
     dofs: int
-    host: int
-    resonator: int
+    paired: bool
     owned: int
     ghosted: int
     exchange: bool
@@ -157,7 +163,7 @@ class Shape(NamedTuple):
 
 
 class LatticeRecord(NamedTuple):
-    """A rank's part of a lattice: sizes, tables of the dtypes above, the sites' local cells, its drives.
+    """A rank's part of a lattice: sizes, tables of the dtypes above, the sites' ``places`` and laws, its drives.
 
     Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
     ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where dashpots are integrated
@@ -168,7 +174,7 @@ class LatticeRecord(NamedTuple):
     masses: np.ndarray
     couplings: np.ndarray
     springs: np.ndarray
-    site_cells: np.ndarray
+    places: np.ndarray
     contacts: np.ndarray
     drives: Drives
     inverse_masses: np.ndarray
@@ -187,8 +193,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
     shape = Shape(
         cells=n,
         dofs=d,
-        host=cell.host,
-        resonator=cell.resonator,
+        paired=bool(chain.pairs),
         owned=layout.size,
         ghosted=layout.size + layout.ghost_rows * ((left is not None) + (right is not None)),
         exchange=layout.comm.size > 1 or layout.periodic,
@@ -212,19 +217,35 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         np.array(masses, MASS),
         np.array([(c.offset, c.other, c.stiffness, c.spring) for c in couplings], COUPLING),
         np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
-        np.array([chain.sites[i] for i in layout.sites], np.int64) - layout.start,
-        site_records(model, layout.sites),
+        create_places(model, layout, (shape.left_ghost, shape.right_ghost)),
+        site_records(model, layout.contacts),
         drives,
         *_coefficients(chain, layout),
     )
 
 
-def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
-    """Free sites of dtype ``SITE``; a number below 0 is a site without stops."""
-    numbers = np.maximum(np.asarray(numbers, np.int64), -1)
-    gaps = np.array(model.gaps or [(gap, gap) for gap in model.chain.clearances]).reshape(-1, 2)
-    laws = [model.laws[i] if i >= 0 else model.contact for i in numbers] if model.laws else model.contact
-    return create_contacts(laws, np.vstack([gaps, [[np.inf] * 2]])[numbers], model.chain.cell.reduced_mass, model.scale)
+def create_places(model: Model, layout: Layout, ghosts: tuple[int, int]) -> np.ndarray:
+    """Records (site,) of dtype ``PLACE`` of the sites ``layout.contacts``; ``ghosts`` are their first components."""
+    chain, n, d = model.chain, layout.owned, layout.dofs
+
+    def end(cell: int, mass: int) -> tuple[int, int, int, int]:
+        if mass < 0:
+            return -1, -1, -1, -1
+        here = cell % chain.cells - layout.start
+        if 0 <= here < n:
+            return mass * n + here, (d + mass) * n + here, here, mass
+        first = ghosts[cell >= layout.stop]
+        return first + mass, first + d + mass, -1, mass
+
+    places, pairs = np.zeros(len(layout.contacts), PLACE), chain.contact_pairs
+    for row, i in zip(places, layout.contacts, strict=True):
+        pair, cell = pairs[i], chain.sites[i]
+        if cell == chain.cells - 1 and layout.start == 0 and n < chain.cells:
+            cell = -1  # of a ring, as its first cells see it
+        row["host"], row["resonator"] = end(cell, pair.host), end(cell + pair.next_cell, pair.resonator)
+    owned = np.isin(layout.contacts, layout.sites)
+    places["ledger"] = np.where(owned, layout.dissipated + np.cumsum(owned) - 1, -1)
+    return places
 
 
 def _coefficients(chain: Chain, layout: Layout) -> list[np.ndarray]:

@@ -17,7 +17,7 @@ from vipetsc.figures import style
 from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.study import counted
 from vipetsc.figures.style import with_prefix
-from vipetsc.lattice import Chain, UnitCell
+from vipetsc.lattice import Chain, Spring, UnitCell
 
 PITCH = 2.0  # distance between neighbouring masses of the drawing
 HALF = 0.34  # half the side of a mass
@@ -147,7 +147,7 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     host, resonator = layout.centre[cell.host], layout.centre[cell.resonator]
     if layout.nested:
         _host_with_resonator(axes, host, cell)
-    else:
+    elif cell.host != cell.resonator:
         # A bowed double arrow between the pair, whose resonator other masses hold too.
         arrow = {"arrowstyle": "<->", "color": style.VERMILION, "lw": 0.9, "ls": (0, (3, 1.5)), "shrinkA": 9,
                  "shrinkB": 9, "connectionstyle": "arc3,rad=0.45"}  # fmt: skip
@@ -168,7 +168,7 @@ def _layout(cell: UnitCell) -> _Layout:
     joined = np.zeros((cell.dofs, cell.dofs), bool)
     for spring in cell.springs:
         joined[spring.start, spring.end] |= not spring.next_cell
-    through = next(s for s in cell.springs if s.next_cell)
+    through = next((s for s in cell.springs if s.next_cell), Spring(cell.dofs - 1, 0, 1.0, next_cell=True))
     ends = [through.end, through.start]
     passed, ahead = shortest_path(csr_array(joined), directed=False, unweighted=True, indices=ends)
     # What no spring inside the cell holds stands at its end.

@@ -171,7 +171,10 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         return empty_figure(f"Phase portraits: cell {cell}, the first site, was not recorded")
     if "displacement" not in run or "velocity" not in run:
         return empty_figure("Phase portraits: they need displacement and velocity, and one was not recorded")
-    pair, motion = Case.of(run).model().chain.cell, run.sel(cell=cell)
+    chain, motion = Case.of(run).model().chain, run.sel(cell=cell)
+    if chain.pairs:
+        return empty_figure("Phase portraits are of the cell's pair, and the contacts join others")
+    pair = chain.cell
     u, v, time = refined(motion["displacement"].values, motion["velocity"].values, field_time(run))
     onsets = run["impacts/onset"].values[run["impacts/site"].values == site + 1]
     before = int(np.searchsorted(time, onsets.min(initial=np.inf)))

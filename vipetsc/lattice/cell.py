@@ -133,9 +133,9 @@ def cell_problems(
     for i, c in enumerate(grounding, 1):
         if not 0 <= c < np.inf:
             problems.append((f"grounding[{i}]", f"damping {c!r} must not be negative (N s/m)"))
-    if host == resonator:
+    if host == resonator and n > 1:
         problems.append(("contact", "host and resonator must be two different masses"))
-    if not any(s.next_cell for s in springs):
+    if springs and not any(s.next_cell for s in springs):
         problems.append(("springs", "no spring has next_cell = true, so cells are not connected"))
     return problems
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,13 +18,22 @@ Ends = Literal["fixed", "free", "periodic"]
 LONGEST = 400  # cells whose linear response is solved for
 
 
+class Pair(NamedTuple):
+    """What a contact joins: masses (0-based; host -1 is ground), ``resonator`` in the next cell if ``next_cell``."""
+
+    host: int
+    resonator: int
+    next_cell: bool = False
+
+
 @dataclass(frozen=True)
 class Chain:
     """``cells`` unit cells in a row; contact ``sites`` are 0-based cells, ``clearances`` in m, one a site.
 
     ``ends``: ``fixed`` puts a wall at either end, held by the inter-cell springs; ``free`` cuts those
-    springs; ``periodic`` joins the last cell to the first. ``variation`` has what differs from ``cell``, which
-    stands for the lattice in all that is said of its bands; raises ValueError if it is not of all cells.
+    springs; ``periodic`` joins the last cell to the first. ``pairs`` are what contacts join, the cell's pair if
+    (). ``variation`` has what differs from ``cell``, which stands for the lattice in all that is said of its bands;
+    raises ValueError if it is not of all cells.
     """
 
     cell: UnitCell
@@ -33,6 +42,7 @@ class Chain:
     sites: tuple[int, ...] = ()
     clearances: tuple[float, ...] = ()
     variation: Variation | None = None
+    pairs: tuple[Pair, ...] = ()
 
     def __post_init__(self) -> None:
         for name, array in self.variation.items() if self.variation else ():
@@ -53,6 +63,24 @@ class Chain:
         varied = [a for n, a in self.variation.items() if n in ("grounding", "damping")] if self.variation else []
         return self.cell.is_damped or any(array.any() for array in varied)
 
+    @property
+    def contact_pairs(self) -> tuple[Pair, ...]:
+        """The pair of each site: those of ``pairs``, or the cell's."""
+        return self.pairs or (Pair(self.cell.host, self.cell.resonator),) * len(self.sites)
+
+    @property
+    def is_joined(self) -> bool:
+        """Whether contacts join cells."""
+        return any(pair.next_cell for pair in self.pairs)
+
+    def reduced_masses(self) -> list[float]:
+        """Mass in kg of each site's relative motion."""
+        of_pair, masses = {Pair(self.cell.host, self.cell.resonator): self.cell.reduced_mass}, self.cell.masses
+        for host, resonator, _ in set(self.pairs):
+            mass = 1 / ((1 / masses[host] if host >= 0 else 0.0) + 1 / masses[resonator])
+            of_pair |= {Pair(host, resonator, joins): mass for joins in (False, True)}
+        return [of_pair[pair] for pair in self.contact_pairs]
+
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
         """Whether no cell from ``start`` to ``stop`` differs from the reference cell; of a ring they count on."""
         if self.variation is None:
@@ -67,7 +95,7 @@ class Chain:
     @property
     def _reference(self) -> Coefficients:
         cell = self.cell
-        of_springs = np.array([(s.stiffness, s.damping) for s in cell.springs]).T
+        of_springs = np.array([(s.stiffness, s.damping) for s in cell.springs]).reshape(-1, 2).T
         return Coefficients(np.array(cell.masses), np.array(cell.grounding or np.zeros(cell.dofs)), *of_springs)
 
     def coefficients(self, start: int, stop: int) -> Coefficients:
@@ -102,7 +130,7 @@ class Chain:
     def _rows(self, start: int, stop: int, values: np.ndarray) -> csr_matrix:
         """Rows made of ``values`` (cell, spring) of the cells from ``start`` - 1 on."""
         n, d = self.cells, self.cell.dofs
-        rows, columns, entries = [], [], []
+        rows, columns, entries = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
         index, every = np.arange(start, stop, dtype=np.int64), np.ones(stop - start, bool)
         for mass, offset, other, _, _, spring in self.cell.couplings():
             neighbour = index + offset

@@ -151,7 +151,9 @@ class Propagator(Engine):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """A lattice shorter than P's band, or too many sites that feel one another within a step."""
+        """Contacts of other pairs, or pressed; a lattice shorter than P's band; too many sites close to one another."""
+        if model.chain.pairs or any(min(gaps) < 0 for gaps in model.gaps):
+            return "contacts are not between the cell's pair alone, or pressed together (contacts.pair, precompression)"
         series = step_series(model)
         if series is None:
             shortest = StepSeries(model.chain, model.sample_interval / MOST_PARTS, model.rtol)

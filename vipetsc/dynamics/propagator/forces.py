@@ -16,7 +16,8 @@ from vipetsc.contact.changes import Extremes
 from vipetsc.contact.law import FREE, impact_time
 from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, switch_sites, update_episode, with_room
 from vipetsc.dynamics.drives import Drives, create_drives
-from vipetsc.dynamics.layout import Layout, join, site_records
+from vipetsc.dynamics.layout import Layout, join
+from vipetsc.dynamics.places import site_records
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, create_trial
 from vipetsc.dynamics.propagator.nodes import collocation

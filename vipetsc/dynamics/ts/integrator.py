@@ -1,7 +1,4 @@
-"""The engine ``ts``: one trial of PETSc's explicit Runge-Kutta at a time, landing on every contact change.
-
-The method stands in the package's docstring.
-"""
+"""The engine ``ts``: one trial of PETSc's explicit Runge-Kutta at a time, landing on every contact change."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,7 +18,7 @@ from vipetsc.dynamics.drives import select_piece
 from vipetsc.dynamics.engine import Engine, StalledError, Stretch
 from vipetsc.dynamics.layout import Layout, create_record, join
 from vipetsc.dynamics.samples import Samples, take_sample
-from vipetsc.dynamics.ts.right_hand_side import observe, register
+from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register, right_hand_side
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.parallel import StopRequest
 
@@ -53,33 +50,32 @@ class Integrator(Engine):
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         self.comm, self.layout = layout.comm, layout
         self.lattice = create_record(model, layout)
-        self.tracker = ImpactTracker(self.lattice.contacts, layout.sites)
+        self.tracker = ImpactTracker(self.lattice.contacts, layout.contacts)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
         self.time = 0.0
         self.state = layout.create_vector()
+        self.rates = layout.create_vector() if model.chain.pairs else self.state
+        self._mine = np.isin(layout.contacts, layout.sites)  # others log the rest
         register_sums(self.state)
         self.saved = self.state.duplicate()
-        self.ts = self._create_ts(model, layout)
-        self._first_step = 0.002 / model.drive.frequency
+        self.ts, self._first_step = self._create_ts(model, layout), 0.002 / model.drive.frequency
         options = PETSc.Options()
         self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
         self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
         self._interval = model.sample_interval
         self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
-        self._stop = stop or StopRequest()
-        self._any_open = False
+        self._stop, self._any_open = stop or StopRequest(), False
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
         # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
         # as h^(5/2). The shares are those that the controller settles at.
-        bends = any(law.exponent != 1 for law in model.laws or (model.contact,))
-        share, order = (1 / 200, 2.5) if bends else (1 / 20, 8)
+        exponents = {law.exponent for law in model.laws or (model.contact,)}
+        share, order = (1 / 20, 8) if exponents == {1} else (1 / 200, 2.5)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
         self.observe(self.tracker.start)
 
     def _create_ts(self, model: Model, layout: Layout) -> PETSc.TS:
         options = PETSc.Options()
-        tolerances = self.state.duplicate()
-        half = layout.dofs * layout.owned
+        tolerances, half = self.state.duplicate(), layout.dofs * layout.owned
         tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol
         tolerances.array[2 * half :] = 1e30  # work and losses do not decide the step
         ts = PETSc.TS().create(layout.comm)
@@ -108,8 +104,14 @@ class Integrator(Engine):
         """Fill ``motion`` (sites, 3) from the state; it is taken at ``time``, else at the present one."""
         if self.lattice.shape.exchange:
             self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        time, paired = self.time if time is None else time, self.lattice.shape.paired
         with self.state.localForm() as local:
-            observe(self.time if time is None else time, local.array, self.lattice, motion)
+            if not paired:
+                return observe(time, local.array, self.lattice, motion)
+            right_hand_side(time, local.array, self.rates.array, self.lattice)
+        self.rates.ghostUpdate()
+        with self.state.localForm() as local, self.rates.localForm() as rates:
+            observe_pairs(local.array, rates.array, self.lattice, motion)
 
     def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         self.layout.place(cells, energy, self.state.array)
@@ -241,8 +243,9 @@ class Integrator(Engine):
 
     def _switch(self) -> None:
         """Switch modes of all landed sites and set the step with which to go on."""
-        was_free, losses = not self._any_open, self.state.array_r[self.lattice.shape.dissipated :]
-        self.counts["switches"] += self.tracker.switch(self.time, losses)
+        was_free, sites, modes = not self._any_open, self.tracker.contacts, self.tracker.contacts["mode"].copy()
+        self.tracker.switch(self.time, self.layout.losses(self.state.array_r))
+        self.counts["switches"] += int((modes != sites["mode"])[self._mine].sum())
         self._restart(was_free)
 
     def _restart(self, was_free: bool) -> None:
@@ -260,18 +263,20 @@ class Integrator(Engine):
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
         """Those of the owned sites."""
-        return self.tracker.take_episodes(self.state.array_r[self.lattice.shape.dissipated :], unfinished)
+        episodes = self.tracker.take_episodes(self.layout.losses(self.state.array_r), unfinished)
+        return episodes[np.isin(episodes["site"], self.layout.sites)]
 
     def statistics(self) -> dict[str, Any]:
         """Steps, and what landings and limits of the contact law there were."""
-        of_sites = np.array([self.counts["switches"], *(self.tracker.counts[name].sum() for name in LIMITS)])
+        limits = self.tracker.counts[self._mine]
+        of_sites = np.array([self.counts["switches"], *(limits[name].sum() for name in LIMITS)])
         self.comm.Allreduce(MPI.IN_PLACE, of_sites, MPI.SUM)
         sums = dict(zip(("switches", *LIMITS), of_sites.tolist(), strict=True))
         return self.counts | sums | {"method": self.ts.getRKType()}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         return self.layout.checkpoint(self.state.array_r) | {
-            "sites": self.tracker.checkpoint(),
+            "sites": self.tracker.checkpoint()[self._mine],
             "time": np.array(self.time),
             "steps": np.array([self.step, self.free_step, float(self._any_open)]),
             "counts": np.array([list(self.counts.values())]),
@@ -291,5 +296,5 @@ class Integrator(Engine):
         self.observe(self.tracker.start)
 
     def destroy(self) -> None:
-        for petsc_object in (self.ts, self.state, self.saved):
+        for petsc_object in (self.ts, self.state, self.rates, self.saved):
             petsc_object.destroy()

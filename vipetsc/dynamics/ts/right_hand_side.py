@@ -18,6 +18,7 @@ from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
 from vipetsc.dynamics.layout import COEFFICIENTS, COUPLING, MASS, SPRING, LatticeRecord, Shape
 from vipetsc.dynamics.native import pointer
+from vipetsc.dynamics.places import PLACE
 from vipetsc.dynamics.ts.springs import damping_powers, inverse_mass, spring_acceleration, spring_accelerations
 from vipetsc.lattice.drive import PIECE
 
@@ -25,10 +26,10 @@ from vipetsc.lattice.drive import PIECE
 @njit(error_model="numpy", forceinline=True)
 def relative_motion(y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[float, float]:
     """w = u_resonator - u_host of site ``i`` and w'."""
-    n, cell = lattice.shape.cells, lattice.site_cells[i]
-    host, resonator = lattice.shape.host * n + cell, lattice.shape.resonator * n + cell
-    velocities = lattice.shape.dofs * n
-    return y[resonator] - y[host], y[velocities + resonator] - y[velocities + host]
+    host, resonator = lattice.places[i].host, lattice.places[i].resonator
+    if host.u < 0:
+        return y[resonator.u], y[resonator.v]
+    return y[resonator.u] - y[host.u], y[resonator.v] - y[host.v]
 
 
 @njit(error_model="numpy")
@@ -48,29 +49,42 @@ def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray)
     for i in range(motion.shape[0]):
         w, rate = relative_motion(y, lattice, i)
         force, _ = contact_force(lattice.contacts, i, w, rate)
-        cell = lattice.site_cells[i]
-        at_host = _acceleration(t, y, lattice, cell, lattice.shape.host, force)
-        at_resonator = _acceleration(t, y, lattice, cell, lattice.shape.resonator, -force)
+        host, resonator = lattice.places[i].host, lattice.places[i].resonator
+        at_host = _acceleration(t, y, lattice, host.cell, host.mass, force)
+        at_resonator = _acceleration(t, y, lattice, resonator.cell, resonator.mass, -force)
         motion[i, 0], motion[i, 1], motion[i, 2] = w, rate, at_resonator - at_host
+
+
+@njit(error_model="numpy")
+def observe_pairs(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
+    """The same of every site, given the state ``y`` and its derivative ``f``, both with their ghosts."""
+    for i in range(motion.shape[0]):
+        motion[i, 0], motion[i, 1] = relative_motion(y, lattice, i)
+        motion[i, 2] = relative_motion(f, lattice, i)[1]
 
 
 @njit(error_model="numpy")
 def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
     """Time derivative ``f`` (owned,) of the state ``y`` (ghosted,): velocities, accelerations, powers."""
     shape = lattice.shape
-    n, d, host, resonator = shape.cells, shape.dofs, shape.host, shape.resonator
+    n, d = shape.cells, shape.dofs
     f[: d * n] = y[d * n : 2 * d * n]
     for mass in range(d):
         spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
-    for i in range(lattice.site_cells.size):
-        power = 0.0
+    for i in range(lattice.places.size):
+        power, place = 0.0, lattice.places[i]
         if lattice.contacts[i].mode != FREE:
-            cell = lattice.site_cells[i]
+            host, resonator = place.host, place.resonator
             w, rate = relative_motion(y, lattice, i)
             force, power = contact_force(lattice.contacts, i, w, rate)
-            f[(d + host) * n + cell] += force * inverse_mass(lattice, cell, host)
-            f[(d + resonator) * n + cell] -= force * inverse_mass(lattice, cell, resonator)
-        f[shape.dissipated + i] = power
+            force -= lattice.contacts[i].preload
+            if host.cell >= 0:
+                f[(d + host.mass) * n + host.cell] += force * inverse_mass(lattice, host.cell, host.mass)
+            if resonator.cell >= 0:
+                per_mass = inverse_mass(lattice, resonator.cell, resonator.mass)
+                f[(d + resonator.mass) * n + resonator.cell] -= force * per_mass
+        if place.ledger >= 0:
+            f[place.ledger] = power
     for i in range(lattice.drives.rows.size):
         drive, force = lattice.drives.rows[i], drive_force(lattice.drives, i, t)
         f[drive.target] += force * drive.inverse
@@ -79,7 +93,7 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         damping_powers(y, lattice, f[shape.damping : shape.damping + n])
 
 
-_TABLES = ("masses", "couplings", "springs", "site_cells", "contacts", "rows", "pieces", *COEFFICIENTS)
+_TABLES = ("masses", "couplings", "springs", "places", "contacts", "rows", "pieces", *COEFFICIENTS)
 
 
 def _c_struct(record: type) -> np.dtype:
@@ -116,7 +130,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.masses), (size.masses,), MASS),
         carray(pointer(at.couplings), (size.couplings,), COUPLING),
         carray(pointer(at.springs), (size.springs,), SPRING),
-        carray(pointer(at.site_cells), (size.site_cells,), np.int64),
+        carray(pointer(at.places), (size.places,), PLACE),
         carray(pointer(at.contacts), (size.contacts,), SITE),
         Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
         carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
