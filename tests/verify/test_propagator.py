@@ -114,7 +114,9 @@ def agree(folder, case: Case, velocity: float = 1e-7, onset: float = 1e-9) -> di
     energies = [name for name in theirs if name.startswith("energy/")]
     for name in energies:
         np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-7 * scale)
-    assert result.statistics["ledger_error"] < 1e-9
+    # With dashpots the ledger of exact steps gives these what the balance leaves.
+    assert (result.statistics["ledger_error"] is None) == ("energy/dissipated_by_damping" in energies)
+    assert (result.statistics["ledger_error"] or 0.0) < 1e-9
     return result.statistics
 
 
@@ -132,6 +134,7 @@ def agree(folder, case: Case, velocity: float = 1e-7, onset: float = 1e-9) -> di
         ({}, {"restitution": 0.0, "approach_floor": 0.3}, {}, {}),
         ({}, {}, {}, {"sample_interval": 8e-4}),
         ({"cells": 7}, {"sites": [4]}, {"amplitude": 1000.0}, {"end": 0.03}),
+        ({"damping": {"mass": 10.0, "stiffness": 5e-6}}, {"sites": [6, 7, 12]}, {"amplitude": 40.0}, {}),
     ],
 )
 def test_agrees_with_the_time_stepper(folder, lattice, contacts, drive, time):

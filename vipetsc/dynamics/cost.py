@@ -19,7 +19,7 @@ STEP, MASS, RESOLVED, EPISODE_STEPS = 3.7e-5, 1.3e-7, 0.37, 60.0
 # Of the propagator, in s: what it begins with, a linear step, a cell in it, an episode.
 BEGIN, LINEAR_STEP, CELL, EPISODE = 0.06, 2e-5, 6.5e-8, 3.5e-4
 # Of cells with rows of their own, in s: a number of these in a step, what it takes to make one.
-OWN_NUMBER, MAKE_NUMBER = 1e-9, 1e-6
+OWN_NUMBER, MAKE_NUMBER = 4e-10, 7e-7
 
 
 @dataclass(frozen=True)

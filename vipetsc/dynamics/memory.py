@@ -12,6 +12,7 @@ import numpy as np
 from vipetsc.case import CaseError, Model
 from vipetsc.case.reading import Problem
 from vipetsc.case.schema import OutputTable
+from vipetsc.dynamics.propagator.engine import step_series
 from vipetsc.dynamics.recorder import chunk_samples, recorded_cells, written_together
 from vipetsc.io.store import GATHER_LIMIT
 
@@ -42,6 +43,9 @@ def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) ->
     of_cell = 2 * chain.cell.dofs + (engine == "ts" and chain.is_damped)
     tables = 0 if chain.is_uniform() and not chain.is_damped else 2 * (chain.cell.dofs + len(chain.cell.springs))
     varied = sum(array.nbytes for _, array in chain.variation.items()) if chain.variation else 0
+    if engine == "propagator" and varied and (series := step_series(model)):
+        # Rows of cells that differ.
+        varied += 8 * (2 * chain.cell.dofs) ** 2 * (2 * series.reach + 1) * series.own_rows()[1] // ranks
     states = 2 * STAGES[model.method] + STATES_BESIDE_STAGES if engine == "ts" else PROPAGATOR_STATES
     local, every = min(owned, len(recorded)) * per_cell + own_sites, len(recorded) * per_cell + len(chain.sites)
     together = ranks == 1 or written_together(model, output, ranks)
