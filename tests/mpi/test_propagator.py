@@ -35,6 +35,13 @@ def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
 
 
 @pytest.mark.parallel([2, 3])
+def test_same_bits_with_dashpots(folder):
+    damping, sites = {"mass": 10.0, "stiffness": 5e-6}, [1, 7, 12, 13, 16, 17]
+    time = {"end": 0.02, "engine": "propagator"}
+    runs_alike(folder, small_case(lattice={"damping": damping}, contacts={"sites": sites}, time=time))
+
+
+@pytest.mark.parallel([2, 3])
 def test_same_bits_diatomic_and_driven_in_the_middle(folder):
     table = {
         "lattice": {"preset": "diatomic", "cells": 31},
