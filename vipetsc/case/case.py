@@ -28,6 +28,7 @@ from vipetsc.case.resolve import (
 from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
+from vipetsc.case.variation import check_variation
 from vipetsc.case.warnings import warnings_of
 from vipetsc.lattice import UnitCell, pass_bands
 
@@ -65,7 +66,14 @@ class Case(CaseFile):
             beginning, problems = beginning_of(initial, sections["lattice"], frequency)
             if problems:
                 return sections, problems
-        tables, samples = resolved(sections, beginning), sections["time"].samples
+        samples = sections["time"].samples
+        try:
+            tables = resolved(sections, beginning)
+            if problems := list(check_variation(LatticeTable(**tables["lattice"]), tables["drive"].get("cell", 1))):
+                return sections, problems
+        except ValueError as error:
+            given = sections["lattice"].absorbing
+            return sections, [Problem("lattice.absorbing.reflection", given and given.reflection, str(error))]
         count = tables["time"]["end"] / tables["time"]["sample_interval"]
         if count > MOST_SAMPLES:
             remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} can be taken, and the bands need so many"
@@ -85,6 +93,8 @@ class Case(CaseFile):
         lattice, contacts = sections["lattice"], sections["contacts"]
         cell, problems = check_cell(lattice) if valid("lattice") else (None, [])
         yield from problems
+        if cell and valid("drive.cell"):
+            yield from check_variation(lattice, sections["drive"].cell)
         if valid("lattice.cells", "contacts.sites"):
             yield from check_contacts(lattice, contacts, valid)
             if cell and valid("contacts"):

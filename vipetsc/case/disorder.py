@@ -6,46 +6,19 @@ same numbers on any number of ranks, in any order, beside any other quantity.
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
 from vipetsc.case.contacts import lists_of
 from vipetsc.case.reading import Problem, Section, Table
-from vipetsc.case.schema import CONTACTS, LatticeTable, NotNegative
+from vipetsc.case.schema import CONTACTS, LatticeTable
 from vipetsc.case.sites import ContactsTable
+from vipetsc.case.varied import Deviation
 from vipetsc.lattice import UnitCell
 
 SEED = "disorder.seed"
-
-
-class Deviation(Section):
-    """Standard deviation of values about those of the case: ``relative`` to each, or ``absolute`` in its unit.
-
-    Their mean is the case's value with every ``distribution``; ``uniform`` ends sqrt(3) deviations from it.
-    """
-
-    relative: NotNegative | None = None
-    absolute: NotNegative | None = None
-    distribution: Literal["normal", "uniform", "lognormal"] = "normal"
-
-    def draw(self, values: np.ndarray, seed: int, name: str) -> np.ndarray:
-        """Values (n) of the quantity ``name`` about ``values`` (n); a larger n begins with the same numbers."""
-        key = np.random.SeedSequence([seed, int.from_bytes(name.encode(), "little")])
-        generator = np.random.Generator(np.random.Philox(key))
-        deviation = np.full(len(values), self.absolute) if self.relative is None else self.relative * np.abs(values)
-        if self.distribution == "uniform":
-            return values + deviation * np.sqrt(3) * generator.uniform(-1, 1, len(values))
-        normal = generator.standard_normal(len(values))
-        if self.distribution == "normal":
-            return values + deviation * normal
-        spread = np.log1p((deviation / values) ** 2)  # variance of the logarithm
-        return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
-
-    def __str__(self) -> str:
-        size = f"{100 * self.relative:g} %" if self.relative is not None else f"{self.absolute:g}"
-        return f"{self.distribution}, deviation {size}"
 
 
 class DisorderTable(Section):
@@ -53,6 +26,7 @@ class DisorderTable(Section):
 
     Of every site: ``clearance`` (m), ``sites`` (the cell, rounded). Of all sites together: ``restitution``,
     ``stiffness`` (N/m^n) or ``modulus`` (Pa). Of the cell, the same in all cells: ``masses`` (kg), ``springs`` (N/m).
+    Of every cell by itself: ``cells``, by quantity; the resolved case keeps these as they are said.
     """
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -63,10 +37,12 @@ class DisorderTable(Section):
     modulus: Deviation | None = None
     masses: Deviation | None = None
     springs: Deviation | None = None
+    cells: dict[str, Deviation] | None = None
 
     def quantities(self) -> dict[str, Deviation]:
         """What scatters, by name."""
-        return {name: getattr(self, name) for name in type(self).model_fields if name != "seed" and getattr(self, name)}
+        names = type(self).model_fields.keys() - {"seed", "cells"}
+        return {name: getattr(self, name) for name in type(self).model_fields if name in names and getattr(self, name)}
 
 
 def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Sequence[float]]:
@@ -108,11 +84,14 @@ def scatter(
                 )
                 problems.append(Problem(key, numbers, remedy))
             drawn[name] = new.tolist()
+    if disorder.cells and not problems:
+        scattered = {key: deviation.model_dump(exclude_none=True) for key, deviation in disorder.cells.items()}
+        tables = tables | {"lattice": tables["lattice"] | {"scatter": {"seed": disorder.seed, "quantities": scattered}}}
     if problems or not drawn:
         empty = Problem(
             "disorder", disorder.seed, "names nothing that scatters, as in: clearance = { relative = 0.01 }"
         )
-        return tables, problems if disorder.quantities() else [empty]
+        return tables, problems if disorder.quantities() or disorder.cells else [empty]
     law |= {name: drawn[name] for name in ("clearance",) if name in drawn}
     of_each = law.get("each", {})
     law |= {name: drawn[name][0] for name in ("restitution", "stiffness") if name in drawn and name not in of_each}

@@ -237,7 +237,7 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
 def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem:
     """The problem behind one of pydantic's errors in section ``name``."""
     # Pydantic puts the branches of a union that it tried into the path: "float", "list[int]", "Span".
-    branch = re.compile(r"int|float|str|bool|Span|ClearanceSpan|.*\[.*|constrained.*")
+    branch = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
     keys = [part for part in item["loc"] if isinstance(part, int) or not branch.fullmatch(part)]
     path = name + "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in keys)
     if item["type"] == "extra_forbidden":

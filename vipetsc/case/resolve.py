@@ -12,6 +12,8 @@ from vipetsc.case.initial import Beginning
 from vipetsc.case.reading import Problem, Table, Valid
 from vipetsc.case.schema import CONTACTS, PRESETS, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
+from vipetsc.case.variation import variation_of
+from vipetsc.case.varied import designed_end
 from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import cell_problems, groups_of
 
@@ -91,9 +93,9 @@ def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
     """The lattice with its contact sites."""
     sites = site_cells(lattice, contacts)
     gaps = clearances(lattice, contacts, len(sites))
-    cell = lattice.unit_cell()
+    cell, places = lattice.unit_cell(), tuple(c - 1 for c in sites)
     pairs = pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites))
-    return Chain(cell, lattice.cells, lattice.ends, tuple(c - 1 for c in sites), tuple(gaps), pairs=pairs)
+    return Chain(cell, lattice.cells, lattice.ends, places, tuple(gaps), variation_of(lattice), pairs)
 
 
 def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
@@ -201,6 +203,10 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
         interval = end / (time.samples - 1)
     elif interval == "auto":
         interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
+    if (absorbing := lattice.absorbing) and not (absorbing.cells and absorbing.strength):
+        frequency, most = tables["drive"].get("frequency"), lattice.cells // 3
+        designed = designed_end(absorbing, cell, lattice.ends, frequency, drive.cycles, most)
+        tables["lattice"]["absorbing"] = designed.model_dump()
     tables.pop("initial", None)
     tables |= {"initial": beginning.table} if beginning else {}
     if told and "cell" not in drive.model_fields_set:

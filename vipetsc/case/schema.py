@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from vipetsc.case.reading import Section
+from vipetsc.case.varied import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 
 Method = Literal["2a", "3bs", "5f", "5dp", "5bs", "6vr", "7vr", "8vr"]
@@ -40,9 +41,7 @@ def _text(value: Any) -> Any:
     return str(value) if isinstance(value, bool | int | float) else value
 
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Wavenumber = Annotated[float, Field(gt=0, le=np.pi), BeforeValidator(number)]
 
 
@@ -132,6 +131,9 @@ class LatticeTable(Section):
     lam: Positive | None = Field(None, alias="lambda")
     eta: Annotated[float, Field(gt=0, lt=1)] | None = None
     damping: RayleighTable | None = None
+    profiles: dict[str, list[Finite] | Profile | Defects] | None = None
+    scatter: ScatterTable | None = None
+    absorbing: AbsorbingTable | None = None
 
     def unit_cell(self) -> UnitCell:
         """The unit cell: ``cell``, or the preset's in its reading, damped; raises ValueError for an invalid one."""

@@ -19,6 +19,7 @@ from vipetsc.case.contacts import stops_told
 from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
+from vipetsc.cli.lattice import ends_text, initial_text
 from vipetsc.io.lock import locked
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
@@ -143,7 +144,7 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
     needed, left = sum(memory_needed(model, case.output, cost.engine, ranks).values()), memory_available() / ranks
     return [
         ("case", case.name),
-        ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {chain.ends} ends, "
+        ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {ends_text(case)}, "
                     f"reading {case.lattice.reading}"),
         ("pass bands", ", ".join(f"{b.low:.2f}-{b.high:.2f}" for b in bands) + " rad/s"),
         ("gaps", ", ".join(f"{a:.2f}-{b:.2f}" for a, b in gaps(bands)) + " rad/s" if gaps(bands) else "none"),
@@ -169,23 +170,6 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
 def duration(seconds: float) -> str:
     """Seconds, or minutes, in two digits."""
     return f"{seconds:.2g} s" if seconds < 120 else f"{seconds / 60:.3g} min"
-
-
-def initial_text(case: Case) -> str:
-    """What a run begins with, in words; empty for a lattice at rest."""
-    initial = case.initial
-    if initial is None:
-        return ""
-    if initial.kind == "file":
-        which = f" at {initial.time:g} s" if initial.time is not None else f", orbit {initial.orbit}"
-        return f"{initial.path}{'' if initial.time is initial.orbit is None else which}"
-    size = f"{initial.amplitude:.4g} m" if initial.amplitude else f"{initial.energy:.4g} J"
-    if initial.kind == "mode":
-        return f"mode {initial.number or f'near {initial.near:g} rad/s'}, {size}"
-    return (
-        f"a packet of band {initial.band} about kappa = {(initial.wavenumber or 0) / np.pi:.4f} pi,"
-        f" {initial.width:g} cells wide in cell {initial.cell}, {size}"
-    )
 
 
 def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> list[tuple[str, str]]:

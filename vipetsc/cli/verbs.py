@@ -20,6 +20,7 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli import tables
+from vipetsc.cli.lattice import damping_report, damping_table
 from vipetsc.cli.messages import echo, logger
 from vipetsc.cli.plot import draw_source
 from vipetsc.io.atomic import write_text
@@ -181,14 +182,14 @@ def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
         from vipetsc.figures.registry import draw_bands
 
         cell = case.lattice.unit_cell()
-        numbers = tables.bands_table(cell)
+        numbers = tables.bands_table(cell) | damping_table(cell, case.drive.frequency or 0.0)
         with locked(MPI.COMM_SELF, folder):
             for leftover in folder.glob(".*.part"):  # of a command that was killed
                 leftover.unlink()
             picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
             text = json.dumps(numbers | {"picture": str(picture)} | origin(), indent=2)
             write_text(folder / "bands.json", text + "\n")
-        return text if options.json else f"{tables.bands_report(numbers)}\n  {picture}"
+        return text if options.json else f"{tables.bands_report(numbers)}{damping_report(numbers)}\n  {picture}"
 
     modes = tables.modes_told(case, options.modes, options.near, folder, comm)
     echo(comm, on_root(comm, report) + modes * (not options.json))

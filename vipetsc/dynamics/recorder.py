@@ -67,6 +67,9 @@ class Recorder(Observer):
         }
         if setup.model.gaps:
             given["sites/clearance"], given["sites/clearance_minus"] = np.array(setup.model.gaps).T
+        if chain.variation:
+            given |= {f"lattice/{name}": array[recorded] for name, array in chain.variation.items()}
+            given["spring"] = np.arange(1, len(chain.cell.springs) + 1)
         rows = -(-setup.model.samples // output.stride)
         self._energies = [part for part, name in ENERGIES.items() if name != DAMPED or chain.is_damped]
         sampled = ("time", "field_time", *(ENERGIES[part] for part in self._energies))

@@ -1,0 +1,155 @@
+"""Complex bands of damped cells, absorbing ends, and cells that differ as case files say it."""
+
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.case import Case, CaseError
+from vipetsc.case.varied import lobe_reflection
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.ts.integrator import Integrator
+from vipetsc.io.store import RunMemory
+from vipetsc.lattice import Chain, Variation, bloch, diatomic, four_band, max_group_velocity
+from vipetsc.lattice.damped import absorber, damped_bloch, decay_length, reflection
+
+KAPPA = np.linspace(0.2, 3.0, 7)
+
+
+def damped(cell, alpha=0.0, beta=0.0, extra=(0.0, 0.0, 0.0, 0.0)):
+    """``cell`` with Rayleigh damping, and more in its springs."""
+    springs = tuple(replace(s, damping=beta * s.stiffness + c) for s, c in zip(cell.springs, extra, strict=False))
+    return replace(cell, springs=springs, grounding=tuple(alpha * m for m in cell.masses))
+
+
+@pytest.mark.parametrize("cell", [four_band(), diatomic()])
+def test_rayleigh_damping_has_its_closed_form(cell):
+    """zeta = (alpha/omega + beta omega)/2, and a wave of real frequency decays over v_g/(zeta omega) cells."""
+    alpha, beta = 20.0, 2e-5
+    lossy, omega = damped(cell, alpha, beta), bloch(cell, KAPPA).frequency
+    point = damped_bloch(lossy, KAPPA)
+    assert point.ratio == pytest.approx((alpha / omega + beta * omega) / 2, rel=1e-10)
+    assert np.abs(point.rate) == pytest.approx(omega, rel=1e-10)
+    weak = damped(cell, 1e-3 * alpha, 1e-3 * beta)
+    _, frequency, speed = max_group_velocity(cell, 2)
+    zeta = 1e-3 * (alpha / frequency + beta * frequency) / 2
+    assert decay_length(weak, frequency) == pytest.approx(speed / (zeta * frequency), rel=1e-4)
+    assert decay_length(cell, frequency) == np.inf
+
+
+def test_overdamped_waves_are_the_slow_ones():
+    cell = damped(diatomic(), alpha=1e5)
+    rate = damped_bloch(cell, 1.0).rate
+    omega = bloch(diatomic(), 1.0).frequency
+    assert np.sort(rate.real) == pytest.approx(np.sort(-5e4 + np.sqrt(25e8 - omega**2)), rel=1e-8)
+    assert rate.imag == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_bloch_waves_of_a_damped_ring_decay_as_the_bands_say(number):
+    """Each wave u = Re(phi exp(i kappa n + s t)) of a cell whose damping is not proportional, by ``ts``, to 1e-8."""
+    cells = 8
+    cell = damped(four_band(), 30.0, 1e-5, (0.3, 0.0, 0.1, 0.02))
+    model = small_case(contacts={"sites": 0}, lattice={"cells": cells, "ends": "periodic"}).model()
+    model = replace(model, chain=Chain(cell, cells, "periodic"), drive=replace(model.drive, amplitude=0.0))
+    kappa = 2 * np.pi * number / cells
+    point, end = damped_bloch(cell, kappa), 0.01
+    for s, phi in zip(point.rate, point.vectors.T, strict=True):
+        wave = phi * np.exp(1j * kappa * np.arange(cells))[:, None]
+        engine = Integrator(
+            replace(model, rtol=1e-12, atol=(1e-12, 1e-12 * abs(s))), Layout(model, MPI.COMM_SELF, True)
+        )
+        start = [u.real.T.ravel() for u in (wave, s * wave)]
+        engine.state.array[: 8 * cells] = np.concatenate(start)
+        engine.advance(end)
+        found, there = engine.state.array_r[: 4 * cells].reshape(4, cells).T, (wave * np.exp(s * end)).real
+        assert np.abs(found - there).max() < 1e-8 * np.abs(there).max()
+        engine.destroy()
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free"])
+def test_ends_without_dashpots_send_all_back(ends):
+    omega = max_group_velocity(four_band(), 2)[1]
+    masses = np.tile(four_band().masses, (12, 1))
+    masses[4:8] *= 1.3
+    chain = Chain(four_band(), 12, ends, variation=Variation(masses))
+    assert [reflection(chain, omega, 9, "right"), reflection(chain, omega, 9, "left")] == pytest.approx([1, 1])
+    assert np.isnan(reflection(chain, 890.0, 9))  # in a gap
+
+
+def test_a_packet_comes_back_as_computed():
+    """What is left of a packet's energy after an end that absorbs little."""
+    cell, kappa, width = four_band("calibrated"), 1.8, 8
+    omega = float(bloch(cell, kappa).frequency[1])
+    table = {
+        "lattice": {"preset": "four-band", "cells": 130, "absorbing": {"cells": 10, "strength": 400.0}},
+        "contacts": {"sites": 0},
+        "initial": {"kind": "packet", "band": 2, "wavenumber": kappa, "cell": 70, "width": width, "amplitude": 1e-3},
+        "time": {"end": 0.26, "engine": "propagator"},
+    }
+    case, memory = Case.from_table(table), RunMemory(MPI.COMM_SELF)
+    simulate(case, memory)
+    energy = (memory.dataset["energy/kinetic"] + memory.dataset["energy/spring"]).values
+    computed = reflection(absorber(cell, "fixed", 10, 400.0), omega, 10)
+    assert 1e-3 < computed < 0.1
+    assert energy[-1] / energy[0] == pytest.approx(computed, rel=0.1)
+
+
+def test_an_absorbing_end_is_found_for_the_drive():
+    case = small_case(lattice={"cells": 90, "absorbing": {"reflection": 1e-4}}, drive={"cycles": 30})
+    end, drive, chain = case.lattice.absorbing, case.drive, case.model().chain
+    section = absorber(chain.cell, "fixed", end.cells, end.strength)
+    assert lobe_reflection(section, drive.frequency, drive.cycles) < 1e-4
+    assert np.flatnonzero(chain.differs).tolist() == list(range(90 - end.cells, 90))
+    assert reflection(chain, drive.frequency, end.cells + 1) < 1e-4
+    assert Case.from_toml(case.to_toml()) == case
+    for wrong, key in (({"absorbing": {"end": "left"}}, "absorbing.end"), ({"ends": "periodic"}, "lattice.absorbing")):
+        with pytest.raises(CaseError, match=key):
+            small_case(lattice={"cells": 90, "absorbing": {}} | wrong, drive={"cycles": 30})
+    with pytest.raises(CaseError, match="in a gap"):
+        small_case(lattice={"cells": 90, "absorbing": {}}, drive={"frequency": 650.0})
+
+
+def test_profiles_defects_and_scatter_of_a_case():
+    scattered = {"seed": 3, "cells": {"masses[1]": {"relative": 0.02}, "springs[3].stiffness": {"absolute": 50.0}}}
+    profiles = {
+        "masses[2]": {"cells": [3], "factor": 2.0},
+        "springs[1].stiffness": {"first": 2e4, "last": 3e4},
+        "springs[4].damping": [0.1] * 24,
+    }
+    lattice = {"profiles": profiles, "damping": {"mass": 5.0}}
+    case = small_case(lattice=lattice, disorder=scattered)
+    varied, cell = case.model().chain.variation, case.model().chain.cell
+    assert varied.masses[2, 1] == 2 * cell.masses[1]
+    assert varied.stiffness[[0, -1], 0] == pytest.approx([2e4, 3e4])
+    assert varied.damping[:, 3] == pytest.approx(0.1)
+    assert varied.grounding == pytest.approx(5.0 * varied.masses)
+    assert 0.005 < np.std(varied.masses[:, 0] / cell.masses[0]) < 0.04
+    assert Case.from_toml(case.to_toml()) == case
+    assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
+    other = small_case(lattice=lattice, disorder=scattered | {"seed": 4}).model().chain.variation
+    assert np.all(other.masses[:, 0] != varied.masses[:, 0])
+    assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])
+
+
+def test_what_differs_is_refused_by_name_and_stands_in_the_file():
+    profiles = {"masses[9]": [1.0], "springs[1].stiffness": [1.0], "masses[2]": {"cells": [99], "value": 1.0}}
+    profiles |= {"masses[3]": {"first": -1.0, "last": 1.0}, "masses[4]": {"cells": [1], "value": 1.0, "factor": 1.0}}
+    with pytest.raises(CaseError) as error:
+        small_case(lattice={"profiles": profiles})
+    assert sorted(p.key for p in error.value.problems) == [f'lattice.profiles."{key}"' for key in sorted(profiles)]
+    with pytest.raises(CaseError, match="one of relative and absolute"):
+        small_case(disorder={"cells": {"masses[1]": {}}})
+    case = small_case(
+        lattice={"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}},
+        output={"window": [2, 4]},
+        time={"end": 1e-3},
+    )
+    memory = RunMemory(MPI.COMM_SELF)
+    simulate(case, memory)
+    assert memory.dataset["lattice/masses"].sel(dof=2).values == pytest.approx([0.0025, 0.005, 0.0025])
+    assert "lattice/stiffness" not in memory.dataset

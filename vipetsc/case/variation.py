@@ -1,0 +1,119 @@
+"""Masses, springs and dashpots of all cells, from profiles, scatter and absorbing ends.
+
+A quantity is named as in a cell's table: ``masses[2]``, ``springs[1].stiffness``, ``springs[1].damping``,
+``grounding[3]``, counted from 1.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+
+from vipetsc.case.reading import Problem
+from vipetsc.case.schema import LatticeTable
+from vipetsc.case.varied import AnyProfile, Deviation, Profile
+from vipetsc.lattice import Chain, Coefficients, UnitCell, Variation
+from vipetsc.lattice.damped import absorber
+
+QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping)")
+MOST_VARIED = 10**8  # cells that may differ: every rank holds them all
+
+
+def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
+    """The name in ``Coefficients`` and the column of a quantity; None if the cell has none of that name."""
+    match = QUANTITY.fullmatch(key)
+    if match is None:
+        return None
+    name, index = match[1] or match[4], int(match[2] or match[3]) - 1
+    return (name, index) if index < (cell.dofs if match[1] else len(cell.springs)) else None
+
+
+def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
+    """The quantity's values (cells,) in place of the reference cell's, or what is wrong."""
+    if isinstance(given, Profile):
+        return np.linspace(given.first, given.last, len(values)), ""
+    if isinstance(given, list):
+        wrong = f"one value for each of the {len(values)} cells is needed" if len(given) != len(values) else ""
+        return (values if wrong else np.array(given)), wrong
+    if outside := [c for c in given.cells if not 1 <= c <= len(values)]:
+        return values, f"cells {outside} are outside the lattice; cells count from 1 to {len(values)}"
+    if (given.value is None) == (given.factor is None):
+        return values, "give one of value and factor"
+    at, new = np.array(given.cells) - 1, values.copy()
+    new[at] = given.value if given.factor is None else given.factor * values[at]
+    return new, ""
+
+
+def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:
+    return deviation.draw(values, seed, key), ""
+
+
+def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Problem]]:
+    """Masses, springs and dashpots of all cells without Rayleigh damping, and what is wrong with what differs."""
+    arrays, problems = Chain(cell, lattice.cells).coefficients(0, lattice.cells), list[Problem]()
+
+    def put(key: str, path: str, change: Callable[[np.ndarray], tuple[np.ndarray, str]]) -> None:
+        place = place_of(key, cell)
+        if place is None:
+            remedy = f"the cell has {cell.dofs} masses and {len(cell.springs)} springs; as in masses[1], grounding[1]"
+            problems.append(Problem(path, None, f"{remedy}, springs[1].stiffness or springs[1].damping"))
+            return
+        column = getattr(arrays, place[0])[:, place[1]]
+        column[:], wrong = change(column.copy())
+        least = column.min()
+        if not wrong and (least < 0 or (least == 0 and place[0] in ("masses", "stiffness"))):
+            wrong = (
+                f"is {least:.4g} in cell {int(column.argmin()) + 1}: no smaller than 0, and a mass or spring above it"
+            )
+        if wrong:
+            problems.append(Problem(path, None, wrong))
+
+    for key, given in (lattice.profiles or {}).items():
+        put(key, f'lattice.profiles."{key}"', partial(_profile, given))
+    if scatter := lattice.scatter:
+        for key, deviation in scatter.quantities.items():
+            path = f'disorder.cells."{key}"'
+            if (deviation.relative is None) == (deviation.absolute is None):
+                problems.append(Problem(path, None, "give one of relative and absolute"))
+            else:
+                put(key, path, partial(_drawn, deviation, scatter.seed, key))
+    return arrays, problems
+
+
+def variation_of(lattice: LatticeTable) -> Variation | None:
+    """What differs from the reference cell in a valid, resolved case; None if nothing may."""
+    if not (lattice.profiles or lattice.scatter or lattice.absorbing):
+        return None
+    arrays, rayleigh, absorbing = vary(lattice, lattice.undamped_cell())[0], lattice.damping, lattice.absorbing
+    if rayleigh:
+        arrays.grounding[:] += rayleigh.mass * arrays.masses
+        arrays.damping[:] += rayleigh.stiffness * arrays.stiffness
+    if absorbing and absorbing.cells and absorbing.strength:
+        graded = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength, 0)
+        assert graded.variation is not None and graded.variation.grounding is not None
+        extra = graded.variation.grounding - graded.coefficients(-2, -1).grounding
+        if absorbing.end != "left":
+            arrays.grounding[-absorbing.cells :] += extra
+        if absorbing.end != "right":
+            arrays.grounding[: absorbing.cells] += extra[::-1]
+    reference = Chain(lattice.unit_cell(), 2).coefficients(0, 1)
+    differing = {n: a for n, a, r in zip(Coefficients._fields, arrays, reference, strict=True) if np.any(a != r)}
+    return Variation(**differing) if differing else None
+
+
+def check_variation(lattice: LatticeTable, drive_cell: int) -> Iterator[Problem]:
+    """What is wrong with what differs from a valid cell."""
+    if (lattice.profiles or lattice.scatter) and lattice.cells > MOST_VARIED:
+        yield Problem("lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ: every rank holds them")
+    elif lattice.profiles or lattice.scatter:
+        yield from vary(lattice, lattice.undamped_cell())[1]
+    if (absorbing := lattice.absorbing) is None:
+        return
+    if lattice.ends == "periodic":
+        yield Problem("lattice.absorbing", None, 'a ring has no end; ends = "fixed" or "free"')
+    n = absorbing.cells or 0
+    if 2 * n >= lattice.cells:
+        yield Problem("lattice.absorbing.cells", n, f"half of the {lattice.cells} cells, or more")
+    elif (absorbing.end != "right" and drive_cell <= n) or (absorbing.end != "left" and drive_cell > lattice.cells - n):
+        yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {drive_cell} is in the absorbing end")
