@@ -73,8 +73,8 @@ def waves_of(cell: UnitCell, omega: float) -> Waves:
     scale = np.abs(dynamic).max()
     left = np.block([[none, one], [-b.T / scale, -dynamic / scale]])
     values, vectors = eig(left, np.block([[one, none], [none, b / scale]]), homogeneous_eigvals=True)
-    kept = np.min(np.abs(values), axis=0) > 1e-9 * np.max(np.abs(values), axis=0)
-    factor, shape = values[0, kept] / values[1, kept], vectors[:d, kept]
+    finite = np.min(np.abs(values), axis=0) > 1e-9 * np.max(np.abs(values), axis=0)
+    factor, shape = values[0, finite] / values[1, finite], vectors[:d, finite]
     shape = shape / np.linalg.norm(shape, axis=0)
     flux = omega / 2 * np.imag(factor * np.einsum("dw,de,ew->w", shape.conj(), b, shape))
     growth = np.log(np.abs(factor))
