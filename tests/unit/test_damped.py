@@ -55,7 +55,8 @@ def test_bloch_waves_of_a_damped_ring_decay_as_the_bands_say(number):
     cells = 8
     cell = damped(four_band(), 30.0, 1e-5, (0.3, 0.0, 0.1, 0.02))
     model = small_case(contacts={"sites": 0}, lattice={"cells": cells, "ends": "periodic"}).model()
-    model = replace(model, chain=Chain(cell, cells, "periodic"), drive=replace(model.drive, amplitude=0.0))
+    still = replace(model.drives[0], waveform=replace(model.drive, amplitude=0.0))
+    model = replace(model, chain=Chain(cell, cells, "periodic"), drives=(still,))
     kappa = 2 * np.pi * number / cells
     point, end = damped_bloch(cell, kappa), 0.01
     for s, phi in zip(point.rate, point.vectors.T, strict=True):

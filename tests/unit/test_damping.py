@@ -29,13 +29,13 @@ def damped_case(**sections) -> Case:
 @pytest.mark.parametrize("ends", ENDS)
 @pytest.mark.parametrize("dashpots", [True, False])
 def test_rates_and_energies_are_those_of_the_equations(ends, dashpots):
-    model = small_case(lattice={"cells": CELLS}, contacts={"sites": [SITE]}).model()
+    model = small_case(lattice={"cells": CELLS}, contacts={"sites": [SITE]}, drive={"cell": DRIVEN, "mass": 2}).model()
     bare = {} if dashpots else {"damping": np.zeros((CELLS, 4)), "grounding": np.zeros((CELLS, 4))}
     chain = replace(varied(ends, **bare), sites=(SITE - 1,), clearances=(1e-5,))
     if not dashpots:
         cell = replace(chain.cell, grounding=(), springs=tuple(replace(s, damping=0.0) for s in chain.cell.springs))
         chain = replace(chain, cell=cell)
-    model = replace(model, chain=chain, drive_cell=DRIVEN - 1, drive_mass=1)
+    model = replace(model, chain=chain)
     layout, d = Layout(model, MPI.COMM_SELF, Integrator.dashpots), chain.cell.dofs
     engine = Integrator(model, layout)
     t, (host, resonator) = 0.3 * model.drive.duration, (chain.cell.host, chain.cell.resonator)

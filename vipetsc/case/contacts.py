@@ -137,7 +137,8 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
         if pair.next_cell and (pair.host < 0 or (at == lattice.cells and lattice.ends != "periodic")):
             yield Problem("contacts.next_cell", True, f"site {number} in cell {at} has no next cell to touch")
             return
-    if twice := [at for (at, _), times in Counter(zip(cells, pairs, strict=True)).items() if times > 1]:
+    named = contacts.pair or (contacts.each and contacts.each.pair)  # else a cell twice is one problem already
+    if named and (twice := [at for (at, _), times in Counter(zip(cells, pairs, strict=True)).items() if times > 1]):
         yield Problem("contacts.sites", twice, "named twice with the same contact pair")
     if not cell.springs and cells and not any(pair.next_cell for pair in pairs):
         yield Problem("lattice.cell.springs", None, "neither springs nor contacts (contacts.next_cell) join the cells")
