@@ -15,7 +15,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import Chain, Variation, bloch, diatomic, four_band, max_group_velocity
-from vipetsc.lattice.damped import absorber, damped_bloch, decay_length, reflection
+from vipetsc.lattice.damped import absorber, damped_bloch, decay_length, reflection, waves_of
 
 KAPPA = np.linspace(0.2, 3.0, 7)
 
@@ -39,6 +39,10 @@ def test_rayleigh_damping_has_its_closed_form(cell):
     zeta = 1e-3 * (alpha / frequency + beta * frequency) / 2
     assert decay_length(weak, frequency) == pytest.approx(speed / (zeta * frequency), rel=1e-4)
     assert decay_length(cell, frequency) == np.inf
+    waves = waves_of(cell, frequency)
+    for factor, shape in zip(waves.factor, waves.shape.T, strict=True):
+        residual = cell.stiffness_matrix(np.angle(factor)) @ shape - frequency**2 * np.array(cell.masses) * shape
+        assert np.abs(residual).max() < 1e-8 * frequency**2
 
 
 def test_overdamped_waves_are_the_slow_ones():
@@ -116,7 +120,12 @@ def test_an_absorbing_end_is_found_for_the_drive():
 
 
 def test_profiles_defects_and_scatter_of_a_case():
-    scattered = {"seed": 3, "cells": {"masses[1]": {"relative": 0.02}, "springs[3].stiffness": {"absolute": 50.0}}}
+    cells = {
+        "masses[1]": {"relative": 0.02},
+        "springs[3].stiffness": {"absolute": 50.0},
+        "masses[4]": {"relative": 0.02},
+    }
+    scattered = {"seed": 3, "cells": cells}
     profiles = {
         "masses[2]": {"cells": [3], "factor": 2.0},
         "springs[1].stiffness": {"first": 2e4, "last": 3e4},
@@ -129,6 +138,7 @@ def test_profiles_defects_and_scatter_of_a_case():
     assert varied.stiffness[[0, -1], 0] == pytest.approx([2e4, 3e4])
     assert varied.damping[:, 3] == pytest.approx(0.1)
     assert varied.grounding == pytest.approx(5.0 * varied.masses)
+    assert np.all(varied.masses[:, 0] != varied.masses[:, 3])  # as much, but each quantity by itself
     assert 0.005 < np.std(varied.masses[:, 0] / cell.masses[0]) < 0.04
     assert Case.from_toml(case.to_toml()) == case
     assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
