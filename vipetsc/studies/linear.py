@@ -13,9 +13,10 @@ import xarray as xr
 
 import vipetsc
 from vipetsc.case import Case, case_id
+from vipetsc.case.contacts import gaps_of_sites, pairs_of_sites
 from vipetsc.io.read import field_time
 from vipetsc.io.records import Record, read_records
-from vipetsc.lattice.chain import cells_between
+from vipetsc.lattice.chain import Pair, cells_between
 from vipetsc.studies.analysis import LAYOUT, analyse
 
 # A member is scaled where its linear wave stays below this share of every clearance: the largest w between samples
@@ -67,9 +68,15 @@ class LinearRun(NamedTuple):
         return float(self.arrival[site - 1]) if site else None
 
     def reached(self, case: Case) -> np.ndarray:
-        """Linear relative displacement over clearance (site) at the amplitude of ``case``."""
-        envelope = self.envelope[np.asarray(case.contacts.sites, int) - 1]
-        return np.asarray(factor(case) * envelope / np.asarray(case.contacts.clearance or [], float))
+        """Linear relative displacement over the lesser clearance (site) at the amplitude of ``case``.
+
+        It is inf where contacts join other masses than the cell's pair, of which the envelope tells nothing.
+        """
+        sites, clearance = np.asarray(case.contacts.sites, int) - 1, np.asarray(case.contacts.clearance or [], float)
+        if _pairs(case):
+            return np.full(len(sites), np.inf)
+        gaps = gaps_of_sites(case.contacts, clearance.tolist())
+        return factor(case) * self.envelope[sites] / (np.min(gaps, axis=1) if gaps else clearance)
 
     def joined(self, other: "LinearRun | str | None") -> "LinearRun":
         """The run with the measures that another record of it tells as well."""
@@ -104,19 +111,31 @@ def measured(analysis: xr.Dataset) -> Record:
     return row | ({"entropy/start": float(analysis.attrs["entropy/start"])} if "entropy/history" in row else {})
 
 
+def _pairs(case: Case) -> tuple[Pair, ...]:
+    """The masses that contacts join, if not everywhere those of the cell's pair."""
+    sites = case.contacts.sites if isinstance(case.contacts.sites, list) else []
+    return pairs_of_sites(case.contacts, case.lattice.unit_cell(), len(sites))
+
+
+def is_proportional(case: Case) -> bool:
+    """Whether the lattice moves in proportion to the one amplitude of its drive until something touches."""
+    return not (case.initial or case.drive.more or _pairs(case))
+
+
 def factor(case: Case) -> float:
     """By how much the wave of ``case`` is larger than that of its linear run."""
-    return 1.0 if case.initial else abs(case.drive.amplitude)
+    return abs(case.drive.amplitude) if is_proportional(case) else 1.0
 
 
 def linear_case(case: Case) -> Case:
     """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone share it.
 
-    With an initial state the drive is that of the case.
+    Unless it ``is_proportional``, the drives are those of the case. Contacts that join other masses than the cell's
+    pair may be all that joins the cells: they stay.
     """
     table = case.model_dump(by_alias=True, exclude_none=True)
-    table["contacts"] = {"sites": 0}
-    table["drive"]["amplitude"] = case.drive.amplitude if case.initial else 1.0
+    table["contacts"] = table["contacts"] if _pairs(case) else {"sites": 0}
+    table["drive"]["amplitude"] = 1.0 if is_proportional(case) else case.drive.amplitude
     table["output"] = {}
     return Case.from_table(table | {"name": "linear"})
 
