@@ -55,6 +55,23 @@ def test_same_bits_with_dashpots_in_cells_that_differ(folder, ends):
 
 
 @pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+def test_same_bits_with_springs_that_are_not_linear(folder, ends):
+    springs = [
+        {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True, "quadratic": -1e7, "cubic": 1e10},
+        {"start": 1, "end": 2, "stiffness": 2e3, "cubic": 1e9},
+    ]
+    cell = {"masses": [0.01, 0.005], "springs": springs, "contact": [1, 2]}
+    table = {
+        "lattice": {"cell": cell, "cells": 23, "ends": ends},
+        "contacts": {"law": "hertz", "stiffness": 1e8, "restitution": 0.7, "sites": [7, 8, 12], "clearance": 1e-4},
+        "drive": {"amplitude": 20.0, "cycles": 4, "frequency": 500.0},
+        "time": {"end": 0.03},
+    }
+    runs_alike(folder, Case.from_table(table))
+
+
+@pytest.mark.parallel([2, 3])
 def test_same_bits_diatomic_and_driven_in_the_middle(folder):
     table = {
         "lattice": {"preset": "diatomic", "cells": 31},

@@ -114,7 +114,7 @@ def _with_cell(lattice: Table, cell: UnitCell, drawn: dict[str, list[float]]) ->
     stiffness: list[float] = drawn.get("springs", [spring.stiffness for spring in cell.springs])
     springs: list[dict[str, Any]] = [
         {"start": s.start + 1, "end": s.end + 1, "stiffness": k, "next_cell": s.next_cell}
-        | ({"damping": s.damping} if s.damping else {})
+        | {key: getattr(s, key) for key in ("damping", "quadratic", "cubic") if getattr(s, key)}
         for s, k in zip(cell.springs, stiffness, strict=True)
     ]
     table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}

@@ -151,8 +151,8 @@ def _check_place(
         yield Problem(
             f"{key}.end", drive.end, f'only a wall can be moved, and lattice.ends = "{lattice.ends}" has none'
         )
-    if cell and any(s.damping for s in cell.springs if s.next_cell):
-        yield Problem(f"{key}.end", drive.end, "no wall moves the dashpot beside its spring; leave out its damping")
+    if cell and any(s.damping or s.quadratic or s.cubic for s in cell.springs if s.next_cell):
+        yield Problem(f"{key}.end", drive.end, "a wall moves a linear spring alone: no damping, quadratic, cubic")
     if cell and length:
         place = {"cell": 1 if drive.end == "left" else length, "mass": _end_masses(cell, drive.end)[0][0] + 1}
         for name, value in place.items():

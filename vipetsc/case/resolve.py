@@ -122,7 +122,9 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
 
 
 def check_undamped(lattice: LatticeTable, what: str) -> Iterator[Problem]:
-    """Dashpots, where ``what`` is made of a lattice without."""
+    """Dashpots and springs that are not linear, where ``what`` is made of a lattice without."""
+    if check_cell(lattice)[1] == [] and not lattice.unit_cell().is_linear:
+        yield Problem("lattice.cell.springs", None, f"{what} of linear springs; leave quadratic and cubic out")
     if check_cell(lattice)[1] == [] and lattice.unit_cell().is_damped:
         yield Problem(
             "lattice", "damped", f"{what} without dashpots; leave [lattice.damping] and those of the cell out"

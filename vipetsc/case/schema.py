@@ -84,13 +84,18 @@ PRESETS: dict[str, Preset] = {
 
 
 class SpringTable(Section):
-    """A spring from mass ``start`` to mass ``end`` (1-based), of the next cell if ``next_cell``, and a dashpot."""
+    """A spring from mass ``start`` to mass ``end`` (1-based), of the next cell if ``next_cell``, and a dashpot.
+
+    Its force at the elongation z is ``stiffness`` z + ``quadratic`` z^2 + ``cubic`` z^3.
+    """
 
     start: int
     end: int
     stiffness: Finite
     next_cell: bool = False
     damping: Finite | None = None
+    quadratic: Finite | None = None
+    cubic: Finite | None = None
 
 
 class CellTable(Section):
@@ -103,9 +108,9 @@ class CellTable(Section):
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """Those of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
-        springs = tuple(
-            Spring(s.start - 1, s.end - 1, s.stiffness, s.next_cell, s.damping or 0.0) for s in self.springs
-        )
+        parts = [[part or 0.0 for part in (s.damping, s.quadratic, s.cubic)] for s in self.springs]
+        ends = [(s.start - 1, s.end - 1, s.stiffness, s.next_cell) for s in self.springs]
+        springs = tuple(Spring(*end, *part) for end, part in zip(ends, parts, strict=True))
         host, resonator = self.contact or (1, min(2, len(self.masses)))
         return tuple(self.masses), springs, host - 1, resonator - 1, tuple(self.grounding or ())
 

@@ -144,8 +144,8 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
     needed, left = sum(memory_needed(model, case.output, cost.engine, ranks).values()), memory_available() / ranks
     return [
         ("case", case.name),
-        ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {ends_text(case)}, "
-                    f"reading {case.lattice.reading}"),
+        ("lattice", f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {ends_text(case)}"
+                    + (f", reading {case.lattice.reading}" if case.lattice.preset else "")),
         ("pass bands", ", ".join(f"{b.low:.2f}-{b.high:.2f}" for b in bands) + " rad/s"),
         ("gaps", ", ".join(f"{a:.2f}-{b:.2f}" for a, b in gaps(bands)) + " rad/s" if gaps(bands) else "none"),
         ("contact", "; ".join(dict.fromkeys(map(str, model.laws[:8] or (model.contact,))))),

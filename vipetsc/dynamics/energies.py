@@ -15,7 +15,7 @@ from vipetsc.compiled import njit
 from vipetsc.contact.law import elastic_energy
 from vipetsc.dynamics.layout import LatticeRecord, Layout, create_record
 from vipetsc.dynamics.ts.right_hand_side import relative_motion
-from vipetsc.dynamics.ts.springs import CHUNK, add_squares, displacement, is_varied
+from vipetsc.dynamics.ts.springs import CHUNK, add_smooth_energies, add_squares, displacement, is_varied
 
 _FINE = 2.0**40  # multiples of the finer rest in one unit
 LARGEST = 2.0**50
@@ -91,6 +91,8 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
         _kinetic_energies(y, lattice, first, of_cells)
         _add(sums, _KINETIC, of_cells, unit)
         _spring_energies(y, lattice, first, of_cells)
+        if lattice.smooth.size > 0:
+            add_smooth_energies(y, lattice, first, of_cells)
         _add(sums, _SPRING, of_cells, unit)
     for i in range(lattice.places.size):
         if lattice.places[i].ledger < 0:

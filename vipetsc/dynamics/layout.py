@@ -132,6 +132,12 @@ MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
 COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64), ("spring", np.int64)])
 """A spring as one of its masses sees it: cells to the other mass, that mass, N/m, the spring's number."""
+SMOOTH = np.dtype([(name, np.int64) for name in ("mass", "offset", "other")]
+                  + [(name, np.float64) for name in ("quadratic", "cubic")])  # fmt: skip
+"""A spring that is not linear as one of its masses sees it: that mass, cells to the other one, N/m^2, N/m^3.
+
+The force on the mass is q z^2 + c z^3, z what the other one is ahead; of each spring the end ``start`` comes first.
+"""
 SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int64), ("stiffness", np.float64)])
 """A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
 
@@ -177,6 +183,7 @@ class LatticeRecord(NamedTuple):
     places: np.ndarray
     contacts: np.ndarray
     drives: Drives
+    smooth: np.ndarray
     inverse_masses: np.ndarray
     grounding: np.ndarray
     stiffness: np.ndarray
@@ -208,6 +215,9 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
     couplings = cell.couplings()
     rows = np.searchsorted([c[0] for c in couplings], np.arange(d + 1)).tolist()
     masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
+    bent = [spring for spring in cell.springs if spring.quadratic or spring.cubic]
+    smooth = [row for s in bent for row in ((s.start, s.next_cell, s.end, s.quadratic, s.cubic),
+                                            (s.end, -s.next_cell, s.start, -s.quadratic, s.cubic))]  # fmt: skip
     drives = create_drives(model.drives, layout.drives)
     for row, drive in zip(drives.rows, (model.drives[i] for i in layout.drives), strict=True):
         row["target"] = (d + drive.mass) * n + drive.cell - layout.start
@@ -220,6 +230,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         create_places(model, layout, (shape.left_ghost, shape.right_ghost)),
         site_records(model, layout.contacts),
         drives,
+        np.array(smooth, SMOOTH),
         *_coefficients(chain, layout),
     )
 

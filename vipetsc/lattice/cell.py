@@ -14,10 +14,11 @@ Reading = Literal["printed", "calibrated"]
 
 @dataclass(frozen=True)
 class Spring:
-    """A linear spring between two masses (0-based) of one cell, or from one cell to the next.
+    """A spring between two masses (0-based) of one cell, or from one cell to the next.
 
-    ``stiffness`` is in N/m, ``damping`` that of a dashpot beside it in N s/m. With ``next_cell`` the spring runs from
-    mass ``start`` of a cell to mass ``end`` of the cell after it.
+    Its force at the elongation z is k z + q z^2 + c z^3: ``stiffness`` k in N/m, ``quadratic`` q in N/m^2 and ``cubic``
+    c in N/m^3, which bands and modes leave out. ``damping`` is that of a dashpot beside it in N s/m. With ``next_cell``
+    the spring runs from mass ``start`` of a cell to mass ``end`` of the cell after it.
     """
 
     start: int
@@ -25,6 +26,8 @@ class Spring:
     stiffness: float
     next_cell: bool = False
     damping: float = 0.0
+    quadratic: float = 0.0
+    cubic: float = 0.0
 
 
 class Coupling(NamedTuple):
@@ -70,6 +73,11 @@ class UnitCell:
     def is_damped(self) -> bool:
         """Whether there is a dashpot."""
         return any(self.grounding) or any(spring.damping for spring in self.springs)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether no spring has a quadratic or a cubic part."""
+        return not any(spring.quadratic or spring.cubic for spring in self.springs)
 
     def couplings(self) -> list[Coupling]:
         """Every spring seen from both its ends.

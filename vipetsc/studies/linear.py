@@ -119,7 +119,7 @@ def _pairs(case: Case) -> tuple[Pair, ...]:
 
 def is_proportional(case: Case) -> bool:
     """Whether the lattice moves in proportion to the one amplitude of its drive until something touches."""
-    return not (case.initial or case.drive.more or _pairs(case))
+    return not (case.initial or case.drive.more or _pairs(case)) and case.lattice.unit_cell().is_linear
 
 
 def factor(case: Case) -> float:

@@ -151,7 +151,9 @@ class Propagator(Engine):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """Contacts of other pairs, or pressed; a lattice shorter than P's band; too many sites close to one another."""
+        """Springs that are not linear; contacts of other pairs, or pressed; too few cells; too many close sites."""
+        if not model.chain.cell.is_linear:
+            return "its steps are those of linear springs, and some have a quadratic or cubic part"
         if model.chain.pairs or any(min(gaps) < 0 for gaps in model.gaps):
             return "contacts are not between the cell's pair alone, or pressed together (contacts.pair, precompression)"
         series = step_series(model)

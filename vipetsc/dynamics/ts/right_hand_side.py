@@ -16,10 +16,16 @@ from vipetsc.compiled import cfunc, njit
 from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
-from vipetsc.dynamics.layout import COEFFICIENTS, COUPLING, MASS, SPRING, LatticeRecord, Shape
+from vipetsc.dynamics.layout import COEFFICIENTS, COUPLING, MASS, SMOOTH, SPRING, LatticeRecord, Shape
 from vipetsc.dynamics.native import pointer
 from vipetsc.dynamics.places import PLACE
-from vipetsc.dynamics.ts.springs import damping_powers, inverse_mass, spring_acceleration, spring_accelerations
+from vipetsc.dynamics.ts.springs import (
+    damping_powers,
+    inverse_mass,
+    smooth_force,
+    spring_acceleration,
+    spring_accelerations,
+)
 from vipetsc.lattice.drive import PIECE
 
 
@@ -37,6 +43,8 @@ def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, ma
     """Acceleration of one mass by its springs, a contact ``force`` and the drives."""
     per_mass = inverse_mass(lattice, cell, mass)
     acceleration = spring_acceleration(y, lattice, cell, mass) + force * per_mass
+    if lattice.smooth.size > 0:
+        acceleration += smooth_force(y, lattice, cell, mass) * per_mass
     for i in range(lattice.drives.rows.size):
         if lattice.drives.rows[i].target == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:
             acceleration += drive_force(lattice.drives, i, t) * per_mass
@@ -71,6 +79,10 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
     f[: d * n] = y[d * n : 2 * d * n]
     for mass in range(d):
         spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
+        if lattice.smooth.size > 0:
+            for cell in range(n):
+                force = smooth_force(y, lattice, cell, mass)
+                f[(d + mass) * n + cell] += force * inverse_mass(lattice, cell, mass)
     for i in range(lattice.places.size):
         power, place = 0.0, lattice.places[i]
         if lattice.contacts[i].mode != FREE:
@@ -93,7 +105,7 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         damping_powers(y, lattice, f[shape.damping : shape.damping + n])
 
 
-_TABLES = ("masses", "couplings", "springs", "places", "contacts", "rows", "pieces", *COEFFICIENTS)
+_TABLES = ("masses", "couplings", "springs", "places", "contacts", "rows", "pieces", "smooth", *COEFFICIENTS)
 
 
 def _c_struct(record: type) -> np.dtype:
@@ -133,6 +145,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.places), (size.places,), PLACE),
         carray(pointer(at.contacts), (size.contacts,), SITE),
         Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
+        carray(pointer(at.smooth), (size.smooth,), SMOOTH),
         carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
         carray(pointer(at.grounding), (size.grounding,), np.float64),
         carray(pointer(at.stiffness), (size.stiffness,), np.float64),

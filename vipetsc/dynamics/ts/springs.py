@@ -136,6 +136,38 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
 
 
 @njit(error_model="numpy")
+def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> float:
+    """What the other mass of the ``smooth`` coupling ``s`` of a ``cell`` is ahead, in m; 0 beyond a free end."""
+    coupling, c, shape = lattice.smooth[s], cell + lattice.smooth[s].offset, lattice.shape
+    if (c < 0 and shape.left_free) or (c >= shape.cells and shape.right_free):
+        return 0.0
+    return displacement(y, lattice, c, coupling.other) - y[coupling.mass * shape.cells + cell]
+
+
+@njit(error_model="numpy")
+def smooth_force(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
+    """Force in N on one mass by the parts of its springs that are not linear."""
+    total = 0.0
+    for s in range(lattice.smooth.size):
+        if lattice.smooth[s].mass == mass:
+            z = _elongation(y, lattice, s, cell)
+            total += z * z * (lattice.smooth[s].quadratic + lattice.smooth[s].cubic * z)
+    return total
+
+
+@njit(error_model="numpy")
+def add_smooth_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
+    """Add the energies of those parts in the cells from ``first`` on, and in a spring to a wall on the left."""
+    for s in range(lattice.smooth.size):
+        coupling, starts = lattice.smooth[s], s % 2 == 0
+        for i in range(energies.size):
+            at_wall = first + i + coupling.offset < 0 and lattice.shape.left_ghost < 0
+            if starts or at_wall:
+                z = _elongation(y, lattice, s, first + i)
+                energies[i] += z * z * z * (coupling.quadratic / 3.0 + 0.25 * coupling.cubic * z)
+
+
+@njit(error_model="numpy")
 def add_squares(
     y: np.ndarray, lattice: LatticeRecord, first: int, half: int, values: np.ndarray, sums: np.ndarray
 ) -> None:
