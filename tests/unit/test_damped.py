@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import small_case
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.varied import lobe_reflection
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.layout import Layout
@@ -155,6 +155,9 @@ def test_what_differs_is_refused_by_name_and_stands_in_the_file():
     assert sorted(p.key for p in error.value.problems) == [f'lattice.profiles."{key}"' for key in sorted(profiles)]
     with pytest.raises(CaseError, match="one of relative and absolute"):
         small_case(disorder={"cells": {"masses[1]": {}}})
+    for kind, table in ((LawCase, {}), (Case, {"initial": {"kind": "mode", "number": 3, "amplitude": 1e-4}})):
+        with pytest.raises(CaseError, match="whose cells"):
+            kind.from_table({"lattice": {"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}}} | table)
     case = small_case(
         lattice={"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}},
         output={"window": [2, 4]},

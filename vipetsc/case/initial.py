@@ -95,6 +95,10 @@ def check_initial(
     dofs = lattice.cells * cell.dofs if cell and valid("lattice.cells") else None
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
+    elif initial.kind == "mode" and (lattice.profiles or lattice.scatter):
+        yield Problem(
+            "initial.kind", "mode", "the mode of a lattice whose cells differ; a packet, or a state in a file"
+        )
     elif dofs and initial.kind == "mode" and dofs > MOST_DOFS:
         yield Problem("initial.kind", "mode", f"the modes of {dofs} masses, more than {MOST_DOFS}, are not counted")
 

@@ -196,16 +196,18 @@ class OptimiseCase(CaseFile):
         if bounds.restitution:
             contacts["restitution"] = next(left)
         if bounds.masses or bounds.springs:
-            cell = self.base.lattice.unit_cell()
+            cell = self.base.lattice.undamped_cell()
             masses, stiffness = list(cell.masses), [spring.stiffness for spring in cell.springs]
             for values_of, numbers in ((masses, bounds.masses), (stiffness, bounds.springs)):
                 for number in numbers:
                     values_of[int(number) - 1] = next(left)
             springs = [
                 {"start": s.start + 1, "end": s.end + 1, "next_cell": s.next_cell, "stiffness": k}
+                | ({"damping": s.damping} if s.damping else {})
                 for s, k in zip(cell.springs, stiffness, strict=True)
             ]
             changed = {"masses": masses, "springs": springs, "contact": [cell.host + 1, cell.resonator + 1]}
+            changed |= {"grounding": list(cell.grounding)} if cell.grounding else {}
             others = {k: v for k, v in table["lattice"].items() if k not in ("preset", "reading", "lambda", "eta")}
             table["lattice"] = others | {"cell": changed}
         return _case(table | {"contacts": contacts})

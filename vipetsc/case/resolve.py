@@ -122,7 +122,10 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
 
 
 def check_undamped(lattice: LatticeTable, what: str) -> Iterator[Problem]:
-    """Dashpots and springs that are not linear, where ``what`` is made of a lattice without."""
+    """Dashpots, springs that are not linear and cells that differ, where ``what`` is made of a lattice without."""
+    for key in ("profiles", "scatter", "absorbing"):
+        if getattr(lattice, key):
+            yield Problem(f"lattice.{key}", None, f"{what} whose cells are alike; leave [lattice.{key}] out")
     if check_cell(lattice)[1] == [] and not lattice.unit_cell().is_linear:
         yield Problem("lattice.cell.springs", None, f"{what} of linear springs; leave quadratic and cubic out")
     if check_cell(lattice)[1] == [] and lattice.unit_cell().is_damped:

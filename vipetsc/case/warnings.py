@@ -23,8 +23,10 @@ def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> 
 
 
 def _of_waves(model: Model) -> Iterator[str]:
-    """Evanescent, slow or long waves; a run that ends before its drive."""
+    """Evanescent, slow or long waves; a run that ends before its drive; masses of which measures know nothing."""
     cell, drive, cells = model.chain.cell, model.drive, model.chain.cells
+    if model.chain.variation and model.chain.variation.masses is not None:
+        yield "masses differ: kinetic energies by cell, band and wavenumber are those of the reference cell's masses"
     waves, frequency = waves_at(cell, drive.frequency), f"drive.frequency = {drive.frequency:.6g} rad/s"
     if model.is_driven and not cell.springs:
         return
@@ -57,6 +59,8 @@ def _of_ends(model: Model, output: OutputTable) -> Iterator[str]:
     window = [cell - 1 for cell in output.window or (at + 1,)]
     measured, name = (chain.sites, "site in cell") if chain.sites else (window, "cell")
     for end, cell in (("left", 0), ("right", chain.cells - 1)):
+        if chain.coefficients(cell, cell + 1).grounding.sum() > sum(chain.cell.grounding):
+            continue  # it absorbs
         arrival = abs(cell - at) / model.speed
         if arrival <= drive.settled / 2:  # what comes back is part of what the drive sends out
             continue
