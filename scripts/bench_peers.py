@@ -60,7 +60,7 @@ def parameters(model: Model) -> str:
         ("scale", model.scale, drive.frequency),
         ("masses", *chain.cell.masses),
         ("couplings", len(couplings)),
-        *couplings,
+        *(c[:4] for c in couplings),
         ("contact", int(contact.law == "hertz"), contact.stiffness, chain.cell.host, chain.cell.resonator),
         ("sites", len(chain.sites)),
         *zip(chain.sites, chain.clearances, strict=True),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from mpi4py import MPI
 
 import numpy as np
@@ -26,7 +28,7 @@ WHOLE = UnitCell((1.0, 2.0, 4.0), (Spring(0, 0, 3.0, True), Spring(0, 1, 5.0), S
 def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
     """-M u'' (cell, dof) of this rank's cells by the right-hand side that PETSc calls."""
     model = small_case(drive={"amplitude": 1e-3}).model()
-    model = type(model)(**vars(model) | {"chain": chain, "drive_mass": 0})
+    model = type(model)(**vars(model) | {"chain": chain, "drives": (replace(model.drives[0], mass=0),)})
     layout = Layout(model, COMM)
     state, lattice = layout.create_vector(), create_record(model, layout)
     layout.place(np.hstack([u, 0 * u])[layout.start : layout.stop], 0.0, state.array)

@@ -49,7 +49,7 @@ def test_a_run_too_large_is_refused_with_what_it_needs(folder):
     for engine, least in (("ts", 90), ("propagator", 10)):
         case = small_case(**HUGE, time={"end": 0.08, "engine": engine})
         assert 1e9 * least < needed(case, engine) < 2e9 * least
-    with pytest.raises(CaseError, match=r"50000000 cells, 1 sites and 401 samples need \d+ GB of memory on a rank"):
+    with pytest.raises(CaseError, match=r"50000000 cells, 1 sites and 251 samples need \d+ GB of memory on a rank"):
         simulate(small_case(**HUGE), folder / "run")
     assert not (folder / "run").exists()
 
@@ -62,7 +62,7 @@ def test_a_state_beyond_petscs_indices_is_refused_with_the_build_that_counts_it(
         with pytest.raises(CaseError, match=said):
             refused()
     monkeypatch.setattr(memory.PETSc, "IntType", np.int64)
-    with pytest.raises(CaseError, match="300000000 cells, 1 sites and 401 samples need"):
+    with pytest.raises(CaseError, match="300000000 cells, 1 sites and 251 samples need"):
         simulate(case, folder / "run")
 
 

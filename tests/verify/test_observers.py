@@ -22,7 +22,8 @@ def block(work: list[float], total: list[float], dissipated: float = 0.0) -> Blo
 
 def begun(kind: type[Observer]) -> Observer:
     observer = kind()
-    observer.begin(SimpleNamespace(meter=SimpleNamespace(largest=1e6)))
+    undamped = SimpleNamespace(chain=SimpleNamespace(is_damped=False))
+    observer.begin(SimpleNamespace(meter=SimpleNamespace(largest=1e6), model=undamped))
     return observer
 
 
