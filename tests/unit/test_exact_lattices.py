@@ -1,4 +1,4 @@
-"""Exact steps of lattices with dashpots and cells that differ, against the matrix exponential of the whole lattice."""
+"""Exact steps, with dashpots and cells that differ too, against the matrix exponential of the whole lattice."""
 
 from __future__ import annotations
 
@@ -59,6 +59,9 @@ EVERY = pytest.mark.parametrize(
         ("free", "some", True),
         ("fixed", "some", False),
         ("fixed", "none", True),
+        ("fixed", "none", False),
+        ("free", "none", False),
+        ("periodic", "none", False),
     ],
 )
 

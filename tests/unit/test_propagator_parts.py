@@ -1,4 +1,4 @@
-"""The propagator's parts alone: stencil, series and impulses against the matrix exponential; collocation; grouping."""
+"""The propagator's parts alone: stencil against the matrix exponential; collocation; grouping."""
 
 import re
 
@@ -7,9 +7,9 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
-from scipy.linalg import expm
 
 from tests.conftest import small_case
+from tests.unit.test_exact_lattices import exponential
 from vipetsc.case import Case
 from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.drives import create_drives
@@ -28,27 +28,16 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
+from vipetsc.dynamics.propagator.forces import create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
 from vipetsc.dynamics.propagator.series import StepSeries, evaluate, shift
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
-from vipetsc.dynamics.propagator.tables import apply_impulses, expand_free_motion
+from vipetsc.dynamics.propagator.tables import expand_free_motion
 from vipetsc.dynamics.propagator.tape import create_tape
 from vipetsc.dynamics.samples import Samples
 from vipetsc.dynamics.vectors import LANES
 
 ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-
-
-def exponential(chain, t: float) -> np.ndarray:
-    """The exact P(t), states ordered as (2 dof, cell)."""
-    n, d = chain.cells, chain.cell.dofs
-    order = np.arange(n * d).reshape(n, d).T.ravel()  # mass by mass
-    stiffness = chain.stiffness_matrix().toarray()[np.ix_(order, order)]
-    system = np.zeros((2 * n * d, 2 * n * d))
-    system[: n * d, n * d :] = np.eye(n * d)
-    system[n * d :, : n * d] = -stiffness / chain.masses()[order][:, None]
-    return expm(system * t)
 
 
 def parts(ends: str, interval: float, tolerance: float, sites=(5, 6, 12)):
@@ -117,39 +106,6 @@ def test_the_bound_keeps_below_every_tolerance(interval):
     chain = small_case().model().chain
     for tolerance in np.geomspace(1e-14, 1e-3, 34):
         assert StepSeries(chain, interval, tolerance).truncation < tolerance
-
-
-@ENDS
-def test_free_motion_and_impulses_are_the_exponential(ends):
-    model, layout, series, halo = parts(ends, 3e-4, 1e-15, sites=(1, 12, 24))
-    groups = group_dofs(model, series.reach)
-    tables = create_dof_tables(groups, model, layout, series, halo)
-    halo = halo.bind_columns([])
-    d, n = layout.dofs, layout.cells
-    state = np.random.default_rng(5).normal(size=(2 * d, n)) * np.repeat([1e-4, 0.1], d)[:, None]
-    exchange(halo, 0, state)
-    dofs = contact_dofs(model)[groups.numbers]
-    taylor = np.zeros((len(dofs), 2 * series.terms))
-    for c in range(len(groups.first) - 1):
-        expand_free_motion(tables, c, halo.columns, taylor)
-    for s in (0.3, 1.0):
-        exact = (exponential(series.chain, s * series.interval) @ state.ravel()).reshape(2 * d, n)
-        for i, dof in enumerate(dofs):
-            w, rate = evaluate(taylor[i], s)
-            assert w == pytest.approx(np.dot(dof["form"], exact[:d, dof["cell"]]), rel=1e-11, abs=1e-17)
-            assert rate / series.interval == pytest.approx(
-                np.dot(dof["form"], exact[d:, dof["cell"]]), rel=1e-11, abs=1e-13
-            )
-    # An impulse on one DoF at s leaves what the exponential makes of it in the rest of the step.
-    s = 0.4
-    for i, dof in enumerate(dofs):
-        moments, out = np.zeros((1, 2 * series.terms)), np.zeros((2 * d, n))
-        moments[0] = (1 - s) ** np.arange(2 * series.terms)
-        apply_impulses(tables, i, moments, out)
-        impulse = np.zeros((2 * d, n))
-        impulse[d:, dof["cell"]] = dof["form"] / model.chain.cell.masses
-        exact = exponential(series.chain, (1 - s) * series.interval) @ impulse.ravel()
-        np.testing.assert_allclose(out.ravel(), exact, rtol=0, atol=1e-12 * np.abs(exact).max())
 
 
 def test_clusters_that_cannot_touch_are_left_alone():
