@@ -1,5 +1,7 @@
 """Pictures of one run: where its energy is, its dispersion, impacts, ledger, phase portraits; a cell's bands."""
 
+import json
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -127,6 +129,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     time = run["time"].values
     names = "kinetic", "spring", "contact", "work", "dissipated"
     kinetic, spring, contact, work, dissipated = (run[f"energy/{name}"] for name in names)
+    damped = run.get("energy/dissipated_by_damping", 0.0 * work)
     largest = float(np.abs(work).max())
     if len(time) < 2 or largest == 0:
         return empty_figure("Energy ledger: the drive has done no work")
@@ -143,6 +146,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         ("kinetic, mean", means["energy/kinetic"], style.SKY, "-"),
         ("springs, mean", means["energy/spring"], style.GREEN, (0, (3, 1.5))),
         ("contacts", contact, style.PURPLE, "-"),
+        *([("dissipated in dashpots", damped, style.ORANGE, "-")] if "energy/dissipated_by_damping" in run else []),
     )
     for label, energy, colour, dashes in curves:
         upper.plot(time, energy, color=colour, ls=dashes, label=label, lw=0.9)
@@ -150,12 +154,17 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     upper.yaxis.set_major_formatter(EngFormatter("J"))
     upper.legend(loc="upper center", ncol=2, columnspacing=1.2, labelspacing=0.25)
 
-    residual = np.abs(work - dissipated - stored) / largest
+    residual = np.abs(work - dissipated - damped - stored) / largest
+    told = run.attrs.get("statistics", {})  # text in a file
+    if (json.loads(told) if isinstance(told, str) else told).get("ledger_error", 0.0) is None:
+        residual *= np.nan
+        panels.note(lower, "none: dashpots have what the balance leaves", (0.5, 0.3), (0, 0), xycoords="axes fraction",
+                    ha="center")  # fmt: skip
     lower.semilogy(time, np.maximum(residual, 1e-18), color=style.BLACK, lw=0.5)
     lower.axhline(LARGEST_RESIDUAL, color=style.VERMILION, lw=0.7, ls=style.DASHED)
     panels.note(lower, "limit 1e-8", (0.99, LARGEST_RESIDUAL), (0, 1.5), xycoords=("axes fraction", "data"),
                 ha="right", va="bottom", color=style.VERMILION)  # fmt: skip
-    lower.set(xlabel="Time (s)", ylabel="|Residual| / work", ylim=(1e-15, max(1e-6, 10 * float(residual.max()))))
+    lower.set(xlabel="Time (s)", ylabel="|Residual| / work", ylim=(1e-15, np.fmax(1e-6, 10 * float(residual.max()))))
     return figure
 
 
