@@ -9,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.linalg import eigvalsh
 
 from tests.conftest import small_case
 from vipetsc.case import CaseError
@@ -18,7 +19,7 @@ from vipetsc.dynamics.layout import Layout, create_record
 from vipetsc.dynamics.matrices import LatticeMatrices
 from vipetsc.dynamics.ts.right_hand_side import right_hand_side
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, four_band
-from vipetsc.lattice.modes import frequencies, mode_shape
+from vipetsc.lattice.modes import mode_frequency, mode_shape
 from vipetsc.studies.linear_modes import find_modes
 
 COMM = MPI.COMM_WORLD
@@ -102,8 +103,11 @@ def test_the_contact_jacobian_is_the_derivative_of_the_force(contact):
 def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(ends, cells, near, count):
     chain = Chain(four_band("calibrated"), cells, ends)
     matrices = LatticeMatrices(chain, COMM)
+    taken, vector = [], matrices.vector
+    matrices.vector = lambda *cells: taken.append(1) or vector(*cells)
     modes = modes_near(matrices, count, near)
-    every = frequencies(chain)
+    assert len(taken) <= count + 3  # it ends with the first mode that is not nearer
+    every = np.array([mode_frequency(chain, number) for number in range(1, matrices.rows + 1)])
     nearest = np.sort(every[np.argsort(np.abs(every**2 - near**2), kind="stable")[:count]])
     assert modes.frequency == pytest.approx(nearest, rel=1e-9, abs=1e-3)
     assert modes.residual.max() < 1e-9
@@ -132,11 +136,24 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
 
 
 @pytest.mark.parallel([1])
+def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
+    profiles = {"masses[1]": [0.005, 0.02], "springs[2].stiffness": [1e4, 3e4]}
+    case = small_case(lattice={"cells": 2, "profiles": profiles}, contacts={"sites": [1]})
+    data, chain = find_modes(case, 8, 900.0, folder, COMM), case.model().chain
+    stiffness, masses = chain.stiffness_matrix().toarray(), chain.masses()
+    assert data["frequency"].values ** 2 == pytest.approx(eigvalsh(stiffness, np.diag(masses)), rel=1e-9)
+    assert (data["left"] + data["right"]).values == pytest.approx(1.0, abs=1e-12)  # a tenth is one cell of two
+
+
+@pytest.mark.parallel([1])
 def test_refused(monkeypatch, folder):
     case = small_case()
     for count, near, key in ((0, 1.0, "--modes"), (97, 1.0, "--modes"), (2, -1.0, "--near")):
         with pytest.raises(CaseError, match=key):
             find_modes(case, count, near, folder, COMM)
+    pressed = small_case(contacts={"side": "plus", "precompression": 3e-4, "restitution": 1.0})
+    with pytest.raises(CaseError, match="touch at rest"):
+        find_modes(pressed, 2, 1.0, folder, COMM)
     monkeypatch.setattr(eigen, "RESTARTS", 1)
     with pytest.raises(CaseError, match="of 6 modes come out"):
         modes_near(LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM), 6, 2034.0)

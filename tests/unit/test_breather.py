@@ -110,8 +110,8 @@ def test_the_slope_of_the_energy_is_that_between_points():
         assert min(a.slope, b.slope) * 0.99 <= chord <= max(a.slope, b.slope) * 1.01
 
 
-def reduced(law: str) -> System:
-    return System.reduced(four_band(), D, Contact(law, HERTZ.stiffness))
+def reduced(law: str, power: float | None = None) -> System:
+    return System.reduced(four_band(), D, Contact(law, HERTZ.stiffness, power=power))
 
 
 KERSCHEN = System.assemble(
@@ -125,7 +125,7 @@ KERSCHEN = System.assemble(
         (KERSCHEN, 0, 1e-2, 1e-9),
         (KERSCHEN, 1, 1e-2, 1e-9),
         (reduced("hertz"), 0, 0.0034, 1e-8),
-        (reduced("hertz"), 1, 0.028, 1e-8),
+        (reduced("power", 2.3), 1, 0.028, 1e-8),
         (reduced("bilinear"), 3200.0, 0.0, 1e-7),  # rad/s: from a describing function
     ],
 )

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.linalg import eigvalsh
 
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError, LawCase, Sweep
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.state import State
-from vipetsc.lattice import Chain, bloch, four_band
-from vipetsc.lattice.modes import frequencies, mode_shape
+from vipetsc.lattice import Chain, Spring, UnitCell, bloch, four_band
+from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
 from vipetsc.lattice.packet import gaussian_packet
 from vipetsc.studies.linear import linear_case
 
@@ -22,15 +23,43 @@ TABLE = {"name": "t", "lattice": {"preset": "four-band", "cells": 24}, "contacts
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_modes_solve_the_eigenvalue_problem(ends):
-    chain = Chain(four_band(), 15, ends)
-    every, stiffness, masses = frequencies(chain), chain.stiffness_matrix(), chain.masses()
-    shapes = np.array([mode_shape(chain, number).ravel() for number in range(1, 61)])
+    """Counted and found one by one, they are those of dense matrices, copies on a ring too."""
+    chain = Chain(four_band(), 50, ends)
+    stiffness, masses, numbers = chain.stiffness_matrix(), chain.masses(), range(1, 201)
+    every = np.array([mode_frequency(chain, number) for number in numbers])
+    squares = eigvalsh(stiffness.toarray(), np.diag(masses))
+    assert every**2 == pytest.approx(squares, rel=0, abs=1e-13 * squares[-1])
+    shapes = np.array([mode_shape(chain, number).ravel() for number in numbers])
     residual = shapes @ stiffness - every[:, None] ** 2 * masses * shapes
     assert np.abs(residual).max() < 1e-9 * every[-1] ** 2 * masses.max()
     assert np.abs(shapes).max(axis=1) == pytest.approx(1.0)
     # They are different ones: together they span all.
-    assert np.linalg.matrix_rank(shapes, tol=1e-6) == 60
+    assert np.linalg.matrix_rank(shapes, tol=1e-6) == 200
     assert (every[0] == 0) == (ends != "fixed")
+    for omega in (1.0, 890.0, 1300.0, 2200.0, 9000.0):
+        away = np.abs(every - omega)
+        assert away[number_near(chain, omega) - 1] == pytest.approx(away.min(), abs=1e-8)
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free"])
+def test_modes_of_a_long_chain_are_known_in_closed_form(ends):
+    n, m, k = 20_000, 0.02, 5e4
+    chain = Chain(UnitCell((m,), (Spring(0, 0, k, next_cell=True),), 0, 0), n, ends)
+    for number in (2, 137, 9_999, 19_999):
+        phase, x = (np.pi * number / (n + 1), np.arange(1, n + 1)) if ends == "fixed" else (
+            np.pi * (number - 1) / n, np.arange(n) + 0.5)  # fmt: skip
+        omega, shape = 2 * np.sqrt(k / m) * np.sin(phase / 2), (np.sin if ends == "fixed" else np.cos)(phase * x)
+        assert mode_frequency(chain, number) ** 2 == pytest.approx(omega**2, rel=0, abs=1e-14 * k / m)
+        assert number_near(chain, omega * (1 + 1e-7 / number)) == number
+        found = mode_shape(chain, number).ravel()
+        assert np.abs(found * (shape @ found) / (found @ found) - shape).max() < 1e-6
+    table = {"cell": {"masses": [m], "springs": [{"start": 1, "end": 1, "stiffness": k, "next_cell": True}]}}
+    initial = {"kind": "mode", "near": 300.0, "amplitude": 1e-3}
+    lattice = table | {"cells": n, "ends": ends}
+    case = Case.from_table({"name": "t", "lattice": lattice, "contacts": {"sites": 0}, "initial": initial,
+                            "time": {"end": 0.01}})  # fmt: skip
+    assert case.drive.frequency == pytest.approx(300, abs=0.2)
+    assert case.initial.number == number_near(chain, 300.0)
 
 
 def test_a_packet_is_a_gaussian_of_the_width_and_amplitude_asked():
@@ -119,12 +148,12 @@ def test_refused_beside_other_sections():
         )
 
 
-def put_branch(path) -> None:
+def put_branch(path, size=1e-4) -> None:
     """Two orbits of cells 3 and 4, as branches keep them."""
     axes = {"states/orbit": 2, "states/cell": 2, "states/dof": 4}
     data = {name: variable(name, np.arange(1, n + 1), "1", name) for name, n in axes.items()}
     data["states/cell"] = variable("states/cell", [3, 4], "1", "cell")
-    u = np.arange(16.0).reshape(2, 2, 4) * 1e-4
+    u = np.arange(16.0).reshape(2, 2, 4) * size
     for name, values in (("displacement", u), ("velocity", 0 * u)):
         data[f"states/{name}"] = variable(tuple(axes), values, "m", name)
     data["states/period"] = variable("states/orbit", [0.004, 0.005], "s", "period")
@@ -146,5 +175,9 @@ def test_orbits_of_a_branch(tmp_path):
     for wrong, text in ((initial | {"orbit": 3}, "from 1 to 2, not 3"), (initial | {"time": 0.1}, "no such thing")):
         with pytest.raises(CaseError, match=text):
             Case.from_table(TABLE | {"initial": wrong})
+    put_branch(path, size=0.0)
+    with pytest.raises(CaseError, match="is at rest"):
+        Case.from_table(TABLE | {"initial": initial})
+    put_branch(path)
     with pytest.raises(CaseError, match="cells up to 4"):
         Case.from_table(TABLE | {"initial": initial, "lattice": {"preset": "four-band", "cells": 3}})

@@ -387,6 +387,29 @@ def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
         NnmCase.from_table({"lattice": {"cell": cell}, "contacts": {"clearance": 0.1}})
 
 
+@pytest.mark.parametrize("nnm", [{}, {"system": "chain"}, {"system": "condensed", "start_frequency": [1600.0]}])
+@pytest.mark.parametrize(
+    ("table", "key"),
+    [
+        ({"contacts": {"law": "power"}}, r"contacts\.exponent: missing"),
+        ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: is for law"),
+        ({"contacts": {"restitution": 0.7}}, r"contacts\.restitution"),
+        ({"contacts": {"side": "plus"}}, r"contacts\.side"),
+        ({"contacts": {"clearance_minus": 2e-3}}, r"contacts\.clearance_minus"),
+        ({"contacts": {"each": {"law": ["bilinear"]}}}, r"contacts\.each"),
+        ({"contacts": {"next_cell": True}}, r"contacts\.next_cell"),
+        ({"lattice": {"damping": {"mass": 1.0}}}, "without dashpots"),
+        ({"lattice": {"absorbing": {"cells": 2, "strength": 1.0}}}, r"lattice\.absorbing"),
+        ({"disorder": {"seed": 1, "cells": {"masses": {"relative": 0.01}}}}, "disorder"),
+    ],
+)
+def test_what_branches_do_not_know_is_refused(nnm, table, key):
+    contacts = {"sites": [2], "clearance": 1e-3} | table.get("contacts", {})
+    lattice = {"preset": "four-band", "cells": 8} | table.get("lattice", {})
+    with pytest.raises(CaseError, match=key):
+        NnmCase.from_table(table | {"contacts": contacts, "lattice": lattice, "nnm": nnm})
+
+
 @pytest.fixture(scope="module")
 def short_branch() -> Branch:
     problem = Shooting(Dop853Flow(reduced()), MAPS["quarter"])

@@ -15,7 +15,7 @@ from vipetsc.dynamics import simulate
 from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import bloch
-from vipetsc.lattice.modes import frequencies, modes_of
+from vipetsc.lattice.modes import mode_frequency, modes_of
 from vipetsc.modes.condensed_follow import CondensedFollower
 from vipetsc.modes.follow import follow_all
 from vipetsc.spectra.modal import ModalParts
@@ -45,7 +45,7 @@ def test_a_mode_stays_a_mode(engine, ends):
     case = moving({"kind": "mode", "number": 50, "energy": 2e-3}, lattice={"ends": ends},
                   time={"engine": engine, "end": 0.02, "rtol": 1e-13})  # fmt: skip
     chain = case.model().chain
-    omega = frequencies(chain)[49]
+    omega = mode_frequency(chain, 50)
     assert case.drive.frequency == omega
     data = run(case)
     work = data["energy/work"].values

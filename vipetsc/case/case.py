@@ -50,6 +50,7 @@ class Case(CaseFile):
     petsc: PetscTable | None = None
 
     builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}}
+    waveforms: ClassVar[tuple[str, ...]] = ("burst",)  # on a mass, that a subclass takes
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -113,8 +114,9 @@ class Case(CaseFile):
             yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
         of_drive, drive = list(check_drives(sections["drive"], lattice, cell, length, valid)), sections["drive"]
         yield from of_drive
-        if (drive.kind != "burst" or drive.end or drive.more) and cls is not Case:
-            yield Problem("drive.waveform", drive.kind, "this verb is about one burst on a mass; run takes all others")
+        if (drive.kind not in cls.waveforms or drive.end or drive.more) and cls is not Case:
+            remedy = f"this verb is about one {' or '.join(cls.waveforms)} on a mass; run takes all others"
+            yield Problem("drive.waveform", drive.kind, remedy)
         if cell and not of_drive and drive.ways and valid("lattice", "drive", "time.end"):
             yield from check_wave(cell, drive, sections["time"])
         if cell and not cell.springs and valid("drive", "time"):

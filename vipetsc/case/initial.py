@@ -12,7 +12,7 @@ from vipetsc.case.reading import CaseError, Problem, Section, Table, Valid
 from vipetsc.case.schema import LatticeTable, Positive, Wavenumber
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
-from vipetsc.lattice.modes import MOST_DOFS, frequencies, mode_shape
+from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
 from vipetsc.lattice.packet import Packet, gaussian_packet
 
 # Which keys a kind needs all of, and of which it needs one; others that it takes.
@@ -99,8 +99,6 @@ def check_initial(
         yield Problem(
             "initial.kind", "mode", "the mode of a lattice whose cells differ; a packet, or a state in a file"
         )
-    elif dofs and initial.kind == "mode" and dofs > MOST_DOFS:
-        yield Problem("initial.kind", "mode", f"the modes of {dofs} masses, more than {MOST_DOFS}, are not counted")
 
 
 def beginning_of(
@@ -118,10 +116,8 @@ def beginning_of(
 
 
 def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> tuple[Table, float, int]:
-    number, every = initial.number, frequencies(chain)
-    if number is None:
-        number = int(np.argmin(np.abs(every - initial.near))) + 1
-    omega = float(every[number - 1])
+    number = initial.number or number_near(chain, initial.near or 0.0)
+    omega = mode_frequency(chain, number)
     if omega == 0:
         raise CaseError([Problem("initial.number", number, "the frequency of this mode is 0; another one moves")])
     table: Table = {"number": number, "near": None}

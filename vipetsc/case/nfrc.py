@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -12,6 +12,7 @@ from vipetsc.case.reading import Problem, Section, Table, Valid
 from vipetsc.case.resolve import check_stiffness, check_undamped
 from vipetsc.case.schema import Positive, once
 from vipetsc.lattice import Contact, UnitCell, waves_at
+from vipetsc.lattice.contact import LEAST_RESTITUTION
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
 
@@ -55,6 +56,8 @@ class NfrcCase(Case):
 
     nfrc: NfrcTable
 
+    waveforms: ClassVar[tuple[str, ...]] = ("burst", "harmonic")
+
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
@@ -90,6 +93,9 @@ class NfrcCase(Case):
             yield Problem("nfrc.smallest_step", nfrc.smallest_step, "must be below nfrc.largest_step")
         if valid("contacts"):
             yield from check_stiffness(sections["contacts"], True, valid)
+            bounded = sections["contacts"].damping in ("exact", "flores")
+            if bounded and (small := [r for r in nfrc.restitutions if r < LEAST_RESTITUTION]):
+                yield Problem("nfrc.restitutions", small, f"below {LEAST_RESTITUTION} this damping grows without bound")
             if sections["contacts"].sites in (0, []):
                 yield Problem("contacts.sites", sections["contacts"].sites, "name a cell with a contact")
 

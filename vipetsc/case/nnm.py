@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from vipetsc.case.contacts import check_alike
+from vipetsc.case.contacts import check_alike, check_each
 from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.resolve import (
     check_cell,
@@ -157,6 +157,8 @@ class NnmCase(CaseFile):
             stated = table.get("contacts", {})
             table = table | {"contacts": {key: v for key, v in given.items() if key in MATERIAL or key in stated}}
         fields, problems = super().read(with_default_preset(table))
+        if "disorder" in table:
+            problems.append(Problem("disorder", None, "normal modes are those of the case without it; leave it out"))
         lattice, contacts = fields["lattice"], fields["contacts"]
         if not (problems or lattice_free or contacts.clearance):
             count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
@@ -170,6 +172,9 @@ class NnmCase(CaseFile):
             return []
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
         problems, dofs, rigid = [*_check_options(nnm), *check_alike(contacts)], 2, 0
+        problems += [] if contacts.each else check_each(contacts, 0, [], valid)
+        if contacts.restitution < 1:
+            problems.append(Problem("contacts.restitution", contacts.restitution, "normal modes lose nothing: give 1"))
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:
@@ -178,6 +183,10 @@ class NnmCase(CaseFile):
         else:
             cell, wrong = check_cell(lattice)
             problems += [*wrong, *check_undamped(lattice, "normal modes are those of a lattice")]
+        if nnm.system in ("chain", "condensed"):
+            problems += check_sites(lattice, contacts)
+            if not site_cells(lattice, contacts):
+                problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
         if nnm.system == "chain":
             dofs = cell.dofs * lattice.cells if cell else 2
             rigid = int(lattice.ends != "fixed")
@@ -187,9 +196,6 @@ class NnmCase(CaseFile):
             if dofs > most:
                 remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
                 return [*problems, Problem("lattice.cells", lattice.cells, remedy)]
-            if not site_cells(lattice, contacts):
-                problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
-            problems += check_sites(lattice, contacts)
         elif nnm.shooting == "krylov" or (nnm.multipliers and nnm.system != "condensed"):
             remedy = '"krylov" is for "chain", multipliers are for "chain" and "condensed"'
             problems.append(Problem("nnm.system", nnm.system, remedy))
@@ -262,11 +268,8 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
 
 
 def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable, valid: Valid) -> Iterator[Problem]:
-    """What is wrong with the sites and the start of a lattice's motions."""
+    """What is wrong with the start of a lattice's motions."""
     sites = site_cells(lattice, contacts)
-    if not sites:
-        yield Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}")
-    yield from check_sites(lattice, contacts)
     yield from check_stiffness(contacts, True, valid)
     if not nnm.start_frequency:
         yield Problem("nnm.start_frequency", [], "name frequencies in rad/s, between the pass bands or above them")

@@ -22,24 +22,32 @@ SWEEPS = {"up": (style.GREEN, "sweep up", 6.0), "down": (style.PURPLE, "sweep do
 
 def answers(paths: Sequence[Path]) -> Figure:
     """Largest relative displacement and shares of the energy over the parameter; a column for each file."""
-    figure = style.new_figure(style.COLUMN if len(paths) == 1 else style.PAGE, 4.6)
-    for column, path in zip(figure.subplots(2, len(paths), sharex="col", squeeze=False).T, paths, strict=True):
+    branches = []
+    for path in paths:
         with open_netcdf(path, "branch", ("share", "unstable", "over")) as file:
-            data = file.load()
+            branches.append(file.load())
+    told = any(np.isfinite(data["share"].values).any() for data in branches)
+    figure = style.new_figure(style.COLUMN if len(paths) == 1 else style.PAGE, 2.3 * (1 + told))
+    columns = figure.subplots(1 + told, len(paths), sharex="col", squeeze=False).T
+    for column, data in zip(columns, branches, strict=True):
         over = str(data.attrs["over"])
         p, folds = data[over].values, np.nonzero(data["kind"].values == 1)[0]
         _displacement(column[0], data, p, folds)
-        _energy(column[1], data, p)
+        if told:
+            _energy(column[1], data, p)
         wave = '"wave"' in next(line for line in data.attrs["case"].splitlines() if line.startswith("source = "))
         label = "frequency [rad/s]" if over == "frequency" else "amplitude [N]"
-        column[1].set_xlabel("amplitude of the wave / clearance" if wave and over == "amplitude" else label)
+        column[-1].set_xlabel("amplitude of the wave / clearance" if wave and over == "amplitude" else label)
         column[0].set_title(str(data.attrs["name"]), fontsize=8)
     return figure
 
 
 def _displacement(axes: Axes, data: xr.Dataset, p: np.ndarray, folds: np.ndarray) -> None:
-    """Stable states as a line, unstable ones dashed; jumps of slow sweeps as dotted lines."""
-    stable, size = data["unstable"].values == 0, data["largest"].values[:, 0] / data["clearance"].values[0]
+    """Of the first site: stable states as a line, unstable ones dashed, slow sweeps broad; thin lines of others."""
+    stable, sizes = data["unstable"].values == 0, data["largest"].values / data["clearance"].values
+    size = sizes[:, 0]
+    for number, other in enumerate(sizes.T[1:]):
+        axes.plot(p, other, color=style.GREY, lw=0.6, label=None if number else "other sites")
     for colour, label, width in (value for name, value in SWEEPS.items() if data[f"{name}_point"].size > 1):
         way = data["up_point" if label == "sweep up" else "down_point"].values
         axes.plot(p[way], size[way], color=colour, lw=width, alpha=0.35, label=label, solid_capstyle="butt")
@@ -63,4 +71,5 @@ def _energy(axes: Axes, data: xr.Dataset, p: np.ndarray) -> None:
             axes.plot(p, share, color=colour, lw=0.6, ls="--")
             axes.plot(p, np.where(stable, share, np.nan), color=colour, lw=1.4, label=label)
     axes.set(ylabel="share of the energy", ylim=(-0.02, 1.04))
-    axes.legend(fontsize=6, loc="best")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=6, loc="best")

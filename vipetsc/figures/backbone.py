@@ -81,7 +81,7 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
     energy, frequency, kind = (branch[name].values for name in ("energy", "frequency", "kind"))
     few = np.isin(kind, list(MARKS)).sum() <= MOST_MARKS
     _shade(axes, branch)
-    _line(axes, branch)
+    line(axes, branch)
     for name, (mark, label) in MARKS.items() if few else ():
         at = kind == name
         if at.any():
@@ -212,16 +212,17 @@ def lowest(branch: xr.Dataset) -> np.ndarray:
     return frequency <= least[np.argsort(order)] * (1 + 1e-9)
 
 
-def _line(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
-    """The branch, blue where stable and vermilion where not."""
-    energy, frequency = smooth(branch)
-    unstable = branch["multiplier_max"].values > UNSTABLE
-    if len(energy) > len(unstable):
-        unstable = np.append(np.repeat(unstable[:-1] & unstable[1:], FINE), unstable[-1])
-    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label="stable")
-    if unstable.any():
-        line = {"color": style.VERMILION, "lw": 1.3 * width, "zorder": 3, "label": "unstable"}
-        axes.plot(energy, np.where(unstable, frequency, np.nan), **line)
+def line(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
+    """The branch, blue where stable, vermilion where not, grey where that is not known."""
+    (energy, frequency), multiplier = smooth(branch), branch["multiplier_max"].values
+    label = "stable" if np.any(multiplier <= UNSTABLE) else None
+    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label=label)
+    untold = np.isnan(multiplier)
+    for at, colour, label in (multiplier > UNSTABLE, style.VERMILION, "unstable"), (untold, style.GREY, "not known"):
+        if len(energy) > len(at):
+            at = np.append(np.repeat(at[:-1] & at[1:], FINE), at[-1])
+        if at.any():
+            axes.plot(energy, np.where(at, frequency, np.nan), color=colour, lw=1.3 * width, zorder=3, label=label)
 
 
 def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
@@ -237,7 +238,7 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
         np.sum(np.all((curve > np.subtract(at, MARGIN)) & (curve < np.add(at, INSET)), axis=1)) for at in CORNERS
     ]
     inset = axes.inset_axes([*CORNERS[int(np.argmin(covered))], *INSET])
-    _line(inset, near, 0.9)
+    line(inset, near, 0.9)
     at = near["kind"].values == "fold-energy"
     inset.plot(near["energy"][at], near["frequency"][at], "o", ms=2.5, **HOLLOW)
     inset.margins(0.1)

@@ -11,7 +11,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import style
-from vipetsc.figures.backbone import MARKS, backbone
+from vipetsc.figures.backbone import MARKS, backbone, line
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import pass_bands
 
@@ -26,12 +26,9 @@ def branches(paths: Sequence[Path]) -> Figure:
     for path in paths:
         with open_netcdf(path, "branch") as file:
             if "states/number" in file and "harmonics" in file:
-                condensed.append(file.load())
-    if not condensed:
-        return backbone(paths)
-    kinds = [branch["kind"].attrs["flag_meanings"].split() for branch in condensed]
-    named = [("point", np.array(names)[branch["kind"].values]) for names, branch in zip(kinds, condensed, strict=True)]
-    return breathers([branch.assign(kind=kind) for branch, kind in zip(condensed, named, strict=True)])
+                names = np.array(file["kind"].attrs["flag_meanings"].split())
+                condensed.append(file.load().assign(kind=("point", names[file["kind"].values])))
+    return breathers(condensed) if condensed else backbone(paths)
 
 
 def breathers(branches: Sequence[xr.Dataset]) -> Figure:
@@ -55,9 +52,11 @@ def breathers(branches: Sequence[xr.Dataset]) -> Figure:
 
 
 def frequency_energy(axes: Axes, branch: xr.Dataset, case: NnmCase) -> None:
-    """Frequency over energy with the folds; pass bands shaded."""
+    """Frequency over energy with its stability and the folds; pass bands shaded."""
     energy, frequency = branch["energy"].values, branch["frequency"].values
-    axes.plot(energy, frequency, color=style.BLACK, lw=1.0, marker="." if len(energy) == 1 else "")
+    line(axes, branch, 1.0)
+    if len(energy) == 1:
+        axes.plot(energy, frequency, ".", color=style.BLACK)
     for kind, (mark, label) in MARKS.items():
         at = branch["kind"].values == kind
         if at.any():
@@ -70,8 +69,7 @@ def frequency_energy(axes: Axes, branch: xr.Dataset, case: NnmCase) -> None:
             axes.axhspan(band.low / (2 * np.pi), band.high / (2 * np.pi), color=style.PALE, lw=0, zorder=0)
         axes.set_ylim(limits)
     axes.set_ylabel("frequency (Hz)")
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=5.5)
+    axes.legend(fontsize=5.5)
 
 
 def amplitude(axes: Axes, branch: xr.Dataset) -> None:

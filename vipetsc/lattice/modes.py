@@ -9,6 +9,7 @@ taken for a part of a ring: with one more cell, at rest, that is a wall on both 
 lack the spring that a ring has between them. A wave that meets an end is seen in other bands too until it has left.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -22,6 +23,7 @@ from vipetsc.lattice.drive import Waveform
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size
 CLOSE = 1e-3  # modes nearer than this share of the largest Om^2 are made orthogonal one by one
+EPS = float(np.finfo(float).eps)
 ORTHONORMAL = 2e-13  # error of the norm of any field in all modes up to which they are taken
 
 
@@ -95,8 +97,7 @@ def _modes(chain: Chain) -> Modes:
         return _ring(chain, chain.cells + (chain.ends == "fixed"), ring)
     if many:
         raise ValueError(f"modes of {chain.cells} cells that differ, more than {MOST_DOFS} masses")
-    root = diags(1 / np.sqrt(chain.masses()))
-    matrix = csc_matrix(root @ chain.stiffness_matrix() @ root)
+    matrix = _scaled(chain)
     squared, vectors = eigh(matrix.toarray(), driver="evr") if ring else _near_diagonal(matrix)
     x = np.random.default_rng(0).standard_normal((2, len(squared)))
     if np.any(np.abs(np.sum((x @ vectors) ** 2, axis=1) / np.sum(x**2, axis=1) - 1) > ORTHONORMAL):
@@ -116,21 +117,33 @@ def _ring(chain: Chain, cells: int, exact: bool) -> Modes:
     return Modes(chain, frequency, np.repeat(number, chain.cell.dofs), vectors, exact, cells)
 
 
+def number_near(chain: Chain, omega: float) -> int:
+    """The number (from 1, lowest first) of the mode whose frequency is nearest to ``omega`` in rad/s."""
+    if chain.ends == "periodic":
+        return int(np.argmin(np.abs(np.sort(_ring(chain, chain.cells, True).frequency) - omega))) + 1
+    below = _counter(chain)[0](omega**2)
+    around = range(max(below, 1), min(below + 1, chain.cells * chain.cell.dofs) + 1)
+    return min(around, key=lambda number: abs(mode_frequency(chain, number) - omega))
+
+
 @lru_cache(maxsize=4)
-def frequencies(chain: Chain) -> np.ndarray:
-    """Frequencies (mode) in rad/s of all modes of ``chain``, lowest first, up to ``MOST_DOFS`` or of any ring."""
+def mode_frequency(chain: Chain, number: int) -> float:
+    """Frequency in rad/s of mode ``number`` (from 1, lowest first) of a chain of any length, with ends by bisection."""
     if chain.ends == "periodic":
         every = np.sort(_ring(chain, chain.cells, True).frequency)
+        low, high, top = 0.0, every[number - 1] ** 2, every[-1] ** 2
     else:
-        root = diags(1 / np.sqrt(chain.masses()))
-        band = _band(csc_matrix(root @ chain.stiffness_matrix() @ root))
-        every = np.sqrt(np.maximum(eigvals_banded(band[2 * (len(band) // 3) :], lower=True), 0.0))
-    return np.where(every < 1e-6 * every[-1], 0.0, every)  # free ends
+        count, top = _counter(chain)
+        low, high = 0.0, top
+        while high > 64 * EPS * top and high - low > 2 * EPS * high:
+            middle = (low + high) / 2
+            low, high = (middle, high) if count(middle) < number else (low, middle)
+    return 0.0 if high <= 64 * EPS * top else float(np.sqrt(high))  # free ends
 
 
 @lru_cache(maxsize=4)
 def mode_shape(chain: Chain, number: int) -> np.ndarray:
-    """Displacement (cell, dof) in m of mode ``number`` (from 1, as in ``frequencies``), the largest 1 m.
+    """Displacement (cell, dof) in m of mode ``number`` (from 1, lowest first), the largest 1 m.
 
     Of a wave that a ring carries both ways, the standing one that is largest at cell 1 has the lower number.
     """
@@ -142,17 +155,33 @@ def mode_shape(chain: Chain, number: int) -> np.ndarray:
         turned = wave / wave[np.argmax(np.abs(wave))] * np.exp(1j * kappa * np.arange(chain.cells))[:, None]
         shape = turned.imag if kappa > 0 else turned.real
     else:
-        root = 1 / np.sqrt(chain.masses())
-        band = _band(csc_matrix(diags(root) @ chain.stiffness_matrix() @ diags(root)))
-        width, every = len(band) // 3, frequencies(chain)
-        band[2 * width] -= every[number - 1] ** 2 + 4 * np.finfo(float).eps * every[-1] ** 2
-        factor, pivots, _ = lapack.dgbtrf(band, width, width)
+        band, root = _band(_scaled(chain)), 1 / np.sqrt(chain.masses())
+        width = len(band) // 3
+        band[2 * width] -= mode_frequency(chain, number) ** 2 + 4 * EPS * _counter(chain)[1]
+        factor, pivots, _ = lapack.dgbtrf(band, width, width, overwrite_ab=True)
         x = np.random.default_rng(number).standard_normal(len(root))
         for _ in range(3):
             x, _ = lapack.dgbtrs(factor, width, width, x, pivots)
             x /= np.linalg.norm(x)
         shape = (x * root).reshape(chain.cells, -1)
     return np.asarray(shape / shape.flat[np.argmax(np.abs(shape))])
+
+
+@lru_cache(maxsize=1)
+def _counter(chain: Chain) -> tuple[Callable[[float], int], float]:
+    """What counts squared frequencies below a number, and a bound of all (Gershgorin's circles)."""
+    from vipetsc.lattice.inertia import count_below  # numba
+
+    matrix = _scaled(chain)
+    top, upper = float(abs(matrix).sum(axis=0).max()), _band(matrix)
+    band = np.ascontiguousarray(upper[2 * (len(upper) // 3) :].T)
+    return lambda shift: count_below(band.copy(), shift, EPS**2 * top), top
+
+
+def _scaled(chain: Chain) -> csc_matrix:
+    """M^(-1/2) K M^(-1/2) in (rad/s)^2."""
+    root = diags(1 / np.sqrt(chain.masses()))
+    return csc_matrix(root @ chain.stiffness_matrix() @ root)
 
 
 def _band(matrix: csc_matrix) -> np.ndarray:
@@ -178,7 +207,7 @@ def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
     first, shift = 0, -np.inf
     for j, value in enumerate(squared):
         first += int(np.searchsorted(squared[first:j], value - CLOSE * squared[-1]))
-        shift = max(value, shift + 4 * np.finfo(float).eps * squared[-1])
+        shift = max(value, shift + 4 * EPS * squared[-1])
         shifted = band.copy(order="F")
         shifted[2 * width] -= shift
         factor, pivots, _ = lapack.dgbtrf(shifted, width, width, overwrite_ab=True)

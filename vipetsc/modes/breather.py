@@ -165,7 +165,7 @@ class CondensedProblem:
         """
         g, z = self.compliance.at(np.array([omega]))[0], np.zeros(len(signs))
         for place in np.nonzero(signs)[0]:
-            z[place] = signs[place] * self._describing(place, g[place, place], omega)
+            z[place] = signs[place] * describing(self.forces, place, g[place, place], omega)
         x = self.balance.pack(z[:, None] * (np.arange(self.balance.last + 1) == 1))
         size, weight, step = float(np.abs(z).max()), 0.0, 0.1
         row = np.append(0 * x, 1.0)
@@ -187,23 +187,27 @@ class CondensedProblem:
         self._scale = 1.0, omega
         return self.point(Attempt(False, "", [], np.append(x, 1.0)))
 
-    def _describing(self, place: int, g: float, omega: float) -> float:
-        """Amplitude in m of z = a cos(Om t) at a ``place`` with the compliance ``g`` in m/N."""
-        z = np.zeros((self.forces.pairs, 2), complex)
 
-        def balance(amplitude: float) -> float:
-            z[place, 1] = amplitude
-            return amplitude + g * float(self.forces.series(z, omega).forces[place, 1].real)
+def describing(forces: SiteForces, place: int, g: float, omega: float) -> float:
+    """Amplitude in m of z = a cos(Om t) at a ``place`` with the compliance ``g`` in m/N and one of the ``forces``.
 
-        contacts = self.forces.contacts
-        cubic = contacts[place][1] if place < len(contacts) else self.forces.springs[place - len(contacts)][1]
-        size = cubic if place < len(contacts) else 1 / np.sqrt(np.abs(g * cubic) or 1.0)
-        if balance(size) * balance(LARGEST * size) >= 0:
-            raise ContinuationError(
-                f"no breather begins at {omega:g} rad/s: the compliance of its site is {g:.4g} m/N there, and a force "
-                f"that hardens needs a negative one of moderate size; change nnm.start_frequency"
-            )
-        return float(brentq(balance, size, LARGEST * size, rtol=1e-12))
+    Raises ContinuationError where there is none.
+    """
+    z = np.zeros((forces.pairs, 2), complex)
+
+    def balance(amplitude: float) -> float:
+        z[place, 1] = amplitude
+        return amplitude + g * float(forces.series(z, omega).forces[place, 1].real)
+
+    contacts = forces.contacts
+    cubic = contacts[place][1] if place < len(contacts) else forces.springs[place - len(contacts)][1]
+    size = cubic if place < len(contacts) else 1 / np.sqrt(np.abs(g * cubic) or 1.0)
+    if balance(size) * balance(LARGEST * size) >= 0:
+        raise ContinuationError(
+            f"no breather begins at {omega:g} rad/s: the compliance of its site is {g:.4g} m/N there, and a force "
+            f"that hardens needs a negative one of moderate size; change nnm.start_frequency"
+        )
+    return float(brentq(balance, size, LARGEST * size, rtol=1e-12))
 
 
 class CondensedFrame(Frame):

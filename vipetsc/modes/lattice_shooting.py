@@ -14,11 +14,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.sparse import diags, spmatrix
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
+from vipetsc.modes.breather import describing
 from vipetsc.modes.harmonics import SiteForces
 from vipetsc.modes.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton
@@ -168,30 +168,16 @@ class LatticeShooting(Shooting):
         row = np.append(xi[:-1], 0.0)
         return np.ones(len(xi) - 1), self.tangent(xi, row / np.linalg.norm(row))
 
-    def _field(self, row: np.ndarray, omega: float) -> np.ndarray:
-        """Amplitudes (n,) in m/N of the motion that a force along ``row`` of frequency ``omega`` makes."""
-        return splu((self.system.stiffness - omega**2 * diags(self.system.masses)).tocsc()).solve(row)
-
     def breather(self, omega: float) -> Point:
         """The orbit of a frequency ``omega`` in rad/s, between the bands, in which the first site touches.
 
-        The guess is a describing function: the amplitude at which the site's response to its own force's first
-        harmonic is itself. Raises StartError if there is none or Newton's method does not converge from there.
+        The guess is a describing function, as for condensed motions. Raises ContinuationError if there is none,
+        StartError if Newton's method does not converge from there.
         """
         system, period = self.system, 2 * np.pi / omega
         row, pair = system.contact_rows[0], system.contacts[0]
-        field, forces = self._field(row, omega), SiteForces([(pair.law, pair.clearance)])
-
-        def balance(w: float) -> float:
-            harmonics = forces.series(np.array([[0.0, w]], complex), omega).forces[0]
-            return float(w + row @ field * harmonics[1].real)
-
-        amplitudes = pair.clearance * np.geomspace(1 + 1e-9, 1e3, 200)
-        balances = [balance(w) for w in amplitudes]
-        change = next((i for i, (a, b) in enumerate(pairwise(balances)) if a * b < 0), None)
-        if change is None:
-            raise StartError(f"no motion of {omega:g} rad/s balances the first site's contact: {REMEDY}")
-        x = field * (brentq(balance, amplitudes[change], amplitudes[change + 1]) / (row @ field))
+        field = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc()).solve(row)  # of 1 N, in m
+        x = field * (describing(SiteForces([(pair.law, pair.clearance)]), 0, row @ field, omega) / (row @ field))
         chart = self.chart("relative", x, period)
         row = np.append(np.zeros(system.dofs), 1.0)
         attempt = self.solve(chart, chart.encode(x, period), row, 1.0)

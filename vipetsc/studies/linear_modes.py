@@ -41,10 +41,12 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
 
     All ranks must call it. Raises CaseError if there are not so many, or SLEPc is missing.
     """
-    chain = case.model().chain
+    chain, stops = case.model().chain, case.model().gaps
     masses = chain.cells * chain.cell.dofs
     if not 1 <= count <= masses:
         raise CaseError([Problem("--modes", count, f"the lattice has {masses} modes")])
+    if stops and np.min(stops) <= 0:
+        raise CaseError([Problem("contacts.clearance", None, "contacts that touch at rest are in no linear mode")])
     if not 0 <= near < 1e50:
         raise CaseError([Problem("--near", near, "give a frequency in rad/s, from 0 on")])
     if 8 * count * masses > GATHER_LIMIT:
@@ -72,7 +74,7 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
 
 def places(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:
     """In which band modes (mode, cell, dof) are, and in which cells."""
-    energy = shape**2 @ np.asarray(chain.cell.masses)
+    energy = np.sum(shape**2 * chain.masses().reshape(shape.shape[1:]), axis=2)
     bands = pass_bands(chain.cell)
     reach, end = EDGE * bands[-1].high, max(int(END * chain.cells), 1)
     inside = [[b.number for b in bands if b.low - reach <= f <= b.high + reach] for f in frequency]
