@@ -10,12 +10,13 @@ import pytest
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.varied import lobe_reflection
+from vipetsc.case.warnings import losses
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import Chain, Variation, bloch, diatomic, four_band, max_group_velocity
-from vipetsc.lattice.damped import absorber, damped_bloch, decay_length, reflection, waves_of
+from vipetsc.lattice.damped import KAPPAS, absorber, damped_bloch, decay_length, fitted_dashpots, reflection, waves_of
 
 KAPPA = np.linspace(0.2, 3.0, 7)
 
@@ -167,3 +168,59 @@ def test_what_differs_is_refused_by_name_and_stands_in_the_file():
     simulate(case, memory)
     assert memory.dataset["lattice/masses"].sel(dof=2).values == pytest.approx([0.0025, 0.005, 0.0025])
     assert "lattice/stiffness" not in memory.dataset
+
+
+def lossy(cell, loss):
+    """``cell`` with dashpots fitted to a ``loss`` by band."""
+    ground, beside = fitted_dashpots(cell, tuple(loss.items()))
+    return replace(damped(cell, extra=beside.tolist()), grounding=tuple(ground.tolist()))
+
+
+@pytest.mark.parametrize("loss", [{2: 0.02}, {2: 0.002, 4: 0.003}, {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.001}])
+def test_dashpots_fitted_to_a_loss_are_the_best_by_the_complex_dispersion(loss):
+    cell, bands = four_band("calibrated"), np.array([*loss]) - 1
+    fitted = lossy(cell, loss)
+
+    def misses(ground, beside):
+        varied = replace(damped(cell, extra=beside), grounding=tuple(ground))
+        ratios = 2 * damped_bloch(varied, KAPPAS).ratio[:, bands] / [*loss.values()]
+        return float(((ratios - 1) ** 2).sum()), ratios
+
+    given = [*fitted.grounding], [s.damping for s in fitted.springs]
+    least, ratios = misses(*given)
+    if len(loss) == 1:
+        assert ratios == pytest.approx(1.0, abs=4e-3)
+    assert min(map(min, given)) >= 0
+    for part, number in np.ndindex(2, 4):
+        for step in (0.03, -0.03):
+            values = [list(values) for values in given]
+            values[part][number] = max(values[part][number] + step * max(map(max, given)), 0.0)
+            assert misses(*values)[0] >= least * (1 - 1e-3)
+
+
+def test_a_loss_by_bands_is_resolved_to_dashpots():
+    case = small_case(
+        lattice={"damping": {"loss": {"2": 0.02}}, "profiles": {"masses[1]": {"cells": [3], "factor": 2.0}}}
+    )
+    resolved, chain = case.lattice.damping, case.model().chain
+    assert Case.from_toml(case.to_toml()) == case
+    assert chain.cell == lossy(four_band("calibrated"), {2: 0.02})
+    assert [*chain.cell.grounding] == resolved.grounding
+    assert [s.damping for s in chain.cell.springs] == resolved.springs
+    assert chain.variation.grounding is None and chain.is_damped  # the same dashpots in all cells
+    asked, least, mean, most = losses(case.lattice)[1]
+    assert asked == 0.02 and 0.0199 < least < mean == pytest.approx(0.02, rel=1e-3) < most < 0.0201
+    assert not any("loss" in sentence for sentence in case.warnings())
+    flat = small_case(lattice={"damping": {"loss": {"1": 0.02, "2": 0.02}}})
+    assert any("band 1 0.00" in sentence and "asked 0.02" in sentence for sentence in flat.warnings())
+
+
+@pytest.mark.parametrize("damping", [
+    {"loss": {}}, {"loss": {"5": 0.1}}, {"loss": {"x": 0.1}}, {"loss": {"2": -0.1}}, {"loss": {"2": 1.0}},
+    {"loss": {"2": float("nan")}}, {"loss": {"2": 0.1}, "mass": 1.0}, {"springs": [0.1] * 4}, {"loss": 0.1},
+    {"loss": {"2": 0.1}, "grounding": [0.1], "springs": [0.1] * 4},
+])  # fmt: skip
+def test_a_loss_that_cannot_be_is_refused(damping):
+    with pytest.raises(CaseError, match=r"lattice\.damping\.(loss|grounding)") as error:
+        small_case(lattice={"damping": damping})
+    assert len(error.value.problems) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,7 +101,7 @@ def test_linear_runs_are_shared_by_samples_of_clearances_alone():
         ({"clearance": {"relative": 0.1, "distribution": "norml"}}, "did you mean 'normal'?"),
         ({"sites": {"relative": 0.1}}, "give absolute, in cells"),
         ({"sites": {"absolute": 3.0}}, "draws contacts.sites = "),
-        ({"restitution": {"absolute": 0.3, "distribution": "uniform"}}, "draws contacts.restitution = "),
+        ({"restitution": {"absolute": 0.18, "distribution": "uniform"}}, "draws contacts.each.restitution[1] = "),
         ({"seed": -1, "clearance": {"relative": 0.1}}, "disorder.seed = -1"),
     ],
 )  # fmt: skip
@@ -108,6 +109,36 @@ def test_what_cannot_be_drawn_is_refused(disorder, says):
     with pytest.raises(CaseError) as error:
         Case.from_table(BASE | {"contacts": SITES, "disorder": disorder})
     assert says in str(error.value) and len(error.value.problems) == 1, error.value
+
+
+def test_a_restitution_is_drawn_for_every_site():
+    spread = {"seed": 3, "restitution": {"relative": 0.05}}
+    case = draw(**spread)
+    drawn = case.contacts.each.restitution
+    assert len(set(drawn)) == 10 and drawn == pytest.approx([0.7] * 10, rel=0.3)
+    assert [law.restitution for law in case.model().laws] == drawn
+    assert case.contacts.restitution == 0.7 and Case.from_toml(case.to_toml()) == case
+    one = draw({"sites": [5], "clearance": 2e-3}, **spread).contacts
+    assert one.each is None and one.restitution == drawn[0]
+
+
+def test_cells_drawn_keep_smooth_parts_and_dashpots_of_springs():
+    parts = {"quadratic": -2e6, "cubic": 3e9, "damping": 0.5}
+    springs = [
+        {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True} | parts,
+        {"start": 1, "end": 2, "stiffness": 2e3},
+    ]
+    lattice = {"cell": {"masses": [0.01, 0.02], "springs": springs, "grounding": [0.0, 0.1]}, "cells": 40}
+    table = {"lattice": lattice, "contacts": {"sites": []}, "drive": {"frequency": 300.0, "cycles": 4}}
+    nominal, case = (
+        Case.from_table(table | more) for more in ({}, {"disorder": {"seed": 1, "springs": {"relative": 0.02}}})
+    )
+    before, after = (case.lattice.unit_cell() for case in (nominal, case))
+    assert [s.stiffness for s in after.springs] != [s.stiffness for s in before.springs]
+    assert tuple(replace(s, stiffness=1.0) for s in after.springs) == tuple(
+        replace(s, stiffness=1.0) for s in before.springs
+    )
+    assert (after.grounding, after.springs[0].cubic, after.springs[0].quadratic) == ((0.0, 0.1), 3e9, -2e6)
 
 
 def test_a_quantity_that_the_case_lacks_is_refused():

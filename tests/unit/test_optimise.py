@@ -27,6 +27,23 @@ BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
 TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "last": 1e-4}}, optimise=BOUNDS)
 
 
+def test_designs_of_other_cells_keep_smooth_parts_and_dashpots():
+    parts = {"quadratic": -2e6, "cubic": 3e9, "damping": 0.5}
+    springs = [
+        {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True} | parts,
+        {"start": 1, "end": 2, "stiffness": 2e3},
+    ]
+    cell = {"masses": [0.01, 0.02], "springs": springs, "contact": [1, 2]}
+    table = TABLE | {"lattice": {"cell": cell, "cells": 40}, "drive": {"frequency": 300.0, "cycles": 3}}
+    table |= {"contacts": {"sites": [10, 20], "clearance": 1e-4, "stiffness": 1e6}}
+    table |= {"optimise": {"budget": 12, "variables": {"springs": {"1": [1e3, 1e4]}},
+                           "objective": [{"measure": "transmitted"}]}}  # fmt: skip
+    case = OptimiseCase.from_table(table).design(np.array([5e3]))
+    first, second = case.lattice.unit_cell().springs
+    assert first.stiffness == 5e3 and {key: getattr(first, key) for key in parts} == parts
+    assert second.stiffness == 2e3 and not (second.cubic or second.damping)
+
+
 def plan(*changes: str) -> OptimiseCase:
     return OptimiseCase.from_table(TABLE, changes)
 

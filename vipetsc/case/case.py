@@ -12,7 +12,15 @@ import numpy as np
 
 from vipetsc.case.contacts import check_alike, check_pairs, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
-from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
+from vipetsc.case.drive import (
+    DriveTable,
+    build_drives,
+    check_drives,
+    check_wave,
+    drive_tables,
+    driven_wave,
+    packet_speed,
+)
 from vipetsc.case.initial import InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.reading import CaseFile, Problem, Table, Valid, read_section
@@ -29,7 +37,7 @@ from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.variation import check_variation
-from vipetsc.case.warnings import warnings_of
+from vipetsc.case.warnings import of_losses, warnings_of
 from vipetsc.lattice import UnitCell, pass_bands
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
@@ -70,7 +78,8 @@ class Case(CaseFile):
         samples = sections["time"].samples
         try:
             tables = resolved(sections, beginning)
-            if problems := list(check_variation(LatticeTable(**tables["lattice"]), tables["drive"].get("cell", 1))):
+            driven = [one["cell"] for one in drive_tables(tables["drive"])]
+            if problems := list(check_variation(LatticeTable(**tables["lattice"]), driven)):
                 return sections, problems
         except ValueError as error:
             given = sections["lattice"].absorbing
@@ -94,8 +103,9 @@ class Case(CaseFile):
         lattice, contacts = sections["lattice"], sections["contacts"]
         cell, problems = check_cell(lattice) if valid("lattice") else (None, [])
         yield from problems
-        if cell and valid("drive.cell"):
-            yield from check_variation(lattice, sections["drive"].cell)
+        if cell and valid("drive"):
+            driven = [one.cell for _, one in sections["drive"].every if one.end is None]
+            yield from check_variation(lattice, driven)
         if valid("lattice.cells", "contacts.sites"):
             yield from check_contacts(lattice, contacts, valid)
             if cell and valid("contacts"):
@@ -165,7 +175,8 @@ class Case(CaseFile):
 
     def warnings(self) -> list[str]:
         """What is allowed but likely not meant, one sentence each."""
-        return warnings_of(self.model(), self.output, self.petsc.model_extra or {} if self.petsc else {})
+        options = self.petsc.model_extra or {} if self.petsc else {}
+        return [*of_losses(self.lattice), *warnings_of(self.model(), self.output, options)]
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

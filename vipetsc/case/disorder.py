@@ -5,13 +5,13 @@ a run tells what was simulated. Each quantity has a generator of its own (Philox
 same numbers on any number of ranks, in any order, beside any other quantity.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.contacts import lists_of
+from vipetsc.case.contacts import lists_of, values_of_sites
 from vipetsc.case.reading import Problem, Section, Table
 from vipetsc.case.schema import CONTACTS, LatticeTable
 from vipetsc.case.sites import ContactsTable
@@ -24,8 +24,9 @@ SEED = "disorder.seed"
 class DisorderTable(Section):
     """What scatters about the values of the case, and the ``seed`` of what is drawn.
 
-    Of every site: ``clearance`` (m), ``sites`` (the cell, rounded). Of all sites together: ``restitution``,
-    ``stiffness`` (N/m^n) or ``modulus`` (Pa). Of the cell, the same in all cells: ``masses`` (kg), ``springs`` (N/m).
+    Of every site: ``clearance`` (m), ``restitution``, ``sites`` (the cell, rounded), ``stiffness`` (N/m^n) if it is a
+    list, which else is that of all sites, as ``modulus`` (Pa) is. Of the cell, the same in all cells: ``masses`` (kg),
+    ``springs`` (N/m).
     Of every cell by itself: ``cells``, by quantity; the resolved case keeps these as they are said.
     """
 
@@ -52,7 +53,7 @@ def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Seque
     each = lists_of(contacts)
     stiffness = each.get("stiffness") or ([contacts.stiffness] if contacts.stiffness else [])
     of_sites: dict[str, Sequence[float]] = {"clearance": clearance, "sites": sites}
-    of_law = {"restitution": each.get("restitution", [contacts.restitution]), "stiffness": stiffness}
+    of_law = {"restitution": values_of_sites(contacts, "restitution", len(sites)), "stiffness": stiffness}
     of_law["modulus"] = [contacts.stiffness] if contacts.stiffness else []
     return of_sites | of_law | {"masses": cell.masses, "springs": [spring.stiffness for spring in cell.springs]}
 
@@ -94,23 +95,25 @@ def scatter(
         return tables, problems if disorder.quantities() or disorder.cells else [empty]
     law |= {name: drawn[name] for name in ("clearance",) if name in drawn}
     of_each = law.get("each", {})
-    law |= {name: drawn[name][0] for name in ("restitution", "stiffness") if name in drawn and name not in of_each}
-    if lists := {name: drawn[name] for name in ("restitution", "stiffness") if name in drawn and name in of_each}:
-        law["each"] = of_each | lists
+    for name in [name for name in ("restitution", "stiffness") if name in drawn]:
+        if name in of_each or len(drawn[name]) > 1:
+            of_each = law["each"] = of_each | {name: drawn[name]}
+        else:
+            law[name] = drawn[name][0]
     if "sites" in drawn:
         law["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
     if "modulus" in drawn and contacts.modulus:
         law["stiffness"] *= drawn["modulus"][0] / contacts.modulus
     tables = tables | {"contacts": law}
     if drawn.keys() & {"masses", "springs"}:
-        tables["lattice"] = _with_cell(tables["lattice"], lattice.undamped_cell(), drawn)
+        tables["lattice"] = with_cell(tables["lattice"], lattice.undamped_cell(), drawn)
         if lattice.preset and "stiffness" in law:
             law.setdefault("radius", CONTACTS["radius"])
     return tables, []
 
 
-def _with_cell(lattice: Table, cell: UnitCell, drawn: dict[str, list[float]]) -> Table:
-    """The table ``lattice`` with a cell of its own, of the masses and springs ``drawn``."""
+def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) -> Table:
+    """The table ``lattice`` with a cell of its own: ``cell`` with the masses (kg) and springs (N/m) ``drawn``."""
     stiffness: list[float] = drawn.get("springs", [spring.stiffness for spring in cell.springs])
     springs: list[dict[str, Any]] = [
         {"start": s.start + 1, "end": s.end + 1, "stiffness": k, "next_cell": s.next_cell}

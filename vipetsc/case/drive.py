@@ -13,6 +13,7 @@ from vipetsc.case.schema import Finite, LatticeTable, Positive, TimeTable, Waven
 from vipetsc.lattice import Chain, Drive, ToneBurst, UnitCell, Waveform, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.drive import impulse, main_frequency, ramped, spline
 
+CYCLES = 30  # of a burst that is not told
 STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 PERIODS, SHARE = 10, 0.1  # of a ramp that is not told: of a harmonic drive, of a chirp's duration
 KEYS: dict[str, tuple[str, ...]] = {
@@ -36,7 +37,7 @@ class OneDrive(Section):
 
     waveform: Literal["burst", "harmonic", "chirp", "impulse", "step", "samples"] | None = None
     amplitude: Finite = 1.0
-    cycles: int = Field(30, ge=1)
+    cycles: int = Field(CYCLES, ge=1)
     envelope: Literal["paper", "hann"] = "paper"
     ramp: Positive | None = None
     duration: Positive | None = None
@@ -91,6 +92,11 @@ class DriveTable(OneDrive):
     def every(self) -> list[tuple[str, OneDrive]]:
         """All drives by the path of their keys, this one first."""
         return [("drive", self), *((f"drive.more[{i}]", drive) for i, drive in enumerate(self.more or [], 1))]
+
+
+def drive_tables(table: Table) -> list[Table]:
+    """The tables of all drives of a resolved section."""
+    return [table, *table.get("more", [])]
 
 
 def check_drives(

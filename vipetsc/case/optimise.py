@@ -11,6 +11,7 @@ from pydantic import Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.contacts import check_alike
+from vipetsc.case.disorder import with_cell
 from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import Positive
@@ -201,15 +202,7 @@ class OptimiseCase(CaseFile):
             for values_of, numbers in ((masses, bounds.masses), (stiffness, bounds.springs)):
                 for number in numbers:
                     values_of[int(number) - 1] = next(left)
-            springs = [
-                {"start": s.start + 1, "end": s.end + 1, "next_cell": s.next_cell, "stiffness": k}
-                | ({"damping": s.damping} if s.damping else {})
-                for s, k in zip(cell.springs, stiffness, strict=True)
-            ]
-            changed = {"masses": masses, "springs": springs, "contact": [cell.host + 1, cell.resonator + 1]}
-            changed |= {"grounding": list(cell.grounding)} if cell.grounding else {}
-            others = {k: v for k, v in table["lattice"].items() if k not in ("preset", "reading", "lambda", "eta")}
-            table["lattice"] = others | {"cell": changed}
+            table["lattice"] = with_cell(table["lattice"], cell, {"masses": masses, "springs": stiffness})
         return _case(table | {"contacts": contacts})
 
     def run(self, design: Case, amplitude: float, lot: int | None = None) -> Case:

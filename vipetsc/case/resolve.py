@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.contacts import check_each, pairs_of_sites, resolved_each
-from vipetsc.case.drive import SINES, DriveTable, packet_speed, resolved_drive, waveform_of
+from vipetsc.case.drive import CYCLES, SINES, DriveTable, drive_tables, packet_speed, resolved_drive, waveform_of
 from vipetsc.case.initial import Beginning
 from vipetsc.case.reading import Problem, Table, Valid
-from vipetsc.case.schema import CONTACTS, PRESETS, LatticeTable, TimeTable
+from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.variation import variation_of
 from vipetsc.case.varied import designed_end
@@ -108,6 +108,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
             problems.append(Problem(key, value, "only the four-band preset has it"))
     wrong = cell_problems(*lattice.cell.arguments()) if lattice.cell else []
     problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
+    problems += [] if problems or lattice.damping is None else _check_damping(lattice.damping, lattice.undamped_cell())
     if problems:
         return None, problems
     cell = lattice.unit_cell()
@@ -119,6 +120,18 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
         remedy = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
         problems.append(Problem("lattice.cell.springs", None, remedy))
     return cell, problems
+
+
+def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
+    """What is wrong with the loss of bands, or with dashpots that are given in its place."""
+    loss, fitted, bands = damping.loss, (damping.grounding, damping.springs), [str(i + 1) for i in range(cell.dofs)]
+    if loss is not None and (not loss or loss.keys() - {*bands} or not cell.springs):
+        remedy = "a cell without springs has no bands" if not cell.springs else f"give it by band, 1 to {cell.dofs}"
+        yield Problem("lattice.damping.loss", loss, f"{remedy}, as in loss = {{ 2 = 0.02 }}")
+    elif loss is not None and (damping.mass or damping.stiffness):
+        yield Problem("lattice.damping.loss", loss, "give it, or mass and stiffness, not both")
+    elif fitted != (None, None) and (loss is None or [len(f or ()) for f in fitted] != [cell.dofs, len(cell.springs)]):
+        yield Problem("lattice.damping.grounding", fitted[0], "it and springs are fitted to loss; leave them out")
 
 
 def check_undamped(lattice: LatticeTable, what: str) -> Iterator[Problem]:
@@ -209,9 +222,12 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
     elif interval == "auto":
         interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
     if (absorbing := lattice.absorbing) and not (absorbing.cells and absorbing.strength):
-        frequency, most = tables["drive"].get("frequency"), lattice.cells // 3
-        designed = designed_end(absorbing, cell, lattice.ends, frequency, drive.cycles, most)
+        sent = tuple((one["frequency"], one.get("cycles", CYCLES)) for one in drive_tables(tables["drive"]))
+        designed = designed_end(absorbing, cell, lattice.ends, sent, lattice.cells // 3)
         tables["lattice"]["absorbing"] = designed.model_dump()
+    if (damping := lattice.damping) and damping.loss:
+        fitted = (np.asarray(values).tolist() for values in damping.fitted(lattice.undamped_cell()))
+        tables["lattice"]["damping"] |= dict(zip(("grounding", "springs"), fitted, strict=True))
     tables.pop("initial", None)
     tables |= {"initial": beginning.table} if beginning else {}
     if told and "cell" not in drive.model_fields_set:

@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from vipetsc.case.reading import Section
 from vipetsc.case.varied import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
+from vipetsc.lattice.damped import fitted_dashpots
 
 Method = Literal["2a", "3bs", "5f", "5dp", "5bs", "6vr", "7vr", "8vr"]
 """Runge-Kutta methods of PETSc (``-ts_rk_type``)."""
@@ -115,14 +117,24 @@ class CellTable(Section):
         return tuple(self.masses), springs, host - 1, resonator - 1, tuple(self.grounding or ())
 
 
-class RayleighTable(Section):
+class DampingTable(Section):
     """Dashpots everywhere: to ground ``mass`` times each mass, beside each spring ``stiffness`` times its stiffness.
 
-    A mode of frequency w then has the damping ratio (mass/w + stiffness w)/2.
+    A mode of frequency w then has the damping ratio (mass/w + stiffness w)/2. In their place ``loss``, twice the ratio
+    asked of bands, by number; ``grounding`` (dof) and ``springs`` (spring) are the dashpots in N s/m fitted to it.
     """
 
     mass: NotNegative = 0.0
     stiffness: NotNegative = 0.0
+    loss: dict[str, Annotated[float, Field(ge=0, lt=1)]] | None = None
+    grounding: list[NotNegative] | None = None
+    springs: list[NotNegative] | None = None
+
+    def fitted(self, cell: UnitCell) -> tuple[ArrayLike, ArrayLike]:
+        """The dashpots (dof,), (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``; 0 without one."""
+        if self.grounding is None and self.loss:
+            return fitted_dashpots(cell, tuple((int(band), loss) for band, loss in self.loss.items()))
+        return self.grounding or 0.0, self.springs or 0.0
 
 
 class LatticeTable(Section):
@@ -135,20 +147,21 @@ class LatticeTable(Section):
     reading: Literal["printed", "calibrated"] = "calibrated"
     lam: Positive | None = Field(None, alias="lambda")
     eta: Annotated[float, Field(gt=0, lt=1)] | None = None
-    damping: RayleighTable | None = None
+    damping: DampingTable | None = None
     profiles: dict[str, list[Finite] | Profile | Defects] | None = None
     scatter: ScatterTable | None = None
     absorbing: AbsorbingTable | None = None
 
     def unit_cell(self) -> UnitCell:
         """The unit cell: ``cell``, or the preset's in its reading, damped; raises ValueError for an invalid one."""
-        cell, rayleigh = self.undamped_cell(), self.damping
-        if rayleigh is None or not (rayleigh.mass or rayleigh.stiffness):
+        cell, damping = self.undamped_cell(), self.damping
+        if damping is None or not (damping.mass or damping.stiffness or damping.loss):
             return cell
-        springs = tuple(replace(s, damping=s.damping + rayleigh.stiffness * s.stiffness) for s in cell.springs)
-        ground = cell.grounding or (0.0,) * cell.dofs
-        grounding = tuple(c + rayleigh.mass * m for c, m in zip(ground, cell.masses, strict=True))
-        return replace(cell, springs=springs, grounding=grounding)
+        ground, beside = damping.fitted(cell)
+        beside = np.multiply(damping.stiffness, [s.stiffness for s in cell.springs]) + beside
+        springs = tuple(replace(s, damping=s.damping + c) for s, c in zip(cell.springs, beside.tolist(), strict=True))
+        grounding = np.add(cell.grounding or 0.0, np.multiply(damping.mass, cell.masses) + ground)
+        return replace(cell, springs=springs, grounding=tuple(grounding.tolist()))
 
     def undamped_cell(self) -> UnitCell:
         """The unit cell without what ``damping`` adds."""

@@ -5,7 +5,7 @@ A quantity is named as in a cell's table: ``masses[2]``, ``springs[1].stiffness`
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -62,7 +62,9 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Prob
         column = getattr(arrays, place[0])[:, place[1]]
         column[:], wrong = change(column.copy())
         least = column.min()
-        if not wrong and (least < 0 or (least == 0 and place[0] in ("masses", "stiffness"))):
+        if not wrong and not np.isfinite(column).all():
+            wrong = "is no number in some cells: a value of 0 has no lognormal scatter, nor has one that large"
+        elif not wrong and (least < 0 or (least == 0 and place[0] in ("masses", "stiffness"))):
             wrong = (
                 f"is {least:.4g} in cell {int(column.argmin()) + 1}: no smaller than 0, and a mass or spring above it"
             )
@@ -85,10 +87,12 @@ def variation_of(lattice: LatticeTable) -> Variation | None:
     """What differs from the reference cell in a valid, resolved case; None if nothing may."""
     if not (lattice.profiles or lattice.scatter or lattice.absorbing):
         return None
-    arrays, rayleigh, absorbing = vary(lattice, lattice.undamped_cell())[0], lattice.damping, lattice.absorbing
-    if rayleigh:
-        arrays.grounding[:] += rayleigh.mass * arrays.masses
-        arrays.damping[:] += rayleigh.stiffness * arrays.stiffness
+    cell, damping, absorbing = lattice.undamped_cell(), lattice.damping, lattice.absorbing
+    arrays = vary(lattice, cell)[0]
+    if damping:
+        ground, beside = damping.fitted(cell)
+        arrays.grounding[:] += damping.mass * arrays.masses + ground
+        arrays.damping[:] += damping.stiffness * arrays.stiffness + beside
     if absorbing and absorbing.cells and absorbing.strength:
         graded = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength, 0)
         assert graded.variation is not None and graded.variation.grounding is not None
@@ -102,11 +106,12 @@ def variation_of(lattice: LatticeTable) -> Variation | None:
     return Variation(**differing) if differing else None
 
 
-def check_variation(lattice: LatticeTable, drive_cell: int) -> Iterator[Problem]:
-    """What is wrong with what differs from a valid cell."""
-    if (lattice.profiles or lattice.scatter) and lattice.cells > MOST_VARIED:
+def check_variation(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Problem]:
+    """What is wrong with what differs from a valid cell; ``driven`` are the cells (from 1) of the drives."""
+    if (lattice.profiles or lattice.scatter or lattice.absorbing) and lattice.cells > MOST_VARIED:
         yield Problem("lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ: every rank holds them")
-    elif lattice.profiles or lattice.scatter:
+        return
+    if lattice.profiles or lattice.scatter:
         yield from vary(lattice, lattice.undamped_cell())[1]
     if (absorbing := lattice.absorbing) is None:
         return
@@ -115,5 +120,7 @@ def check_variation(lattice: LatticeTable, drive_cell: int) -> Iterator[Problem]
     n = absorbing.cells or 0
     if 2 * n >= lattice.cells:
         yield Problem("lattice.absorbing.cells", n, f"half of the {lattice.cells} cells, or more")
-    elif (absorbing.end != "right" and drive_cell <= n) or (absorbing.end != "left" and drive_cell > lattice.cells - n):
-        yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {drive_cell} is in the absorbing end")
+        return
+    low, high = n * (absorbing.end != "right"), lattice.cells - n * (absorbing.end != "left")
+    if inside := [cell for cell in driven if not low < cell <= high]:
+        yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {inside[0]} is in the absorbing end")

@@ -82,17 +82,20 @@ class AbsorbingTable(Section):
 
 @lru_cache
 def designed_end(
-    table: AbsorbingTable, cell: UnitCell, ends: Ends, frequency: float | None, cycles: int, most: int
+    table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[tuple[float, int], ...], most: int
 ) -> AbsorbingTable:
-    """``table`` with cells, at ``most`` so many, and a strength; raises ValueError if none will do."""
-    if frequency is None:
-        raise ValueError("the drive has no frequency of its own: give cells and strength")
-    if not (waves := waves_at(cell, frequency)):
+    """``table`` with cells, at ``most`` so many, and a strength; raises ValueError if none will do.
+
+    ``drives`` are frequencies in rad/s and cycles; those in gaps send no wave.
+    """
+    waves = [wave for frequency, _ in drives for wave in waves_at(cell, frequency)]
+    if not waves:
         raise ValueError("the drive is in a gap: no wave comes to the end")
     speed, best = max(wave[2] for wave in waves), np.inf
     for cells in [table.cells] if table.cells else [n for n in LENGTHS if n <= most]:
         for strength in [table.strength] if table.strength else [2 * speed * loss / cells for loss in LOSSES]:
-            back = lobe_reflection(absorber(cell, ends, cells, strength), frequency, cycles)
+            end = absorber(cell, ends, cells, strength)
+            back = float(np.nanmax([lobe_reflection(end, *drive) for drive in drives]))
             best = min(best, back)
             if back <= table.reflection:
                 return table.model_copy(update={"cells": cells, "strength": strength})
@@ -102,13 +105,13 @@ def designed_end(
 def lobe_reflection(chain: Chain, frequency: float, cycles: int) -> float:
     """Share of a burst's energy that comes back from the right end of ``chain``.
 
-    Mean over the pass bands in the main lobe of its spectrum, weighted with the square of that.
+    Mean over the pass bands in the main lobe of its spectrum, weighted with the square of that; NaN if there are none.
     """
     lobe = frequency * (1 + np.linspace(-2, 2, 17)[1:-1] / cycles)
     lobe = lobe[lobe > 0]
     shares = np.array([reflection(chain, omega, chain.cells - 1) for omega in lobe.tolist()])
     waves, weights = np.isfinite(shares), np.abs(ToneBurst(1.0, frequency, cycles).spectrum(lobe)) ** 2
-    return float(np.average(shares[waves], weights=weights[waves]))
+    return float(np.average(shares[waves], weights=weights[waves])) if waves.any() else np.nan
 
 
 AnyProfile = list[Finite] | Profile | Defects

@@ -9,11 +9,13 @@ from math import gamma, pi, sqrt
 import numpy as np
 
 from vipetsc.case.model import Model
-from vipetsc.case.schema import OutputTable
+from vipetsc.case.schema import LatticeTable, OutputTable
 from vipetsc.lattice import Contact, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice.damped import KAPPAS, damped_bloch
 
 SLOW = 0.1  # of the band's fastest group velocity
 WAVELENGTHS = 4.0  # that a lattice should hold
+MISSED = 0.1  # of the loss asked, in the mean over the wavenumbers of a band
 BRIEF, STEPS = 0.1, 10.0  # a contact over the sample interval; fixed steps that a contact should take
 
 
@@ -22,11 +24,35 @@ def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> 
     return [*_of_waves(model), *_of_ends(model, output), *_of_fields(model, output), *_of_contacts(model, petsc)]
 
 
+def losses(lattice: LatticeTable) -> np.ndarray:
+    """Loss ratios (band, 4): the one asked in ``[lattice.damping]`` (NaN: none), the least, mean and largest there is.
+
+    From the complex dispersion of the resolved cell, at ``KAPPAS``; (0, 4) if it asks for none.
+    """
+    if not (lattice.damping and lattice.damping.loss):
+        return np.zeros((0, 4))
+    loss = 2 * damped_bloch(lattice.unit_cell(), KAPPAS).ratio
+    asked = [lattice.damping.loss.get(str(band + 1), np.nan) for band in range(loss.shape[1])]
+    return np.column_stack([asked, loss.min(axis=0), loss.mean(axis=0), loss.max(axis=0)])
+
+
+def of_losses(lattice: LatticeTable) -> Iterator[str]:
+    """Bands whose loss is another than the one asked: by more than ``MISSED``, or by a factor of 2 somewhere."""
+    rows = enumerate(losses(lattice), 1)
+    if off := [
+        f"band {band} {least:.3g} to {most:.3g} (mean {mean:.3g}, asked {asked:.3g})"
+        for band, (asked, least, mean, most) in rows
+        if abs(mean - asked) > MISSED * asked or most > 2 * asked or least < asked / 2
+    ]:
+        yield (
+            f"lattice.damping.loss: dashpots of the cell's masses and springs can give no more like it than"
+            f" {', '.join(off)}; fewer bands, and those that matter, come nearer"
+        )
+
+
 def _of_waves(model: Model) -> Iterator[str]:
-    """Evanescent, slow or long waves; a run that ends before its drive; masses of which measures know nothing."""
+    """Evanescent, slow or long waves; a run that ends before its drive."""
     cell, drive, cells = model.chain.cell, model.drive, model.chain.cells
-    if model.chain.variation and model.chain.variation.masses is not None:
-        yield "masses differ: kinetic energies by cell, band and wavenumber are those of the reference cell's masses"
     waves, frequency = waves_at(cell, drive.frequency), f"drive.frequency = {drive.frequency:.6g} rad/s"
     if model.is_driven and not cell.springs:
         return

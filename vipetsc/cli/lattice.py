@@ -6,6 +6,7 @@ import numpy as np
 
 from vipetsc.case import Case
 from vipetsc.case.varied import lobe_reflection
+from vipetsc.case.warnings import losses
 from vipetsc.lattice import UnitCell, max_group_velocity, pass_bands
 from vipetsc.lattice.damped import absorber, damped_bloch, decay_length, reflection
 
@@ -39,15 +40,29 @@ def damping_report(numbers: dict[str, Any]) -> str:
 
 
 def ends_text(case: Case) -> str:
-    """The ends; of one that absorbs, what comes back of the energy of a wave at the drive's frequency."""
-    lattice, drive, absorbing = case.lattice, case.drive, case.lattice.absorbing
-    if absorbing is None or not (absorbing.cells and absorbing.strength and drive.frequency):
+    """The ends; of one that absorbs, what comes back of the energy of a wave at each drive's frequency."""
+    lattice, absorbing = case.lattice, case.lattice.absorbing
+    if absorbing is None or not (absorbing.cells and absorbing.strength):
         return f"{lattice.ends} ends"
-    end = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength)
-    back = reflection(end, drive.frequency, absorbing.cells)
-    lobe = lobe_reflection(end, drive.frequency, drive.cycles)
+    end, told = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength), []
+    for omega, cycles in dict.fromkeys((one.frequency or 0.0, one.cycles) for _, one in case.drive.every):
+        back, lobe = reflection(end, omega, absorbing.cells), lobe_reflection(end, omega, cycles)
+        told.append(
+            f"{back:.1e} of the energy comes back at {omega:.6g} rad/s, {lobe:.1e} of the burst's"
+            if np.isfinite(lobe)
+            else f"no wave comes to it at {omega:.6g} rad/s"
+        )
     which = "both ends absorb" if absorbing.end == "both" else f"{lattice.ends} ends, the {absorbing.end} one absorbs"
-    return f"{which} over {absorbing.cells} cells: {back:.1e} of the energy comes back at Om, {lobe:.1e} of the burst's"
+    return f"{which} over {absorbing.cells} cells: {'; '.join(told)}"
+
+
+def loss_text(case: Case) -> str:
+    """The loss ratio of each band, least, mean and largest over its wavenumbers; empty where none is asked."""
+    rows = enumerate(losses(case.lattice), 1)
+    return "; ".join(
+        f"band {band} {least:.3g}-{most:.3g}, mean {mean:.3g}" + f" (asked {asked:.3g})" * bool(np.isfinite(asked))
+        for band, (asked, least, mean, most) in rows
+    )
 
 
 def initial_text(case: Case) -> str:

@@ -19,7 +19,7 @@ from vipetsc.case.contacts import stops_told
 from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
-from vipetsc.cli.lattice import ends_text, initial_text
+from vipetsc.cli.lattice import ends_text, initial_text, loss_text
 from vipetsc.io.lock import locked
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, waves_at
 
@@ -148,6 +148,7 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
                     + (f", reading {case.lattice.reading}" if case.lattice.preset else "")),
         ("pass bands", ", ".join(f"{b.low:.2f}-{b.high:.2f}" for b in bands) + " rad/s"),
         ("gaps", ", ".join(f"{a:.2f}-{b:.2f}" for a, b in gaps(bands)) + " rad/s" if gaps(bands) else "none"),
+        ("loss", loss_text(case)),
         ("contact", "; ".join(dict.fromkeys(map(str, model.laws[:8] or (model.contact,))))),
         ("sites", _first_few([c + 1 for c in chain.sites])),
         ("clearance", _first_few(stops_told(model.gaps, chain.clearances)) + " mm" if chain.sites else "none"),
@@ -207,10 +208,11 @@ def run_table(result: "Result", faster: str = "") -> str:
         energy, damped = f"work {s['work']:.6g} J, {share}", s.get("dissipated_by_damping", 0.0)
         energy += f" in contacts and {100 * damped / s['work']:.4g} % in dashpots" if damped else ""
         energy += f", ledger closes to {s['ledger_error']:.2g} of the work" if s["ledger_error"] is not None else ""
+    rebounds = [*dict.fromkeys(np.ravel(s.get("effective_restitution", [])).tolist())]
     rows = [
         ("energy", energy),
         ("impacts", f"{s['episodes']} episodes, {s['landings']} landings"),
-        ("restitution", f"{s['effective_restitution']:.3f} (effective)" if "effective_restitution" in s else ""),
+        ("restitution", f"{_first_few([f'{e:.3f}' for e in rebounds])} (effective)" if rebounds else ""),
         ("limits", ", ".join(f"{name} {s[name]}" for name in ("grazes", "floored", "clipped", "pulled") if s[name])),
         ("steps", steps),
         ("time", f"{s['wall_seconds']:.2f} s wall, {s['cpu_seconds']:.2f} s CPU of all ranks"),

@@ -253,7 +253,9 @@ class Run:
             self.checkpoint()
             sentence += "; the same command goes on from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
-        statistics["effective_restitution"] = self.setup.model.contact.effective_restitution
+        model = self.setup.model
+        rebounds = {law: law.effective_restitution for law in {*model.laws, model.contact}}
+        statistics["effective_restitution"] = [rebounds[law] for law in model.laws] or rebounds[model.contact]
         warnings = self.setup.case.warnings()
         for observer in self.observers:
             observer.finish(ending == STOPPED)

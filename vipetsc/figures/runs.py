@@ -15,6 +15,7 @@ from vipetsc.figures import panels, style
 from vipetsc.figures.panels import empty_figure
 from vipetsc.io.read import field_time, leading_site
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
+from vipetsc.lattice.damped import decay_length
 
 CELLS = {
     "dispersion_before": ("Before the first site", style.BLUE),
@@ -233,15 +234,24 @@ def centre_axes(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
-    """Frequency against wavenumber and against group velocity; gaps shaded, a drive ``frequency`` (rad/s) marked."""
+    """Frequency against wavenumber and against group velocity; gaps shaded, a drive ``frequency`` (rad/s) marked.
+
+    Of a damped cell also against the decay along the lattice of the wave that goes farthest.
+    """
     point, passing = bloch(cell, np.linspace(0, np.pi, 361)), pass_bands(cell)
-    figure = style.new_figure(style.PAGE * 0.72, 3.0)
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.3, 1))
+    figure = style.new_figure(style.PAGE * (0.95 if cell.is_damped else 0.72), 3.0)
+    widths = [1.3, 1, 1][: 2 + cell.is_damped]
+    left, right, *decay = figure.subplots(1, len(widths), sharey=True, width_ratios=widths)
     panels.band_diagram(left, cell, frequency)
     right.plot(point.group_velocity, point.frequency / 1e3)
-    panels.shade_bands(right, gaps(passing))
-    if frequency is not None:
-        right.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
+    for axes in decay:
+        omega = np.linspace(0, 1.08 * passing[-1].high, 541)[1:]
+        axes.semilogx([1 / decay_length(cell, w) for w in omega.tolist()], omega / 1e3, color=style.BLACK)
+        axes.set(title="(c) Decay along the lattice", xlabel="|Im κ| (1/cell)")
+    for axes in (right, *decay):
+        panels.shade_bands(axes, gaps(passing))
+        if frequency is not None:
+            axes.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")
     right.axvline(0, color=style.GREY, lw=0.5)
     for i, band in enumerate(passing):
         panels.note(left, f"{band.number}", (1, (band.low + band.high) / 2e3), (3, 0), va="center", color=f"C{i}")

@@ -75,11 +75,12 @@ class Chain:
 
     def reduced_masses(self) -> list[float]:
         """Mass in kg of each site's relative motion."""
-        of_pair, masses = {Pair(self.cell.host, self.cell.resonator): self.cell.reduced_mass}, self.cell.masses
-        for host, resonator, _ in set(self.pairs):
-            mass = 1 / ((1 / masses[host] if host >= 0 else 0.0) + 1 / masses[resonator])
-            of_pair |= {Pair(host, resonator, joins): mass for joins in (False, True)}
-        return [of_pair[pair] for pair in self.contact_pairs]
+        varied = self.variation.masses if self.variation else None
+        inverse = 1 / (np.array([self.cell.masses]) if varied is None else varied)
+        host, resonator, joins = np.array(self.contact_pairs, np.int64).reshape(-1, 3).T
+        sites = np.array(self.sites, np.int64)
+        of_host = np.where(host >= 0, inverse[sites % len(inverse), host], 0.0)
+        return np.asarray(1 / (of_host + inverse[(sites + joins) % len(inverse), resonator])).tolist()
 
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
         """Whether no cell from ``start`` to ``stop`` differs from the reference cell; of a ring they count on."""

@@ -6,16 +6,21 @@ At a real wavenumber (s^2 M + s C(kappa) + K(kappa)) u = 0 for motion exp(s t): 
 coupling to the next cell: a wave decays by 1/e in 1/|log |lambda|| cells. Cf. Mead, J. Sound Vib. 27 (1973) 235.
 """
 
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eig
+from scipy.optimize import nnls
 
+from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.chain import Chain, Ends
 from vipetsc.lattice.variation import Variation
 from vipetsc.lattice.waves import NEUTRAL
+
+KAPPAS = np.pi * (np.arange(60) + 0.5) / 60  # wavenumbers at which the loss of bands is fitted
 
 
 class DampedPoint(NamedTuple):
@@ -48,6 +53,26 @@ def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
     order = np.take_along_axis(order, np.argsort(np.take_along_axis(rate.imag, order, -1), axis=-1), -1)
     shapes = np.take_along_axis(vectors, order[..., None, :], -1)[..., :d, :]
     return DampedPoint(np.take_along_axis(rate, order, -1), shapes / np.linalg.norm(shapes, axis=-2, keepdims=True))
+
+
+@lru_cache
+def fitted_dashpots(cell: UnitCell, loss: tuple[tuple[int, float], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Dashpots in N s/m to ground (dof,) and beside the springs (spring,) that bring bands near to a ``loss``.
+
+    It is given by band (from 1), as twice the damping ratio. A wave phi of omega, phi* M phi = 1, has phi* C phi/omega
+    if C is small, which is linear in the dashpots: not negative, they minimise the sum over ``KAPPAS`` and these bands
+    of the squared difference over the loss asked, over the mean where none is. Those that ``cell`` has are counted.
+    """
+    bands, asked = np.array(loss).T
+    point, springs, bands = bloch(cell, KAPPAS), cell.springs, bands.astype(int) - 1
+    turn = np.exp(1j * np.multiply.outer(KAPPAS, [s.next_cell for s in springs]))[:, :, None]
+    first, second = (point.vectors[:, [getattr(s, end) for s in springs]] for end in ("start", "end"))
+    rows = np.abs(np.concatenate([point.vectors, second * turn - first], axis=1)) ** 2
+    scale = np.where(asked > 0, asked, asked.mean() or 1.0)
+    rows = np.moveaxis(rows[..., bands] / (point.frequency[:, bands] * scale)[:, None], 1, -1)
+    given = [*(cell.grounding or [0.0] * cell.dofs), *(s.damping for s in springs)]
+    fitted = nnls(rows.reshape(-1, len(given)), (asked / scale - rows @ given).ravel())[0]
+    return fitted[: cell.dofs], fitted[cell.dofs :]
 
 
 class Waves(NamedTuple):

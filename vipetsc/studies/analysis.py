@@ -132,7 +132,7 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     (nt, cells, dofs), (samples, _) = record.velocity.shape, record.sizes
     kinetic, contents, total, wavenumber = [], [], [], np.zeros(0)
     for rows in spectra.blocks(-(-nt // samples), 8 * samples * cells * dofs, record.memory):
-        held = np.asarray(record.velocity[rows.start * samples : rows.stop * samples])
+        held = np.asarray(record.weighted[rows.start * samples : rows.stop * samples])
         energy = spectra.kinetic_energy(held, record.masses)
         total.append(energy.sum(axis=1))
         kinetic.append(record.mean(energy))
@@ -168,7 +168,7 @@ def _dispersions(record: VelocityRecord) -> dict[str, Any]:
     highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
     count = np.count_nonzero(2 * np.pi * fft.rfftfreq(lengths[0], record.interval) <= highest)
     sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, count)]
-    measured = record.velocity, record.masses, record.interval
+    measured = record.weighted, record.masses, record.interval
     given: dict[str, Any] = {"lengths": lengths, "highest": highest, "memory": record.memory}
     for name, window in windows.items():
         if len(range(cells)[window]) < 2:
@@ -231,7 +231,7 @@ def _partition(record: VelocityRecord, every: int, maps: bool) -> dict[str, Any]
     """Kinetic energies of the wavenumber bins at every ``every``-th sample, with their ``maps``."""
     time = record.time[::every]
     blocks = spectra.blocks(len(time), 8 * np.prod(record.velocity.shape[1:]), record.memory)
-    windows = (record.velocity[some.start * every : some.stop * every : every] for some in blocks)
+    windows = (record.weighted[some.start * every : some.stop * every : every] for some in blocks)
     mean_over = record.sizes[1] if maps else 0
     parts = [spectra.partition(window, record.masses, mean_over=mean_over) for window in windows]
     bins = len(parts[0].energy)

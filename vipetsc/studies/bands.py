@@ -31,7 +31,7 @@ BANDS = {
 def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     """Energies of the pass bands and gaps, and the inter-band transfer from the wave's arrival on."""
     parts, stride = spectra.Parts.of(pass_bands(record.model.chain.cell)), record.options.band_stride
-    measured = record.velocity, record.masses, record.interval, parts.edges
+    measured = record.weighted, record.masses, record.interval, parts.edges
     energy = spectra.part_energies(*measured, stride, record.memory)
     above = parts.above(record.model.drive.frequency)
     if record.site is None:
@@ -39,7 +39,7 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
         first, reason = min(after, len(record.time) - 1), "the drive ends (the lattice has no sites)"
     else:
         at = int(np.argmin(np.abs(record.cells - record.site)))
-        first = spectra.front_arrival(spectra.kinetic_energy(record.velocity[:, at], record.masses))
+        first = spectra.front_arrival(spectra.kinetic_energy(record.weighted[:, at], record.masses))
         reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
     # The filters see less than the waves' length at the record's ends.
     nt, ends = len(record.time), int(np.ceil(ENDS * len(record.time)))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from vipetsc import spectra
 from vipetsc.case import Case
@@ -26,10 +27,11 @@ def options_of(run: xr.Dataset, folder: Path | None = None, overrides: Iterable[
 class VelocityRecord:
     """What the measures need of a run, and what they tell besides their values: attributes, and what is left out.
 
-    ``masses`` (dof) in kg, ``velocity`` (t, cell, dof) in m/s, ``time`` (t) and ``interval`` in s, ``cells`` (cell) and
-    ``site``, the leading one's cell, as numbers from 1. ``sizes`` are the blocks (samples, cells) of which maps hold
-    the means, at ``mean_time`` and ``mean_cells``; ``memory`` in bytes. ``attributes`` are those of variables, of
-    groups under "".
+    ``masses`` (dof) of the reference cell in kg, ``velocity`` (t, cell, dof) in m/s and ``weighted`` the same times
+    sqrt(m/m_reference) of each mass, so that its energies by the reference cell's masses are those of the masses there
+    are; ``time`` (t) and ``interval`` in s, ``cells`` (cell) and ``site``, the leading one's cell, as numbers from 1.
+    ``sizes`` are the blocks (samples, cells) of which maps hold the means, at ``mean_time`` and ``mean_cells``;
+    ``memory`` in bytes. ``attributes`` are those of variables, of groups under "".
     """
 
     def __init__(self, run: xr.Dataset, options: AnalysisTable) -> None:
@@ -38,6 +40,9 @@ class VelocityRecord:
         self.model = Case.of(run).model()
         self.masses = np.asarray(self.model.chain.cell.masses)
         self.velocity: Any = self.field(field)
+        self.weighted = self.velocity
+        if "lattice/masses" in run:
+            self.weighted = self.field(field, np.sqrt(run["lattice/masses"].values / self.masses))
         self.time, self.interval, self.cells = field_time(run), field_interval(run), run["cell"].values
         self.site = None if leading is None else int(run["sites/cell"].values[leading])
         self.sizes = -(-len(self.time) // options.pixels), -(-len(self.cells) // options.pixels)
@@ -47,9 +52,11 @@ class VelocityRecord:
         self.left_out: list[str] = []
         self.warnings: list[str] = []
 
-    def field(self, field: xr.DataArray) -> Any:
-        """A recorded ``field``, read as a whole if it fits into the memory."""
-        return _StoredField(field) if field.nbytes > self.memory else field.values
+    def field(self, field: xr.DataArray, factor: ArrayLike = 1.0) -> Any:
+        """A recorded ``field``, read as a whole if it fits into the memory; times a ``factor`` (cell, dof)."""
+        if field.nbytes > self.memory:
+            return _StoredField(field, factor)
+        return field.values * factor if np.ndim(factor) else field.values
 
     def unresolved(self) -> set[str]:
         """Measures that would take waves for longer or slower ones in what was kept; warns of them."""
@@ -71,10 +78,11 @@ class VelocityRecord:
 
 
 class _StoredField:
-    """A field (t, cell, dof) that stays in its file; what is sliced is read."""
+    """A field (t, cell, dof) that stays in its file; what is sliced is read, and multiplied by the ``factor``."""
 
-    def __init__(self, field: xr.DataArray) -> None:
-        self._field, self.shape = field, field.shape
+    def __init__(self, field: xr.DataArray, factor: ArrayLike) -> None:
+        self._field, self.shape, self._factor = field, field.shape, np.asarray(factor)
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        return np.asarray(self._field[index].values)
+        values = np.asarray(self._field[index].values)
+        return values * np.broadcast_to(self._factor, self.shape)[index] if self._factor.ndim else values
