@@ -101,7 +101,7 @@ def test_linear_runs_are_shared_by_samples_of_clearances_alone():
         ({"clearance": {"relative": 0.1, "distribution": "norml"}}, "did you mean 'normal'?"),
         ({"sites": {"relative": 0.1}}, "give absolute, in cells"),
         ({"sites": {"absolute": 3.0}}, "draws contacts.sites = "),
-        ({"restitution": {"absolute": 0.18, "distribution": "uniform"}}, "draws contacts.each.restitution[1] = "),
+        ({"restitution": {"absolute": 0.25, "distribution": "uniform"}}, "draws contacts.each.restitution[1] = "),
         ({"seed": -1, "clearance": {"relative": 0.1}}, "disorder.seed = -1"),
     ],
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Pictures of damped lattices: the ledger tells what dashpots take, and no residual where there is none."""
+"""Pictures of a laboratory's lattices: what dashpots take, how waves decay, impacts of many sites."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from tests.conftest import small_case
 from vipetsc.dynamics import simulate
 from vipetsc.figures import runs
 from vipetsc.io.store import RunMemory
+from vipetsc.lattice import four_band, max_group_velocity
 
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
@@ -26,3 +28,38 @@ def test_the_ledger_has_the_dashpots(engine):
         assert residual.max() < 1e-8
     else:
         assert np.isnan(residual).all() and any("balance" in text.get_text() for text in lower.texts)
+
+
+def test_bands_of_a_damped_cell_show_its_decay():
+    cell = small_case(lattice={"damping": {"loss": {"2": 0.02}}}).lattice.unit_cell()
+    *_, decay = runs.bands(cell, 1000.0).axes
+    rates, omega = (np.asarray(values) for values in decay.lines[0].get_data())
+    _, frequency, speed = max_group_velocity(cell, 2)
+    there = np.interp(frequency / 1e3, omega, rates)
+    assert there == pytest.approx(0.01 * frequency / speed, rel=1e-2)  # zeta omega / v_g
+    assert rates[np.argmin(np.abs(omega - 0.65))] > 20 * there  # in a gap
+    assert len(runs.bands(four_band(), 1000.0).axes) == 2
+
+
+def impacts_of(sites: int, episodes: int, loss: float = 0.0):
+    number = np.arange(episodes)
+    logged = {"site": number % sites + 1, "side": np.where(number % 2, 1, -1), "onset": (number + 0.5) / episodes}
+    logged |= {"approach_velocity": 1.0 + number, "loss": np.full(episodes, loss)}
+    data = {f"impacts/{name}": ("episode", values) for name, values in logged.items()}
+    return xr.Dataset(data | {"sites/cell": ("site", 10 * np.arange(1, sites + 1)), "time": [0.0, 1.0]})
+
+
+def test_impacts_that_markers_do_not_tell_apart_are_a_map():
+    few = runs.impacts(impacts_of(5, 20, 1e-6), None).axes
+    assert len(few[0].collections) == 2 and not few[0].images and few[1].get_title() == "(b) Loss, episodes"
+    many = runs.impacts(impacts_of(59, 5900), None).axes
+    (image,) = many[0].images
+    largest = np.ma.filled(image.get_array(), np.nan)
+    assert largest.shape == (59, runs.COLUMNS_OF_A_MAP) and not many[0].collections
+    at = 4000  # site 48 of this episode, its time in columns
+    column = slice(int((at + 0.5) / 5900 * runs.COLUMNS_OF_A_MAP), None)
+    assert 1.0 + at <= largest[at % 59, column][0] < 1.0 + at + 59
+    assert len(many[0].get_yticks()) <= 13 and many[0].get_yticklabels()[1].get_text() == "60"
+    assert many[1].get_title() == "(b) Episodes" and {p.get_width() for p in many[1].patches} == {100}
+    pooled = runs.impacts(impacts_of(1000, 3000), None).axes[0].images[0]
+    assert len(pooled.get_array()) <= runs.ROWS_OF_A_MAP

@@ -118,7 +118,7 @@ class Case(CaseFile):
             yield from check_alike(contacts)
         if initial.moves and cls is not Case:
             yield Problem("initial.kind", initial.kind, "this verb is about a wave in a lattice at rest; leave it out")
-        if undriven and not initial.moves and valid("initial"):
+        if undriven and not initial.moves and valid("initial") and sections["drive"].kind == "burst":
             yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
         if undriven and sections["time"].atol == "paper":
             yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')

@@ -124,6 +124,8 @@ def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple
 
 def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
     """What is wrong with what contacts join, in the ``cells`` (1-based) with sites."""
+    if any(len(lists_of(contacts).get(key, cells)) != len(cells) for key in JOINS):
+        return  # as ``check_each`` says
     pairs = pairs_of_sites(contacts, cell, len(cells)) or [Pair(cell.host, cell.resonator)] * len(cells)
     for number, (at, pair) in enumerate(zip(cells, pairs, strict=True), 1):
         what = f"site {number} joins masses {pair.host + 1} and {pair.resonator + 1}"

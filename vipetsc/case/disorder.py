@@ -71,9 +71,8 @@ def scatter(
     known["modulus"] = [contacts.modulus] if contacts.modulus and known["stiffness"] else []
     for name, deviation in disorder.quantities().items():
         key, values = f"disorder.{name}", np.asarray(known[name], float)
-        if (deviation.relative is None) == (deviation.absolute is None) or (name == "sites" and deviation.relative):
-            remedy = "give absolute, in cells" if name == "sites" else "give one of relative and absolute"
-            problems.append(Problem(key, deviation.model_dump(exclude_none=True), remedy))
+        if name == "sites" and deviation.relative:
+            problems.append(Problem(key, deviation.model_dump(exclude_none=True), "give absolute, in cells"))
         elif not values.size:
             problems.append(Problem(key, None, "the case has none that could scatter"))
         elif deviation.relative or deviation.absolute:  # none leaves the case as it is, to the last bit

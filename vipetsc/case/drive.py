@@ -16,15 +16,10 @@ from vipetsc.lattice.drive import impulse, main_frequency, ramped, spline
 CYCLES = 30  # of a burst that is not told
 STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 PERIODS, SHARE = 10, 0.1  # of a ramp that is not told: of a harmonic drive, of a chirp's duration
-KEYS: dict[str, tuple[str, ...]] = {
-    "burst": ("cycles", "envelope"),
-    "harmonic": ("ramp", "duration"),
-    "chirp": ("bandwidth", "duration", "ramp"),
-    "impulse": ("duration",),
-    "step": ("ramp", "duration"),
-    "samples": ("samples",),
-}
-NEEDED = {"chirp": ("bandwidth", "duration"), "impulse": ("duration",), "step": ("ramp",), "samples": ("samples",)}
+KEYS: dict[str, tuple[str, ...]]  # of each waveform, and the first few of them that it needs
+KEYS = {"burst": ("cycles", "envelope"), "harmonic": ("ramp", "duration"), "chirp": ("bandwidth", "duration", "ramp"),
+        "impulse": ("duration",), "step": ("ramp", "duration"), "samples": ("samples",)}  # fmt: skip
+NEEDED = {"chirp": 2, "impulse": 1, "step": 1, "samples": 1}
 SINES = "burst", "harmonic", "chirp"  # waveforms that want a frequency
 WAYS = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
 
@@ -75,6 +70,11 @@ class OneDrive(Section):
         return f"{self.amplitude:g} {unit}, {about}{where}"
 
     @property
+    def foreign(self) -> set[str]:
+        """The keys that belong to other waveforms alone."""
+        return {name for names in KEYS.values() for name in names} - {*KEYS[self.kind]}
+
+    @property
     def ways(self) -> list[Any]:
         """The frequency as it is given, in how many ways it is."""
         return [way for way in (self.frequency, self.wavenumber, self.at) if way is not None]
@@ -108,9 +108,9 @@ def check_drives(
         if not valid("drive"):
             continue
         given, kind = drive.model_dump(exclude_none=True, exclude_defaults=True), drive.kind
-        for name in sorted({name for names in KEYS.values() for name in names} & given.keys() - {*KEYS[kind]}):
+        for name in sorted(drive.foreign & given.keys()):
             yield Problem(f"{key}.{name}", None, f"belongs to another waveform than {kind!r}")
-        for name in NEEDED.get(kind, ()):
+        for name in KEYS[kind][: NEEDED.get(kind, 0)]:
             if name not in given:
                 yield Problem(f"{key}.{name}", None, f"missing; the waveform {kind!r} needs it")
         if drive.duration and (drive.ramp or 0) > drive.duration / 2 and "ramp" in KEYS[kind]:
@@ -159,10 +159,12 @@ def _check_place(
         )
     if cell and any(s.damping or s.quadratic or s.cubic for s in cell.springs if s.next_cell):
         yield Problem(f"{key}.end", drive.end, "a wall moves a linear spring alone: no damping, quadratic, cubic")
-    if cell and length:
-        place = {"cell": 1 if drive.end == "left" else length, "mass": _end_masses(cell, drive.end)[0][0] + 1}
-        for name, value in place.items():
-            if name in drive.model_fields_set and getattr(drive, name) != value:
+    if cell and not cell.springs:
+        yield Problem(f"{key}.end", drive.end, "a wall moves the springs to it, and the cell has none")
+    elif cell and length:
+        place = _beside_wall(cell, drive.end, length)
+        for name in sorted(place.keys() & drive.model_fields_set):
+            if getattr(drive, name) != place[name]:
                 remedy = f"leave it out: the wall acts on mass {place['mass']} of cell {place['cell']}"
                 yield Problem(f"{key}.{name}", getattr(drive, name), remedy)
 
@@ -170,6 +172,11 @@ def _check_place(
 def _end_masses(cell: UnitCell, end: str) -> list[tuple[int, int]]:
     """Masses of the end's cell that springs tie to the wall, and these springs' numbers."""
     return [(s.end if end == "left" else s.start, i) for i, s in enumerate(cell.springs) if s.next_cell]
+
+
+def _beside_wall(cell: UnitCell, end: str, cells: int) -> Table:
+    """The cell and the mass (from 1) of ``cells`` cells that the wall at an ``end`` acts on first."""
+    return {"cell": 1 if end == "left" else cells, "mass": _end_masses(cell, end)[0][0] + 1}
 
 
 def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
@@ -224,8 +231,7 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
 def resolved_drive(drive: OneDrive, cell: UnitCell, cells: int, frequency: float | None = None) -> Table:
     """The table of a valid drive in which every choice is made; ``frequency`` in rad/s is that of a motion."""
     table = drive.model_dump(by_alias=True, exclude_none=True)
-    others = {name for names in KEYS.values() for name in names} - {*KEYS[drive.kind]}
-    table = {k: v for k, v in table.items() if k not in {*others, "wavenumber", "band", "at", "more"}}
+    table = {k: v for k, v in table.items() if k not in drive.foreign | {"wavenumber", "band", "at", "more"}}
     if drive.kind == "burst":
         table.pop("waveform", None)  # as if left out: the same case
     table["frequency"] = frequency = frequency or frequency_of(cell, drive)
@@ -234,7 +240,7 @@ def resolved_drive(drive: OneDrive, cell: UnitCell, cells: int, frequency: float
         of_chirp = SHARE * (drive.duration or 0.0)
         table["ramp"] = float(of_chirp if drive.kind == "chirp" else min(2 * np.pi * PERIODS / frequency, longest))
     if drive.end:
-        table |= {"cell": 1 if drive.end == "left" else cells, "mass": _end_masses(cell, drive.end)[0][0] + 1}
+        table |= _beside_wall(cell, drive.end, cells)
     return table
 
 

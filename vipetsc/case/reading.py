@@ -27,6 +27,8 @@ SECTIONS = ("lattice", "contacts", "disorder", "drive", "initial", "time", "outp
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
+# The types that pydantic tried a value as, in the path of an error: "float", "list[int]", "Span".
+BRANCH = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
 LARGEST = 1e50
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
@@ -211,8 +213,8 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
     try:
         section = kind(**table)
     except ValidationError as error:
-        for item in error.errors(include_url=False):
-            problem = _problem_of(kind, name, dict(item))
+        for item in _as_the_nearest(error.errors(include_url=False)):
+            problem = _problem_of(kind, name, item)
             problems.setdefault(problem.key, problem)
             invalid.add(item["loc"][0])
     mistyped = tuple(problems)
@@ -234,14 +236,24 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
         yield Problem(path, value, f"must be of a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
 
 
-def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem:
+def _as_the_nearest(errors: Iterable[Any]) -> list[Any]:
+    """Of pydantic's ``errors`` with a value that may be of several types those with the one that it is nearest to."""
+    branches: dict[tuple[Any, ...], dict[Any, list[int]]] = {}
+    places = [next((i for i, part in enumerate(e["loc"]) if BRANCH.fullmatch(str(part))), None) for e in errors]
+    for item, at in zip(errors, places, strict=True):
+        if at is not None:
+            mistyped = len(item["loc"]) == at + 1 and item["type"].endswith("_type")
+            branches.setdefault(item["loc"][:at], {}).setdefault(item["loc"][at], []).append(100 if mistyped else 1)
+    nearest = {path: min(of, key=lambda name: sum(of[name])) for path, of in branches.items()}
+    return [e for e, at in zip(errors, places, strict=True) if at is None or e["loc"][at] == nearest[e["loc"][:at]]]
+
+
+def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     """The problem behind one of pydantic's errors in section ``name``."""
-    # Pydantic puts the branches of a union that it tried into the path: "float", "list[int]", "Span".
-    branch = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
-    keys = [part for part in item["loc"] if isinstance(part, int) or not branch.fullmatch(part)]
+    keys = [part for part in item["loc"] if isinstance(part, int) or not BRANCH.fullmatch(part)]
     path = name + "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in keys)
     if item["type"] == "extra_forbidden":
-        fields = _section_at(kind, keys[:-1]).model_fields
+        fields = _section_at(kind, item["loc"][:-1]).model_fields
         return _unknown_key(path, item["input"], [field.alias or key for key, field in fields.items()])
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     value = None if item["type"] == "missing" else item["input"]
@@ -252,11 +264,13 @@ def _problem_of(kind: type[Section], name: str, item: dict[str, Any]) -> Problem
     return Problem(path, value, message)
 
 
-def _section_at(kind: type[Section], keys: list[int | str]) -> type[Section]:
-    """The section that a path of keys below ``kind`` leads to."""
-    for key in keys:
+def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]:
+    """The section that a path of keys, and of names of the sections that they may be, leads to below ``kind``."""
+    choices: list[type[Section]] = []
+    for key in path:
         fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
-        kind = next(_sections_in(fields.get(str(key))), kind)
+        choices = [*_sections_in(fields.get(str(key)))] or choices
+        kind = next((choice for choice in choices if choice.__name__ == key), choices[0] if key in fields else kind)
     return kind
 
 

@@ -66,7 +66,10 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
     else:
         lines = [re.split(r"[,;\s]+", line.strip()) for line in path.read_text(encoding="utf-8-sig").splitlines()]
         lines = [line for line in lines if line[0] and not line[0].startswith("#")]
-        rows = np.array(lines[1 if lines and not re.match(r"[-+.\d]", lines[0][0]) else 0 :], float)
+        try:
+            rows = np.array(lines[1 if lines and not re.match(r"[-+.\d]", lines[0][0]) else 0 :], float)
+        except ValueError:
+            raise ValueError("is no table of numbers: time and value in two columns are needed") from None
     if rows.ndim != 2 or rows.shape[1] != 2 or len(rows) > MOST_SAMPLES:
         raise ValueError(f"holds {rows.shape} numbers; time and value in two columns, {MOST_SAMPLES} rows at most")
     return rows

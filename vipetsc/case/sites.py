@@ -75,4 +75,4 @@ class ContactsTable(Section):
     precompression: Positive | None = None
     each: EachTable | None = None
     adhesion: Literal["allow", "clip"] = "allow"
-    approach_floor: Annotated[float, Field(ge=0)] = 0.0
+    approach_floor: NotNegative = 0.0

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from vipetsc.case.reading import Problem
+from vipetsc.case.reading import LARGEST, Problem
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.varied import AnyProfile, Deviation, Profile
 from vipetsc.lattice import Chain, Coefficients, UnitCell, Variation
@@ -42,11 +42,12 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
         return values, "give one of value and factor"
     at, new = np.array(given.cells) - 1, values.copy()
     new[at] = given.value if given.factor is None else given.factor * values[at]
-    return new, ""
+    return new, "" if given.factor is None or values[at].any() else "is 0, and so is any factor of it: give value"
 
 
 def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:
-    return deviation.draw(values, seed, key), ""
+    nothing = "is 0 in all cells, and so is what is relative to it" if deviation.relative and not values.any() else ""
+    return deviation.draw(values, seed, key), nothing
 
 
 def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Problem]]:
@@ -62,8 +63,8 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Prob
         column = getattr(arrays, place[0])[:, place[1]]
         column[:], wrong = change(column.copy())
         least = column.min()
-        if not wrong and not np.isfinite(column).all():
-            wrong = "is no number in some cells: a value of 0 has no lognormal scatter, nor has one that large"
+        if not wrong and not np.all((np.abs(column) < LARGEST) & ((np.abs(column) > 1 / LARGEST) | (column == 0))):
+            wrong = f"is no number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
         elif not wrong and (least < 0 or (least == 0 and place[0] in ("masses", "stiffness"))):
             wrong = (
                 f"is {least:.4g} in cell {int(column.argmin()) + 1}: no smaller than 0, and a mass or spring above it"
@@ -75,11 +76,7 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Prob
         put(key, f'lattice.profiles."{key}"', partial(_profile, given))
     if scatter := lattice.scatter:
         for key, deviation in scatter.quantities.items():
-            path = f'disorder.cells."{key}"'
-            if (deviation.relative is None) == (deviation.absolute is None):
-                problems.append(Problem(path, None, "give one of relative and absolute"))
-            else:
-                put(key, path, partial(_drawn, deviation, scatter.seed, key))
+            put(key, f'disorder.cells."{key}"', partial(_drawn, deviation, scatter.seed, key))
     return arrays, problems
 
 
@@ -115,6 +112,8 @@ def check_variation(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Pr
         yield from vary(lattice, lattice.undamped_cell())[1]
     if (absorbing := lattice.absorbing) is None:
         return
+    if not lattice.undamped_cell().springs:
+        yield Problem("lattice.absorbing", None, "no waves come to an end of a lattice without springs; leave it out")
     if lattice.ends == "periodic":
         yield Problem("lattice.absorbing", None, 'a ring has no end; ends = "fixed" or "free"')
     n = absorbing.cells or 0

@@ -1,10 +1,10 @@
 """Sections about cells that differ: profiles and defects, scatter cell by cell, ends that absorb."""
 
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from vipetsc.case.reading import Section
 from vipetsc.lattice import Chain, ToneBurst, UnitCell, waves_at
@@ -27,6 +27,12 @@ class Deviation(Section):
     absolute: NotNegative | None = None
     distribution: Literal["normal", "uniform", "lognormal"] = "normal"
 
+    @model_validator(mode="after")
+    def _one_size(self) -> Self:
+        if (self.relative is None) == (self.absolute is None):
+            raise ValueError("give one of relative and absolute")
+        return self
+
     def draw(self, values: np.ndarray, seed: int, name: str) -> np.ndarray:
         """Values (n) of the quantity ``name`` about ``values`` (n); a larger n begins with the same numbers."""
         key = np.random.SeedSequence([seed, int.from_bytes(name.encode(), "little")])
@@ -37,8 +43,9 @@ class Deviation(Section):
         normal = generator.standard_normal(len(values))
         if self.distribution == "normal":
             return values + deviation * normal
-        spread = np.log1p((deviation / values) ** 2)  # variance of the logarithm
-        return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
+        with np.errstate(all="ignore"):  # of 0 there is none: not a number
+            spread = np.log1p((deviation / values) ** 2)  # variance of the logarithm
+            return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
 
     def __str__(self) -> str:
         size = f"{100 * self.relative:g} %" if self.relative is not None else f"{self.absolute:g}"

@@ -23,6 +23,8 @@ CELLS = {
     "dispersion": ("All cells", style.BLACK),
 }
 LARGEST_RESIDUAL = 1e-8  # of the ledger, over the work of the drive
+ROWS, MARKERS = 16, 2000  # sites with a row, and episodes with a marker, of their own
+ROWS_OF_A_MAP, COLUMNS_OF_A_MAP = 150, 300
 REFINE = 10  # points of a phase portrait drawn for each sample
 
 
@@ -92,7 +94,10 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
 
 def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
-    """Onset of every contact episode by site and side, coloured by approach speed; energy lost per site."""
+    """Onset of every contact episode by site and side, coloured by approach speed; energy lost per site.
+
+    More sites or episodes than ``ROWS`` and ``MARKERS`` become a map of the largest approach speed.
+    """
     sites = run["sites/cell"].values
     names = "site", "side", "onset", "approach_velocity", "loss"
     site, side, onset, velocity, lost = (run[f"impacts/{name}"].values for name in names)
@@ -102,25 +107,38 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         return empty_figure("Impacts: no contact in this run")
     figure = style.new_figure(style.PAGE, min(1.3 + 0.24 * len(sites), 4.5))
     raster, bars = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
-    speed = np.abs(velocity)
-    norm = panels.log_norm(speed, decades=2)
-    for sign, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
-        at = side == sign
-        image = raster.scatter(onset[at], site[at] + shift, 14, speed[at], marker=marker, lw=0, norm=norm,
-                               cmap="viridis_r", rasterized=True)  # fmt: skip
-    number = np.arange(1, len(sites) + 1)
-    raster.set_yticks(number, [f"{c}" for c in sites])
-    title = f"(a) {len(site)} contact episodes (▲ positive side, ▼ negative side)"
-    raster.set(title=title, xlabel="Time (s)", ylabel="Contact site (cell)", xlim=run["time"][[0, -1]])
+    speed, number, index = np.abs(velocity), np.arange(1, len(sites) + 1), site.astype(int) - 1
+    norm, span = panels.log_norm(speed, decades=2), run["time"].values[[0, -1]]
+    few, colours = len(sites) <= ROWS and len(site) <= MARKERS, {"norm": norm, "cmap": "viridis_r"}
+    if few:
+        for sign, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
+            at = side == sign
+            image = raster.scatter(onset[at], site[at] + shift, 14, speed[at], marker=marker, lw=0, rasterized=True,
+                                   **colours)  # fmt: skip
+        raster.grid(axis="y", color=style.PALE, lw=0.5)
+        raster.set_axisbelow(True)
+    else:
+        block = -(-len(sites) // ROWS_OF_A_MAP)
+        largest = np.full((-(-len(sites) // block), COLUMNS_OF_A_MAP), np.nan)
+        column = np.minimum((onset - span[0]) / (span[1] - span[0]) * COLUMNS_OF_A_MAP, COLUMNS_OF_A_MAP - 1).astype(
+            int
+        )
+        np.fmax.at(largest, (index // block, column), speed)
+        image = raster.imshow(largest, extent=(*span, 0.5, 0.5 + block * len(largest)), **colours)
+    shown = number[:: 1 if few else -(-len(sites) // 12)]
+    raster.set_yticks(shown, [f"{c}" for c in sites[shown - 1]])
+    title = f"(a) {len(site)} contact episodes" + " (▲ positive side, ▼ negative side)" * few
+    raster.set(title=title, xlabel="Time (s)", ylabel="Contact site (cell)", xlim=span)
     raster.set_ylim(0.4, len(sites) + 0.6)
-    raster.grid(axis="y", color=style.PALE, lw=0.5)
-    raster.set_axisbelow(True)
-    panels.colour_bar(image, raster, "Approach speed (m/s)")
+    panels.colour_bar(image, raster, "Approach speed (m/s)" if few else "Largest approach speed (m/s)")
 
-    index = site.astype(int) - 1
     loss, episodes = np.bincount(index, np.nan_to_num(lost), len(sites)), np.bincount(index, minlength=len(sites))
-    bars.bar_label(bars.barh(number, loss, 0.6, color=style.VERMILION), episodes, padding=2)
-    bars.set(title="(b) Loss, episodes", xlabel="Energy lost (J)", xlim=(0, 1.25 * max(loss.max(), 1e-300)))
+    lengths = loss if loss.any() else episodes
+    row = bars.barh(number, lengths, 0.6 if few else 1.0, color=style.VERMILION if loss.any() else style.BLUE)
+    if few:
+        bars.bar_label(row, episodes, padding=2)
+    title, label = ("(b) Loss" + ", episodes" * few, "Energy lost (J)") if loss.any() else ("(b) Episodes", "Episodes")
+    bars.set(title=title, xlabel=label, xlim=(0, (1.25 if few else 1.05) * lengths.max()))
     bars.tick_params(left=False)
     return figure
 
