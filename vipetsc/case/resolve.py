@@ -226,7 +226,7 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
         designed = designed_end(absorbing, cell, lattice.ends, sent, lattice.cells // 3)
         tables["lattice"]["absorbing"] = designed.model_dump()
     if (damping := lattice.damping) and damping.loss:
-        fitted = (np.asarray(values).tolist() for values in damping.fitted(lattice.undamped_cell()))
+        fitted = (values.tolist() for values in damping.fitted(lattice.undamped_cell()))
         tables["lattice"]["damping"] |= dict(zip(("grounding", "springs"), fitted, strict=True))
     tables.pop("initial", None)
     tables |= {"initial": beginning.table} if beginning else {}

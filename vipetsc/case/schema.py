@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from vipetsc.case.reading import Section
@@ -130,11 +129,11 @@ class DampingTable(Section):
     grounding: list[NotNegative] | None = None
     springs: list[NotNegative] | None = None
 
-    def fitted(self, cell: UnitCell) -> tuple[ArrayLike, ArrayLike]:
+    def fitted(self, cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
         """The dashpots (dof,), (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``; 0 without one."""
         if self.grounding is None and self.loss:
             return fitted_dashpots(cell, tuple((int(band), loss) for band, loss in self.loss.items()))
-        return self.grounding or 0.0, self.springs or 0.0
+        return np.array(self.grounding or 0.0), np.array(self.springs or 0.0)
 
 
 class LatticeTable(Section):
