@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
 from vipetsc.contact.law import CLIPPED, CLOSED, FREE, LASTING, SITE, contact_force, elastic_force, gap_of, impact_time
 
@@ -109,6 +109,16 @@ def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: flo
         track.counts.clipped += 1
 
 
+@kernel
+def shortest_impact(contacts: np.ndarray) -> float:
+    """The smallest ``impact_time`` in s of the sites in contact, of the approach of each; inf if there is none."""
+    shortest = np.inf
+    for i in range(contacts.size):
+        if abs(contacts[i].mode) in (CLOSED, CLIPPED):
+            shortest = min(shortest, impact_time(contacts[i], abs(contacts[i].approach)))
+    return shortest
+
+
 class ImpactTracker:
     """Switches the modes of ``contacts`` at located changes and logs every episode.
 
@@ -163,9 +173,7 @@ class ImpactTracker:
 
     def contact_time(self) -> float:
         """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
-        sites = self.contacts
-        touching = np.flatnonzero(np.isin(np.abs(sites["mode"]), (CLOSED, CLIPPED)))
-        return min((impact_time(sites[i], abs(sites[i]["approach"])) for i in touching), default=np.inf)
+        return shortest_impact(self.contacts)
 
     def accept_step(self, h: float) -> None:
         """Take the step of ``h`` seconds as done: update the open episodes; its end is the next one's start."""

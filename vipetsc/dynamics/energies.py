@@ -11,7 +11,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.contact.law import elastic_energy
 from vipetsc.dynamics.layout import LatticeRecord, Layout, create_record
 from vipetsc.dynamics.ts.right_hand_side import relative_motion
@@ -23,7 +23,7 @@ PARTS = 5  # that are summed
 _KINETIC, _SPRING, _CONTACT, _DISSIPATED, _DAMPING = range(PARTS)
 
 
-@njit(error_model="numpy")
+@kernel
 def _add(sums: np.ndarray, part: int, energies: np.ndarray, unit: float) -> None:
     """Add energies in J to ``sums`` (part, 2) as multiples of ``unit`` and of unit/2^40."""
     whole_sum = fine_sum = np.int64(0)
@@ -38,7 +38,7 @@ def _add(sums: np.ndarray, part: int, energies: np.ndarray, unit: float) -> None
     sums[part, 1] += fine_sum
 
 
-@njit(error_model="numpy")
+@kernel
 def _kinetic_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
     """Kinetic energies of the cells from ``first`` on."""
     energies[:] = 0.0
@@ -55,7 +55,7 @@ def _kinetic_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energie
             energies[i] += 0.5 * v[i] * v[i] / inverse_mass
 
 
-@njit(error_model="numpy")
+@kernel
 def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
     """Spring energies of the cells from ``first`` on: springs to the next cell, and the first one's to a left wall."""
     shape, n = lattice.shape, lattice.shape.cells

@@ -137,13 +137,13 @@ class Integrator(Engine):
         Raises StalledError, on all ranks, where no step can be taken.
         """
         # The end of a drive or of a piece of one is a kink: a step ends there.
-        first, last = np.searchsorted(self._breaks, self.time, "right"), np.searchsorted(self._breaks, target)
+        first, last = self._breaks.searchsorted(self.time, "right"), self._breaks.searchsorted(target)
         return all(self._reach(time) for time in (*self._breaks[first:last].tolist(), target))
 
     def _reach(self, target: float) -> bool:
         """As ``advance``, without a kink on the way."""
         drives = self.lattice.drives
-        for i in range(len(drives.rows)):
+        for i in range(len(drives.rows) if len(drives.pieces) else 0):
             select_piece(drives, i, self.time)
         trials, stopped = 0, False
         while self.time < target:
@@ -264,7 +264,7 @@ class Integrator(Engine):
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
         """Those of the owned sites."""
         episodes = self.tracker.take_episodes(self.layout.losses(self.state.array_r), unfinished)
-        return episodes[np.isin(episodes["site"], self.layout.sites)]
+        return episodes[np.isin(episodes["site"], self.layout.sites)] if episodes.size else episodes
 
     def statistics(self) -> dict[str, Any]:
         """Steps, and what landings and limits of the contact law there were."""

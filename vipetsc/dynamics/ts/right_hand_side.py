@@ -12,7 +12,7 @@ import numpy as np
 from numba import carray
 from numba.core.ccallback import CFunc
 
-from vipetsc.compiled import cfunc, njit
+from vipetsc.compiled import cfunc, kernel
 from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
@@ -29,7 +29,7 @@ from vipetsc.dynamics.ts.springs import (
 from vipetsc.lattice.drive import PIECE
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def relative_motion(y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[float, float]:
     """w = u_resonator - u_host of site ``i`` and w'."""
     host, resonator = lattice.places[i].host, lattice.places[i].resonator
@@ -38,7 +38,7 @@ def relative_motion(y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[floa
     return y[resonator.u] - y[host.u], y[resonator.v] - y[host.v]
 
 
-@njit(error_model="numpy")
+@kernel
 def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int, force: float) -> float:
     """Acceleration of one mass by its springs, a contact ``force`` and the drives."""
     per_mass = inverse_mass(lattice, cell, mass)
@@ -51,7 +51,7 @@ def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, ma
     return acceleration
 
 
-@njit(error_model="numpy")
+@kernel
 def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
     """Fill ``motion`` (sites, 3) with w, w', w'' of every owned site."""
     for i in range(motion.shape[0]):
@@ -63,7 +63,7 @@ def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray)
         motion[i, 0], motion[i, 1], motion[i, 2] = w, rate, at_resonator - at_host
 
 
-@njit(error_model="numpy")
+@kernel
 def observe_pairs(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
     """The same of every site, given the state ``y`` and its derivative ``f``, both with their ghosts."""
     for i in range(motion.shape[0]):
@@ -71,12 +71,13 @@ def observe_pairs(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord, motion: 
         motion[i, 2] = relative_motion(f, lattice, i)[1]
 
 
-@njit(error_model="numpy")
+@kernel
 def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
     """Time derivative ``f`` (owned,) of the state ``y`` (ghosted,): velocities, accelerations, powers."""
     shape = lattice.shape
     n, d = shape.cells, shape.dofs
-    f[: d * n] = y[d * n : 2 * d * n]
+    for k in range(d * n):
+        f[k] = y[d * n + k]
     for mass in range(d):
         spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
         if lattice.smooth.size > 0:

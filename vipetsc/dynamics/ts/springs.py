@@ -7,14 +7,14 @@ have one number each; else (``is_varied``) each cell has its own, and the same s
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel
 from vipetsc.dynamics.layout import LatticeRecord
 
 # Cells in one pass: what a pass touches stays in the first-level cache.
 CHUNK = 512
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall.
 
@@ -28,13 +28,13 @@ def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) ->
     return y[mass * shape.cells + cell]
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def is_varied(lattice: LatticeRecord) -> bool:
     """Whether each cell has its own masses, springs and dashpots."""
     return lattice.inverse_masses.size > 0
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def inverse_mass(lattice: LatticeRecord, cell: int, mass: int) -> float:
     """1/m in 1/kg of a ``mass`` in an owned ``cell``."""
     if is_varied(lattice):
@@ -42,7 +42,7 @@ def inverse_mass(lattice: LatticeRecord, cell: int, mass: int) -> float:
     return lattice.masses[mass].inverse_mass
 
 
-@njit(error_model="numpy")
+@kernel
 def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """As ``spring_acceleration``, with the cell's own numbers and dashpots."""
     shape = lattice.shape
@@ -61,7 +61,7 @@ def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass:
     return total * lattice.inverse_masses[mass * n + cell]
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Acceleration in m/s^2 of one mass by its springs and dashpots; the sums of the chunked loops, bit for bit."""
     if is_varied(lattice):
@@ -78,19 +78,19 @@ def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: 
     return total * lattice.masses[mass].inverse_mass
 
 
-@njit(error_model="numpy")
+@kernel
 def _add_spring(out: np.ndarray, other: np.ndarray, here: np.ndarray, stiffness: float) -> None:
     for i in range(out.size):
         out[i] += stiffness * (other[i] - here[i])
 
 
-@njit(error_model="numpy")
+@kernel
 def _add_springs(out: np.ndarray, other: np.ndarray, here: np.ndarray, factors: np.ndarray) -> None:
     for i in range(out.size):
         out[i] += factors[i] * (other[i] - here[i])
 
 
-@njit(error_model="numpy")
+@kernel
 def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, a: int, out: np.ndarray) -> None:
     """Accelerations of a mass in the cells from ``a`` on, whose neighbours are all owned."""
     n, m, velocities, row = lattice.shape.cells, out.size, lattice.shape.dofs * lattice.shape.cells, mass
@@ -110,7 +110,7 @@ def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, a: i
         out[i] *= lattice.inverse_masses[mass * n + a + i]
 
 
-@njit(error_model="numpy", forceinline=True)
+@kernel
 def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, acceleration: np.ndarray) -> None:
     """Accelerations (cells,) of a mass by its springs and dashpots, in chunks of cells whose neighbours are owned."""
     n = acceleration.size
@@ -135,7 +135,7 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
         acceleration[n - 1] = spring_acceleration(y, lattice, n - 1, mass)
 
 
-@njit(error_model="numpy")
+@kernel
 def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> float:
     """What the other mass of the ``smooth`` coupling ``s`` of a ``cell`` is ahead, in m; 0 beyond a free end."""
     coupling, c, shape = lattice.smooth[s], cell + lattice.smooth[s].offset, lattice.shape
@@ -144,7 +144,7 @@ def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> flo
     return displacement(y, lattice, c, coupling.other) - y[coupling.mass * shape.cells + cell]
 
 
-@njit(error_model="numpy")
+@kernel
 def smooth_force(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Force in N on one mass by the parts of its springs that are not linear."""
     total = 0.0
@@ -155,7 +155,7 @@ def smooth_force(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) ->
     return total
 
 
-@njit(error_model="numpy")
+@kernel
 def add_smooth_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
     """Add the energies of those parts in the cells from ``first`` on, and in a spring to a wall on the left."""
     for s in range(lattice.smooth.size):
@@ -167,7 +167,7 @@ def add_smooth_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energ
                 energies[i] += z * z * z * (coupling.quadratic / 3.0 + 0.25 * coupling.cubic * z)
 
 
-@njit(error_model="numpy")
+@kernel
 def add_squares(
     y: np.ndarray, lattice: LatticeRecord, first: int, half: int, values: np.ndarray, sums: np.ndarray
 ) -> None:
@@ -192,7 +192,7 @@ def add_squares(
             sums[0] += values[s * (n + 1)] * y[end * n] * y[end * n]
 
 
-@njit(error_model="numpy")
+@kernel
 def damping_powers(y: np.ndarray, lattice: LatticeRecord, powers: np.ndarray) -> None:
     """Power in W that the dashpots of each owned cell dissipate."""
     n, d = lattice.shape.cells, lattice.shape.dofs
