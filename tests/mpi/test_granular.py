@@ -1,4 +1,4 @@
-"""Contacts that join cells of two ranks: the same bits on any number of them."""
+"""Contacts that join cells of two ranks: the same bits on any number of them, of both engines."""
 
 from __future__ import annotations
 
@@ -24,10 +24,25 @@ CHAIN = {
 }  # fmt: skip
 
 
-def digest(comm):
+# A ring whose joint a contact crosses, with a pressed contact, for exact steps.
+RING = CHAIN | {
+    "lattice": CHAIN["lattice"] | {"ends": "periodic"},
+    "contacts": {
+        "stiffness": 1e7, "clearance": 1e-5, "sites": [1, 2, 3, 3, 4, 5, 6, 7],
+        "each": {"pair": [[2, 1], [1, 1], [1, 2], [2, 1], [2, 1], [0, 2], [2, 1], [2, 1]],
+                 "next_cell": [True, True, False, True, True, False, True, True],
+                 "side": ["both", "minus", *["both"] * 6], "restitution": [0.7, 1.0, *[0.7] * 6],
+                 "precompression": [0.0, 3e-5, *[0.0] * 6]},
+    },
+    "time": CHAIN["time"] | {"engine": "propagator"},
+}  # fmt: skip
+
+
+def digest(comm, table):
     memory = RunMemory(comm)
-    result = simulate(Case.from_table(CHAIN), memory)
+    result = simulate(Case.from_table(table), memory)
     assert result.complete, result.sentence
+    assert result.statistics["engine"] == table["time"].get("engine", "ts")
     if comm.rank:
         return None
     data = memory.dataset
@@ -37,8 +52,9 @@ def digest(comm):
 
 
 @pytest.mark.parallel([1, 2, 3])
-def test_contacts_between_cells_of_two_ranks_have_the_bits_of_one():
+@pytest.mark.parametrize("table", [CHAIN, RING])
+def test_contacts_between_cells_of_two_ranks_have_the_bits_of_one(table):
     comm = MPI.COMM_WORLD
-    alone = digest(MPI.COMM_SELF) if comm.rank == 0 else None
-    together = digest(comm)
+    alone = digest(MPI.COMM_SELF, table) if comm.rank == 0 else None
+    together = digest(comm, table)
     assert together == alone

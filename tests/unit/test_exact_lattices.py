@@ -13,11 +13,12 @@ from scipy.linalg import expm
 from tests.conftest import small_case
 from vipetsc.case import Model
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.forces import contact_dofs, create_dof_tables, group_dofs
+from vipetsc.dynamics.propagator.clusters import create_dof_tables, create_responses, group_dofs
 from vipetsc.dynamics.propagator.series import StepSeries, evaluate
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.tables import apply_impulses, expand_free_motion
 from vipetsc.lattice import Chain, Variation
+from vipetsc.lattice.chain import Pair
 
 VARIED = ("all", "some", "none")
 
@@ -87,32 +88,54 @@ def test_a_step_is_the_exponential_within_its_bound(ends, varied, damped):
         assert series.truncation < tolerance
 
 
+# Sites of any pairs: the cell's, ground and a mass, masses of neighbours, two contacts in one cell, next to others.
+PAIRS = {0: Pair(-1, 1), 1: Pair(0, 3, True), 2: Pair(3, 0), 3: Pair(1, 2), 11: Pair(2, 2, True), 22: Pair(1, 0, True)}
+
+
+@pytest.mark.parametrize("own", [True, False])
 @EVERY
-def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped):
+def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped, own):
+    """Of contacts and driven masses, those near an end and across the joint of a ring among them."""
     model = lattice(ends, 24, varied, damped)
+    if not own:
+        pairs = PAIRS | {23: Pair(2, 0, True) if ends == "periodic" else Pair(-1, 3)}
+        chain = replace(model.chain, sites=(*pairs, 11), pairs=(*pairs.values(), Pair(-1, 2)), clearances=(1e-4,) * 8)
+        model = replace(model, chain=chain)
     layout, series = Layout(model, MPI.COMM_SELF), StepSeries(model.chain, 2e-4, 1e-15)
     groups, halo = group_dofs(model, series.reach), HaloRegions(layout)
     tables = create_dof_tables(groups, model, layout, series, halo)
+    response = create_responses(groups, tables, model, series)
     records, d, n = halo.bind_columns([]), layout.dofs, layout.cells
     state = np.random.default_rng(5).normal(size=(2 * d, n)) * np.repeat([1e-4, 0.1], d)[:, None]
     exchange(records, 0, state)
-    dofs = contact_dofs(model)[groups.numbers]
-    taylor = np.zeros((len(dofs), 2 * series.terms))
+    taylor = np.zeros((len(groups.numbers), 2 * series.terms))
     for c in range(len(groups.first) - 1):
         expand_free_motion(tables, c, records.columns, taylor)
-    exact = (exponential(series.chain, 0.7 * series.interval) @ state.ravel()).reshape(2 * d, n)
-    masses = model.chain.masses().reshape(n, d)
-    for i, dof in enumerate(dofs):
+    step = exponential(model.chain, 0.7 * series.interval)
+    exact, masses = (step @ state.ravel()).reshape(2 * d, n), model.chain.masses().reshape(n, d)
+    forms = np.zeros((len(taylor), d, n))
+    for form, number in zip(forms, groups.numbers, strict=True):
+        drive, site = model.drives[max(-1 - number, 0)], max(number, 0)
+        pair, cell = (model.chain.contact_pairs[site], model.chain.sites[site]) if number >= 0 else (None, drive.cell)
+        form[pair.resonator if pair else drive.mass, (cell + (pair is not None and pair.next_cell)) % n] += 1
+        if pair and pair.host >= 0:
+            form[pair.host, cell] -= 1
+    powers = 0.7 ** (1 + np.arange(response.shape[2]) * (1 if damped else 2))
+    for i, form in enumerate(forms):
         w, rate = evaluate(taylor[i], 0.7)
-        assert w == pytest.approx(np.dot(dof["form"], exact[:d, dof["cell"]]), rel=1e-11, abs=1e-17)
-        assert rate / series.interval == pytest.approx(np.dot(dof["form"], exact[d:, dof["cell"]]), rel=1e-11)
+        assert w == pytest.approx(np.sum(form * exact[:d]), rel=1e-11, abs=1e-17)
+        assert rate / series.interval == pytest.approx(np.sum(form * exact[d:]), rel=1e-11)
         # An impulse on the DoF at .3 of the step.
-        moments, out, impulse = 0.7 ** np.arange(2 * series.terms)[None], np.zeros((2 * d, n)), np.zeros((2 * d, n))
+        moments, out = 0.7 ** np.arange(2 * series.terms)[None], np.zeros((2 * d, n))
         apply_impulses(tables, i, moments, out)
-        impulse[d:, dof["cell"]] = dof["form"] / masses[dof["cell"]]
-        left = exponential(model.chain, 0.7 * series.interval) @ impulse.ravel()
+        left = step @ np.append(np.zeros(d * n), form / masses.T)
         for part, expected in zip(out.reshape(2, -1), left.reshape(2, -1), strict=True):
             np.testing.assert_allclose(part, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+        c = np.searchsorted(groups.first, i, side="right") - 1
+        members = slice(*groups.first[c : c + 2])
+        moved = forms[members].reshape(-1, d * n) @ left[: d * n] * series.interval
+        felt = response[members, i - groups.first[c]] @ powers
+        np.testing.assert_allclose(felt, moved, rtol=0, atol=1e-13 * np.abs(moved).max())
 
 
 @pytest.mark.parametrize("band", [0, 1, 3])

@@ -10,6 +10,7 @@ from scipy.linalg import eigh
 
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
+from vipetsc.lattice.chain import Pair
 from vipetsc.modes.flow import FlowError
 from vipetsc.modes.lattice_flow import LatticeFlow
 
@@ -76,6 +77,30 @@ def test_variations_agree_with_differences(kind, law, sites):
         assert np.median(half) < 1e-6
     scale = np.repeat(np.abs(moved).reshape(2, -1).max(axis=1), DOFS)[:, None]
     assert np.max(np.abs(moved - difference) / scale) < 1e-7
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.7])
+def test_variations_of_contacts_between_cells_and_with_ground_agree_with_differences(restitution):
+    """On a ring: two contacts of one cell, one of them with ground, and one across its joint."""
+    pairs, sites = (Pair(-1, 2), Pair(0, 3), Pair(3, 0, True)), (4, 4, CELLS - 1)
+    contact, size = Contact("hertz", STIFFNESS["hertz"], restitution), (2 * DOFS, CELLS)
+    chain = Chain(four_band("calibrated"), CELLS, "periodic", sites, (CLEARANCE,) * 3, None, pairs)
+    flow, random = LatticeFlow(chain, contact, MPI.COMM_SELF), np.random.default_rng(1)
+    start = random.standard_normal(size) * np.repeat([1e-5, 1e-2], DOFS)[:, None]
+    for pair, site in zip(pairs, sites, strict=True):
+        cell = (site + pair.next_cell) % CELLS
+        start[[pair.resonator, DOFS + pair.resonator], cell] = 1.7e-3, 4.0
+    assert flow.arc(start, PERIOD).episodes >= 3
+    change = random.standard_normal(size) * np.repeat([1e-3, 1.0], DOFS)[:, None]
+    moved, difference = differences(flow, start, PERIOD, change)
+    scale = np.repeat(np.abs(moved).reshape(2, -1).max(axis=1), DOFS)[:, None]
+    assert np.max(np.abs(moved - difference) / scale) < 1e-7
+
+
+def test_contacts_that_always_act_are_refused():
+    chain = Chain(four_band("calibrated"), CELLS, "fixed", (5,), (0.0,), None, (Pair(0, 0, True),))
+    with pytest.raises(FlowError, match="touch or are pressed"):
+        LatticeFlow(chain, Contact("hertz", 1e6), MPI.COMM_SELF).arc(np.zeros((2 * DOFS, CELLS)), PERIOD)
 
 
 def test_the_approach_velocity_counts():

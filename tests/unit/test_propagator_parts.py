@@ -15,6 +15,7 @@ from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.engine import Stretch
 from vipetsc.dynamics.layout import Layout, create_record
+from vipetsc.dynamics.propagator.clusters import create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.collocation import (
     HISTORY,
     SUBSTEP_STATE,
@@ -28,7 +29,6 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.forces import create_dof_tables, group_dofs
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
 from vipetsc.dynamics.propagator.series import StepSeries, evaluate, shift
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
@@ -145,6 +145,16 @@ def test_dofs_within_reach_are_grouped_across_a_periodic_end():
     assert sites("fixed", 1) == [[0, -1], [1], [2], [3]]
     assert sites("fixed", 2) == [[0, -1], [1, 2], [3]]
     assert sites("periodic", 1) == [[0, -1], [1], [2], [3]]
+    assert sites("periodic", 2) == [[0, 3, -1], [1, 2]]
+
+
+def test_dofs_whose_next_cells_are_within_reach_are_grouped():
+    def sites(ends, reach):
+        contacts = {"sites": [2, 12, 14, 22], "pair": [1, 1], "next_cell": True}
+        return as_lists(group_dofs(small_case(lattice={"ends": ends}, contacts=contacts).model(), reach))
+
+    assert sites("fixed", 1) == [[0, -1], [1, 2], [3]]
+    assert sites("periodic", 1) == [[0, -1], [1, 2], [3]]
     assert sites("periodic", 2) == [[0, 3, -1], [1, 2]]
 
 

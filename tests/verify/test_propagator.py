@@ -142,6 +142,27 @@ def test_agrees_with_the_time_stepper(folder, lattice, contacts, drive, time):
     assert agree(folder, case)["episodes"] > 5
 
 
+JOINED = {"pair": [1, 1], "next_cell": True}
+PRESSED = JOINED | {"side": "minus", "clearance": 0.0, "precompression": 1e-4, "restitution": 1.0}
+DASHPOTS = {"mass": 10.0, "stiffness": 5e-6}
+
+
+@pytest.mark.parametrize(
+    ("lattice", "contacts"),
+    [
+        ({"ends": "periodic", "damping": DASHPOTS}, JOINED | {"sites": [3, 24], "clearance": 5e-5}),
+        ({}, {"sites": [1, 2], "pair": [0, 1], "side": "plus", "restitution": 0.7}),
+        ({"ends": "free"}, {"sites": [6, 6, 7], "each": {"pair": [[2, 3], [3, 4], [1, 4]]}}),
+        ({"ends": "periodic"}, PRESSED | {"sites": [2, 3, 24]}),
+        ({}, {"clearance": 1e-3, "clearance_minus": 5e-5}),
+    ],
+)
+def test_agrees_on_contacts_of_any_pair(folder, lattice, contacts):
+    """Between cells, with ground, several a cell, pressed ones that open; on a ring across its joint; unequal stops."""
+    case = small_case(lattice=lattice, contacts=contacts, time={"end": 0.03})
+    assert agree(folder, case, 1e-8)["episodes"] >= 3
+
+
 def test_agrees_on_other_cells(folder):
     diatomic = {
         "lattice": {"preset": "diatomic", "cells": 31},
@@ -199,10 +220,10 @@ def test_auto_takes_it_where_it_suits(folder):
     assert "engine_note" not in statistics
 
 
-@pytest.mark.parametrize("looks", [0, 2, 4])
-def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks):
+@pytest.mark.parametrize(("looks", "contacts"), [(0, {}), (2, {}), (4, {}), (3, PRESSED)])
+def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, contacts):
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 49)
-    case = small_case(time={"engine": "propagator"}, contacts={"sites": [1, 6, 12, 13]})
+    case = small_case(time={"engine": "propagator"}, contacts={"sites": [1, 6, 12, 13]} | contacts)
     straight = simulate(case, folder / "straight")
     stopped = simulate(case, folder / "stopped", stop=StopAt(looks))
     assert stopped.resumable

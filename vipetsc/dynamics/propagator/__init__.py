@@ -16,11 +16,12 @@ less than the tolerance. Both bounds and the entries dropped within the band mak
 no term exceeds the result by much, and the series is as good as rounding allows (Moler and Van Loan 2003). Cells at
 least r from an end share one stencil; the others have rows of their own.
 
-**2. Free motion of the contact DoFs** (``series``). A DoF x = c u is the relative displacement w of a
-site or the driven mass's displacement. Its rows c (-A)^m give its free motion x(s) = sum_k a_k s^k beforehand: a site
-with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k (k - 1) |a_k| bounds w by a parabola: on the side sigma
-one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and such steps
-converge to the first one.
+**2. Free motion of the contact DoFs** (``series``, ``clusters``). A DoF x = c u is a driven mass's displacement or the
+relative displacement w of a site, of two masses in one cell or in neighbouring ones, or of a mass to ground: c has an
+entry for each end, so that a force on w acts at both. Its rows c (-A)^m give its free motion x(s) = sum_k a_k s^k
+beforehand: a site with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k (k - 1) |a_k| bounds w by a parabola:
+on the side sigma one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and
+such steps converge to the first one.
 
 **3. Forces** (``collocation``). An impulse on DoF l moves DoF i by G_il(s) = sum_m g_ilm s^(2m+1), odd
 coefficients as in 1. While forces act,
@@ -35,7 +36,8 @@ sec. 6.2), and the nodes lie evenly in z. The last two Legendre coefficients of 
 which h is controlled. After the substep the a_i are shifted to its end, and the motion caused by F is added to them.
 
 **4. Changes** (``advance``). Substeps are searched for changes of a site's mode on the quintic Hermite interpolant of w
-and repeated so that they end on the first one: see ``vipetsc.contact``.
+and repeated so that they end on the first one: see ``vipetsc.contact``. Contacts that touch or are pressed at rest act
+always, F being what they have beyond their load, and are never searched.
 
 **5. What forces leave in the lattice** (``series``). K and M are symmetric, and so is (-A)^m M^-1: the motion
 after an impulse on a DoF, (-A)^m M^-1 c^T = M^-1 (c (-A)^m)^T, has the rows of 2 again (Maxwell's reciprocity). With
@@ -45,11 +47,12 @@ the moments mu_k = integral of F (1 - s)^k dt over the step,
 
 in the cells within r. Nothing else of the forces' history is needed.
 
-**6. Clusters and ranks** (``forces``, ``stencil``). DoFs within r cells of one another must be solved for together and
-form a cluster. Every rank that owns a cell within r of a cluster advances it, from the same numbers to the same bits,
-so that one exchange of ``HaloRegions`` a step is all that ranks must say to each other. ``engine`` weighs a step's cost
-against the size of its clusters. Its loop over a block of samples is compiled as a whole: ranks agree on requests and
-failures at a block's end, to which a rank that cannot follow its contacts goes on without them.
+**6. Clusters and ranks** (``clusters``, ``stencil``). DoFs within r cells of one another, counted from any cell that
+they have a mass in, must be solved for together and form a cluster. Every rank that owns a cell within r of a cluster
+advances it, from the same numbers to the same bits, so that one exchange of ``HaloRegions`` a step is all that ranks
+must say to each other. ``engine`` weighs a step's cost against the size of its clusters. Its loop over a block of
+samples is compiled as a whole: ranks agree on requests and failures at a block's end, to which a rank that cannot
+follow its contacts goes on without them.
 
 **7. Dashpots.** With M u'' = -K u - C u' + f free motion has all powers of s, and with P_0 = 1, Q_0 = 0 (``rows``)
 

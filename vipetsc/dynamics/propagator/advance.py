@@ -8,7 +8,7 @@ import numpy as np
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import Change, extremes, first_change, switching
 from vipetsc.contact.law import CLOSED, FREE, contact_force, gap_of
-from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
+from vipetsc.contact.search import LANDED, MOST_ATTEMPTS, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.dynamics.drives import drive_end
 from vipetsc.dynamics.propagator.collocation import (
     Cluster,
@@ -20,6 +20,7 @@ from vipetsc.dynamics.propagator.collocation import (
     evaluate_site_motion,
     update_taylor,
 )
+from vipetsc.dynamics.propagator.kinks import first_kink
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
 
@@ -95,6 +96,25 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     evaluate_site_motion(cluster, trial.taylor, trial.site_motion)
     state.position -= substep.length
     return True
+
+
+@inlined
+def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
+    """Repeat a substep just tried to end where a contact without modes first opens or closes; the one that is tried.
+
+    One of negative length could not be collocated.
+    """
+    state = cluster.state[0]
+    for _ in range(MOST_ATTEMPTS):
+        share = first_kink(cluster, trial, substep.length)
+        if share > 1.0 or share * substep.length < SHORTEST:
+            break
+        substep = Substep(substep.kind, share * substep.length)
+        if not _try_substep(cluster, trial, substep):
+            state.rejected += 1
+            state.length = CUT * substep.length
+            return Substep(substep.kind, -1.0)
+    return substep
 
 
 @kernel
@@ -176,7 +196,9 @@ def _take_down(cluster: Cluster, trial: Trial, substep: Substep) -> None:
             row.begin, row.position, row.length, row.kind = state.begin, state.position, substep.length, substep.kind
             row.site, row.mode, row.approach = i, site.mode, site.approach
             row.rate, row.acceleration = motion[1], motion[2]
-            row.onset = state.begin + state.position * cluster.interval == cluster.history[i].onset
+            # Trials leave the position to a rounding.
+            time = state.begin + state.position * cluster.interval
+            row.onset = abs(time - cluster.history[i].onset) <= 4.0 * ROUNDING * (time + cluster.interval)
             for node in range(NODES):
                 tape.motion[0, k, 0, node], tape.motion[0, k, 1, node] = trial.w[i, node], trial.v[i, node]
 
@@ -191,7 +213,7 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]
     force, smallest, largest = max(first, last), min(first, last), max(first, last)
     for node in range(NODES):
-        inside = -side * trial.force[i, node]
+        inside = -side * (trial.force[i, node] - cluster.contacts[i].preload)
         smallest, largest = min(smallest, inside), max(largest, inside)
     if largest > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
         # A turn lies inside.
@@ -244,7 +266,9 @@ def advance_cluster(cluster: Cluster) -> int:
             if substep.length < ROUNDING:
                 return FAILED
             continue
-        landed = False
+        landed, substep = False, _end_on_kink(cluster, trial, substep)
+        if substep.length < 0.0:
+            continue
         if not blind:
             substep, landed = _search_and_land(cluster, trial, substep)
             if substep.length < 0.0:

@@ -104,13 +104,19 @@ def create_trial(dofs: int, terms: int) -> Trial:
 
 
 @kernel
+def _pull(contacts: np.ndarray, i: int, w: float, rate: float) -> float:
+    """Force in N on the relative displacement of site ``i``, beyond the load that a pressed one has at rest."""
+    return -(contact_force(contacts, i, w, rate)[0] - contacts[i].preload)
+
+
+@kernel
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
     """``out`` (site, 3) = w, w', w'' of every site at the present position, where the series is ``taylor``."""
     state, sites, h = cluster.state[0], cluster.contacts.size, cluster.interval
     forces = cluster.trial.sums.forces[: cluster.taylor.shape[0]]
     for i in range(sites):
         out[i, 0], out[i, 1] = taylor[i, 0], taylor[i, 1] / h
-        forces[i] = -contact_force(cluster.contacts, i, out[i, 0], out[i, 1])[0]
+        forces[i] = _pull(cluster.contacts, i, out[i, 0], out[i, 1])
     for i in range(sites, forces.size):
         forces[i] = drive_force(cluster.drives, i, state.begin + state.position * h)
     for i in range(sites):
@@ -190,7 +196,7 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
         last = change
         for i in trial.closed:
             for node in range(NODES):
-                trial.force[i, node] = -contact_force(contacts, i, trial.w[i, node], trial.v[i, node])[0]
+                trial.force[i, node] = _pull(contacts, i, trial.w[i, node], trial.v[i, node])
     trial.force[: contacts.size] = 0.0
     return False
 

@@ -15,8 +15,9 @@ from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.engine import Engine, Stretch
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
+from vipetsc.dynamics.propagator.clusters import group_dofs
 from vipetsc.dynamics.propagator.collocation import Cluster
-from vipetsc.dynamics.propagator.forces import Forces, follow_contacts, group_dofs
+from vipetsc.dynamics.propagator.forces import Forces, follow_contacts
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.tables import DofTables, apply_impulses, expand_free_motion
@@ -50,7 +51,7 @@ def step_series(model: Model) -> StepSeries | None:
             break
         series = StepSeries(model.chain, model.sample_interval / parts, tolerance)
         too_long = max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
-        if too_long or model.chain.cells <= 2 * series.reach:
+        if too_long or model.chain.cells < series.width:
             continue
         sizes = np.diff(group_dofs(model, series.reach).first)
         cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
@@ -68,12 +69,14 @@ class States(NamedTuple):
     """Two states that steps read and write in turn; a sample interval in s has ``parts`` steps.
 
     ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, ``ghosts`` the
-    neighbouring ones, the last columns of ``HaloRegions``. ``progress`` (1,) is of dtype ``PROGRESS``.
+    neighbouring ones, the last columns of ``HaloRegions``, and ``ghost_rows`` what the state has of each. ``progress``
+    (1,) is of dtype ``PROGRESS``.
     """
 
     components: np.ndarray
     owned: int
     ghosts: int
+    ghost_rows: int
     parts: int
     sample_interval: float
     progress: np.ndarray
@@ -97,7 +100,7 @@ def take_steps(
         error = exchange(halo, steps % 2, cells)
         k = steps // states.parts - samples.number if steps % states.parts == 0 else -1
         if steps == progress.last or 0 <= k < samples.work.size:
-            ghosts = halo.columns[: rows // 2, halo.columns.shape[1] - states.ghosts :]
+            ghosts = halo.columns[: states.ghost_rows, halo.columns.shape[1] - states.ghosts :]
             state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
             if 0 <= k < samples.work.size and not take_sample(state, k, samples) and progress.failed > progress.last:
                 progress.failed, progress.cluster = steps, -1
@@ -136,12 +139,13 @@ class Propagator(Engine):
         self._forces = Forces(model, layout, series, self._regions)
         self._stencil = create_stencil(series, layout, self._regions)
         ghosts = [self._regions.add(cell, 1) for cell in layout.neighbours() if cell is not None]
-        self._components = np.zeros((2, layout.size + layout.dofs * len(ghosts)))
+        self._components = np.zeros((2, layout.size + layout.ghost_rows * len(ghosts)))
         self._states = [layout.create_vector(components) for components in self._components]
         self._halo = self._regions.bind_columns(self._states)
         self._progress = np.zeros(1, PROGRESS)
         parts = round(model.sample_interval / series.interval)
-        self._record = States(self._components, layout.owned, len(ghosts), parts, model.sample_interval, self._progress)
+        cells = layout.owned, len(ghosts), layout.ghost_rows
+        self._record = States(self._components, *cells, parts, model.sample_interval, self._progress)
         self.state, self.time = self._states[0], 0.0
 
     @property
@@ -151,15 +155,13 @@ class Propagator(Engine):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """Springs that are not linear; contacts of other pairs, or pressed; too few cells; too many close sites."""
+        """Springs that are not linear; too few cells; too many close sites."""
         if not model.chain.cell.is_linear:
             return "its steps are those of linear springs, and some have a quadratic or cubic part"
-        if model.chain.pairs or any(min(gaps) < 0 for gaps in model.gaps):
-            return "contacts are not between the cell's pair alone, or pressed together (contacts.pair, precompression)"
         series = step_series(model)
         if series is None:
             shortest = StepSeries(model.chain, model.sample_interval / MOST_PARTS, model.rtol)
-            if model.chain.cells > 2 * shortest.reach:
+            if model.chain.cells >= shortest.width:
                 return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
             return f"{model.chain.cells} cells are fewer than the propagator's band"
         numbers, first = group_dofs(model, series.reach)

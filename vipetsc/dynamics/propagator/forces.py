@@ -1,10 +1,10 @@
-"""Clusters: contact sites, and driven masses, that feel one another within one linear step; their records and log.
+"""The forces of clusters of contact sites and driven masses within one linear step; their records and log.
 
 Sec. 5 and 6 of the derivation in the package's docstring.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from mpi4py import MPI
 
@@ -19,11 +19,12 @@ from vipetsc.dynamics.drives import Drives, create_drives
 from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.places import site_records
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
+from vipetsc.dynamics.propagator.clusters import contact_dofs, create_dof_tables, create_responses, group_dofs, reaching
 from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, create_trial
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.propagator.tables import DofTables, owned_cells
+from vipetsc.dynamics.propagator.tables import DofTables
 from vipetsc.dynamics.propagator.tape import create_tape, select_tape
 
 # A contact's first substep as a share of its duration at a tolerance of 1e-6.
@@ -32,53 +33,6 @@ FIRST_SUBSTEP = 0.1
 MOST_CHANGES = 5_000
 FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY), ("cluster", SUBSTEP_STATE)])
 """A DoF of ``contact_dofs`` in a checkpoint: its number, below 0 of a drive, and what its cluster's record has."""
-
-
-def contact_dofs(model: Model) -> np.ndarray:
-    """The relative displacements of the contact sites and the displacements of driven masses, the first drive's last.
-
-    A site has its number, the n-th drive -n. Each has its ``cell``, the weights ``form`` (mass,) of the displacements
-    there and its ``clearance`` in m.
-    """
-    lattice, unit, drives = model.chain, np.eye(model.chain.cell.dofs), model.drives[::-1]
-    dofs = np.zeros(len(lattice.sites) + len(drives), [("cell", int), ("form", float, len(unit)), ("clearance", float)])
-    dofs["cell"] = *lattice.sites, *(drive.cell for drive in drives)
-    dofs["form"] = unit[lattice.cell.resonator] - unit[lattice.cell.host]
-    dofs["form"][len(lattice.sites) :] = unit[[drive.mass for drive in drives]]
-    dofs["clearance"] = *lattice.clearances, *[np.inf] * len(drives)
-    return dofs
-
-
-class Groups(NamedTuple):
-    """Groups of ``contact_dofs``: the ``numbers`` (dof,) of group g are ``first[g]`` to ``first[g + 1]``.
-
-    In each group the sites' numbers come first, in their own order, then -1 for the first drive, -2 for the second.
-    """
-
-    numbers: np.ndarray
-    first: np.ndarray
-
-
-def group_dofs(model: Model, reach: int) -> Groups:
-    """Groups of ``contact_dofs`` of which each is within ``reach`` cells of another, in the lattice's order."""
-    lattice = model.chain
-    cells = contact_dofs(model)["cell"]
-    numbers = np.append(np.arange(len(lattice.sites)), np.arange(-len(model.drives), 0))
-    order, group = np.argsort(cells), np.zeros(len(cells), np.int64)
-    group[order[1:]] = np.cumsum(np.diff(cells[order]) > reach)
-    if lattice.ends == "periodic" and cells.min() + lattice.cells - cells.max() <= reach:
-        group[group == group.max()] = 0
-    first = np.append(0, np.cumsum(np.bincount(group)))
-    return Groups(numbers[np.lexsort((np.abs(numbers), numbers < 0, group))], first)
-
-
-def _reaching(groups: Groups, cells: np.ndarray, reach: int, layout: Layout) -> Groups:
-    """Those of ``groups``, whose DoFs are in ``cells``, that have a DoF within ``reach`` of the rank's cells."""
-    ways = (-layout.cells, 0, layout.cells) if layout.periodic else (0,)
-    near = [(cells + way >= layout.start - reach) & (cells + way < layout.stop + reach) for way in ways]
-    sizes = np.diff(groups.first)
-    feels = np.logical_or.reduceat(np.any(near, axis=0), groups.first[:-1]) & (layout.owned > 0)
-    return Groups(groups.numbers[np.repeat(feels, sizes)], np.append(0, np.cumsum(sizes[feels])))
 
 
 @njit(error_model="numpy")
@@ -164,14 +118,14 @@ class Forces:
     def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
         self._comm = layout.comm
         all_dofs, every = contact_dofs(model), group_dofs(model, series.reach)
-        groups = _reaching(every, all_dofs["cell"][every.numbers], series.reach, layout)
+        groups = reaching(every, all_dofs[every.numbers], series.reach, layout)
         dofs = all_dofs[groups.numbers]
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
         count, terms = len(dofs), series.terms
         self.clusters = Cluster(
             contacts=site_records(model, groups.numbers),
             drives=create_drives(model.drives, np.where(groups.numbers < 0, -1 - groups.numbers, -1).tolist()),
-            response=_responses(groups, self.dofs, model, series),
+            response=create_responses(groups, self.dofs, model, series),
             nodes=collocation(2 * terms),
             interval=series.interval,
             omega_max_h=series.omega_max_h,
@@ -241,60 +195,3 @@ class Forces:
         self.clusters.energy[:], self.clusters.history[:] = mine["energy"], mine["history"]
         self.clusters.state[:] = mine["cluster"][self.dofs.first[:-1]]
         self.tracker.restore(tables["sites"])
-
-
-def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> DofTables:
-    """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
-    numbers, dofs, r = groups.numbers, contact_dofs(model)[groups.numbers], series.reach
-    # DoFs share their rows where the cells around them do.
-    kinds = np.column_stack([series.like(dofs["cell"]), dofs["form"]])
-    kinds, table = np.unique(kinds, axis=0, return_inverse=True)
-    cells, forms = kinds[:, 0].astype(np.int64), kinds[:, 1:]
-    rows = [
-        np.einsum("i,imjc->jcm", form, series.cut(around, -r, 2 * r + 1).astype(float))
-        for form, around in zip(forms, series.rows(cells), strict=True)
-    ]
-    masses = [model.chain.coefficients(cell - r, cell + r + 1).masses.T for cell in cells.tolist()]
-    halves = 1 + series.is_damped
-    places = np.full(len(contact_dofs(model)), -1)
-    places[numbers] = np.arange(len(numbers))
-    return DofTables(
-        column=halo.add(dofs["cell"] - r, 2 * r + 1),
-        owned=owned_cells(dofs["cell"], r, layout),
-        table=table,
-        rows=np.array(rows).reshape(len(rows), halves * layout.dofs, 2 * r + 1, halves * series.terms),
-        factors=series.factors(),
-        inverse_masses=1 / np.array(masses).reshape(len(rows), layout.dofs, 2 * r + 1),
-        # An onset within rounding of the clearance is one.
-        clearance=dofs["clearance"] * (1 - 1e-9),
-        sites=np.add.reduceat(numbers >= 0, groups.first[:-1], dtype=np.int64) if len(numbers) else numbers[:0],
-        first=groups.first,
-        ledger=places[[*(-1 - i for i in layout.drives), *layout.sites]],
-    )
-
-
-def _responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
-    """Motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H: ``Cluster.response``."""
-    dofs, n, (first, r) = contact_dofs(model), model.chain.cells, (groups.first, series.reach)
-    cells, d, damped = dofs["cell"][groups.numbers], model.chain.cell.dofs, series.is_damped
-    # From velocities: (table, mass, cell, term).
-    rows, factors = tables.rows[:, -d:, :, damped:], tables.factors[1::2] * series.interval
-    if damped:
-        factors = tables.factors[2 * series.terms + 1 :] * series.interval
-    _, examples = np.unique(tables.table, return_index=True)
-    weights = tables.inverse_masses[:, :, r] * dofs["form"][groups.numbers[examples]]
-    sizes = np.diff(first)
-    response = np.zeros((len(cells), max(sizes, default=0), rows.shape[-1]))
-    for j in range(response.shape[1]):
-        targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
-        sources = np.repeat(first[:-1], sizes)[targets] + j
-        offsets = cells[sources] - cells[targets]
-        if model.chain.ends == "periodic":
-            offsets = (offsets + n // 2) % n - n // 2
-        near = np.abs(offsets) <= r
-        targets, sources, offsets = targets[near], sources[near], offsets[near]
-        pairs = np.column_stack([tables.table[targets], tables.table[sources], r + offsets])
-        pairs, which = np.unique(pairs, axis=0, return_inverse=True)
-        of_pairs = [factors * (weights[source] @ rows[target, :, at]) for target, source, at in pairs.tolist()]
-        response[targets, j] = np.reshape(of_pairs, (-1, rows.shape[-1]))[which]
-    return response

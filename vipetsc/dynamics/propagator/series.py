@@ -23,6 +23,8 @@ MOST_TERMS = 24
 BATCH = 64
 # Shares of a step below this are rounding.
 ROUNDING = 1e-15
+# In place of the omega H of a lattice without springs.
+TINY = 1e-100
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,8 @@ class StepSeries:
 
     Rows are arrays (..., term, dof, cell): what a displacement's coefficients take from the displacements around
     it; the same rows, times H, give those of the velocities. With dashpots (..., 2 term, 2 dof, cell): what the
-    coefficient of each power of time takes from displacements and from H times velocities. A chain that is not
-    periodic must have more than 2 ``reach`` cells.
+    coefficient of each power of time takes from displacements and from H times velocities. A chain must have
+    at least ``width`` cells.
     """
 
     chain: Chain
@@ -57,7 +59,7 @@ class StepSeries:
     @cached_property
     def terms(self) -> int:
         """Number of powers of K in the series, the zeroth included; with dashpots half the powers of time."""
-        return next((m for m in range(1, MOST_TERMS) if self._remainder(m) <= self.tolerance / 4), MOST_TERMS)
+        return next((m for m in range(2, MOST_TERMS) if self._remainder(m) <= self.tolerance / 4), MOST_TERMS)
 
     def _remainder(self, terms: int) -> float:
         """Largest velocity that the series of so many terms leaves out, of one of unit velocity amplitude."""
@@ -86,7 +88,7 @@ class StepSeries:
 
     def _magnitudes(self, rows: np.ndarray) -> np.ndarray:
         """Magnitudes of P's entries (2 dof, 2 dof, cell) for it, a velocity counted as omega times a displacement."""
-        n, omega = self.chain.cell.dofs, self.omega_max_h / self.interval
+        n, omega = self.chain.cell.dofs, max(self.omega_max_h, TINY) / self.interval
         share = np.abs(self.stencil(rows))
         share[:n, n:] *= omega
         share[n:, :n] /= omega
@@ -114,6 +116,11 @@ class StepSeries:
     def reach(self) -> int:
         """Cells each way beyond which the propagator's entries sum to less than the tolerance."""
         return next(r for r in range(1, self._width + 1) if self._beyond(r) <= self.tolerance / 2)
+
+    @property
+    def width(self) -> int:
+        """Cells that a mass reaches, or a contact: it may have a mass in the next cell."""
+        return 2 * self.reach + 1 + self.chain.is_joined
 
     @cached_property
     def truncation(self) -> float:

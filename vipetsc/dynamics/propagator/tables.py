@@ -11,9 +11,9 @@ from vipetsc.compiled import njit
 from vipetsc.dynamics.layout import Layout
 
 
-def owned_cells(cells: np.ndarray, reach: int, layout: Layout) -> np.ndarray:
-    """Local numbers (dof, 2 reach + 1) of what lies within ``reach`` of ``cells`` (dof,), -1 where nothing is owned."""
-    around = cells[:, None] + np.arange(-reach, reach + 1)
+def owned_cells(firsts: np.ndarray, count: int, layout: Layout) -> np.ndarray:
+    """Local numbers (dof, count) of so many cells from each of ``firsts`` (dof,) on, -1 where nothing is owned."""
+    around = firsts[:, None] + np.arange(count)
     around = around % layout.cells if layout.periodic else around
     return np.where((around >= layout.start) & (around < layout.stop), around - layout.start, -1)
 
@@ -25,7 +25,7 @@ class DofTables(NamedTuple):
     the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
     mass, cell, term) and the masses there in ``inverse_masses`` (table, mass, cell) in 1/kg; ``factors`` (2 term,) are
     H^(k mod 2)/k!. With dashpots rows are (table, 2 mass, cell, 2 term), ``factors`` 1/k! and then H/k!. ``clearance``
-    (dof,) in m is that of a site, inf for a driven mass; so many ``sites`` (cluster,) come before these. The DoFs
+    (dof,) in m is the lesser of a site, inf for a driven mass; so many ``sites`` (cluster,) come before these. The DoFs
     of cluster c are ``first[c]`` to ``first[c + 1]``, those with an energy in the rank's ledger are in ``ledger``.
     """
 

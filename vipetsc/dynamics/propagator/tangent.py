@@ -5,9 +5,10 @@ import copy
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.law import CLOSED
+from vipetsc.contact.law import CLOSED, LASTING
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout, create_record
+from vipetsc.dynamics.places import site_records
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
@@ -36,6 +37,14 @@ class TangentPropagator(Propagator):
         forces.clusters = clusters._replace(tape=tape)
         self._linear: tuple[np.ndarray, np.ndarray] | None = None
         self._moved: tuple[Variations, Halo, list] | None = None
+
+    @classmethod
+    def refusal(cls, model: Model) -> str | None:
+        """As of the engine; contacts that touch or are pressed at rest, too."""
+        sites = site_records(model, np.arange(len(model.chain.sites)))
+        if (np.abs(sites["mode"]) == LASTING).any():
+            return "contacts touch or are pressed at rest, beside which no variations are moved"
+        return super().refusal(model)
 
     def place(self, cells: np.ndarray, speed: float) -> None:
         """Begin at ``cells``; ``speed`` in m/s is that of relative motion, for the accuracy of closed contacts.
