@@ -122,6 +122,13 @@ def modified(folder: Path) -> dict[Path, int]:
 alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, marks=pytest.mark.mpirun)])
 
 
+def on_two(*values: object) -> list:
+    """Parameters that ``scripts/test`` takes on one rank and two: more ranks would say the same again."""
+    return [
+        pytest.param(*value if isinstance(value, tuple) else (value,), marks=pytest.mark.on_two) for value in values
+    ]
+
+
 class StopAt(StopRequest):
     """A request that comes at the n-th look."""
 
@@ -175,6 +182,21 @@ def in_process(capsys, monkeypatch):
         return subprocess.CompletedProcess(words, code, *capsys.readouterr())
 
     return call
+
+
+@pytest.fixture
+def on_ranks(vipetsc, in_process):
+    """Call the program on so many ranks of mpirun, or with 0 in this process: ``on_ranks(ranks, "run", ...)``."""
+    return lambda ranks, *arguments: vipetsc(ranks, *arguments) if ranks else in_process(*arguments)
+
+
+@pytest.fixture
+def plain_pictures(monkeypatch):
+    """Coarse pictures that are not laid out, which costs most: for tests of files, not of what is seen."""
+    from vipetsc.figures import style
+
+    monkeypatch.setattr(style, "SCREEN", 80)
+    monkeypatch.setattr(style, "_lay_out", lambda figure: figure.set_layout_engine("none"))
 
 
 @pytest.fixture

@@ -21,6 +21,9 @@ wavenumbers = 21
 FIGURES = {"deflections", "cost_maps", "dispersion_against_lambda", "dispersion_against_eta"}
 
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
+
 @pytest.fixture
 def case(tmp_path):
     path = tmp_path / "small.toml"
@@ -36,7 +39,7 @@ def numbers(path):
 @pytest.mark.mpirun
 def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, in_process, case, tmp_path):
     out = tmp_path / "out"
-    done = vipetsc(0, "design", case, "--out", out)
+    done = in_process("design", case, "--out", out)
     assert done.returncode == 0, done.stderr
     rows = {tuple(line.split()[:2]): line.split()[2:] for line in done.stdout.splitlines()}
     assert rows["printed", "weighted"][:2] == rows["calibrated", "weighted"][:2] == ["0.1", "0.5"]
@@ -126,10 +129,10 @@ def test_what_is_wrong_with_a_search_is_named(change, message):
 
 
 @alone_and_on_two_ranks
-def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
+def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
     """Everything wrong is said at once, once."""
     wrong = ("--set", "design.eta.last=1.5", "--set", "design.lambda.coutn=3", "--set", "design.wavenumbers=2")
-    done = vipetsc(ranks, "design", case, "--out", tmp_path / "out", *wrong)
+    done = on_ranks(ranks, "design", case, "--out", tmp_path / "out", *wrong)
     assert done.returncode == 2, done.stdout
     for message in (
         "3 problems",

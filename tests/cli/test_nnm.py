@@ -126,10 +126,10 @@ def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tm
 
 
 @alone_and_on_two_ranks
-def test_a_file_that_is_no_branch_is_refused_on_all_ranks(vipetsc, tmp_path, ranks):
+def test_a_file_that_is_no_branch_is_refused_on_all_ranks(on_ranks, tmp_path, ranks):
     with h5py.File(tmp_path / "branch-x.h5", "w") as file:
         file["energy"] = [1.0]
-    done = vipetsc(ranks, "plot", tmp_path)
+    done = on_ranks(ranks, "plot", tmp_path)
     assert done.returncode == 2
     assert "is not a branch" in done.stderr
     assert "Traceback" not in done.stderr

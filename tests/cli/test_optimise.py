@@ -24,6 +24,9 @@ from vipetsc.io.records import read_records
 FIGURES = {"convergence", "compared_designs", "compared_curves"}
 
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
+
 @pytest.fixture
 def case(tmp_path):
     path = tmp_path / "small.toml"
@@ -100,7 +103,7 @@ def test_a_request_to_stop_ends_with_75_and_the_same_command_goes_on(vipetsc, in
 
 
 @alone_and_on_two_ranks
-def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
+def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
     """Everything wrong is said at once, once."""
     wrong = (
         "--set",
@@ -108,7 +111,7 @@ def test_bad_cases_write_nothing(vipetsc, case, tmp_path, ranks):
         "--set",
         "optimise.objective=[{measure='band_share'}]",
     )
-    done = vipetsc(ranks, "optimise", case, "--out", tmp_path / "out", *wrong)
+    done = on_ranks(ranks, "optimise", case, "--out", tmp_path / "out", *wrong)
     assert done.returncode == 2, done.stdout
     for message in ("2 problems", "optimise.variables.clearance[1] = -1.0", "optimise.objective[1].band: missing"):
         assert done.stderr.count(message) == 1

@@ -55,14 +55,14 @@ def one_of_each(tasks):
 
 @pytest.mark.mpirun
 @pytest.mark.parametrize(("kind", "code"), [("sigterm", 75), ("sigkill", 137)])
-def test_a_fault_by_the_front_door(vipetsc, tmp_path, kind, code):
-    """Real processes from their beginning to their end, as a user has them: exit codes, and the plain command again."""
+def test_a_fault_by_the_front_door(vipetsc, in_process, tmp_path, kind, code):
+    """Real processes from their beginning to their end, as a user has them: exit codes; and the plain command again."""
     case, whole, out = prepare(SCENARIOS["run-ts"], tmp_path), tmp_path / "whole", tmp_path / "out"
     simulate(Case.load(case), whole)
     fault = vipetsc(2, "step", "60", "1", kind, "--", "run", case, "--out", out, module="tests.faults.inject", cwd=ROOT)
     assert fault.returncode == code, fault.stderr
     assert "Traceback" not in fault.stderr
     assert not (out / "run.h5").exists()
-    again = vipetsc(2, "run", case, "--out", out)
+    again = in_process("run", case, "--out", out)
     assert again.returncode == 0, again.stderr
     assert_same_bits(datasets(whole / "run.h5"), datasets(out / "run.h5"))

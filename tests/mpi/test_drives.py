@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, on_two, small_case
 from tests.mpi.test_partition import runs_alike
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.observers import Observer
@@ -24,13 +24,13 @@ class InParts(Observer):
 
 
 @pytest.mark.parallel([1, 2, 3])
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
+@pytest.mark.parametrize("engine", ["ts", *on_two("propagator")])
 def test_same_bits_under_several_drives(folder, engine):
     runs_alike(folder, small_case(drive={"more": DRIVES}, time={"end": 0.03, "engine": engine}))
 
 
 @pytest.mark.parallel([1, 2, 3])
-@pytest.mark.parametrize("engine", ["ts", "propagator"])
+@pytest.mark.parametrize("engine", [*on_two("ts"), "propagator"])
 def test_a_run_goes_on_amid_its_drives(folder, engine):
     case = small_case(drive={"more": DRIVES}, time={"end": 0.02, "engine": engine})
     simulate(case, folder / "whole", observers=[InParts])

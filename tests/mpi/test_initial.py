@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.conftest import small_case
+from tests.conftest import on_two, small_case
 from tests.mpi.test_partition import runs_alike
 
 PACKET = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width": 2, "amplitude": 2e-3}
@@ -13,7 +13,7 @@ MODE = {"kind": "mode", "number": 40, "energy": 0.5}
 
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
-@pytest.mark.parametrize(("initial", "ends"), [(PACKET, "periodic"), (PACKET, "fixed"), (MODE, "free")])
+@pytest.mark.parametrize(("initial", "ends"), [(PACKET, "periodic"), *on_two((PACKET, "fixed"), (MODE, "free"))])
 def test_same_bits_with_closed_contacts_across_borders(folder, engine, initial, ends):
     # On 2 and 3 ranks, 24 cells are cut after 12; 8, 16.
     case = small_case(

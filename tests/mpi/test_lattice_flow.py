@@ -7,6 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
+from tests.conftest import on_two
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
 from vipetsc.modes.lattice_flow import LatticeFlow
@@ -15,7 +16,7 @@ COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.parallel([2, 3])
-@pytest.mark.parametrize("restitution", [1.0, 0.7])
+@pytest.mark.parametrize("restitution", [*on_two(1.0), 0.7])
 def test_variations_have_the_same_bits(restitution):
     """Clusters lie across the borders: 18 cells are cut after 9 or after 6 and 12."""
     sites, cells, dofs = (5, 8, 9, 12), 18, 4

@@ -12,7 +12,7 @@ from vipetsc.parallel import on_root
 from vipetsc.studies.one_site import make_law
 
 
-@pytest.mark.parallel([2, 3])
+@pytest.mark.parallel([2])
 def test_law_is_the_same_on_any_number_of_ranks(folder):
     comm, of = MPI.COMM_WORLD, case(law=COARSE | {"samples": 2})
     make_law(of, folder / "shared", comm)

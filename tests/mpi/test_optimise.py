@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import pytest
 
-from tests.conftest import TWO, StopAt, assert_same_bits, datasets, search_table
+from tests.conftest import TWO, StopAt, assert_same_bits, datasets, on_two, search_table
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.parallel import StoppedError, StopRequest
 from vipetsc.studies.optimise import run_search
@@ -27,7 +27,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.parallel([1, 2, 3])
-@pytest.mark.parametrize("team", [1, 2])
+@pytest.mark.parametrize("team", [*on_two(1), 2])
 def test_the_optimum_does_not_depend_on_the_ranks(folder, whole, team):
     text = run_search(plan(f"optimise.ranks={team}"), folder, MPI.COMM_WORLD)
     assert "14 designs" in text

@@ -19,7 +19,7 @@ from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, spread
 COMM = MPI.COMM_WORLD
 
 
-@pytest.mark.parallel([2, 3])
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("writer", ["gather", "parallel"])
 def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer):
     """HDF5 fails to close a file whose attributes, such as the seconds a run took, differ between ranks."""
@@ -38,7 +38,7 @@ def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer
         assert file.attrs["ranks"] == COMM.size
 
 
-@pytest.mark.parallel([2, 3])
+@pytest.mark.parallel(2)
 def test_a_run_in_memory_is_gathered_on_rank_0(folder):
     case = small_case(output={"writer": "parallel"}, time={"end": 0.02})
     memory = RunMemory(COMM)
@@ -79,7 +79,7 @@ def test_rows_are_sorted_over_ranks_and_none_has_all():
     np.testing.assert_array_equal(rows, expected[first : first + len(rows)])
 
 
-@pytest.mark.parallel([2, 3])
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("writer", ["gather", "parallel"])
 def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch, writer):
     path = folder / "run"

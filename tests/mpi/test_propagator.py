@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from tests.conftest import small_case
+from tests.conftest import on_two, small_case
 from tests.mpi.test_partition import runs_alike
 from vipetsc.case import Case
 
 
 @pytest.mark.parallel([2, 3, 4])
-@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+@pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
+@pytest.mark.parametrize("law", ["hertz", *on_two("bilinear")])
 def test_same_bits_with_clusters_across_borders(folder, ends, law):
     # On 2, 3 and 4 ranks, 24 cells are cut after 12; 8, 16; 6, 12, 18.
     case = small_case(
@@ -22,7 +22,7 @@ def test_same_bits_with_clusters_across_borders(folder, ends, law):
     runs_alike(folder, case)
 
 
-@pytest.mark.parallel([2, 3, 4])
+@pytest.mark.parallel([2, 4])
 def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
     """Samples .8 ms apart: the band reaches over several ranks of a few cells."""
     case = small_case(
@@ -34,7 +34,7 @@ def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
     runs_alike(folder, case)
 
 
-@pytest.mark.parallel([2, 3])
+@pytest.mark.parallel(2)
 def test_same_bits_with_dashpots(folder):
     damping, sites = {"mass": 10.0, "stiffness": 5e-6}, [1, 7, 12, 13, 16, 17]
     time = {"end": 0.02, "engine": "propagator"}

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets
+from tests.conftest import StopAt, assert_same_bits, datasets, on_two
 from tests.faults.inject import Injector
 from vipetsc.case import Sweep
 from vipetsc.parallel import SharedCounter, StopRequest
@@ -110,7 +110,7 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
 
 
 @pytest.mark.parallel([2, 3])
-@pytest.mark.parametrize(("team", "looks"), [(1, 1), (2, 1)])
+@pytest.mark.parametrize(("team", "looks"), [*on_two((1, 1)), (2, 1)])
 def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
     comm = MPI.COMM_WORLD
     plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])

@@ -92,6 +92,7 @@ def members(ensemble):
     return [folder for _, folder in whole_members(ensemble)]
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_every_figure_is_drawn_from_files(whole):
     folder = Path(whole.attrs["folder"])
     written = draw("sweep", [folder]) + draw("sweep", [folder], ["amplitudes"], ("pdf",))

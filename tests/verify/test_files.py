@@ -101,7 +101,7 @@ def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
         return going
 
     monkeypatch.setattr(integrator.Integrator, "advance", poisoned)
-    result = simulate(small_case(), folder / "run")
+    result = simulate(small_case(time={"end": 0.0302}), folder / "run")
     assert "not finite" in result.sentence
     assert "cell 4, nearest site 1 in cell 6" in result.sentence
     run = datasets(folder / "run" / "run.h5")

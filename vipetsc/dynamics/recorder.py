@@ -85,8 +85,7 @@ class Recorder(Observer):
 
     def _begin_chunk(self) -> None:
         n, self._held, self._rows, self._number = self._length, 0, 0, 0
-        shape = n, len(self.setup.model.drives)
-        self._sums, self._work = np.zeros((n, PARTS, 2), np.int64), np.zeros(shape)
+        self._sums, self._work = np.zeros((n, PARTS, 2), np.int64), np.zeros((n, len(self.setup.model.drives)))
         self._losses = np.zeros((n, len(self.setup.layout.sites)))
         self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[part] for part in self._energies))}
         self._fields = self.setup.output.room(self._shape)
@@ -95,7 +94,10 @@ class Recorder(Observer):
         """Room for the samples from ``number`` on: for as many as the chunk still takes, and at ``most`` so many."""
         meter, output = self.setup.meter, self.setup.case.output
         here = slice(self._held, self._held + most)
-        arrays = self._sums[here], self._work[here], self._losses[here], self._fields[:, self._rows :], self._moving
+        fields = self._fields[:, self._rows :][:, :most]
+        if not fields.flags.c_contiguous:  # engines would be compiled once more
+            fields = np.empty(fields.shape)
+        arrays = self._sums[here], self._work[here], self._losses[here], fields, self._moving
         of_lattice = meter.lattice, meter.unit, self.setup.model.sample_interval
         return Samples(number, *arrays, self._first, output.every, output.stride, *of_lattice)
 
@@ -105,7 +107,10 @@ class Recorder(Observer):
         for part in self._energies:
             self._kept[ENERGIES[part]][here] = getattr(block.energies, part)
         self._number = block.first - self._held
-        self._held, self._rows = here.stop, self._rows + block.share.rows(len(block))
+        rows = self._rows + block.share.rows(len(block))
+        if not np.may_share_memory(self._fields, block.share.fields):
+            self._fields[:, self._rows : rows] = block.share.fields[:, : rows - self._rows]
+        self._held, self._rows = here.stop, rows
 
     @property
     def due(self) -> bool:

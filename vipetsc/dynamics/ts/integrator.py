@@ -18,7 +18,7 @@ from vipetsc.dynamics.drives import select_piece
 from vipetsc.dynamics.engine import Engine, StalledError, Stretch
 from vipetsc.dynamics.layout import Layout, create_record, join
 from vipetsc.dynamics.samples import Samples, take_sample
-from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register, right_hand_side
+from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.parallel import StopRequest
 
@@ -104,11 +104,11 @@ class Integrator(Engine):
         """Fill ``motion`` (sites, 3) from the state; it is taken at ``time``, else at the present one."""
         if self.lattice.shape.exchange:
             self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-        time, paired = self.time if time is None else time, self.lattice.shape.paired
-        with self.state.localForm() as local:
-            if not paired:
+        time = self.time if time is None else time
+        if not self.lattice.shape.paired:
+            with self.state.localForm() as local:
                 return observe(time, local.array, self.lattice, motion)
-            right_hand_side(time, local.array, self.rates.array, self.lattice)
+        self.ts.computeRHSFunction(time, self.state, self.rates)
         self.rates.ghostUpdate()
         with self.state.localForm() as local, self.rates.localForm() as rates:
             observe_pairs(local.array, rates.array, self.lattice, motion)
