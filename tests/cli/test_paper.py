@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import subprocess
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -181,7 +183,8 @@ def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser
     left, top, width, height = browser.ask(
         session, look + "image.scrollIntoView({block: 'center'}); return box(image);"
     )
-    axes = json.loads(browser.ask(session, look + "return figure.querySelector('script').textContent;"))
+    packed = browser.ask(session, look + "return figure.querySelector('script').textContent;")
+    axes = json.loads(zlib.decompress(base64.b64decode(packed)))
     (first,) = [a for a in axes if a["curves"]][:1]
     curve, (west, north, east, south) = first["curves"][0], first["box"]
     with h5py.File(made / "interband/ensemble.h5") as file:  # the numbers are those of the results

@@ -84,6 +84,34 @@ def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
     assert content.sites.tolist() == [8, 16]
 
 
+def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(tmp_path):
+    """With velocities alone, what a frame shows is the kinetic energy of the cells as they are."""
+    write_run(tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        profiles = (
+            '"masses[1]" = { first = 0.005, last = 0.01 }',
+            '"springs[1].stiffness" = { cells = [10], factor = 3.0 }',
+        )
+        file.attrs["case"] = "\n".join([file.attrs["case"], "[lattice.profiles]", *profiles])
+        file["displacement"][...] = 0.0
+        velocity = file["velocity"][...]
+    own = np.tile(CELL.masses, (24, 1))
+    own[:, 0] = np.linspace(0.005, 0.01, 24)
+    with open_run(tmp_path / "run.h5") as run:
+        content = scenes(run, None, Shot(speed=0.016, rate=3.0))
+        part = scenes(run, None, Shot(speed=0.016, rate=3.0, cells=(11, 24)))
+        fast = scenes(run, None, Shot("velocity", speed=0.016, rate=3.0))
+    rows = np.rint(content.time / 2e-4).astype(int)
+    kinetic = 0.5 * (own * velocity[rows] ** 2).sum(axis=(1, 2))
+    assert content.waves.sum(axis=(1, 2)) == pytest.approx(kinetic, rel=1e-12)
+    assert content.wave.sum(axis=(1, 2))[3:] == pytest.approx(kinetic[3:], rel=0.05)  # some is beyond the ends
+    assert np.array_equal(fast.wave[:, 0], velocity[rows, :, CELL.host])
+    assert content.cell.masses == pytest.approx((0.0075, *CELL.masses[1:]))
+    assert part.cell.masses[0] == pytest.approx(own[10:, 0].mean())
+    stiffness = [cell.springs[0].stiffness / CELL.springs[0].stiffness for cell in (content.cell, part.cell)]
+    assert stiffness == pytest.approx([1 + 2 / 24, 1.0])
+
+
 def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monkeypatch):
     read, original = {}, h5py.Dataset.__getitem__
 

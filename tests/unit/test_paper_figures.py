@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -104,7 +105,8 @@ def test_what_a_picture_shows_is_told_as_numbers(tmp_path):
         left.scatter([2, 3], [4, 5], c=[0.1, 0.9], label="by colour")
         left.scatter([2], [4], facecolors="none", edgecolors="k")
         left.set(xscale="log", xlabel="Amplitude $A$ (N)", title="")
-        right.pcolormesh(np.eye(3))
+        mesh = right.pcolormesh(np.eye(3), norm=LogNorm(1e-4, 1), cmap="viridis")
+        figure.colorbar(mesh, ax=right, label="Energy $E$ (J)")
         right.plot([0, 2], [0, 2])
         table.axis("off")
         path = save(figure, tmp_path / "plain.json")
@@ -115,10 +117,12 @@ def test_what_a_picture_shows_is_told_as_numbers(tmp_path):
     curve, many, points = axes["curves"]
     assert points["label"] == "by colour" and points["x"] == [2, 3] and not points["joined"]
     assert many["label"] == "" and len(many["x"]) < 400
-    assert np.interp(wave[0], many["x"], many["y"]) == pytest.approx(wave[1], abs=3)
+    assert np.interp(np.log(wave[0]), np.log(many["x"]), many["y"]) == pytest.approx(wave[1], abs=6)  # it is steep
     assert curve["label"] == "measured" and curve["colour"] == "#0072b2" and curve["joined"]
     assert curve["x"] == [1, 10, None, 100] and curve["y"] == [2, 20, None, 200]
-    assert image["curves"] == []
+    assert image["curves"] == [] and "map" not in axes and image["map"]["label"] == "Energy E (J)"
+    assert image["map"]["colours"][:6] == "440154" and len(image["map"]["colours"]) == 6 * len(image["map"]["values"])
+    assert image["map"]["values"] == pytest.approx(np.geomspace(1e-4, 1, len(image["map"]["values"])), rel=1e-4)
     with rc_style():
         figure = new_figure(4, 2)
         _, right = figure.subfigures(1, 2)

@@ -1,4 +1,4 @@
-"""What a figure shows, as numbers: its axes' places, scales and labels, and the curves in them.
+"""What a figure shows, as numbers: its axes' places, scales and labels, their curves, the values of a map's colours.
 
 A page lays this over the picture, so that values can be read off and curves drawn again, larger or without some.
 """
@@ -13,8 +13,9 @@ from matplotlib.colors import to_hex
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
-CLOSE = 0.1  # pixels that a curve may move for the sake of fewer points
+CLOSE = 0.5  # pixels that a curve may move for the sake of fewer points
 FEW = 100  # points of a curve, of which none is left out
+STOPS = 33  # colours of a map whose values are told; those between lie on lines
 MARKUP = re.compile(r"[${}]|\\[a-z]+ ?|\\[,;]")
 
 
@@ -22,19 +23,21 @@ def drawn(figure: Figure, strip: float) -> list[dict[str, Any]]:
     """Every axes of a laid-out ``figure`` under whose picture a ``strip`` (in) stands, insets last.
 
     ``box``: left, top, right and bottom as shares of the picture; ``title``; ``x`` and ``y``: low, high, whether
-    logarithmic, label; ``curves``: label, colour, whether points are joined, x and y in five digits, None for a gap.
+    logarithmic, label; ``curves``: label, colour, whether points are joined, x and y in four digits, None for a gap;
+    ``map`` of axes with one: its label, ``colours`` (rrggbb one after another, lowest first), and their ``values``.
     """
     _, height = figure.get_size_inches()
     share = height / (height + strip)
     panels = []
     outer = figure.get_axes()
+    bars = {shape.norm: shape.colorbar.ax for axes in outer for shape in _maps(axes) if shape.colorbar}
     for axes in [*outer, *(inset for around in outer for inset in around.child_axes)]:
         if not axes.axison or axes.get_label() == "<colorbar>" or not {_scale(axes, way) for way in "xy"} <= SCALES:
             continue
         box = axes.bbox.transformed(figure.transFigure.inverted())  # that of a subfigure's axes as well
         edges = [box.x0, (1 - box.y1) * share, box.x1, (1 - box.y0) * share]
         about = {"box": [round(float(edge), 4) for edge in edges], "title": plain(axes.get_title("left"))}
-        panels.append(about | {"x": _axis(axes, "x"), "y": _axis(axes, "y"), "curves": _curves(axes)})
+        panels.append(about | {"x": _axis(axes, "x"), "y": _axis(axes, "y")} | _shown(axes, bars))
     return panels
 
 
@@ -60,10 +63,23 @@ def _axis(axes: Axes, way: str) -> dict[str, Any]:
     return {"low": low, "high": high, "log": _scale(axes, way) == "log", "label": plain(next(filter(None, labels), ""))}
 
 
+def _maps(axes: Axes) -> list[Any]:
+    """Images and meshes in ``axes``, the lowest first."""
+    return [*axes.images, *(shape for shape in axes.collections if isinstance(shape, QuadMesh))]
+
+
+def _shown(axes: Axes, bars: dict[Any, Axes]) -> dict[str, Any]:
+    """The curves of ``axes``, or what its map's colours stand for, with the label of the one of ``bars`` for them."""
+    if not (maps := _maps(axes)):
+        return {"curves": _curves(axes)}
+    norm, shares, bar = maps[0].norm, np.linspace(0, 1, STOPS), bars.get(maps[0].norm)
+    label = plain(bar.get_ylabel() or bar.get_xlabel()) if bar else ""
+    colours = "".join(to_hex(colour)[1:] for colour in maps[0].cmap(shares))
+    return {"curves": [], "map": {"label": label, "colours": colours, "values": _rounded(norm.inverse(shares))}}
+
+
 def _curves(axes: Axes) -> list[dict[str, Any]]:
-    """Lines and scattered points in the data's coordinates, none of a map; error bars are named by their container."""
-    if axes.images or any(isinstance(shape, QuadMesh) for shape in axes.collections):
-        return []
+    """Lines and scattered points in the data's coordinates; error bars are named by their container."""
     bars = [shape for shape in axes.containers if isinstance(shape, ErrorbarContainer)]
     names, caps = {bar[0]: bar.get_label() for bar in bars}, {cap for bar in bars for cap in bar[1]}
     shapes = [
@@ -118,4 +134,4 @@ def _needed(place: np.ndarray) -> np.ndarray:
 
 
 def _rounded(values: np.ndarray) -> list[float | None]:
-    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]
+    return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values]

@@ -40,14 +40,14 @@ class Stage:
     """The figure of ``content``, ``width`` pixels wide; ``frame`` draws what moves."""
 
     def __init__(self, run: xr.Dataset, content: Scenes, width: int = WIDTH) -> None:
-        self.content, case = content, Case.of(run)
+        self.content = content
         figure = style.new_figure(INCHES, round(width * SHAPE / 2) * 2 * INCHES / width)
         figure.set_dpi(width / INCHES)
         ratios = {"width_ratios": (1.6, 1), "height_ratios": (1.4, 1)}
         axes = figure.subplot_mosaic([["wave", "waves"], ["energy", "waves"]], **ratios)
         self._moving: list[tuple[Any, Any]] = []
-        self._draw_wave(axes["wave"], case.name)
-        self._draw_waves(axes["waves"], case.model().chain.cell)
+        self._draw_wave(axes["wave"], Case.of(run).name)
+        self._draw_waves(axes["waves"], content.cell)
         self._draw_energies(axes["energy"], run)
         self._canvas = FigureCanvasAgg(figure)
         figure.get_layout_engine().execute(figure)

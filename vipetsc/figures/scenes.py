@@ -9,6 +9,7 @@ from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.figures import panels
 from vipetsc.io.read import field_time
+from vipetsc.lattice import UnitCell
 
 LENGTH, RATE, WIDTH = 10.0, 15.0, 960  # in s, frames a second and pixels where none are asked for
 MOST_FRAMES, MOST_CELLS = 5000, 20_000
@@ -35,10 +36,12 @@ class Scenes(NamedTuple):
 
     ``time`` (frame) in s; ``cells`` (cell) from 1; ``wave`` is the energy in J of the bands by cell or the velocity in
     m/s of the host; ``wavenumber`` in rad/cell, empty if waves cannot be told apart; ``flash`` (frame, site), the light
-    of impacts: 1 for one since the frame before, fading then; ``energies`` (part, instant) in J of ``parts``.
+    of impacts: 1 for one since the frame before, fading then; ``energies`` (part, instant) in J of ``parts``. Where
+    cells differ ``cell`` has the means of those shown, and masses are their own.
     """
 
     quantity: str
+    cell: UnitCell
     time: np.ndarray
     cells: np.ndarray
     wave: np.ndarray
@@ -84,17 +87,20 @@ def scenes(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> Scenes:
     """The content of the frames, from the samples nearest to them; others are not read. Raises as ``check``."""
     window, instants, whole = check(run, shot)
     time, cells, chain = field_time(run), run["cell"].values[window], Case.of(run).model().chain
-    cell, count = chain.cell, len(cells)
+    shown, count = (int(cells[0]) - 1, int(cells[-1])), len(cells)
+    cell = chain.mean_cell(*shown)
+    # A cell with its own masses moves as one with the mean masses and the same kinetic energy.
+    weight = np.sqrt(chain.coefficients(*shown).masses / cell.masses) if whole and cell is not chain.cell else 1.0
     # Of a ring, which joins the ends: cells at rest between them.
     beyond = 0 if chain.ends == "periodic" and count == chain.cells else count // 8 + 1
     ends = np.ones(count) if count == run.sizes["cell"] else spectra.taper(count, spectra.TAPER)
     ends = np.pad(ends, (0, beyond))[:, None]
     wave, waves = [], []
     for row in np.rint((instants - time[0]) / (time[1] - time[0])).astype(int):  # samples are even in time
-        fields = (run[name][row, window].values for name in ("velocity", "displacement")[: 1 + whole])
-        v, *u = (np.pad(field, ((0, beyond), (0, 0))) for field in fields)
+        fields = [run[name][row, window].values for name in ("velocity", "displacement")[: 1 + whole]]
+        v, *u = (np.pad(field * weight, ((0, beyond), (0, 0))) for field in fields)
         by_band = shot.quantity == "energy"
-        wave.append(spectra.band_envelopes(cell, u[0], v)[:, :count] if by_band else v[None, :count, cell.host])
+        wave.append(spectra.band_envelopes(cell, u[0], v)[:, :count] if by_band else fields[0][None, :, cell.host])
         waves.append(spectra.wave_energies(cell, u[0] * ends, v * ends)[0] if whole else np.zeros((0, cell.dofs)))
     sites, site = panels.recorded_sites(run, cells), run["impacts/site"].values.astype(int) - 1
     at, onset = run["sites/cell"].values[site], run["impacts/onset"].values
@@ -105,7 +111,7 @@ def scenes(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> Scenes:
     wavenumber = 2 * np.pi * np.fft.fftfreq(count + beyond, 1.0) if whole else np.zeros(0)
     energies = _energies(run, analysis)
     content = np.array(wave), wavenumber, np.array(waves)
-    return Scenes(shot.quantity, instants, cells, *content, sites, flash, *energies)
+    return Scenes(shot.quantity, cell, instants, cells, *content, sites, flash, *energies)
 
 
 def _energies(run: xr.Dataset, analysis: xr.Dataset | None) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """A finite lattice: its cells, its ends, its contact sites, its linear response."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -112,6 +112,15 @@ class Chain:
             if self.variation and (varied := getattr(self.variation, name)) is not None:
                 array[exists] = varied[cells[exists] % self.cells]
         return Coefficients(*arrays)
+
+    def mean_cell(self, start: int, stop: int) -> UnitCell:
+        """The reference cell with the mean masses, springs and dashpots of the cells ``start`` to ``stop``."""
+        if self.is_uniform(start, stop):
+            return self.cell
+        masses, grounding, *of_springs = (values.mean(axis=0).tolist() for values in self.coefficients(start, stop))
+        springs = zip(self.cell.springs, *of_springs, strict=True)
+        springs = tuple(replace(spring, stiffness=k, damping=c) for spring, k, c in springs)
+        return replace(self.cell, masses=tuple(masses), springs=springs, grounding=tuple(grounding))
 
     def stiffness_matrix(self) -> csc_matrix:
         """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; needs little for <= 1e6."""

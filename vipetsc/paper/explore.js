@@ -29,6 +29,31 @@ function nearest(axes, curves, sx, sy, width, height, reach) {
   return best;
 }
 
+// The value of a map at a share of its picture, by the colour that is there; nothing where no colour of the map is.
+const pixel = make("canvas", {width: 1, height: 1}).getContext("2d", {willReadFrequently: true}), FAR = 40;
+
+function read(map, image, fx, fy) {
+  const [x, y] = [fx * image.naturalWidth, fy * image.naturalHeight].map(Math.floor);
+  pixel.drawImage(image, x, y, 1, 1, 0, 0, 1, 1);
+  const seen = pixel.getImageData(0, 0, 1, 1).data, stops = map.colours.match(/../g).map(two => parseInt(two, 16));
+  let at = -1, least = FAR;
+  for (let i = 0; i + 1 < map.values.length; i++) {
+    let along = 0, length = 0, distance = 0;
+    for (let c = 0; c < 3; c++) {
+      const step = stops[3 * i + 3 + c] - stops[3 * i + c];
+      along += (seen[c] - stops[3 * i + c]) * step;
+      length += step * step;
+    }
+    const t = Math.min(Math.max(along / (length || 1), 0), 1);
+    for (let c = 0; c < 3; c++) distance += (seen[c] - (1 - t) * stops[3 * i + c] - t * stops[3 * i + 3 + c]) ** 2;
+    if (Math.sqrt(distance) < least) { least = Math.sqrt(distance); at = i + t; }
+  }
+  if (at < 0) return "";
+  const i = Math.min(Math.floor(at), map.values.length - 2), last = map.values.length - 1;
+  const v = map.values[i] + (at - i) * (map.values[i + 1] - map.values[i]);
+  return `; ${map.label || "value"} ${at < 0.3 ? "≤" : at > last - 0.3 ? "≥" : "≈"} ${Number(v.toPrecision(2))}`;
+}
+
 function ticks(axis, most) {
   const low = Math.min(axis.low, axis.high), high = Math.max(axis.low, axis.high), found = [];
   if (axis.log && high / low > 20) {
@@ -123,10 +148,16 @@ function plot(axes, host) {
   draw();
 }
 
-for (const figure of document.querySelectorAll("figure")) {
+// The numbers beside a picture, which zlib has packed.
+async function unpacked(source) {
+  const bytes = Uint8Array.from(atob(source.textContent), letter => letter.charCodeAt(0));
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).json();
+}
+
+async function explore(figure) {
   const source = figure.querySelector("script"), holder = figure.querySelector(".frame"), image = figure.querySelector("img");
-  if (!source || !holder) continue;
-  const all = JSON.parse(source.textContent), readout = make("output", {class: "small"}), tools = make("div", {class: "tools"});
+  if (!source || !holder) return;
+  const all = await unpacked(source), readout = make("output", {class: "small"}), tools = make("div", {class: "tools"});
   const mark = make("span", {class: "mark", hidden: ""}, holder);
   figure.querySelector("figcaption").before(readout);
   readout.after(tools);
@@ -138,10 +169,11 @@ for (const figure of document.querySelectorAll("figure")) {
     const [l, t, r, b] = axes.box, sx = (fx - l) / (r - l), sy = (b - fy) / (b - t);
     const best = nearest(axes, axes.curves, sx, sy, (r - l) * box.width, (b - t) * box.height, 14);
     readout.textContent = best ? `${best.curve.label} ${told(axes, best.x, best.y)}` : told(axes, value(axes.x, sx), value(axes.y, sy));
+    if (axes.map) readout.textContent += read(axes.map, image, fx, fy);
     if (best) {
-      mark.hidden = false;
       mark.style.left = `${(l + best.px * (r - l)) * image.offsetWidth}px`;
       mark.style.top = `${(b - best.py * (b - t)) * image.offsetHeight}px`;
+      mark.hidden = false; // last: below the picture it would bring a scroll bar, which makes that narrower
     }
   };
   image.onpointerleave = () => { mark.hidden = true; };
@@ -151,7 +183,7 @@ for (const figure of document.querySelectorAll("figure")) {
     if (large) holder.scrollTo(fx * image.offsetWidth - holder.clientWidth / 2, fy * image.offsetHeight - holder.clientHeight / 2);
   };
   const curves = all.filter(axes => axes.curves.length);
-  if (!curves.length) continue;
+  if (!curves.length) return;
   const choice = make("select", {"aria-label": "curves to draw larger"}, tools);
   make("option", {value: -1}, choice, "curves, larger …");
   curves.forEach((axes, i) => make("option", {value: i}, choice, axes.title || axes.y.label || `panel ${i + 1}`));
@@ -160,3 +192,5 @@ for (const figure of document.querySelectorAll("figure")) {
     if (choice.value >= 0) plot(curves[choice.value], tools);
   };
 }
+
+document.querySelectorAll("figure").forEach(explore);

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import io
 import re
+import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -22,7 +23,7 @@ from vipetsc.paper.figures import READINGS, PaperFigure, describe
 from vipetsc.studies.engines import COMPARED
 
 COLOURS = 256  # of a picture of lines in the page
-WIDTH, QUALITY = 1000, 60  # of a picture of maps, in pixels and of WebP
+WIDTH, QUALITY = 1000, 50  # of a picture of maps, in pixels and of WebP
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
 VERDICTS = HOLDS, IN_PART, FAILS, UNMEASURED
 
@@ -72,14 +73,14 @@ def write_report(
 
 
 def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str, str]:
-    """Width and height in pixels, a hash of the file, the data URI, ``encoded`` or made now, and its axes."""
+    """Width and height in pixels, a hash of the file, the data URI, ``encoded`` or made now, and its axes, packed."""
     data = path.read_bytes()
     key = hashlib.sha256(data).hexdigest()
     with Image.open(io.BytesIO(data)) as image:
         uri = encoded.get(key) or "data:image/webp;base64," + base64.b64encode(small(image.convert("RGB"))).decode()
         shown = path.with_suffix(".json")
-        axes = shown.read_text(encoding="utf-8") if shown.exists() else "[]"
-        return image.width, image.height, key, uri, axes.replace("<", "\\u003c")
+        axes = zlib.compress(shown.read_bytes() if shown.exists() else b"[]", 9)
+        return image.width, image.height, key, uri, base64.b64encode(axes).decode()
 
 
 def small(image: Image.Image) -> bytes:
