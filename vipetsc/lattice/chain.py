@@ -118,8 +118,8 @@ class Chain:
         if self.is_uniform(start, stop):
             return self.cell
         masses, grounding, *of_springs = (values.mean(axis=0).tolist() for values in self.coefficients(start, stop))
-        springs = zip(self.cell.springs, *of_springs, strict=True)
-        springs = tuple(replace(spring, stiffness=k, damping=c) for spring, k, c in springs)
+        rows = zip(self.cell.springs, *of_springs, strict=True)
+        springs = tuple(replace(spring, stiffness=k, damping=c) for spring, k, c in rows)
         return replace(self.cell, masses=tuple(masses), springs=springs, grounding=tuple(grounding))
 
     def stiffness_matrix(self) -> csc_matrix:
