@@ -1,6 +1,6 @@
 """Where contacts that touch or are pressed at rest, which have no modes, open or close within a substep.
 
-Their force is max(x, 0)^n of the indentation x: nodes see little of a kink near an end, so that no substep has one inside.
+Their force is max(x, 0)^n of the indentation x. Nodes see little of a kink near an end: no substep has one inside.
 """
 
 from vipetsc.compiled import kernel
