@@ -15,7 +15,7 @@ from vipetsc.lattice import four_band
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, fit_curve
 from vipetsc.studies.linear import LinearRun, leading_cell, linear_name, read_linear
-from vipetsc.studies.sweep import conclude
+from vipetsc.studies.sweep import conclude, summarise
 
 SWEEP = {
     "name": "small",
@@ -33,6 +33,11 @@ def measure(case):
     """A number that tells the members apart."""
     sites = len(case.contacts.sites)
     return case.drive.amplitude + 100 * sites + 1000 * case.drive.cycles + 1e5 * (case.contacts.law == "hertz")
+
+
+def test_warnings_that_differ_in_numbers_are_one():
+    told = ["deep: 0.0052 m", "deep: 5.3e-03 m", "lost 2 of 5", "deep: 0.0052 m", "lost 2 of 5", "alone"]
+    assert summarise(told) == ["3 members, for instance: deep: 5.3e-03 m", "2 members: lost 2 of 5", "1 member: alone"]
 
 
 def put_sweep(folder, plan, failing=(), changed=lambda case: 0.0):

@@ -1,9 +1,10 @@
 """Every member of a sweep, over all ranks: linear runs first, then the longest; resumes, and goes on past failures."""
 
 import json
+import re
 import sys
 import time
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -198,8 +199,7 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
     count = {name: int((status == code).sum()) for code, name in enumerate(STATUS)}
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__, "sweep": plan.name}
     index = about | {"members": count, "failed": failed}
-    warned = Counter(text for first in results.first for text in results.warnings.get(int(first), ()))
-    warnings = [f"{n} member{'s' * (n > 1)}: {sentence}" for sentence, n in warned.items()]
+    warnings = summarise([text for first in results.first for text in results.warnings.get(int(first), ())])
     path, text = folder / "index.json", json.dumps(index, indent=1, default=int) + "\n"
     told = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
     # The index comes last: with it and nothing made since, the ensemble is that of these members.
@@ -212,3 +212,12 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
     if not told:
         write_text(path, text)
     return status, warnings
+
+
+def summarise(sentences: Sequence[str]) -> list[str]:
+    """Warnings of members: of those that differ in numbers alone the last in the alphabet, with how many there are."""
+    kinds: dict[str, list[str]] = {}
+    for sentence in sentences:
+        kinds.setdefault(re.sub(r"\d[\d.e+-]*", "0", sentence), []).append(sentence)
+    counted = ((len(texts), len(set(texts)) > 1, max(texts)) for texts in kinds.values())
+    return [f"{n} member{'s' * (n > 1)}{', for instance' * differ}: {text}" for n, differ, text in counted]
