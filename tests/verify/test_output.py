@@ -10,6 +10,7 @@ import pytest
 from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorder, simulate
+from vipetsc.dynamics.recorder import Recorder
 from vipetsc.io import chunks
 from vipetsc.io.atomic import load_arrays, save_arrays
 from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
@@ -148,3 +149,18 @@ def test_contacts_that_still_last_at_the_end_are_logged(folder):
     assert np.isnan(cut["impacts/separation"]).tolist() == (separation[expected] > end).tolist()
     assert np.isnan(cut["impacts/separation"]).any()
     assert result.statistics["episodes"] == expected.sum()
+
+
+def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch):
+    """For other arrays kernels would be compiled once more; blocks of samples do not show in what is recorded."""
+    given, runs, room = [], [], Recorder.room
+    monkeypatch.setattr(Recorder, "room", lambda *arguments: given.append(room(*arguments)) or given[-1])
+    case = small_case(time={"end": 0.004, "engine": "propagator"}, output={"stride": 2})
+    for cells in (1_000_000, 24 * 6):  # a block of all samples, and of six
+        monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", cells)
+        runs.append(RunMemory())
+        simulate(case, runs[-1])
+    assert len(given) == 1 + 4 and all(samples.fields.flags.c_contiguous for samples in given)
+    for name in ("displacement", "velocity", "field_time"):
+        whole, blocks = (run.dataset[name].values for run in runs)
+        assert len(whole) == 11 and whole[-1].any() and whole.tobytes() == blocks.tobytes(), name

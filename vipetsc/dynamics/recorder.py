@@ -19,7 +19,6 @@ from vipetsc.io.store import GATHER_LIMIT
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
 CHUNK_SAMPLES = 256
 CHUNK_BYTES = 64 * 2**20
-# Names in the file.
 ENERGIES = {part.name: f"energy/{part.name}" for part in fields(Energies) if part.name != "balanced"}
 
 
@@ -56,7 +55,6 @@ class Recorder(Observer):
         recorded = np.array(recorded_cells(output, chain.cells))
         first, stop = np.searchsorted(recorded, [layout.start, layout.stop]).tolist()
         local = recorded[first:stop] - layout.start
-        # A run in memory is gathered whatever the writer is.
         together = bool(setup.output.folder) and written_together(setup.model, output, layout.comm.size)
         given = {
             "cell": recorded + 1,
@@ -94,9 +92,7 @@ class Recorder(Observer):
         """Room for the samples from ``number`` on: for as many as the chunk still takes, and at ``most`` so many."""
         meter, output = self.setup.meter, self.setup.case.output
         here = slice(self._held, self._held + most)
-        fields = self._fields[:, self._rows :][:, :most]
-        if not fields.flags.c_contiguous:  # engines would be compiled once more
-            fields = np.empty(fields.shape)
+        fields = np.ascontiguousarray(self._fields[:, self._rows :][:, :most])  # engines are compiled for such alone
         arrays = self._sums[here], self._work[here], self._losses[here], fields, self._moving
         of_lattice = meter.lattice, meter.unit, self.setup.model.sample_interval
         return Samples(number, *arrays, self._first, output.every, output.stride, *of_lattice)
@@ -106,11 +102,10 @@ class Recorder(Observer):
         self._kept["time"][here] = block.times
         for part in self._energies:
             self._kept[ENERGIES[part]][here] = getattr(block.energies, part)
-        self._number = block.first - self._held
         rows = self._rows + block.share.rows(len(block))
         if not np.may_share_memory(self._fields, block.share.fields):
             self._fields[:, self._rows : rows] = block.share.fields[:, : rows - self._rows]
-        self._held, self._rows = here.stop, rows
+        self._number, self._held, self._rows = block.first - self._held, here.stop, rows
 
     @property
     def due(self) -> bool:
