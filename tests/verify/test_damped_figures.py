@@ -9,8 +9,9 @@ import pytest
 import xarray as xr
 
 from tests.conftest import small_case
+from vipetsc.case import Case
 from vipetsc.dynamics import simulate
-from vipetsc.figures import runs
+from vipetsc.figures import panels, runs
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import four_band, max_group_velocity
 
@@ -46,7 +47,8 @@ def impacts_of(sites: int, episodes: int, loss: float = 0.0):
     logged = {"site": number % sites + 1, "side": np.where(number % 2, 1, -1), "onset": (number + 0.5) / episodes}
     logged |= {"approach_velocity": 1.0 + number, "loss": np.full(episodes, loss)}
     data = {f"impacts/{name}": ("episode", values) for name, values in logged.items()}
-    return xr.Dataset(data | {"sites/cell": ("site", 10 * np.arange(1, sites + 1)), "time": [0.0, 1.0]})
+    data |= {"sites/cell": ("site", 10 * np.arange(1, sites + 1)), "time": [0.0, 1.0]}
+    return xr.Dataset(data, attrs={"case": small_case().to_toml()})
 
 
 def test_impacts_that_markers_do_not_tell_apart_are_a_map():
@@ -63,3 +65,20 @@ def test_impacts_that_markers_do_not_tell_apart_are_a_map():
     assert many[1].get_title() == "(b) Episodes" and {p.get_width() for p in many[1].patches} == {100}
     pooled = runs.impacts(impacts_of(1000, 3000), None).axes[0].images[0]
     assert len(pooled.get_array()) <= runs.ROWS_OF_A_MAP
+
+
+def test_contacts_that_touch_from_the_beginning_show_their_indentation():
+    """Of three beads: the second goes towards the third by 2e-6 m, the first and the second come apart."""
+    cell = {"lattice": {"cells": 3, "ends": "free", "cell": {"masses": [1e-3]}}, "drive": {"frequency": 1e3}}
+    contacts = {"sites": [1, 2], "next_cell": True, "side": "minus", "clearance": 0.0, "stiffness": 1e9}
+    case = Case.from_table(cell | {"contacts": contacts, "time": {"end": 1.0, "sample_interval": 0.1}})
+    u = np.zeros((11, 3, 1))
+    u[5, 1] = 2e-6
+    data = {**impacts_of(2, 2).drop_vars("time"), "impacts/force": ("episode", [0.0, 3.0])}
+    data = xr.Dataset(
+        {**data, "time": np.arange(11) / 10, "cell": [1, 2, 3], "displacement": (("time", "cell", "dof"), u)}
+    )
+    depth = panels.indentations(data, case.model())
+    assert depth[1, 5] == 2e-6 and np.count_nonzero(depth) == 1
+    raster, bars, *_ = runs.impacts(data.assign_attrs(case=case.to_toml()), None).axes
+    assert raster.get_title() == "(a) Indentation" and [bar.get_width() for bar in bars.patches] == [0.0, 3.0]

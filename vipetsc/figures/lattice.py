@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
 from vipetsc.case import Case
+from vipetsc.case.contacts import Gaps, stops_told
 from vipetsc.figures import style
 from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.study import counted
@@ -37,8 +38,9 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     figure = style.new_figure(style.PAGE, 2.7)
     upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
     draw_unit_cell(upper, model.chain.cell)
-    draw_lattice(lower, model.chain, model.drive_cell)
-    upper.set_title("(a) Unit cell")
+    draw_lattice(lower, model.chain, model.drive_cell, model.gaps)
+    differing = f" of the case, from which {counted(n, 'cell')} differ" if (n := int(model.chain.differs.sum())) else ""
+    upper.set_title(f"(a) Unit cell{differing}")
     legend = LEGEND if model.drive.amplitude else LEGEND.replace("driven", "begins")
     lower.set_title(f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends; sites: {legend}")
     return figure
@@ -243,8 +245,11 @@ def _spring(axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, hei
     axes.text(*(start + along / 2 + shift), text, ha=alignment[0], va=alignment[1])
 
 
-def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
-    """The lattice as a strip: its ends, drive (0-based cell) and contacts with their cells and clearances."""
+def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, gaps: Gaps = ()) -> None:
+    """The lattice as a strip: its ends, drive (0-based cell) and contacts with their cells and clearances.
+
+    ``gaps`` in m are those of the sides + and -, where they differ.
+    """
     n = chain.cells
     axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
     if n <= 150:
@@ -256,12 +261,14 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0) -> None:
     arrow = {"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8}
     axes.annotate("", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), arrowprops=arrow)
     last, width = -np.inf, max(0.006 * n, 1)
-    for site, clearance in sorted(zip(chain.sites, chain.clearances, strict=True)):
+    texts = stops_told(gaps, ()) if gaps else [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
+    for site, text in sorted(zip(chain.sites, texts, strict=True)):
         axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
-        # Labels need about a tenth of the strip each; neighbouring sites go without.
-        if site - last > 0.085 * n:
+        # Labels need about a twentieth of the strip each; neighbouring sites go without.
+        if site - last > 0.06 * n:
             axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
-            axes.text(site + 1, -0.2, f"{clearance * 1e3:#.3g}", color=style.VERMILION, ha="center", va="top")
+            below = {"color": style.VERMILION, "ha": "center", "va": "top", "linespacing": 1.0}
+            axes.text(site + 1, -0.2, "0" if text in ("+0", "-0") else text.replace(" ", "\n"), **below)
             last = site
     if not chain.sites:
         axes.text(n / 2, -0.2, "no contact sites", color=style.GREY, ha="center", va="top")

@@ -34,7 +34,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         share = float(energy[p, -1] / energy[:, -1].sum())
         steps.plot(time, energy[p], color=colour, lw=0.9, label=f"{names[p]}: {share:.1%}")
     steps.set(ylabel="Energy of the linear modes (J)", xlim=run["time"][[0, -1]], ylim=(0, None))
-    steps.legend(loc="best", title="share at the end", title_fontsize=7)
+    steps.legend(loc="best", ncols=1 + (len(shown) > 5), title="share at the end", title_fontsize=7)
     if not rows:
         steps.set(xlabel="Time (s)")
         return figure
@@ -77,13 +77,13 @@ def _matrix(axes: Axes, rows: list[str], columns: list[str], share: np.ndarray) 
     """Shares (site, part) of the work in % as a matrix with numbers."""
     top = max(float(np.abs(share).max()), 1e-300)
     axes.imshow(share, cmap="RdBu_r", norm=SymLogNorm(top / 10, vmin=-top, vmax=top), aspect="auto", origin="upper")
-    size = 7 if len(rows) <= 12 else 5
+    wide, size = len(columns) > 7, 5 if len(rows) > 12 or len(columns) > 7 else 7
     for (y, x), value in np.ndenumerate(share):
-        text = f"{value:+.2f}" if abs(value) >= 0.005 else "0"
+        text = f"{value:+.{1 if wide and abs(value) >= 9.995 else 2}f}" if abs(value) >= 0.005 else "0"
         colour = "white" if abs(value) > 0.35 * top else style.BLACK
         axes.text(x, y, text, ha="center", va="center", fontsize=size, color=colour)
     axes.set_xticks(range(len(columns)), columns, rotation=40, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(len(rows)), rows, fontsize=size + 1)
+    axes.set_yticks(range(len(rows)), rows, fontsize=6 if len(rows) > 12 else 8)
     axes.tick_params(length=0)
     axes.grid(visible=False)
     axes.set(title="(b) Moved by each site (% of the work)", ylabel="Contact site (cell)")

@@ -12,11 +12,13 @@ from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike
 
 from vipetsc import spectra
+from vipetsc.case import Model
 from vipetsc.figures import style
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
 DECADES = 5  # of energy that a map shows
 PIXELS = 600  # most rows and columns of a map: a printed page shows no more
+MOST_LINES = 30  # of sites in a map
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
@@ -101,9 +103,9 @@ def recorded_sites(run: xr.Dataset, cells: np.ndarray | None = None) -> np.ndarr
 def mark_sites(
     axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y", cells: np.ndarray | None = None
 ) -> None:
-    """Dotted lines at the ``recorded_sites``, triangles on the edge of the axis ``along`` ("x" or "y") of cells."""
+    """Dotted lines at the ``recorded_sites`` if these are few, triangles on the edge of the axis ``along`` of cells."""
     sites = recorded_sites(run, cells)
-    for site in sites:
+    for site in sites if len(sites) <= MOST_LINES else ():
         (axes.axhline if along == "y" else axes.axvline)(site, color=colour, lw=0.5, ls=style.DOTTED, alpha=0.8)
     edge = np.full(len(sites), 0.02)
     points, transform, marker = {
@@ -112,6 +114,18 @@ def mark_sites(
     }[along]
     marks = {"color": style.SKY, "mec": "white", "mew": 0.3, "ms": 3.5, "ls": "", "label": "contact sites"}
     axes.plot(*points, marker=marker, transform=transform, **marks)
+
+
+def indentations(run: xr.Dataset, model: Model) -> np.ndarray:
+    """Indentation (site, t) in m of every contact of a ``run`` that recorded all displacements."""
+    u, chain, depth = run["displacement"].values, model.chain, []
+    gaps = model.gaps or [(gap, gap) for gap in chain.clearances]
+    for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, gaps, strict=True):
+        w = u[:, (cell + pair.next_cell) % chain.cells, pair.resonator] - (
+            u[:, cell, pair.host] if pair.host >= 0 else 0
+        )
+        depth.append(np.maximum(np.maximum(w - plus, -w - minus), 0.0))
+    return np.array(depth)
 
 
 def below_cutoff(analysis: xr.Dataset, cell: UnitCell, names: Sequence[str]) -> xr.Dataset:

@@ -96,7 +96,8 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Onset of every contact episode by site and side, coloured by approach speed; energy lost per site.
 
-    More sites or episodes than ``ROWS`` and ``MARKERS`` become a map of the largest approach speed.
+    More sites or episodes than ``ROWS`` and ``MARKERS`` become a map of the largest approach speed. Contacts that touch
+    or are pressed from the beginning have no impacts: a map of their indentation.
     """
     sites = run["sites/cell"].values
     names = "site", "side", "onset", "approach_velocity", "loss"
@@ -105,12 +106,19 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         return empty_figure("Impacts: the lattice has no contact sites")
     if not len(site):
         return empty_figure("Impacts: no contact in this run")
+    model = Case.of(run).model()
+    lasting = bool(model.gaps) and max(min(gap) for gap in model.gaps) <= 0 and "displacement" in run
     figure = style.new_figure(style.PAGE, min(1.3 + 0.24 * len(sites), 4.5))
     raster, bars = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
     speed, number, index = np.abs(velocity), np.arange(1, len(sites) + 1), site.astype(int) - 1
     norm, span = panels.log_norm(speed, decades=2), run["time"].values[[0, -1]]
     few, colours = len(sites) <= ROWS and len(site) <= MARKERS, {"norm": norm, "cmap": "viridis_r"}
-    if few:
+    title, about = f"(a) {len(site)} contact episodes", "Largest approach speed (m/s)"
+    if lasting and len(run["cell"]) == model.chain.cells:
+        few, title, about, depth = False, "(a) Indentation", "Indentation (m)", panels.indentations(run, model)
+        image = panels.draw_map(raster, field_time(run), number, depth, panels.log_norm(depth, decades=3))
+    elif few:
+        title, about = f"{title} (▲ positive side, ▼ negative side)", "Approach speed (m/s)"
         for sign, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
             at = side == sign
             image = raster.scatter(onset[at], site[at] + shift, 14, speed[at], marker=marker, lw=0, rasterized=True,
@@ -127,17 +135,20 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         image = raster.imshow(largest, extent=(*span, 0.5, 0.5 + block * len(largest)), **colours)
     shown = number[:: 1 if few else -(-len(sites) // 12)]
     raster.set_yticks(shown, [f"{c}" for c in sites[shown - 1]])
-    title = f"(a) {len(site)} contact episodes" + " (▲ positive side, ▼ negative side)" * few
     raster.set(title=title, xlabel="Time (s)", ylabel="Contact site (cell)", xlim=span)
     raster.set_ylim(0.4, len(sites) + 0.6)
-    panels.colour_bar(image, raster, "Approach speed (m/s)" if few else "Largest approach speed (m/s)")
+    panels.colour_bar(image, raster, about)
 
     loss, episodes = np.bincount(index, np.nan_to_num(lost), len(sites)), np.bincount(index, minlength=len(sites))
-    lengths = loss if loss.any() else episodes
+    title, label, lengths = "(b) Loss" + ", episodes" * few, "Energy lost (J)", loss
+    if not loss.any():
+        title, label, lengths = "(b) Episodes", "Episodes", episodes
+    if lasting:
+        title, label, lengths = "(b) Largest force", "Force (N)", np.zeros(len(sites))
+        np.fmax.at(lengths, index, np.abs(run["impacts/force"].values))
     row = bars.barh(number, lengths, 0.6 if few else 1.0, color=style.VERMILION if loss.any() else style.BLUE)
     if few:
         bars.bar_label(row, episodes, padding=2)
-    title, label = ("(b) Loss" + ", episodes" * few, "Energy lost (J)") if loss.any() else ("(b) Episodes", "Episodes")
     bars.set(title=title, xlabel=label, xlim=(0, (1.25 if few else 1.05) * lengths.max()))
     bars.tick_params(left=False)
     return figure
@@ -183,6 +194,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     lower.axhline(LARGEST_RESIDUAL, color=style.VERMILION, lw=0.7, ls=style.DASHED)
     panels.note(lower, "limit 1e-8", (0.99, LARGEST_RESIDUAL), (0, 1.5), xycoords=("axes fraction", "data"),
                 ha="right", va="bottom", color=style.VERMILION)  # fmt: skip
+    lower.locator_params(axis="x", nbins=5)
     lower.set(xlabel="Time (s)", ylabel="|Residual| / work", ylim=(1e-15, np.fmax(1e-6, 10 * float(residual.max()))))
     return figure
 

@@ -204,7 +204,7 @@ def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps:
     if arrival is None:
         chain, start = record.model.chain, record.model.drive_cell
         distance = 0 if record.site is None else cells_between(record.site - 1, start, chain.cells, chain.ends)
-        arrival = float(0.5 * record.model.drive.duration + distance / record.model.speed)
+        arrival = float(0.5 * record.model.drive.duration + distance / (record.model.speed or np.inf))
         reason = "half the burst and the way to the first site at the group velocity"
     # A record that ends before keeps its last snapshot.
     start = min(int(np.searchsorted(time, arrival)), len(time) - 1)

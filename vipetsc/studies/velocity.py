@@ -62,6 +62,9 @@ class VelocityRecord:
         """Measures that would take waves for longer or slower ones in what was kept; warns of them."""
         top, every = pass_bands(self.model.chain.cell)[-1].high, int(np.diff(self.cells).max(initial=1))
         names: set[str] = set()
+        if top == 0:
+            self.left_out.append("dispersion, bands, ibtet: a lattice without springs has no bands")
+            names |= {"dispersion", "bands"}
         if self.interval * top >= np.pi:
             text = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
             self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
