@@ -41,6 +41,8 @@ def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection
         record.left_out.append(f"upper_share_at_end, bands/modal_energy: {missing} not recorded")
         return {}
     try:
+        if not chain.cell.springs:
+            raise ValueError("a lattice without springs has no modes")
         parts = ModalParts.of(chain)
     except ValueError as error:
         record.left_out.append(f"upper_share_at_end, bands/modal_energy: {error}")
