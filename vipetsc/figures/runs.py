@@ -142,7 +142,7 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     loss, episodes = np.bincount(index, np.nan_to_num(lost), len(sites)), np.bincount(index, minlength=len(sites))
     title, label, lengths = "(b) Loss" + ", episodes" * few, "Energy lost (J)", loss
     if not loss.any():
-        title, label, lengths = "(b) Episodes", "Episodes", episodes
+        title, label, lengths = "(b) Episodes", "Episodes", episodes.astype(float)
     if lasting:
         title, label, lengths = "(b) Largest force", "Force (N)", np.zeros(len(sites))
         np.fmax.at(lengths, index, np.abs(run["impacts/force"].values))
