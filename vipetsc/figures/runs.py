@@ -140,9 +140,10 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     panels.colour_bar(image, raster, about)
 
     loss, episodes = np.bincount(index, np.nan_to_num(lost), len(sites)), np.bincount(index, minlength=len(sites))
-    title, label, lengths = "(b) Loss" + ", episodes" * few, "Energy lost (J)", loss
+    lengths: np.ndarray = loss
+    title, label = "(b) Loss" + ", episodes" * few, "Energy lost (J)"
     if not loss.any():
-        title, label, lengths = "(b) Episodes", "Episodes", episodes.astype(float)
+        title, label, lengths = "(b) Episodes", "Episodes", episodes
     if lasting:
         title, label, lengths = "(b) Largest force", "Force (N)", np.zeros(len(sites))
         np.fmax.at(lengths, index, np.abs(run["impacts/force"].values))
