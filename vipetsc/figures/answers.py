@@ -51,7 +51,7 @@ def _displacement(axes: Axes, data: xr.Dataset, p: np.ndarray, folds: np.ndarray
     for colour, label, width in (value for name, value in SWEEPS.items() if data[f"{name}_point"].size > 1):
         way = data["up_point" if label == "sweep up" else "down_point"].values
         axes.plot(p[way], size[way], color=colour, lw=width, alpha=0.35, label=label, solid_capstyle="butt")
-    axes.plot(p, np.where(stable, size, np.nan), color=style.BLACK, lw=1.3, label="stable")
+    axes.plot(p, np.where(stable, size, np.nan), color=style.BLACK, lw=1.3, label="stable" if stable.any() else None)
     beside = ~stable | np.append(~stable[1:], False) | np.insert(~stable[:-1], 0, False)
     if not stable.all():
         axes.plot(p, np.where(beside, size, np.nan), color=style.BLACK, lw=0.9, ls="--", label="unstable")
