@@ -74,8 +74,8 @@ def test_a_mass_between_two_stops_has_its_period_in_closed_form():
     k, kc, m, clearance = 3.0, 40.0, 2.0, 0.1
     pair = ContactPair(None, 0, clearance, Contact("bilinear", kc))
     system = System.assemble([m], [(None, 0, k)], [pair])
-    problem, points = branch(system, 0, 0.5 * k * (0.99 * clearance) ** 2, truncation=1e-7, points=12)
-    points += [problem.from_gap(share * np.sqrt(k / m), np.array([1.0])) for share in (1.05, 1.3, 2.0, 3.0)]
+    problem, points = branch(system, 0, 0.5 * k * (0.99 * clearance) ** 2, truncation=1e-7, points=6)
+    points += [problem.from_gap(share * np.sqrt(k / m), np.array([1.0])) for share in (1.3, 3.0)]
     assert points[0].frequency == pytest.approx(np.sqrt(k / m) / (2 * np.pi), rel=1e-12)  # no contact yet
     assert points[0].truncation < 1e-15
     for point in points:
@@ -134,11 +134,11 @@ def test_same_curves_as_by_shooting(system, mode, energy, truncation):
     if energy:
         problem, points = branch(system, mode, energy, truncation=truncation, points=12)
     else:
-        problem = condensed(system, truncation=truncation, points=4)
+        problem = condensed(system, truncation=truncation, points=2)
         points = list(CondensedContinuation(problem, problem.from_gap(mode, np.array([1.0])), problem.control))
     assert system.springs or points[-1].episodes
     shooting = Shooting(Dop853Flow(system), MAPS["quarter"], 1e-12)
-    for point in points[3::4]:
+    for point in points[:0:-4]:
         u = displacement(problem, point)
         chart = Relative(system, u, point.period)
         xi = chart.encode(u, point.period)
@@ -226,7 +226,8 @@ def test_two_sites_in_and_out_of_phase():
     assert together.energy + against.energy == pytest.approx(4 * alone.energy, rel=0.05)
 
 
-def case(omega: str = "4000.0", points: int = 6, cells: int = 60, site: int = 20, more: str = "") -> NnmCase:
+def case(omega: str = "4000.0", points: int = 3, cells: int = 60, site: int = 20, more: str = "") -> NnmCase:
+    more = more if "truncation" in more else f"truncation = 1e-5\n{more}"
     return NnmCase.from_toml(BREATHER.format(omega=omega, points=points, cells=cells, site=site) + more)
 
 
@@ -239,7 +240,7 @@ def followed(given: NnmCase, folder, resume: bool = False, stop: StopRequest | N
 
 def test_files_states_and_the_way_on(tmp_path):
     (whole,) = followed(case(), tmp_path / "whole")
-    (part,) = followed(case(points=3), tmp_path / "part")
+    (part,) = followed(case(points=2), tmp_path / "part")
     assert "resume" in part.ending
     (rest,) = followed(case(), tmp_path / "part", resume=True)
     read = CondensedBranch.read(tmp_path / "whole" / "branch-breather-4000.h5")
@@ -253,7 +254,7 @@ def test_files_states_and_the_way_on(tmp_path):
     u = state.on(0, 60)[0].ravel()
     chain = build_chain(case().lattice, case().contacts)
     energy = 0.5 * u @ chain.stiffness_matrix() @ u + HERTZ.potential(u[4 * 19 + 2] - u[4 * 19 + 1], D)
-    assert whole.points[0].energy == pytest.approx(float(energy), rel=1e-6)
+    assert whole.points[0].energy == pytest.approx(float(energy), rel=1e-5)
     lines = (tmp_path / "whole" / "branch-breather-4000.csv").read_text().splitlines()
     assert lines[0].startswith("energy,frequency,period,w1,harmonics,truncation")
     assert len(lines) == 1 + len(whole.points)

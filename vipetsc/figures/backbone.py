@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from vipetsc.figures import style
 from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, note, shade_regions
@@ -69,7 +69,9 @@ def backbone(paths: Sequence[Path]) -> Figure:
         panels[0].set_title(f"({tag}) {', '.join(filter(None, heading))}")
         panels[-1].set(xlabel="energy (J)")
         if energy.max() < 10 * energy.min():  # labels of less than a decade
-            panels[-1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            narrow = energy.max() < 3 * energy.min()
+            panels[-1].xaxis.set_major_locator(MaxNLocator(4) if narrow else LogLocator(subs=(1, 2, 5)))
+            panels[-1].xaxis.set_major_formatter(FormatStrFormatter("%.4g"))
             panels[-1].xaxis.set_minor_formatter(NullFormatter())
         for page in lower:
             portraits(page, branch)
