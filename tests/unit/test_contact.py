@@ -112,6 +112,24 @@ def test_the_earliest_of_several_sites_changes_first(order):
     assert change.share == pytest.approx(1 / 6)
 
 
+def test_either_side_has_its_own_clearance():
+    contacts, h = create_contacts(Contact("hertz", KC), [2 * D]), 1e-3
+    contacts["clearance_minus"], rate = D, -1.5 * D / h
+    start, end = (np.array([[w, rate, 0.0]]) for w in (0.0, -1.5 * D))
+    change = changes.first_change(contacts, start, end, h, np.empty((2, 6)))
+    assert change == (pytest.approx(2 / 3), 0, 1)
+
+
+def test_the_extremes_of_a_contact_that_turns_within_a_step_are_those_of_its_turn():
+    """w - D = c s (1 - s)^2 turns at s = 1/3, where it is 4 c/27."""
+    contacts, h, c = create_contacts(Contact("hertz", KC), [D]), 1e-3, D
+    contacts["mode"], contacts["approach"] = CLOSED, c / h
+    start, end = np.array([[D, c / h, -4 * c / h**2]]), np.array([[D, 0.0, 2 * c / h**2]])
+    reached = changes.extremes(contacts, 0, start, end, h)
+    assert reached.indentation == pytest.approx(4 * c / 27, rel=1e-12)
+    assert reached.force == pytest.approx(KC * (4 * c / 27) ** 1.5, rel=1e-8)
+
+
 def test_clipping_begins_where_g_falls_through_zero():
     h, approach = 1e-3, 0.01
     w = np.poly1d([D + 1e-4]) - np.poly1d([20.0, 0.02, 0.0])  # ever faster out
@@ -203,6 +221,11 @@ def test_the_tracker_follows_an_impact_from_onset_to_separation():
         assert each.contacts["mode"].tolist() == [FREE, FREE]
         assert each.counts.tolist() == tracker.counts.tolist()
     assert tracker.contact_time() == np.inf
+    for motion in ((-D, -0.01, 0.0), (-1.5 * D, 0.0, 0.0), (-D, 0.2, 0.0)):  # once more: it pulls again
+        tracker.end[1] = motion
+        tracker.accept_step(1e-3)
+        tracker.switch(0.4, np.zeros(2))
+    assert tracker.counts["pulled"].tolist() == [0, 2]
 
 
 @LAWS

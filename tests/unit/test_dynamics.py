@@ -10,7 +10,7 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.contact.law import CLOSED
-from vipetsc.dynamics.energies import Energies, EnergyMeter, measure
+from vipetsc.dynamics.energies import LARGEST, PARTS, Energies, EnergyMeter, add_energy, measure
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.dynamics.ts.sums import register_sums
@@ -107,6 +107,13 @@ def test_energies_below_the_unit_of_the_sums_add_up():
     first = layout.dofs * layout.owned
     state.array[first : first + layout.owned] = np.sqrt(2 * 0.4 * unit / model.chain.cell.masses[0])
     assert energies_of(model, layout, state).kinetic == pytest.approx(0.4 * unit * layout.owned, rel=1e-10)
+
+
+def test_energies_beyond_all_scales_saturate_the_sums():
+    sums = np.zeros((PARTS, 2), np.int64)
+    for energy in (np.nan, np.inf, 1e300):
+        add_energy(sums, energy, 1.0)
+    assert sums[1].tolist() == [3 * int(LARGEST), 0]
 
 
 @pytest.mark.parametrize("size", [1, 31, 77, 640])

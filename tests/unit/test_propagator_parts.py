@@ -1,6 +1,7 @@
 """The propagator's parts alone: stencil against the matrix exponential; collocation; grouping."""
 
 import re
+from math import factorial
 
 from mpi4py import MPI
 
@@ -26,6 +27,8 @@ from vipetsc.dynamics.propagator.collocation import (
     collocate,
     create_trial,
     error_ratio,
+    evaluate_site_motion,
+    node_responses,
     update_taylor,
 )
 from vipetsc.dynamics.propagator.engine import Propagator
@@ -210,7 +213,8 @@ def one_substep(cluster: Cluster, substep: Substep) -> Trial:
 @pytest.mark.parametrize("kind", [PLAIN, ONSET, EXIT])
 def test_a_linear_contact_is_an_oscillator(kind):
     cluster, rate = oscillator()
-    mass, speed, h = 0.02, 0.5, cluster.interval
+    mass, speed, h, begin = 0.02, 0.5, cluster.interval, 0.25
+    cluster.state["position"] = begin
     trial = one_substep(cluster, Substep(kind, 0.3))
     phase = rate * 0.3 * h
     assert trial.taylor[0, 0] - 1 == pytest.approx(speed / rate * np.sin(phase), rel=1e-9)
@@ -219,7 +223,7 @@ def test_a_linear_contact_is_an_oscillator(kind):
     assert cluster.moments[0, 0] == pytest.approx(mass * speed * (np.cos(phase) - 1), rel=1e-9)
     t = np.linspace(0, 0.3 * h, 20001)
     force = -mass * rate * speed * np.sin(rate * t)
-    assert cluster.moments[0, 1] == pytest.approx(trapezoid(force * (1 - t / h), t), rel=1e-7)
+    assert cluster.moments[0, 1] == pytest.approx(trapezoid(force * (1 - begin - t / h), t), rel=1e-7)
     assert cluster.energy[0] == 0.0
 
 
@@ -240,6 +244,29 @@ def test_the_error_estimate_falls_as_the_order_says():
         ratios.append(error_ratio(cluster, one_substep(cluster, Substep(PLAIN, length)), length))
     # The last two coefficients fall as h^6 and h^7, times the length.
     assert 6 < np.log2(ratios[0] / ratios[1]) < 8.5
+    # What is allowed goes with the approach velocity, 0.5 m/s till now.
+    cluster.contacts["approach"] = 1.0
+    assert error_ratio(cluster, cluster.trial, 0.4) == pytest.approx(ratios[1] * 5.1e-11 / 1.01e-10)
+
+
+def test_a_sites_acceleration_is_that_of_the_free_motion_and_of_the_force():
+    cluster, rate = oscillator()
+    h, taylor = cluster.interval, np.array([[1.0 + 2e-6, 3.0, 20.0]])
+    evaluate_site_motion(cluster._replace(taylor=taylor), taylor * [1.0, h, h * h], cluster.site_motion)
+    assert cluster.site_motion[0] == pytest.approx([1.0 + 2e-6, 3.0, 40.0 - rate**2 * 2e-6], rel=1e-9)
+
+
+def test_responses_are_added_up_over_all_terms():
+    """A constant force F on an oscillator: m omega^2 w = F (1 - cos omega t), m omega w' = F sin omega t."""
+    cluster, turn, terms, mass = oscillator()[0], 1.2, 8, 0.02
+    signs = (-(turn**2)) ** np.arange(terms) / [factorial(2 * m + 1) for m in range(terms)]
+    response, nodes = cluster.response * signs, collocation(2 * terms)
+    cluster = cluster._replace(response=response, taylor=np.zeros((1, 2 * terms)), nodes=nodes, omega_max_h=turn)
+    to_w, to_v = np.zeros((2, NODES, NODES))
+    assert node_responses(cluster, Substep(PLAIN, 0.9), 0, 0, to_w, to_v)
+    phase, h = turn * 0.9 * nodes.share[PLAIN], cluster.interval
+    np.testing.assert_allclose(to_w.sum(axis=0), (1 - np.cos(phase)) * h**2 / (mass * turn**2), rtol=1e-11)
+    np.testing.assert_allclose(to_v.sum(axis=0), np.sin(phase) * h / (mass * turn), rtol=1e-11)
 
 
 def test_ten_thousand_sites_are_set_up_and_gone_on_with():
