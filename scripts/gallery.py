@@ -1,39 +1,47 @@
-"""The pictures of the manual's chapter ``gallery``: its commands are run as they stand, its figures made small.
+"""The pictures of the manual's gallery: the commands of its pages are run as they stand, their figures made small.
 
-    python scripts/gallery.py [FOLDER]
+    python scripts/gallery.py [--folder FOLDER] [PAGE ...]
 
-Works in ``FOLDER``, by default a temporary one. A picture ``runs/gallery/RUN.FIGURE`` of the chapter is
-``runs/RUN/figures/FIGURE`` there; what is larger than ``MOST`` is a mistake.
+Works in ``FOLDER``, by default a temporary one, on the pages named, or all. A picture ``runs/gallery/RUN.FIGURE`` of a
+page is ``runs/RUN/figures/FIGURE`` there; what is larger than ``MOST`` is a mistake.
 """
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from PIL import Image
 
 ROOT = Path(__file__).parents[1]
-CHAPTER = ROOT / "vipetsc/manual/gallery.md"
+INDEX = ROOT / "vipetsc/manual/gallery.md"
 WIDTH, COLOURS = 900, 200
-MOST = {".png": 100_000, ".gif": 1_500_000}  # bytes
+MOST = {".png": 125_000, ".gif": 1_500_000}  # bytes
 
 
-def commands() -> list[list[str]]:
-    """The words of every command of the chapter, in its order."""
-    blocks = re.findall(r"^```sh\n(.*?)^```$", CHAPTER.read_text(encoding="utf-8"), flags=re.M | re.S)
+def pages() -> dict[str, Path]:
+    """The pages of the gallery by name, in the order of its index."""
+    names = re.findall(r"\]\(gallery/([\w-]+)\.md\)", INDEX.read_text(encoding="utf-8"))
+    return {name: INDEX.with_suffix("") / f"{name}.md" for name in names}
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The words of every command of a page, in its order."""
+    blocks = re.findall(r"^```sh\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line.strip()]
 
 
-def pictures() -> list[Path]:
-    """The pictures of the chapter."""
-    links = re.findall(r"!\[[^]]*\]\((\S+)\)", CHAPTER.read_text(encoding="utf-8"))
-    return [(CHAPTER.parent / link).resolve() for link in links]
+def pictures(page: Path) -> list[Path]:
+    """The pictures of a page."""
+    links = re.findall(r"!\[[^]]*\]\((\S+)\)", page.read_text(encoding="utf-8"))
+    return [(page.parent / link).resolve() for link in links]
 
 
 def make_small(source: Path, target: Path) -> None:
@@ -49,17 +57,31 @@ def make_small(source: Path, target: Path) -> None:
         raise ValueError(f"{target}: {target.stat().st_size} bytes")
 
 
-def main(folder: Path) -> None:
-    """Run the commands in ``folder``, and renew the pictures."""
-    shutil.copytree(ROOT / "runs", folder / "runs", ignore=shutil.ignore_patterns("*.h5"), dirs_exist_ok=True)
-    for words in commands():
-        subprocess.run([sys.executable, *words[1:]], cwd=folder, check=True)
-    for target in pictures():
+def make(page: Path, folder: Path) -> None:
+    """Run the commands of a page in ``folder``, and renew its pictures."""
+    for words in commands(page):
+        here = [sys.executable if word == "python" else word for word in words]
+        subprocess.run(here, cwd=folder, check=True)
+    for target in pictures(page):
         run, figure = target.name.split(".", 1)
         make_small(folder / "runs" / run / "figures" / figure, target)
-        print(target.relative_to(ROOT))
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Renew the pictures; says how long each page took."""
+    every = pages()
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("page", nargs="*", default=list(every), help=f"{', '.join(every)}; all if left out")
+    parser.add_argument("--folder", type=Path, help="where runs are made and stay; a temporary one if left out")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.folder or Path(scratch)
+        shutil.copytree(ROOT / "runs", folder / "runs", ignore=shutil.ignore_patterns("*.h5"), dirs_exist_ok=True)
+        for name in options.page:
+            begin = time.monotonic()
+            make(every[name], folder)
+            print(f"{name}: {time.monotonic() - begin:.0f} s", flush=True)
 
 
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as scratch:
-        main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(scratch))
+    main()

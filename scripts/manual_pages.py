@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))
 import vipetsc
 from vipetsc.case.keys import chapter as all_keys
 
-PACKAGE, CHAPTERS = ROOT / "vipetsc", ROOT / "vipetsc/manual"
+PACKAGE, CHAPTERS, GALLERY = ROOT / "vipetsc", ROOT / "vipetsc/manual", ROOT / "vipetsc/manual/gallery"
 START, KEYS, API = "start", "case-keys", "api"
 CONFIGURATION = {
     "project": "vipetsc",
@@ -49,7 +49,7 @@ Named = ast.ClassDef | ast.FunctionDef
 
 def write_sources(folder: Path, packages: list[str]) -> None:
     """All pages as Markdown in ``folder``, with their pictures; the interface of ``packages``, all if there is none."""
-    folder.mkdir(parents=True)
+    (folder / GALLERY.name).mkdir(parents=True)
     index = (CHAPTERS / "index.md").read_text(encoding="utf-8")
     names = re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", index, flags=re.M)
     names += sorted({path.stem for path in CHAPTERS.glob("*.md")} - {"index", *names})
@@ -60,7 +60,12 @@ def write_sources(folder: Path, packages: list[str]) -> None:
     put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
     put(folder / f"{KEYS}.md", all_keys(), CHAPTERS)
     for name in names:
-        put(folder / f"{name}.md", (CHAPTERS / f"{name}.md").read_text(encoding="utf-8"), CHAPTERS)
+        text = (CHAPTERS / f"{name}.md").read_text(encoding="utf-8")
+        studies = re.findall(r"\]\((gallery/[\w-]+)\.md\)", text)
+        put(folder / f"{name}.md", text + (contents("", studies) if name == GALLERY.name else ""), CHAPTERS)
+    for path in GALLERY.glob("*.md"):
+        text = path.read_text(encoding="utf-8")
+        put(folder / GALLERY.name / path.name, text + case_files(text), GALLERY)
     put(folder / f"{API}.md", "# The Python interface\n" + contents("", list(pages), hidden=False), CHAPTERS)
     for name, text in pages.items():
         put(folder / f"{name}.md", text, CHAPTERS)
@@ -72,13 +77,22 @@ def contents(caption: str, names: list[str], hidden: bool = True) -> str:
     return f"\n```{{toctree}}\n{options}\n" + "\n".join(names) + "\n```\n"
 
 
+def case_files(text: str) -> str:
+    """The case files that a study's commands name, as blocks."""
+    names = [name for name in dict.fromkeys(re.findall(r"\bruns/[\w/-]+\.toml", text)) if (ROOT / name).exists()]
+    return "".join(f"\n## {name}\n\n```toml\n{(ROOT / name).read_text(encoding='utf-8')}```\n" for name in names)
+
+
 def put(path: Path, text: str, home: Path) -> None:
     """Write a page whose links are those of a file in ``home``: chapters beside it, pictures copied there."""
+    up = "../" if home == GALLERY else ""
 
     def link(match: re.Match[str]) -> str:
         target = (home / match[1]).resolve()
-        if target.parent == CHAPTERS or target == ROOT / "README.md":
-            return f"]({target.name if target.parent == CHAPTERS else START + '.md'}{match[2] or ''})"
+        if target == ROOT / "README.md":
+            return f"]({up}{START}.md{match[2] or ''})"
+        if target.suffix == ".md":
+            return f"]({up}{target.relative_to(CHAPTERS)}{match[2] or ''})"
         shutil.copy(target, path.parent / target.name)  # raises where a link leads nowhere
         return f"]({target.name})"
 

@@ -129,5 +129,7 @@ def test_the_manual_at_the_prompt(in_process):
     assert re.search(r"^`frequency` +number > 0 +rad/s +angular frequency", shown, flags=re.M)
     trust = in_process("manual", "trust").stdout
     assert "performance (manual performance)" in trust and "](" not in trust
+    study = in_process("manual", "gallery/designed").stdout
+    assert study.startswith("# A designed lattice") and "optimise (manual optimise)" in study
     wrong = in_process("manual", "cooking")
     assert wrong.returncode == 2 and ", case-file, case-keys" in wrong.stderr

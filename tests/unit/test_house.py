@@ -75,7 +75,7 @@ def test_every_chapter_is_in_the_index_and_every_link_leads_somewhere():
     chapters = {path.name for path in manual.glob("*.md")}
     index = (manual / "index.md").read_text(encoding="utf-8")
     assert set(re.findall(r"\]\((\w[\w-]*\.md)\)", index)) == chapters - {"index.md"}
-    for page in [*manual.glob("*.md"), ROOT.parent / "README.md"]:
+    for page in [*manual.rglob("*.md"), ROOT.parent / "README.md"]:
         for target in re.findall(r"\]\((?!https:)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
     assert (ROOT.parent / "README.md").read_text(encoding="utf-8").count("\n") <= 150

@@ -182,14 +182,14 @@ def _beside_wall(cell: UnitCell, end: str, cells: int) -> Table:
 def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
     """The frequency in rad/s that a valid ``drive`` is about: as given, else that of its samples or its half-sine.
 
-    Of half a sine that is shorter than the lattice can follow, it is the top band's edge.
+    Of half a sine that is shorter than the lattice can follow, it is the top band's edge, if springs make bands.
     """
     if drive.ways or drive.kind in SINES:
         return driven_wave(cell, drive)[0]
     if drive.kind == "samples" and drive.samples is not None:
         return main_frequency(drive.samples.time, drive.samples.value)
     half = (drive.duration if drive.kind == "impulse" else drive.ramp) or 1.0
-    return float(min(np.pi / half, pass_bands(cell)[-1].high))
+    return float(min(np.pi / half, pass_bands(cell)[-1].high or np.inf))
 
 
 def driven_wave(cell: UnitCell, drive: OneDrive) -> tuple[float, float]:

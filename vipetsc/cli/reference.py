@@ -14,10 +14,9 @@ from vipetsc.parallel import StopRequest, on_root
 KEYS = "case-keys"  # the chapter that is made from the schema
 
 
-def chapters() -> dict[str, str]:
-    """Names of the manual's chapters and their titles, in the order of its index."""
-    folder = files("vipetsc") / "manual"
-    names = [KEYS, *re.findall(r"\]\((\S+)\.md\)", (folder / "index.md").read_text(encoding="utf-8"))]
+def chapters(index: str = "index") -> dict[str, str]:
+    """Names and titles of the manual's chapters, or of the pages that another ``index`` than its own leads to."""
+    names = [*([KEYS] if index == "index" else ()), *re.findall(r"\]\((\S+)\.md\)", chapter(index))]
     return {name: chapter(name).partition("\n")[0].removeprefix("# ") for name in sorted(names)}
 
 
@@ -32,15 +31,15 @@ def chapter(name: str) -> str:
 
 def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """A chapter of the manual as plain text, or which there are."""
-    titles = on_root(comm, chapters)
+    titles, studies = on_root(comm, lambda: (chapters(), chapters("gallery")))
     if options.topic is None:
         width = max(map(len, titles))
         echo(comm, "\n".join(f"  {name:<{width}}  {title}" for name, title in titles.items()))
         echo(comm, "vipetsc manual TOPIC shows one")
-    elif options.topic in titles:
+    elif options.topic in titles | studies:
         echo(comm, on_root(comm, lambda: plain(chapter(options.topic))))
     else:
-        known = ", ".join(titles)
+        known = ", ".join(titles | studies)
         raise CaseError([Problem("TOPIC", options.topic, f"no chapter; there are {known}")], "manual")
     return DONE
 
@@ -48,7 +47,7 @@ def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 def plain(text: str) -> str:
     """Markdown for a terminal: links and pictures by their words, tables in columns."""
     text = re.sub(r"!\[([^\]]*)\]\([^)]*\)", r"[picture: \1]", text)
-    text = re.sub(r"\[([^\]]+)\]\((?!http)(\w[\w-]*)\.md\)", r"\1 (manual \2)", text)
+    text = re.sub(r"\[([^\]]+)\]\((?!http)(?:\.\./)?(\w[\w/-]*)\.md\)", r"\1 (manual \2)", text)
     return re.sub(r"(?m)(^\|.*\n)+", lambda rows: _columns(rows[0]), text)
 
 
