@@ -23,8 +23,6 @@ MOST_TERMS = 24
 BATCH = 64
 # Shares of a step below this are rounding.
 ROUNDING = 1e-15
-# In place of the omega H of a lattice without springs.
-TINY = 1e-100
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ class StepSeries:
 
     def _magnitudes(self, rows: np.ndarray) -> np.ndarray:
         """Magnitudes of P's entries (2 dof, 2 dof, cell) for it, a velocity counted as omega times a displacement."""
-        n, omega = self.chain.cell.dofs, max(self.omega_max_h, TINY) / self.interval
+        n, omega = self.chain.cell.dofs, (self.omega_max_h or 1.0) / self.interval  # 1.0: no springs
         share = np.abs(self.stencil(rows))
         share[:n, n:] *= omega
         share[n:, :n] /= omega
