@@ -17,7 +17,7 @@ from vipetsc.lattice import Contact
 M, A = 1e-3, 1e9  # kg, N/m^1.5
 
 
-def beads(path, u, v, end, samples, frequency=1e4, lattice=None, rtol=1e-10, **contacts):
+def beads(path, u, v, end, samples, frequency=1e4, lattice=None, rtol=1e-10, engine="ts", **contacts):
     """The run of beads from displacements ``u`` (cell,) and velocities ``v``, joined by Hertz's contacts."""
     n = max(np.size(u), np.size(v))
     zeros = np.zeros(n)
@@ -27,14 +27,15 @@ def beads(path, u, v, end, samples, frequency=1e4, lattice=None, rtol=1e-10, **c
     lattice = {"cell": {"masses": [M]}, "cells": n, "ends": "free"} | (lattice or {})
     sites = list(range(1, n + (lattice["ends"] == "periodic")))
     joined = {"law": "hertz", "stiffness": A, "next_cell": True, "side": "minus", "clearance": 0.0, "sites": sites}
-    time = {"end": end, "samples": samples, "rtol": rtol, "engine": "ts"}
+    time = {"end": end, "samples": samples, "rtol": rtol, "engine": engine}
     initial = {"kind": "file", "path": str(path / "state.nc")}
     case = Case.from_table({
         "lattice": lattice, "contacts": joined | contacts, "time": time,
         "drive": {"amplitude": 0.0, "frequency": frequency}, "initial": initial,
     })  # fmt: skip
     memory = RunMemory(MPI.COMM_SELF)
-    assert simulate(case, memory).complete
+    result = simulate(case, memory)
+    assert result.complete and result.statistics["engine"] == engine
     run = memory.dataset
     stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"] + run["energy/dissipated"]
     rounding = 1e-14 * n * A * contacts.get("precompression", 0.0) ** 2.5  # of what the static state holds
@@ -56,9 +57,10 @@ def test_a_pressed_chain_has_the_dispersion_of_its_linearised_contacts(tmp_path,
     assert len(force) == n - (ends == "free") and force == pytest.approx(A * d**1.5, rel=1e-5)
 
 
-def test_a_struck_chain_is_that_of_an_independent_solver(tmp_path):
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_a_struck_chain_is_that_of_an_independent_solver(tmp_path, engine):
     n, v = 8, np.append(0.1, np.zeros(7))
-    run = beads(tmp_path, 0.0 * v, v, 4e-4, 11, rtol=1e-11)
+    run = beads(tmp_path, 0.0 * v, v, 4e-4, 11, rtol=1e-11, engine=engine)
 
     def rate(_t, y):
         push = A * np.maximum(y[: n - 1] - y[1:n], 0) ** 1.5
