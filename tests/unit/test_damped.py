@@ -207,7 +207,7 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
     assert chain.cell == lossy(four_band("calibrated"), {2: 0.02})
     assert [*chain.cell.grounding] == resolved.grounding
     assert [s.damping for s in chain.cell.springs] == resolved.springs
-    assert chain.variation.grounding is None and chain.is_damped  # the same dashpots in all cells
+    assert [name for name, _ in chain.variation.items()] == ["masses"] and chain.is_damped  # dashpots as in all cells
     asked, least, mean, most = losses(case.lattice)[1]
     assert asked == 0.02 and 0.0199 < least < mean < most < 0.0201
     assert mean == pytest.approx(0.02, rel=1e-3)
@@ -224,4 +224,36 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
 def test_a_loss_that_cannot_be_is_refused(damping):
     with pytest.raises(CaseError, match=r"lattice\.damping\.(loss|grounding)") as error:
         small_case(lattice={"damping": damping})
+    assert len(error.value.problems) == 1
+
+
+BEADS = {"cell": {"masses": [1e-3]}, "cells": 20}
+TOUCHING = {"sites": [3], "stiffness": 1e6, "next_cell": True, "side": "minus", "clearance": 0.0}
+
+
+@pytest.mark.parametrize(("key", "sections"), [
+    ("disorder.cells", {"disorder": {"cells": {"grounding[1]": {"absolute": 0.1, "distribution": "lognormal"}}}}),
+    ("is 0 in all cells", {"disorder": {"cells": {"grounding[1]": {"relative": 0.1}}}}),
+    ("is 0, and so is any factor", {"lattice": {"profiles": {"grounding[1]": {"cells": [3], "factor": 2.0}}}}),
+    (r"masses\[2\].last: Field required", {"lattice": {"profiles": {"masses[2]": {"first": 1.0}}}}),
+    (r"profiles.masses\[2\].value = nan", {"lattice": {"profiles": {"masses[2]": {"cells": [3], "value": np.nan}}}}),
+    ("at most 100000000 cells", {"lattice": {"cells": 10**12, "absorbing": {}}}),
+    ("contacts.each.pair", {"contacts": {"each": {"pair": [[1, 2]] * 4}}}),
+    ("contacts.sites.count = 0: must be greater", {"contacts": {"sites": {"first": 1, "count": 0}}}),
+    ("contacts.approach_floor = inf", {"contacts": {"approach_floor": np.inf}}),
+    ("without springs", {"lattice": BEADS | {"absorbing": {"cells": 3, "strength": 1.0}}}),
+    ("the cell has none", {"lattice": BEADS, "drive": {"end": "left"}}),
+])  # fmt: skip
+def test_nonsense_has_one_message(key, sections):
+    table = {"lattice": {"preset": "four-band", "cells": 60}, "contacts": {"sites": [20, 30], "clearance": 1e-4}}
+    if sections.get("lattice", {}).get("cell"):
+        times = {
+            "time": {"end": 1e-2, "sample_interval": 1e-4},
+            "drive": {"frequency": 100.0} | sections.get("drive", {}),
+        }
+        table, sections = {"contacts": TOUCHING}, sections | times
+    for name, values in sections.items():
+        table[name] = table.get(name, {}) | values
+    with pytest.raises(CaseError, match=key) as error:
+        Case.from_table(table)
     assert len(error.value.problems) == 1
