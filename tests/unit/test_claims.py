@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
@@ -35,7 +34,8 @@ SPREAD_FIT = "share of configurations of spread sites with adjusted R^2 >= 0.95 
 
 
 def measure(id, root, reading="calibrated"):
-    return SimpleNamespace(**measure_claim(id, reading, Path(root)))
+    with Evidence(root) as evidence:
+        return SimpleNamespace(**measure_claim(id, reading, evidence))
 
 
 def curve_of(amplitude, value):

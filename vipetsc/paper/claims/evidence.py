@@ -97,8 +97,8 @@ class AmplitudeCurve:
 class Evidence(ExitStack):
     """The steps in ``root``, opened as they are asked for, and closed when the context ends.
 
-    ``files`` are those asked for so far, relative to ``root``, in order. Every method raises MissingEvidence for what
-    is not there, OSError or ValueError for a file that cannot be used.
+    ``files`` are those asked for since this list was emptied, relative to ``root``, in order. Every method raises
+    MissingEvidence for what is not there, OSError or ValueError for a file that cannot be used.
     """
 
     def __init__(self, root: str | Path) -> None:
@@ -106,6 +106,7 @@ class Evidence(ExitStack):
         self.root = Path(root)
         self.files: list[str] = []
         self._open_ensemble = cache(open_ensemble)
+        self._open = cache(lambda path, needs: self.enter_context(open_netcdf(path, "file of results", needs)))
 
     def path(self, *parts: str) -> Path:
         """A file below ``root``, noted down."""
@@ -118,7 +119,7 @@ class Evidence(ExitStack):
 
     def open(self, *parts: str, needs: tuple[str, ...] = ()) -> xr.Dataset:
         """An HDF5 file below ``root`` with the variables and groups ``needs``."""
-        return self.enter_context(open_netcdf(self.path(*parts), "file of results", needs))
+        return self._open(self.path(*parts), needs)
 
     def ensemble(self, step: str) -> xr.Dataset:
         """The finished sweep of a step."""

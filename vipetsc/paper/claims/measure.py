@@ -23,25 +23,26 @@ def measure_claims(root: str | Path) -> list[dict[str, Any]]:
     the claim, ``files`` are what it was measured from, relative to ``root``. What cannot be measured because its files
     are missing has the verdict "not measured", and ``reason`` says what is missing.
     """
-    return [measure_claim(claim, reading, Path(root)) for claim, spec in CLAIMS.items() for reading in spec.readings]
+    with Evidence(root) as evidence:
+        return [measure_claim(claim, reading, evidence) for claim, spec in CLAIMS.items() for reading in spec.readings]
 
 
-def measure_claim(claim: str, reading: str, root: Path) -> dict[str, Any]:
+def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any]:
     """One claim, by its id, in one reading."""
     result, spec = Measurement(), CLAIMS[claim]
     judgement, missed = UNMEASURED, list[str]()
     measure = resolve_name(f"vipetsc.paper.claims.{spec.measure}")
-    with Evidence(root) as evidence:
-        try:
-            measure(evidence, reading, result)
-        except MissingEvidence as missing:
-            result.reasons.append(str(missing))
-        except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
-            message = " ".join(str(error).split()).replace(f"{root}/", "")
-            file = evidence.files[-1] if evidence.files else "a file"
-            result.reasons.append(f"{file} cannot be used: {message}")
-        else:
-            judgement, missed = verdict(spec.criteria, result.value)
+    evidence.files = []
+    try:
+        measure(evidence, reading, result)
+    except MissingEvidence as missing:
+        result.reasons.append(str(missing))
+    except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
+        message = " ".join(str(error).split()).replace(f"{evidence.root}/", "")
+        file = evidence.files[-1] if evidence.files else "a file"
+        result.reasons.append(f"{file} cannot be used: {message}")
+    else:
+        judgement, missed = verdict(spec.criteria, result.value)
     reasons = [f"not met: {' / '.join(missed)}"] if 0 < len(missed) < len(spec.criteria) else []
     return {
         "id": claim,
