@@ -188,7 +188,7 @@ def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser
     (first,) = [a for a in axes if a["curves"]][:1]
     curve, (west, north, east, south) = first["curves"][0], first["box"]
     with h5py.File(made / "interband/ensemble.h5") as file:  # the numbers are those of the results
-        assert curve["x"] == pytest.approx(list(file["amplitude"][...][: len(curve["x"])]), rel=1e-4)
+        assert curve["x"] == pytest.approx(list(file["amplitude"][...][: len(curve["x"])]), rel=5e-4)  # four digits
     browser.drag(session, (left + (west + east) / 2 * width, top + (north + south) / 2 * height))
     told = browser.ask(session, look + "return figure.querySelector('output').textContent;")
     assert first["x"]["label"] in told and first["y"]["label"] in told

@@ -9,7 +9,7 @@ import vipetsc
 ROOT = Path(vipetsc.__file__).parent
 SOURCES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob("*.py"))}
 # What stands here is what there is: a change that needs more lines says so here.
-MOST_LINES, MOST_IN_A_FILE, MOST_IN_A_FUNCTION, MOST_ARGUMENTS = 30_600, 300, 60, 7
+MOST_LINES, MOST_IN_A_FILE, MOST_IN_A_FUNCTION, MOST_ARGUMENTS = 30_239, 300, 60, 7
 COMPILED = {"njit", "jit", "cfunc", "kernel", "inlined"}  # decorators of compiled functions
 # Words that were a dialect of this package; the field has names for what they held.
 DIALECT = {"awake", "again", "loud", "heard", "alike", "letter", "found", "own", "words", "kept", "there"}

@@ -387,13 +387,17 @@ def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
         NnmCase.from_table({"lattice": {"cell": cell}, "contacts": {"clearance": 0.1}})
 
 
+def test_a_restitution_is_warned_of():
+    told = [NnmCase.from_table({"contacts": {"restitution": r}}).warnings() for r in (0.7, 1.0)]
+    assert told == [["contacts.restitution = 0.7 counts as 1: normal modes lose nothing"], []]
+
+
 @pytest.mark.parametrize("nnm", [{}, {"system": "chain"}, {"system": "condensed", "start_frequency": [1600.0]}])
 @pytest.mark.parametrize(
     ("table", "key"),
     [
         ({"contacts": {"law": "power"}}, r"contacts\.exponent: missing"),
         ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: is for law"),
-        ({"contacts": {"restitution": 0.7}}, r"contacts\.restitution"),
         ({"contacts": {"side": "plus"}}, r"contacts\.side"),
         ({"contacts": {"clearance_minus": 2e-3}}, r"contacts\.clearance_minus"),
         ({"contacts": {"each": {"law": ["bilinear"]}}}, r"contacts\.each"),

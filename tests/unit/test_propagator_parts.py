@@ -16,7 +16,7 @@ from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.engine import Stretch
 from vipetsc.dynamics.layout import Layout, create_record
-from vipetsc.dynamics.propagator.clusters import create_dof_tables, group_dofs
+from vipetsc.dynamics.propagator.clusters import Groups, create_dof_tables, create_responses, group_dofs
 from vipetsc.dynamics.propagator.collocation import (
     HISTORY,
     SUBSTEP_STATE,
@@ -124,6 +124,14 @@ def test_clusters_that_cannot_touch_are_left_alone():
         state[resonator, 11] = reached
         exchange(halo, 0, state)
         assert [c for c in range(4) if expand_free_motion(tables, c, halo.columns, taylor)] == expected
+
+
+def test_a_rank_far_from_contacts_and_drives_has_empty_tables():
+    model, layout, series, halo = parts("fixed", 1e-4, 1e-14, sites=(4, 12, 20))
+    nothing = Groups(np.zeros(0, np.int64), np.zeros(1, np.int64))
+    tables = create_dof_tables(nothing, model, layout, series, halo)
+    assert tables.rows.shape[0] == tables.clearance.size == tables.sites.size == 0
+    assert create_responses(nothing, tables, model, series).size == 0
 
 
 def test_contacts_that_cannot_be_followed_end_the_run():

@@ -69,11 +69,11 @@ class Guards(Section):
     """Bounds on one step that keep a branch from jumping to another arc; 0 switches one off.
 
     Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc, length of the
-    correction over the step's length, angle in rad between consecutive tangents: in the chart of the step, and in the
-    chart ``relative`` whatever the step's, since near grazing another chart hides the angle between two branches that
-    cross. Residuals cannot tell a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill``
-    points are all within ``advance`` of each other, in units of the orbit's size, is ended: orbits are corrected to
-    1e-13 or so, and no branch of the paper's models moves by less than 2e-6 in 200 points.
+    correction over the step's length, angle in rad between consecutive tangents: in the chart of the step, and in that
+    named ``relative``, since near grazing another chart hides the angle between two branches that cross. Residuals
+    cannot tell a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill`` points are all
+    within ``advance`` times the orbit's size is ended: orbits are corrected to 1e-13, and the paper's branches move by
+    2e-6 in 200 points at least.
     """
 
     half_trace: Annotated[float, Field(ge=0)] = 0.5
@@ -157,13 +157,17 @@ class NnmCase(CaseFile):
             stated = table.get("contacts", {})
             table = table | {"contacts": {key: v for key, v in given.items() if key in MATERIAL or key in stated}}
         fields, problems = super().read(with_default_preset(table))
-        if "disorder" in table:
-            problems.append(Problem("disorder", None, "normal modes are those of the case without it; leave it out"))
+        problems += [Problem("disorder", None, "normal modes do not take it")] if "disorder" in table else []
         lattice, contacts = fields["lattice"], fields["contacts"]
         if not (problems or lattice_free or contacts.clearance):
             count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
             fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
         return fields, problems
+
+    def warnings(self) -> list[str]:
+        """What the case says that normal modes do not take."""
+        r = self.contacts.restitution
+        return [f"contacts.restitution = {r:g} counts as 1: normal modes lose nothing"] if r < 1 else []
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
@@ -173,8 +177,6 @@ class NnmCase(CaseFile):
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
         problems, dofs, rigid = [*_check_options(nnm), *check_alike(contacts)], 2, 0
         problems += [] if contacts.each else check_each(contacts, 0, [], valid)
-        if contacts.restitution < 1:
-            problems.append(Problem("contacts.restitution", contacts.restitution, "normal modes lose nothing: give 1"))
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:
@@ -197,7 +199,7 @@ class NnmCase(CaseFile):
                 remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
                 return [*problems, Problem("lattice.cells", lattice.cells, remedy)]
         elif nnm.shooting == "krylov" or (nnm.multipliers and nnm.system != "condensed"):
-            remedy = '"krylov" is for "chain", multipliers are for "chain" and "condensed"'
+            remedy = '"krylov" is for "chain", multipliers for that and "condensed"'
             problems.append(Problem("nnm.system", nnm.system, remedy))
         if nnm.system == "condensed":
             return [*problems, *_check_condensed(lattice, contacts, nnm, valid)]
@@ -263,25 +265,23 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
     pairs += [(f"contacts[{i}]", p.host, p.resonator) for i, p in enumerate(nnm.custom.contacts, 1)]
     for key, start, end in pairs:
         if start == end or max(start, end) > masses:
-            remedy = f"is not a pair of the system's {masses} masses (0 is the ground)"
-            yield Problem(f"nnm.own.{key}", [start, end], remedy)
+            yield Problem(f"nnm.own.{key}", [start, end], f"is not a pair of the {masses} masses (0 is the ground)")
 
 
 def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable, valid: Valid) -> Iterator[Problem]:
     """What is wrong with the start of a lattice's motions."""
-    sites = site_cells(lattice, contacts)
     yield from check_stiffness(contacts, True, valid)
     if not nnm.start_frequency:
         yield Problem("nnm.start_frequency", [], "name frequencies in rad/s, between the pass bands or above them")
-    if outside := [n for n in nnm.start_sites if not 1 <= abs(n) <= len(sites)]:
-        yield Problem("nnm.start_sites", outside, f"number the sites from 1 to {len(sites)}, with a sign")
+    count = len(site_cells(lattice, contacts))
+    if outside := [n for n in nnm.start_sites if not 1 <= abs(n) <= count]:
+        yield Problem("nnm.start_sites", outside, f"number the sites from 1 to {count}, with a sign")
     sound = not check_cell(lattice)[1]
     if nnm.multipliers and sound and (masses := lattice.unit_cell().dofs * lattice.cells) > MOST_OF_LATTICE:
         remedy = f"need the motion of all {masses} masses, and are found up to {MOST_OF_LATTICE}"
         yield Problem("nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs the sites alone")
     bands = pass_bands(lattice.unit_cell()) if sound else ()
-    inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
-    if inside:
+    if inside := [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]:
         told = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
         yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({told} rad/s); motions there radiate")
 

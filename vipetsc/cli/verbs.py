@@ -121,6 +121,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 
     case = _load(NnmCase, options, comm)
     folder = _output(options, case.name)
+    echo_warnings(comm, case.warnings())
     with claim_branches(case, folder, comm, options.force, options.resume) as claim:
         branches = follow_all(case, claim.folder, comm, claim.going_on, tables.branch_log(), stop, follower_of(case))
         for branch in branches:

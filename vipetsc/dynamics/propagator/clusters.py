@@ -75,7 +75,7 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     numbers, dofs, r, width = groups.numbers, contact_dofs(model)[groups.numbers], series.reach, series.width
     # DoFs share their rows where the cells around them do.
     ends = np.stack([dofs["cell"], dofs["last"] % layout.cells][: dofs["form"].shape[1]], axis=1)
-    forms = dofs["form"].reshape(len(dofs), -1)
+    forms = dofs["form"].reshape(len(dofs), ends.shape[1] * layout.dofs)  # of none, too
     kinds, table = np.unique(
         np.hstack([series.like(ends.ravel()).reshape(ends.shape), forms]), axis=0, return_inverse=True
     )
