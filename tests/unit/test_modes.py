@@ -374,7 +374,7 @@ def test_pairs_that_are_not_in_the_system_are_named(key):
     ends = {"host": 1, "resonator": 2} if key == "contacts" else {"start": 1, "end": 2}
     rest = {"springs": {"stiffness": 1.0}, "smooth": {"cubic": 1.0}, "contacts": {"clearance": 1.0}}
     own[key] = [*own[key], ends | rest[key]]
-    with pytest.raises(CaseError, match=rf"nnm.own.{key}.*not a pair of the system's 1 masses"):
+    with pytest.raises(CaseError, match=rf"nnm.own.{key}.*not a pair of the 1 masses"):
         NnmCase.from_table({"nnm": {"system": "own", "own": own}})
 
 
