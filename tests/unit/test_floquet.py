@@ -122,7 +122,7 @@ def test_what_has_no_breather_says_so_and_keeps_what_there_is(tmp_path):
     [
         ({"shooting": "dense"}, "needs nnm.shooting"),
         ({"compare": ["newmark"]}, "needs dense matrices"),
-        ({"system": "reduced", "start_frequency": [], "multipliers": 3}, 'are for "chain"'),
+        ({"system": "reduced", "start_frequency": [], "multipliers": 3}, 'is for "chain"'),
         ({"shooting": "newton"}, "nnm.shooting"),
     ],
 )

@@ -57,7 +57,7 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
         (TIED + "[contacts]\nclearance = 1.0\n[nnm]", "contacts.stiffness: missing"),
         (TIED + "[nnm]", "contacts.clearance: missing"),
         (OWN.format("{ start = 1, end = 2, stiffness = 1.0 }"), "nnm.modes = [1]: the system is free to move"),
-        (OWN.format("{ start = 0, end = 3, stiffness = 1.0 }"), "not a pair of the system's 2 masses"),
+        (OWN.format("{ start = 0, end = 3, stiffness = 1.0 }"), "not a pair of the 2 masses"),
         ("[lattice]\ncells = 100000\n[contacts]\nsites = 1\n[nnm]\nsystem = 'chain'", "makes 400000 masses"),
         ("x = " + "[" * 5000, "not a TOML file"),
         ("x = " + "9" * 5000, "not a TOML file"),
