@@ -46,6 +46,17 @@ def folder():
         shutil.rmtree(path, ignore_errors=True)
 
 
+# What sites have that differ in their laws and stops: three, one on both sides.
+DIFFERING = {
+    "law": ["hertz", "bilinear", "power"],
+    "stiffness": [5e6, 2e4, 1e6],
+    "restitution": [0.6, 0.8, 1.0],
+    "damping": ["flores", "exact", "paper"],
+    "side": ["plus", "both", "minus"],
+    "clearance_minus": [1e-5, 4e-5, 3e-5],
+}
+
+
 def small_case(**sections) -> Case:
     """A four-band lattice of 24 cells in which contacts begin early; sections update the table."""
     table = {

@@ -13,6 +13,8 @@ from tests.conftest import StopAt, assert_same_bits, datasets, on_two, small_cas
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.observers import Observer
+from vipetsc.dynamics.propagator import engine
+from vipetsc.dynamics.propagator.engine import Forces
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import on_root
 
@@ -114,6 +116,19 @@ class Spoiler(Observer):
     def observe(self, block):
         if block.first == 0 and self.setup.layout.comm.rank == self.setup.layout.comm.size - 1:
             block.state.array[self.setup.layout.owned // 2] = np.nan
+
+
+@pytest.mark.parallel(2)
+def test_an_engine_that_one_rank_cannot_set_up_is_set_up_by_none(monkeypatch):
+    def forces(*arguments):
+        if MPI.COMM_WORLD.rank == 1:
+            raise ValueError("no room")
+        return Forces(*arguments)
+
+    monkeypatch.setattr(engine, "Forces", forces)
+    case = small_case(contacts={"sites": [5]}, time={"engine": "propagator"})
+    with pytest.raises(ValueError, match="no room"):
+        simulate(case, RunMemory(MPI.COMM_WORLD))
 
 
 @pytest.mark.parallel([2, 3])

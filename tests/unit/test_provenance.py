@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import platform
-import re
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 
 from mpi4py import MPI
-
-import pytest
 
 import vipetsc as package
 from tests.conftest import assert_same_bits, datasets, small_case
@@ -66,12 +63,15 @@ def test_petsc_options_are_told(petsc_options):
     assert "-ts_monitor ascii:nowhere.txt" in io_folder.origin()["petsc_options"]
 
 
-def test_the_revision_is_that_of_git():
-    root = Path(package.__file__).parents[1]
-    if not (root / ".git").exists():
-        pytest.skip("no git repository around the package")
-    head = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout
-    assert re.fullmatch(rf"{head[:12]}\+?", io_folder.revision.__wrapped__())
+def test_the_revision_is_that_of_git(tmp_path, monkeypatch):
+    (tmp_path / "pyproject.toml").touch()
+    for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -qm one"):
+        subprocess.run(["git", "-C", tmp_path, *words.split()], check=True)
+    head = subprocess.run(["git", "-C", tmp_path, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+    monkeypatch.setattr(package, "__file__", str(tmp_path / "vipetsc/__init__.py"))
+    assert io_folder.revision.__wrapped__() == head.stdout[:12]
+    (tmp_path / "pyproject.toml").write_text("changed")
+    assert io_folder.revision.__wrapped__() == head.stdout[:12] + "+"
 
 
 def test_a_package_in_a_foreign_repository_has_no_revision(tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, appl
 from vipetsc.dynamics.propagator.tables import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.lattice import ToneBurst
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StopRequest, on_every_rank
 
 # Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
 LARGEST_OMEGA_H = 3.2
@@ -136,7 +136,7 @@ class Propagator(Engine):
         self.series = series
         self._layout, self._stop = layout, stop or StopRequest()
         self._regions = HaloRegions(layout)
-        self._forces = Forces(model, layout, series, self._regions)
+        self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions))
         self._stencil = create_stencil(series, layout, self._regions)
         ghosts = [self._regions.add(cell, 1) for cell in layout.neighbours() if cell is not None]
         self._components = np.zeros((2, layout.size + layout.ghost_rows * len(ghosts)))
