@@ -8,7 +8,7 @@ import pytest
 
 import vipetsc
 from tests.cli.test_guide import ROOT
-from vipetsc.case.every import load_every
+from vipetsc.case.verb_cases import load_every
 from vipetsc.cli.main import main
 
 sys.path.insert(0, str(ROOT / "scripts"))

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 import vipetsc as package
 from tests.conftest import clean_environment
 from vipetsc.case import Case, Sweep
-from vipetsc.case.every import load_every
 from vipetsc.case.nnm import NnmCase
+from vipetsc.case.verb_cases import load_every
 from vipetsc.cli.main import main
 from vipetsc.figures import style
 from vipetsc.modes.system import System

@@ -17,7 +17,7 @@ import pytest
 from tests.cli.browser import NEEDED, SCREENS, browsing
 from tests.cli.tiny_paper import DRAWN, drawing, tiny_plan
 from tests.conftest import clean_environment
-from vipetsc.figures.study import Files
+from vipetsc.figures.sweep_members import Files
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.figures import PAPER_FIGURES
 from vipetsc.paper.make import make_paper

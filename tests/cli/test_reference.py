@@ -14,8 +14,8 @@ import pytest
 
 import vipetsc as package
 from vipetsc.case import keys
+from vipetsc.case.case_file import SECTIONS, CaseError, read_section
 from vipetsc.case.drive import DriveTable
-from vipetsc.case.reading import SECTIONS, CaseError, read_section
 from vipetsc.cli.main import VERBS
 
 ROOT = Path(package.__file__).parents[1]
@@ -79,7 +79,7 @@ def test_the_schema_takes_every_case_file(path):
     ],
 )
 def test_what_the_validator_refuses_of_one_key_the_schema_refuses(text):
-    from vipetsc.case.every import load_every
+    from vipetsc.case.verb_cases import load_every
 
     table = tomllib.loads(text)
     with pytest.raises(jsonschema.ValidationError):

@@ -20,8 +20,8 @@ import tomli_w
 from pydantic import BaseModel
 
 from vipetsc.case import Case, CaseError, CaseFile, DesignCase, NnmCase
-from vipetsc.case.every import load_every
 from vipetsc.case.sweep import SweepTable
+from vipetsc.case.verb_cases import load_every
 from vipetsc.cli.tables import case_rows
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.options import check_options

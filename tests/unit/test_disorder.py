@@ -11,8 +11,8 @@ import pytest
 from tests.conftest import put_members
 from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.case.disorder import Deviation
-from vipetsc.case.every import disorder_of
-from vipetsc.figures.study import Files, Sweeps
+from vipetsc.case.verb_cases import disorder_of
+from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import open_ensemble, over_samples
 from vipetsc.lattice import pass_bands

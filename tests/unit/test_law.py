@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, CaseError, LawCase
-from vipetsc.case.every import load_every
+from vipetsc.case.verb_cases import load_every
 from vipetsc.dynamics import simulate
 from vipetsc.figures.registry import draw
 from vipetsc.io.netcdf import open_netcdf
@@ -21,8 +21,8 @@ from vipetsc.lattice import Chain, ToneBurst, bloch, four_band, waves_at
 from vipetsc.lattice.packet import packet_speeds
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra import by_direction, upper_share, wave_energies
-from vipetsc.studies.law import OF_POINT, Outcome, ScatteringLaw, matched_clearances
 from vipetsc.studies.one_site import Runs, largest_between, make_law
+from vipetsc.studies.scattering_law import OF_POINT, Outcome, ScatteringLaw, matched_clearances
 
 THREE = {
     "masses": [0.010, 0.004, 0.002],

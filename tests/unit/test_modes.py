@@ -20,8 +20,8 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import Guards, NnmCase, NnmTable
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
 from vipetsc.modes import dop853
-from vipetsc.modes.audit import BranchMonitor, is_jump, sampled, suspects
 from vipetsc.modes.branch import Branch, slope_laws, tell_regions
+from vipetsc.modes.branch_checks import BranchMonitor, is_jump, sampled, suspects
 from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
 from vipetsc.modes.continuation import Continuation, half_trace_change, relative_turn, unit
 from vipetsc.modes.dop853 import Dop853Flow

@@ -8,7 +8,7 @@ from PIL import Image
 from tests.unit.test_figures import NT, SHAPES, write_run
 from vipetsc.cli.main import main
 from vipetsc.figures import movie
-from vipetsc.figures.scenes import FADE, Shot, scenes
+from vipetsc.figures.movie_frames import FADE, Shot, scenes
 from vipetsc.figures.style import rc_style
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import field_time, open_run

@@ -8,7 +8,7 @@ import pytest
 
 from tests.faults.mutations import judge, mutations, run_shortly
 from vipetsc.case import CaseError
-from vipetsc.case.every import load_every
+from vipetsc.case.verb_cases import load_every
 
 SWEEPS = ("interband", "scattering", "scattering-neighbours")  # of thousands of members, seconds each
 CELL = "[lattice]\ncells = 20\n[lattice.cell]\nmasses = [1.0, 2.0, 3.0]\ncontact = [1, 2]\nsprings = [{}]\n"

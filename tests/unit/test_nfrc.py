@@ -11,8 +11,8 @@ from scipy.optimize import root
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, CaseError
-from vipetsc.case.every import load_every
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.verb_cases import load_every
 from vipetsc.dynamics import simulate
 from vipetsc.figures.registry import draw
 from vipetsc.io.store import RunMemory

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from tests.conftest import search_table
 from vipetsc.case import CaseError, case_id
 from vipetsc.case.disorder import Deviation
-from vipetsc.case.every import load_every
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.verb_cases import load_every
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.objective import Judge
 from vipetsc.studies.optimise import Search

@@ -14,8 +14,8 @@ from vipetsc.case import Case, Sweep
 from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.scattering import KC, LEAST_WEIGHT, bin_colours, shown_bins
-from vipetsc.figures.study import Files, Sweeps, Wave, in_pi, series_of
 from vipetsc.figures.style import GREY, rc_style
+from vipetsc.figures.sweep_members import Files, Sweeps, Wave, in_pi, series_of
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
 from vipetsc.spectra import filter_bank, normalised, transform

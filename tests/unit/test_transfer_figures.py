@@ -12,8 +12,8 @@ from vipetsc.case import Case, Sweep
 from vipetsc.figures import runs, transfer_curves
 from vipetsc.figures.panels import block_means
 from vipetsc.figures.registry import FIGURES, draw
-from vipetsc.figures.study import Files, MeasuredRun, Sweeps
 from vipetsc.figures.style import rc_style
+from vipetsc.figures.sweep_members import Files, MeasuredRun, Sweeps
 from vipetsc.figures.transfer import closing_error
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members

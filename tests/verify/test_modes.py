@@ -11,7 +11,7 @@ import pytest
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.lattice import Chain, Contact, contact_stiffness, four_band
 from vipetsc.modes import special as special_points
-from vipetsc.modes.audit import BranchMonitor, is_jump, suspects
+from vipetsc.modes.branch_checks import BranchMonitor, is_jump, suspects
 from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.point import Point, linear_start, resonance

@@ -1,14 +1,14 @@
 """What to simulate: strict TOML in, a typed, frozen and fully resolved case out.
 
-``reading`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case);
+``case_file`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case);
 ``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers; ``case``, ``sweep``,
 ``nnm``, ``law`` and ``design`` are the cases of the verbs, with what must hold between their keys. For keys and units
 see the manual.
 """
 
 from vipetsc.case.case import Case, Model, case_id
+from vipetsc.case.case_file import CaseError, CaseFile, Problem
 from vipetsc.case.design import DesignCase
 from vipetsc.case.law import LawCase
 from vipetsc.case.nnm import NnmCase
-from vipetsc.case.reading import CaseError, CaseFile, Problem
 from vipetsc.case.sweep import Sweep, SweepMember

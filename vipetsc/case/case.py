@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from vipetsc.case.case_file import CaseFile, Problem, Table, Valid, read_section
 from vipetsc.case.contacts import check_alike, check_pairs, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
 from vipetsc.case.drive import (
@@ -23,7 +24,6 @@ from vipetsc.case.drive import (
 )
 from vipetsc.case.initial import InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
-from vipetsc.case.reading import CaseFile, Problem, Table, Valid, read_section
 from vipetsc.case.resolve import (
     build_chain,
     check_cell,

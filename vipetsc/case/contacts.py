@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vipetsc.case.reading import Problem, Table, Valid
+from vipetsc.case.case_file import Problem, Table, Valid
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
+from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.schema import Positive
 
 LARGEST = 20_000_000  # Bloch problems (lambda, eta, kappa) of a reading whose bands fit in memory and on disk

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from vipetsc.case.case_file import Problem, Section, Table
 from vipetsc.case.contacts import lists_of, values_of_sites
-from vipetsc.case.reading import Problem, Section, Table
 from vipetsc.case.schema import CONTACTS, LatticeTable
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.varied import Deviation

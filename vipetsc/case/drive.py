@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.reading import Problem, Section, Table, Valid
+from vipetsc.case.case_file import Problem, Section, Table, Valid
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import Finite, LatticeTable, Positive, TimeTable, Wavenumber
 from vipetsc.lattice import Chain, Drive, ToneBurst, UnitCell, Waveform, bloch, max_group_velocity, pass_bands, waves_at

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.reading import CaseError, Problem, Section, Table, Valid
+from vipetsc.case.case_file import CaseError, Problem, Section, Table, Valid
 from vipetsc.case.schema import LatticeTable, Positive, Wavenumber
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch

@@ -13,10 +13,10 @@ from typing import Any, get_args
 from pydantic.json_schema import models_json_schema
 
 from vipetsc.case.case import Case
+from vipetsc.case.case_file import SECTIONS, CaseFile, Section
 from vipetsc.case.disorder import DisorderTable
-from vipetsc.case.every import OF_SECTION
-from vipetsc.case.reading import SECTIONS, CaseFile, Section
 from vipetsc.case.schema import MULTIPLE_OF_PI
+from vipetsc.case.verb_cases import OF_SECTION
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Schema = dict[str, Any]

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.reading import Problem, Section, Table, Valid
+from vipetsc.case.case_file import Problem, Section, Table, Valid
 from vipetsc.case.resolve import check_undamped, with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.sites import ContactsTable

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.reading import Problem, Section, Table, Valid
+from vipetsc.case.case_file import Problem, Section, Table, Valid
 from vipetsc.case.resolve import check_stiffness, check_undamped
 from vipetsc.case.schema import Positive, once
 from vipetsc.lattice import Contact, UnitCell, waves_at

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.contacts import check_alike, check_each
-from vipetsc.case.reading import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.resolve import (
     check_cell,
     check_sites,

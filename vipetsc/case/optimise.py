@@ -10,9 +10,9 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case
+from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.contacts import check_alike
 from vipetsc.case.disorder import with_cell
-from vipetsc.case.reading import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import Positive
 from vipetsc.lattice import pass_bands

@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from vipetsc.case.case_file import Problem, Section, Table, Valid
 from vipetsc.case.law import LawCase
-from vipetsc.case.reading import Problem, Section, Table, Valid
 from vipetsc.case.schema import Positive
 
 MOST = 10_000  # amplitudes

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from vipetsc.case.case_file import Problem, Table, Valid
 from vipetsc.case.contacts import check_each, pairs_of_sites, resolved_each
 from vipetsc.case.drive import CYCLES, SINES, DriveTable, drive_tables, packet_speed, resolved_drive, waveform_of
 from vipetsc.case.initial import Beginning
-from vipetsc.case.reading import Problem, Table, Valid
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.variation import variation_of

@@ -8,8 +8,8 @@ import h5py
 import numpy as np
 from pydantic import Field
 
+from vipetsc.case.case_file import LARGEST, Problem, Section, Table
 from vipetsc.case.initial import file_hash
-from vipetsc.case.reading import LARGEST, Problem, Section, Table
 from vipetsc.case.schema import Finite
 
 MOST_SAMPLES = 100_000

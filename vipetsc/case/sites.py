@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from vipetsc.case.reading import Section
+from vipetsc.case.case_file import Section
 from vipetsc.case.schema import MOST_SITES, NotNegative, Positive
 from vipetsc.lattice.contact import Damping, Law
 

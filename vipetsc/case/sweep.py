@@ -14,8 +14,8 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case
+from vipetsc.case.case_file import LARGEST, CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.disorder import SEED
-from vipetsc.case.reading import LARGEST, CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.schema import number
 
 MOST_MEMBERS = 1_000_000

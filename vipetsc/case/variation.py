@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from vipetsc.case.reading import LARGEST, Problem
+from vipetsc.case.case_file import LARGEST, Problem
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.varied import AnyProfile, Deviation, Profile
 from vipetsc.lattice import Chain, Coefficients, UnitCell, Variation

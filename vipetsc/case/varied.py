@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from vipetsc.case.reading import Section
+from vipetsc.case.case_file import Section
 from vipetsc.lattice import Chain, ToneBurst, UnitCell, waves_at
 from vipetsc.lattice.chain import Ends
 from vipetsc.lattice.damped import absorber, reflection

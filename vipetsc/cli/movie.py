@@ -56,7 +56,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 
 def _film(source: str, folder: Path, quantity: str, given: dict[str, Any], formats: set[str]) -> tuple[list[Path], str]:
     """The files of a movie, and what is to be told of the ones that could not be; nothing is written on bad input."""
-    from vipetsc.figures import movie, scenes
+    from vipetsc.figures import movie, movie_frames
     from vipetsc.figures.style import rc_style
     from vipetsc.io.netcdf import open_netcdf
     from vipetsc.io.read import open_run
@@ -65,7 +65,7 @@ def _film(source: str, folder: Path, quantity: str, given: dict[str, Any], forma
         raise FolderError(f"--movie: {folder} holds no run; of a sweep: run CASE --member ID, then plot that")
     if not (folder / "run.h5").exists():
         raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
-    shot = scenes.Shot(quantity, **given)
+    shot = movie_frames.Shot(quantity, **given)
     if shot.rate > FASTEST or not WIDTHS[0] <= shot.width <= WIDTHS[1]:
         raise FolderError(f"--rate {shot.rate:g} --width {shot.width}: at most {FASTEST:g} a second,"
                           f" {WIDTHS[0]} to {WIDTHS[1]} pixels")  # fmt: skip
@@ -76,11 +76,11 @@ def _film(source: str, folder: Path, quantity: str, given: dict[str, Any], forma
     with rc_style(), ExitStack() as stack:
         run = stack.enter_context(open_run(folder / "run.h5"))
         try:
-            scenes.check(run, shot)
+            movie_frames.check(run, shot)
         except ValueError as error:
             raise FolderError(f"{folder}: {error}") from None
         prepare("run", [folder], None)
         analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
-        stage = movie.Stage(run, scenes.scenes(run, analysis, shot), shot.width)
+        stage = movie.Stage(run, movie_frames.scenes(run, analysis, shot), shot.width)
         paths = [folder / "figures" / f"movie-{quantity}.{suffix}" for suffix in wanted]
         return movie.write_movie(stage, shot.rate, paths), "" if has_ffmpeg or formats else f"no MP4: {movie.REMEDY}"

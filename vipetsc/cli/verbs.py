@@ -14,11 +14,11 @@ from typing import TypeVar
 from mpi4py import MPI
 
 from vipetsc.case import Case, CaseFile, DesignCase, LawCase, NnmCase, Sweep
-from vipetsc.case.every import disorder_of, load_every
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import MOST_TRIED
+from vipetsc.case.verb_cases import disorder_of, load_every
 from vipetsc.cli import tables
 from vipetsc.cli.lattice import damping_report, damping_table
 from vipetsc.cli.messages import echo, logger

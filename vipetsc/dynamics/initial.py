@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case import CaseError, Model
+from vipetsc.case.case_file import Problem
 from vipetsc.case.initial import file_hash
-from vipetsc.case.reading import Problem
 from vipetsc.dynamics.energies import measure
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Setup

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags
 
 from vipetsc.case import CaseError
-from vipetsc.case.reading import Problem
+from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.layout import cell_cuts
 from vipetsc.lattice import Chain, Contact
 from vipetsc.parallel import on_every_rank

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import CaseError, Model
-from vipetsc.case.reading import Problem
+from vipetsc.case.case_file import Problem
 from vipetsc.case.schema import OutputTable
 from vipetsc.dynamics.propagator.engine import step_series
 from vipetsc.dynamics.recorder import chunk_samples, recorded_cells, written_together

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import band_of, percentile_norm
-from vipetsc.figures.study import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
+from vipetsc.figures.sweep_members import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import select
 from vipetsc.spectra import doubt, normalised

@@ -16,8 +16,8 @@ from vipetsc.case import Case
 from vipetsc.case.contacts import Gaps, stops_told
 from vipetsc.figures import style
 from vipetsc.figures.panels import band_diagram, note
-from vipetsc.figures.study import counted
 from vipetsc.figures.style import with_prefix
+from vipetsc.figures.sweep_members import counted
 from vipetsc.lattice import Chain, Spring, UnitCell
 
 PITCH = 2.0  # distance between neighbouring masses of the drawing

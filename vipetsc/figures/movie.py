@@ -19,7 +19,7 @@ from PIL import Image
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
 from vipetsc.figures.modal import COLOURS
-from vipetsc.figures.scenes import WIDTH, Scenes
+from vipetsc.figures.movie_frames import WIDTH, Scenes
 from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
 

@@ -13,13 +13,13 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.figures import (
-    answers,
     breather,
     design,
     entropy,
     lattice,
     law,
     modal,
+    nfrc,
     optimise,
     prediction,
     runs,
@@ -27,8 +27,8 @@ from vipetsc.figures import (
     transfer,
     transfer_curves,
 )
-from vipetsc.figures.study import Files, Sweeps, table
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
+from vipetsc.figures.sweep_members import Files, Sweeps, table
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
@@ -156,7 +156,7 @@ def drawings(
             paths = [other / path.name for other in folders if (other / path.name).exists()]
             stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
             branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
-            function = answers.answers if "share" in branches[0] else spec.function  # of the verb nfrc, or nnm
+            function = nfrc.answers if "share" in branches[0] else spec.function  # of the verb nfrc, or nnm
             yield stem, warned(partial(function, paths), *branches)
     elif source == RUN:
         run, analysis = files.get(folder / "run.h5", open_run), None

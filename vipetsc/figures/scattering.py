@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import ROMAN
-from vipetsc.figures.study import AmplitudeSeries, MeasuredRun, from_series
+from vipetsc.figures.sweep_members import AmplitudeSeries, MeasuredRun, from_series
 from vipetsc.io.read import field_time
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.spectra import Nodes, inverse, transform

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator
 from matplotlib.transforms import Bbox
 
-from vipetsc.figures.drawn import drawn
+from vipetsc.figures.figure_data import drawn
 from vipetsc.io.atomic import atomic_write, write_text
 
 COLUMN, PAGE = 3.4, 7.0  # widths of one and of two journal columns in inches
@@ -54,7 +54,7 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     """Write ``figure`` to ``path`` in the format of its suffix, atomically, with a ``note`` in a strip below it.
 
     The figure's label stands there as well, in lines of the figure's width. What has been laid out for one format stays
-    so for the next. A JSON file holds what the picture shows as numbers: ``vipetsc.figures.drawn``.
+    so for the next. A JSON file holds what the picture shows as numbers: ``vipetsc.figures.figure_data``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine():

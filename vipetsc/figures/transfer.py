@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.study import Files, Labels, MeasuredRun, Sweeps, grouped, transfer_members
+from vipetsc.figures.sweep_members import Files, Labels, MeasuredRun, Sweeps, grouped, transfer_members
 from vipetsc.figures.transfer_curves import Curve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands

@@ -14,7 +14,16 @@ from vipetsc.case import Case, Sweep
 from vipetsc.figures import style
 from vipetsc.figures.panels import band_of, note, recorded_sites, shade_regions
 from vipetsc.figures.runs import centre_axes, refined
-from vipetsc.figures.study import AMPLITUDE, Files, Labels, MeasuredRun, Sweeps, grouped, sites_of, transfer_members
+from vipetsc.figures.sweep_members import (
+    AMPLITUDE,
+    Files,
+    Labels,
+    MeasuredRun,
+    Sweeps,
+    grouped,
+    sites_of,
+    transfer_members,
+)
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, field_interval, field_time
 from vipetsc.spectra import doubt

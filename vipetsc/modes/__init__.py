@@ -35,8 +35,9 @@ SNES. The tangent is the null vector of dH/dxi. Charts scale: ``relative`` (gaps
 ``grazing`` (a root of w - D in place of w: an orbit that starts on its largest |w| depends on w - D through one).
 Narrow tongues of internal resonances lie close together, and a residual cannot tell a jump from one arc to another.
 ``Guards`` therefore bound, per step, the change of asinh(c) of each half-trace, the number of contacts that appear or
-go, the correction over the step and the turn of the tangent, in the step's chart and in ``relative``; ``audit`` looks
-for jumps afterwards, for a branch that retraces itself, stands still or passes on to another one, and compares flows.
+go, the correction over the step and the turn of the tangent, in the step's chart and in ``relative``; ``branch_checks``
+looks for jumps afterwards, for a branch that retraces itself, stands still or passes on to another one, and compares
+flows.
 
 **Condensed.** ``condensed`` has the equations of a motion's harmonics where the system is nonlinear, ``harmonics`` the
 forces in them, ``breather`` the start and the continuation, ``condensed_follow`` the files.

@@ -17,8 +17,8 @@ from mpi4py import MPI
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
-from vipetsc.modes.audit import BranchMonitor, compare, jumps, sampled
 from vipetsc.modes.branch import Branch
+from vipetsc.modes.branch_checks import BranchMonitor, compare, jumps, sampled
 from vipetsc.modes.continuation import Continuation, ContinuationError
 from vipetsc.modes.dop853 import Dop853Flow
 from vipetsc.modes.flow import Flow, FlowError

@@ -7,8 +7,8 @@ from pathlib import Path
 from mpi4py import MPI
 
 from vipetsc.figures import style
-from vipetsc.figures.study import Files
 from vipetsc.figures.style import Drawing, draw_each
+from vipetsc.figures.sweep_members import Files
 from vipetsc.paper.made import FORMATS, Made, is_drawn, read_made, write_made
 from vipetsc.paper.plan import Plan
 from vipetsc.parallel import SharedCounter, StopRequest, on_every_rank, on_root

@@ -16,7 +16,7 @@ from vipetsc.case import Case
 from vipetsc.case.schema import PRESETS
 from vipetsc.figures.lattice import lattice_page, reduced_model
 from vipetsc.figures.registry import FIGURES, drawings
-from vipetsc.figures.study import Files
+from vipetsc.figures.sweep_members import Files
 
 READINGS = "calibrated", "printed"
 TRANSFER = "interband"  # the sweep that is laid over branches

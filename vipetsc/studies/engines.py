@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case import Sweep
-from vipetsc.case.reading import put
+from vipetsc.case.case_file import put
 from vipetsc.io.read import axes, open_ensemble, select
 from vipetsc.studies.ensemble import AMPLITUDE
 from vipetsc.studies.linear import FITTED

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, CaseError
-from vipetsc.case.reading import Problem
+from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.eigen import modes_near
 from vipetsc.dynamics.matrices import LatticeMatrices
 from vipetsc.io.folder import provenance

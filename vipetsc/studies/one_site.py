@@ -43,8 +43,8 @@ from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.directions import by_direction, wave_energies
-from vipetsc.studies.law import FORWARD, LAYOUT, NEAR, OF_POINT, ScatteringLaw
 from vipetsc.studies.recorded import RecordedRuns, run_in_memory
+from vipetsc.studies.scattering_law import FORWARD, LAYOUT, NEAR, OF_POINT, ScatteringLaw
 
 LINEAR = 0.0  # the z of the run without a site
 STEP = np.sqrt(2.0)  # between neighbouring points to begin with

@@ -22,12 +22,12 @@ from vipetsc.io.folder import OPTIMUM, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import Progress, StopRequest, on_root
-from vipetsc.studies.law import matched_clearances
 from vipetsc.studies.linear import LinearRun, linear_case
 from vipetsc.studies.objective import Judge
 from vipetsc.studies.one_site import make_law
 from vipetsc.studies.recorded import run_in_memory
 from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, front, knee, smooth
+from vipetsc.studies.scattering_law import matched_clearances
 from vipetsc.studies.sweep import is_whole
 
 POPULATION = 24  # of NSGA-II

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc import spectra
 from vipetsc.case import Case
-from vipetsc.case.reading import read_toml
+from vipetsc.case.case_file import read_toml
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands

@@ -67,7 +67,7 @@ what those beyond would change took a way out there and back, and counts as entr
 ones around them share their rows. omega_max and gamma are the largest of all cells; r and the truncation are those of a
 lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude that any cell's has.
 
-**9. Variations** of the state beside an orbit move by P and by one small matrix a step in contact: ``variations``.
+**9. Variations** of the state beside an orbit move by P and by one small matrix a step in contact: ``tangent_kernels``.
 
 References
 ----------

@@ -1,4 +1,4 @@
-"""An orbit of a lattice that nothing drives, with variations that are moved beside it: see ``variations``."""
+"""An orbit of a lattice that nothing drives, with variations that are moved beside it: see ``tangent_kernels``."""
 
 import copy
 
@@ -13,8 +13,8 @@ from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.tables import expand_free_motion
+from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
 from vipetsc.dynamics.propagator.tape import create_tape
-from vipetsc.dynamics.propagator.variations import Variations, linearise, move_variations
 from vipetsc.dynamics.samples import Samples
 from vipetsc.parallel import on_every_rank
 

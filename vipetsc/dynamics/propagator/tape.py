@@ -1,4 +1,4 @@
-"""What is written down of an orbit's contacts, so that the motion beside it can be moved later: see ``variations``."""
+"""What is written down of an orbit's contacts, from which ``tangent_kernels`` moves the tangent later."""
 
 from typing import NamedTuple
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from vipetsc.case.case import Case
+from vipetsc.case.case_file import CaseError, CaseFile, Problem, Table, read_section, read_toml, with_overrides
 from vipetsc.case.design import DesignCase
 from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.law import LawCase
@@ -11,7 +12,6 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
-from vipetsc.case.reading import CaseError, CaseFile, Problem, Table, read_section, read_toml, with_overrides
 from vipetsc.case.sweep import MOST_TRIED, Sweep
 
 OF_SECTION: dict[str, type[CaseFile]]
