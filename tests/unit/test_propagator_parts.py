@@ -14,7 +14,7 @@ from tests.unit.test_exact_lattices import exponential
 from vipetsc.case import Case
 from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.drives import create_drives
-from vipetsc.dynamics.engine import Stretch
+from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout, create_record
 from vipetsc.dynamics.propagator.clusters import Groups, create_dof_tables, create_responses, group_dofs
 from vipetsc.dynamics.propagator.collocation import (
@@ -138,7 +138,7 @@ def test_contacts_that_cannot_be_followed_end_the_run():
     model = small_case(contacts={"sites": [1, 6], "law": "bilinear", "stiffness": 1e45}).model()
     layout = Layout(model, MPI.COMM_SELF)
     engine = Propagator(model, layout)
-    assert engine.fill(no_samples(model, layout, 4)) == Stretch(0)
+    assert engine.fill(no_samples(model, layout, 4)) == FillResult(0)
     assert (engine.steps, engine.time) == (3, 3 * model.sample_interval)
     stalled = engine.fill(no_samples(model, layout, model.samples)).stalled
     assert re.match(r"the contacts of sites 1 at 0.0\d+ s", stalled)
@@ -283,7 +283,7 @@ def test_ten_thousand_sites_are_set_up_and_gone_on_with():
     assert Propagator.refusal(model) is None
     layout = Layout(model, MPI.COMM_SELF)
     engine, other = Propagator(model, layout), Propagator(model, layout)
-    assert engine.fill(no_samples(model, layout, 2)) == Stretch(0)
+    assert engine.fill(no_samples(model, layout, 2)) == FillResult(0)
     state = engine.checkpoint()
     other.restore([state])
     again = other.checkpoint()

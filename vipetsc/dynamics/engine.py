@@ -18,7 +18,7 @@ class StalledError(RuntimeError):
     """The step size fell to the rounding of the time, or the state is not finite."""
 
 
-class Stretch(NamedTuple):
+class FillResult(NamedTuple):
     """How far an engine came: ``samples`` taken, whether it was ``stopped`` on request, why it stalled, if it did."""
 
     samples: int
@@ -54,7 +54,7 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def fill(self, samples: Samples) -> Stretch:
+    def fill(self, samples: Samples) -> FillResult:
         """Go on through ``samples`` and take them with ``take_sample``; all ranks come equally far.
 
         A stop on request is at a sample, and as soon as that costs little.

@@ -206,9 +206,9 @@ class Run:
         engine = setup.engine
         while self.samples < total:
             samples = self.recorder.room(self.samples, min(self.longest, total - self.samples))
-            stretch = engine.fill(samples)
-            failure, when = stretch.stalled and f"stalled: {stretch.stalled}", engine.time
-            block = self.block(samples, stretch.samples)
+            result = engine.fill(samples)
+            failure, when = result.stalled and f"stalled: {result.stalled}", engine.time
+            block = self.block(samples, result.samples)
             for observer in self.observers:
                 try:
                     if len(block):
@@ -221,7 +221,7 @@ class Run:
                 self.recorder.end = when + setup.model.sample_interval
                 good = "none" if self.last is None else f"t = {self.last:.6g} s"
                 return FAILED, f"{failure}, at t = {when:.6g} s ({fastest_cell(setup)}); last good sample: {good}"
-            if stretch.stopped and self.samples < total:
+            if result.stopped and self.samples < total:
                 return STOPPED, f"stopped on request at t = {engine.time:.6g} s"
             if any(observer.due for observer in self.observers):
                 self.checkpoint()

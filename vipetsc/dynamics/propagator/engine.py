@@ -12,7 +12,7 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.tracker import Tracks
-from vipetsc.dynamics.engine import Engine, Stretch
+from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.clusters import group_dofs
@@ -179,7 +179,7 @@ class Propagator(Engine):
         self._layout.place(cells, energy, self._components[0])
         self._forces.begin(motion, energy)
 
-    def fill(self, samples: Samples) -> Stretch:
+    def fill(self, samples: Samples) -> FillResult:
         """A stop is at the last sample. Without room it goes to the sample before."""
         sys.audit("vipetsc.step")
         forces, comm, progress, parts = self._forces, self._layout.comm, self._progress[0], self._record.parts
@@ -197,12 +197,12 @@ class Propagator(Engine):
         failed, stop = status.tolist()
         self.state, self.time = self._states[self.steps % 2], self._time(min(failed, self.steps))
         if failed > last:
-            return Stretch(len(samples.work), bool(stop))
+            return FillResult(len(samples.work), bool(stop))
         sites, reason = forces.sites(int(progress["cluster"])), "the state is not finite"
         if sites:
             reason = f"the contacts of sites {', '.join(map(str, sites))} at {progress['time']:.9g} s"
         _, reason = min(comm.allgather((int(progress["failed"]), reason)))
-        return Stretch(failed // parts - samples.number + 1, bool(stop), reason)
+        return FillResult(failed // parts - samples.number + 1, bool(stop), reason)
 
     def _time(self, steps: int) -> float:
         """Time in s after so many ``steps``."""

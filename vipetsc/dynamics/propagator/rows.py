@@ -10,17 +10,17 @@ from vipetsc.lattice.variation import Coefficients
 
 # Cells of a lattice that are looked at together.
 CHUNK = 65_536
-Turn = Callable[[np.ndarray], np.ndarray]
+RowMap = Callable[[np.ndarray], np.ndarray]
 
 
-class Turns(NamedTuple):
+class PowerRecursion(NamedTuple):
     """How rows (..., dof, cell) go on by one power: times - H^2 M^-1 K, times - H M^-1 C (None without dashpots)."""
 
-    by_stiffness: Turn
-    by_damping: Turn | None
+    by_stiffness: RowMap
+    by_damping: RowMap | None
 
 
-def power_rows(first: np.ndarray, terms: int, turns: Turns) -> np.ndarray:
+def power_rows(first: np.ndarray, terms: int, turns: PowerRecursion) -> np.ndarray:
     """The rows (..., term, dof, cell) of ``terms`` powers from the zeroth, ``first`` (..., dof, cell), on.
 
     With dashpots (..., 2 term, 2 dof, cell): of each power of time, from displacements and from H times velocities.
@@ -38,7 +38,7 @@ def power_rows(first: np.ndarray, terms: int, turns: Turns) -> np.ndarray:
     return np.stack(pairs, axis=-3)
 
 
-def turns_around(chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int) -> Turns:
+def recursion_around(chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int) -> PowerRecursion:
     """Those of the cells around each of ``cells`` that ``exists`` (cell, around) tells of, for steps of ``interval``.
 
     Those further away than ``near`` are taken to be as the reference cell.
@@ -55,7 +55,7 @@ def turns_around(chain: Chain, interval: float, cells: np.ndarray, exists: np.nd
     # No power reaches the last cells: what is rolled past them is zero.
     acts = exists & np.roll(exists, -1, axis=-1) if chain.ends == "free" else np.ones_like(exists)
 
-    def turn(values: np.ndarray, ground: np.ndarray | None) -> Turn:
+    def turn(values: np.ndarray, ground: np.ndarray | None) -> RowMap:
         def forces(rows: np.ndarray) -> np.ndarray:
             x = rows / masses
             out = np.zeros_like(rows) if ground is None else -ground * x
@@ -70,7 +70,7 @@ def turns_around(chain: Chain, interval: float, cells: np.ndarray, exists: np.nd
         return forces
 
     by_damping = turn(h * damping, h * grounding[:, None]) if chain.is_damped else None
-    return Turns(turn(h**2 * stiffness, None), by_damping)
+    return PowerRecursion(turn(h**2 * stiffness, None), by_damping)
 
 
 class Bounds(NamedTuple):
@@ -91,14 +91,14 @@ class Bounds(NamedTuple):
         """Norm in 1/s of what turns the state, in the norm of its energy."""
         return self.frequency if not self.damping else (self.damping + np.hypot(self.damping, 2 * self.frequency)) / 2
 
-    def turns(self, interval: float) -> Turns:
+    def turns(self, interval: float) -> PowerRecursion:
         """Those of rows that are no smaller than the magnitudes of any cell's."""
 
-        def turn(entries: np.ndarray) -> Turn:
+        def turn(entries: np.ndarray) -> RowMap:
             return lambda rows: sum(entries[1 + o] @ np.roll(rows, -o, axis=-1) for o in (-1, 0, 1))
 
         by_damping = turn(interval * self.by_damping) if self.damping else None
-        return Turns(turn(interval**2 * self.by_stiffness), by_damping)
+        return PowerRecursion(turn(interval**2 * self.by_stiffness), by_damping)
 
 
 def bounds_of(chain: Chain) -> Bounds:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from vipetsc.compiled import kernel
 from vipetsc.contact.changes import LANDED_W
 from vipetsc.contact.law import gap_of
-from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, power_rows, turns_around
+from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, power_rows, recursion_around
 from vipetsc.lattice.chain import Chain
 
 MOST_TERMS = 24
@@ -81,7 +81,7 @@ class StepSeries:
     def _interior(self) -> np.ndarray:
         """Rows (dof, term, dof, cell) of an interior cell over all cells within ``_width``."""
         alone = replace(self.chain, variation=None)
-        turns = turns_around(alone, self.interval, np.zeros(1, int), np.ones((1, 2 * self._width + 1), bool), 0)
+        turns = recursion_around(alone, self.interval, np.zeros(1, int), np.ones((1, 2 * self._width + 1), bool), 0)
         return power_rows(self._first, self.terms, turns)[0]
 
     def _magnitudes(self, rows: np.ndarray) -> np.ndarray:
@@ -137,7 +137,7 @@ class StepSeries:
         for part in np.split(cells, range(BATCH, len(cells), BATCH)):
             beside = part[:, None] + around
             exists = (beside >= 0) & (beside < self.chain.cells) | ~self._is_near_end(part)[:, None]
-            turns = turns_around(self.chain, self.interval, part, exists, self.reach + 1)
+            turns = recursion_around(self.chain, self.interval, part, exists, self.reach + 1)
             yield from power_rows(np.repeat(self._first, len(part), axis=0), self.terms, turns)
 
     def cut(self, rows: np.ndarray, first: int, count: int) -> np.ndarray:

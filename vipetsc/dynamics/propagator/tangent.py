@@ -69,10 +69,10 @@ class TangentPropagator(Propagator):
         model, layout, none = self._model, self._layout, np.zeros(0)
         fields = np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1
         sums, losses, record = np.zeros((0, 5, 2), np.int64), none.reshape(0, 0), create_record(model, layout)
-        stretch = self.fill(Samples(samples + 1, sums, losses, losses, *fields, record, 1.0, 1.0))
+        result = self.fill(Samples(samples + 1, sums, losses, losses, *fields, record, 1.0, 1.0))
         needed = layout.comm.allreduce(int(self._forces.clusters.tape.used.max(initial=0)), max)
-        if stretch.stalled or needed > MOST_ROWS:
-            raise StalledError(stretch.stalled or f"an orbit needs {needed} substeps in contact, of {MOST_ROWS}")
+        if result.stalled or needed > MOST_ROWS:
+            raise StalledError(result.stalled or f"an orbit needs {needed} substeps in contact, of {MOST_ROWS}")
         cells = self._components[self.steps % 2][: 2 * layout.dofs * layout.owned]
         return cells.reshape(2 * layout.dofs, layout.owned).copy()
 

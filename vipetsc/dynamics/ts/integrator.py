@@ -15,7 +15,7 @@ from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, corre
 from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
 from vipetsc.dynamics.drives import select_piece
-from vipetsc.dynamics.engine import Engine, StalledError, Stretch
+from vipetsc.dynamics.engine import Engine, FillResult, StalledError
 from vipetsc.dynamics.layout import Layout, create_record, join
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
@@ -118,18 +118,18 @@ class Integrator(Engine):
         self.tracker.begin(motion)
         self._restart(True)
 
-    def fill(self, samples: Samples) -> Stretch:
+    def fill(self, samples: Samples) -> FillResult:
         """A sample at which it stops is not taken."""
         for k in range(len(samples.work)):
             sys.audit("vipetsc.step")
             try:
                 if not self.advance((samples.number + k) * self._interval):
-                    return Stretch(k, stopped=True)
+                    return FillResult(k, stopped=True)
             except StalledError as error:
-                return Stretch(k, stalled=str(error))
+                return FillResult(k, stalled=str(error))
             with self.state.localForm() as local:
                 take_sample(local.array, k, samples)
-        return Stretch(len(samples.work))
+        return FillResult(len(samples.work))
 
     def advance(self, target: float) -> bool:
         """Go on to the sample at ``target`` in s and take none; False if a stop was requested, on all ranks.
