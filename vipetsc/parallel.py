@@ -42,7 +42,7 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
     sys.excepthook = hook
 
 
-def meet(comm: MPI.Comm) -> None:
+def wait_for_all(comm: MPI.Comm) -> None:
     """Wait for all ranks of ``comm``, asleep after a moment: those that still work need the cores."""
     met, begin = comm.Ibarrier(), time.monotonic()
     while not met.Test():
@@ -53,14 +53,14 @@ def meet(comm: MPI.Comm) -> None:
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
     attempt = _attempt(function) if comm.rank == 0 else None
-    meet(comm)
+    wait_for_all(comm)
     return _agreed(*comm.bcast(attempt))
 
 
 def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
     value, error = _attempt(function)
-    meet(comm)
+    wait_for_all(comm)
     return _agreed(value, next((e for e in comm.allgather(error) if e is not None), None))
 
 
@@ -78,7 +78,7 @@ def _agreed(value: T | None, error: Exception | None) -> T:
     return cast(T, value)
 
 
-def spread(comm: MPI.Comm, rows: np.ndarray, keys: Sequence[str]) -> tuple[np.ndarray, int, int]:
+def sort_over_ranks(comm: MPI.Comm, rows: np.ndarray, keys: Sequence[str]) -> tuple[np.ndarray, int, int]:
     """Sort the ``rows`` of all ranks by their ``keys``: this rank's part of them, how many come before it, all.
 
     The parts are about as large; rows that agree in the first key stay together. All ranks must call it.

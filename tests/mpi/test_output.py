@@ -14,7 +14,7 @@ from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.dynamics import recorder, simulate
 from vipetsc.io import chunks
 from vipetsc.io.store import RunFolder, RunMemory
-from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, spread
+from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, sort_over_ranks
 
 COMM = MPI.COMM_WORLD
 
@@ -72,7 +72,9 @@ def test_rows_are_sorted_over_ranks_and_none_has_all():
     random = np.random.default_rng(3)
     table = np.zeros(900, [("onset", float), ("site", np.int64)])
     table["onset"], table["site"] = random.integers(300, size=900) / 7, random.permutation(900)
-    rows, first, total = spread(COMM, table[[slice(700), slice(700, 900), slice(0)][COMM.rank]], ("onset", "site"))
+    rows, first, total = sort_over_ranks(
+        COMM, table[[slice(700), slice(700, 900), slice(0)][COMM.rank]], ("onset", "site")
+    )
     expected = np.sort(table, order=("onset", "site"))
     assert total == len(expected)
     assert 0 < len(rows) < 1.1 * total / COMM.size + 10

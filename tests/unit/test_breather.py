@@ -16,8 +16,8 @@ from vipetsc.case.nnm import NnmCase, NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.figures.breather import branches as draw
 from vipetsc.io.state import State
-from vipetsc.lattice import Chain, Compliance, Contact, DenseCompliance, contact_stiffness, four_band, pass_bands
-from vipetsc.lattice.moments import QuickCompliance
+from vipetsc.lattice import Chain, Contact, DenseCompliance, WaveCompliance, contact_stiffness, four_band, pass_bands
+from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.breather import CondensedContinuation, CondensedProblem
 from vipetsc.modes.condensed_follow import CondensedBranch, CondensedFollower, state_of
 from vipetsc.modes.continuation import ContinuationError
@@ -155,7 +155,7 @@ def test_same_curves_as_by_shooting(system, mode, energy, truncation):
 def breather(cells: int, site: int, omega: float, truncation=1e-8, **options) -> tuple[CondensedProblem, Point]:
     chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (D,))
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
-    problem = CondensedProblem(QuickCompliance(Compliance(chain)), SiteForces([(HERTZ, D)]), control)
+    problem = CondensedProblem(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)]), control)
     return problem, problem.from_gap(omega, np.array([1.0]))
 
 
@@ -186,9 +186,9 @@ def test_the_cost_does_not_grow_with_the_cells():
     def frequencies(cells: int) -> int:
         """How many frequencies waves are solved at for a breather."""
         chain = Chain(four_band("calibrated"), cells, "fixed", (cells // 3,), (D,))
-        compliance, asked = Compliance(chain), 0
+        compliance, asked = WaveCompliance(chain), 0
 
-        class Counted(QuickCompliance):
+        class Counted(SeriesCompliance):
             def at(self, omegas):
                 nonlocal asked
                 asked += np.size(omegas)
@@ -207,14 +207,16 @@ def test_the_cost_does_not_grow_with_the_cells():
 def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
     chain = Chain(four_band("calibrated"), 300, ends, sites, (D,) * len(sites))
     omega = pass_bands(chain.cell)[-1].high * np.array([0.5, 2.01, 3.0, 20.0 - 1e-3j])
-    exact = Compliance(chain).at(omega)
-    assert QuickCompliance(Compliance(chain)).at(omega) == pytest.approx(exact, rel=0, abs=1e-14 * np.abs(exact).max())
+    exact = WaveCompliance(chain).at(omega)
+    assert SeriesCompliance(WaveCompliance(chain)).at(omega) == pytest.approx(
+        exact, rel=0, abs=1e-14 * np.abs(exact).max()
+    )
 
 
 def two_sites(signs: list[int]) -> Point:
     chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (D, D))
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
-    problem = CondensedProblem(QuickCompliance(Compliance(chain)), SiteForces([(HERTZ, D)] * 2), control)
+    problem = CondensedProblem(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)] * 2), control)
     return problem.from_gap(4000.0, np.array(signs))
 
 

@@ -15,7 +15,7 @@ from tests.conftest import put_members
 from vipetsc.case import Case, Sweep
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.lattice import bloch, pass_bands
-from vipetsc.lattice.modes import modes_of
+from vipetsc.lattice.modes import linear_modes
 from vipetsc.paper.claims import criteria as constants
 from vipetsc.paper.claims import interband, measure_claims, write_claims
 from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
@@ -735,10 +735,10 @@ def test_no_motion_misses_the_modal_energies_by_more_than_the_bound(monkeypatch)
     """Of a lattice with its own modes, and where modes or frequencies are wrong by a known share."""
     case = Case.from_table({"lattice": {"preset": "four-band", "cells": 12}})
     chain, rng = case.model().chain, np.random.default_rng(5)
-    modes, root = modes_of(chain), np.sqrt(chain.masses())
+    modes, root = linear_modes(chain), np.sqrt(chain.masses())
     assert modal_error(SimpleNamespace(case=case)) < 1e-11
     for wrong in (replace(modes, vectors=1.01 * modes.vectors), replace(modes, frequency=1.02 * modes.frequency)):
-        monkeypatch.setattr(interband, "modes_of", lambda chain, wrong=wrong: wrong)
+        monkeypatch.setattr(interband, "linear_modes", lambda chain, wrong=wrong: wrong)
         bound = modal_error(SimpleNamespace(case=case))
         fields = rng.standard_normal((2, 30, 48)) / root * [[[1.0]], [[1000.0]]]
         u, v = np.concatenate([fields, np.stack([modes.vectors.T[:30] / root, np.zeros((30, 48))])], axis=1)

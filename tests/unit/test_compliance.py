@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vipetsc.lattice import Chain, Spring, UnitCell, bloch, diatomic, four_band
-from vipetsc.lattice.compliance import Compliance, DenseCompliance
+from vipetsc.lattice.compliance import DenseCompliance, WaveCompliance
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -46,7 +46,7 @@ def largest(error, of):
 @pytest.mark.parametrize(("cells", "sites"), [(1, (0,)), (2, (0, 1)), (3, (1,)), (12, (2, 3, 9)), (12, (0, 11))])
 def test_finite_lattices_as_dense_ones(name, ends, cells, sites):
     chain = Chain(CELLS[name], cells, ends, sites, (1e-3,) * len(sites))
-    compliance, rows, d = Compliance(chain, points=((cells - 1, 0),)), rows_of(chain), chain.cell.dofs
+    compliance, rows, d = WaveCompliance(chain, points=((cells - 1, 0),)), rows_of(chain), chain.cell.dofs
     point = np.eye(cells * d)[(cells - 1) * d]
     stiffness, forces = chain.stiffness_matrix().toarray(), np.arange(1, len(sites) + 2) * (1 + 0.3j)
     for omega, got in zip(FREQUENCIES, compliance.response(FREQUENCIES), strict=True):
@@ -67,11 +67,11 @@ def test_an_infinite_lattice_is_the_limit_of_long_damped_ones(name):
     sites = (500, 503)
     chain = Chain(CELLS[name], 1000, "free", sites, (1e-3,) * 2)
     for omega in (0.0, 400 - 40j, 1023.27 - 40j, 3100.0 - 90j, 8000.0):
-        finite, infinite = Compliance(chain).at(omega), Compliance(chain, infinite=True).at(omega)
+        finite, infinite = WaveCompliance(chain).at(omega), WaveCompliance(chain, infinite=True).at(omega)
         assert largest(finite - infinite, infinite) < 1e-10
-    on_axis, below = (Compliance(chain, infinite=True).at(1023.27 - decay) for decay in (0.0, 1e-6j))
+    on_axis, below = (WaveCompliance(chain, infinite=True).at(1023.27 - decay) for decay in (0.0, 1e-6j))
     assert largest(on_axis - below, on_axis) < 1e-6  # from below, the outgoing side
-    assert Compliance(chain, infinite=True).at(-1023.27)[0, 0, 1] == on_axis[0, 0, 1].conj()
+    assert WaveCompliance(chain, infinite=True).at(-1023.27)[0, 0, 1] == on_axis[0, 0, 1].conj()
 
 
 def test_self_compliance_is_a_sum_over_bloch_waves():
@@ -79,12 +79,12 @@ def test_self_compliance_is_a_sum_over_bloch_waves():
     waves = bloch(cell, 2 * np.pi * np.arange(4096) / 4096)
     weight = np.abs(waves.vectors[:, cell.resonator] - waves.vectors[:, cell.host]) ** 2
     sums = [np.mean(np.sum(weight / (waves.frequency**2 - w**2), axis=1)) for w in omega]
-    assert np.allclose(Compliance(Chain(cell, 1, sites=(0,)), infinite=True).at(omega)[:, 0, 0], sums, rtol=1e-11)
+    assert np.allclose(WaveCompliance(Chain(cell, 1, sites=(0,)), infinite=True).at(omega)[:, 0, 0], sums, rtol=1e-11)
 
 
 @pytest.mark.parametrize("infinite", [False, True])
 def test_reciprocity(infinite):
-    g = Compliance(Chain(RICH, 90, sites=(3, 40, 41), clearances=(1e-3,) * 3), infinite).at(FREQUENCIES)
+    g = WaveCompliance(Chain(RICH, 90, sites=(3, 40, 41), clearances=(1e-3,) * 3), infinite).at(FREQUENCIES)
     assert np.abs(g - g.swapaxes(1, 2)).max() < 1e-12 * np.abs(g).max()
 
 
@@ -94,7 +94,7 @@ def test_a_linear_scatterer_keeps_or_takes_the_energy(name, band, direction):
     cell = CELLS[name]
     chain = Chain(cell, 30, sites=(7, 12), clearances=(1e-3,) * 2)
     omega = float(bloch(cell, 1.3).frequency[band - 1])
-    compliance = Compliance(chain, infinite=True)
+    compliance = WaveCompliance(chain, infinite=True)
     wave = compliance.incident(omega, band, direction)
     assert wave.relative[0] == 1
     assert compliance.outgoing(omega, [0, 0], wave, 2.0)[0 if direction > 0 else 1].sum() == pytest.approx(
@@ -114,7 +114,7 @@ def test_a_linear_scatterer_keeps_or_takes_the_energy(name, band, direction):
 def test_the_flux_is_energy_times_group_velocity():
     cell, kappa = CELLS["four-band"], 1.1
     point = bloch(cell, kappa)
-    compliance = Compliance(Chain(cell, 3, sites=(1,)), infinite=True)
+    compliance = WaveCompliance(Chain(cell, 3, sites=(1,)), infinite=True)
     wave = compliance.incident(float(point.frequency[2]), 3)
     energy = np.sum(np.array(cell.masses) * np.abs(wave.shape) ** 2) * wave.frequency**2 / 2
     assert wave.flux == pytest.approx(energy * abs(point.group_velocity[2]), rel=1e-9)
@@ -126,12 +126,12 @@ def test_the_flux_is_energy_times_group_velocity():
 def test_a_long_lattice_costs_what_a_short_one_does():
     """The number of unknowns does not grow; its answers with losses are those of the infinite one."""
     short, long = (Chain(CELLS["four-band"], n, sites=(n // 2,), clearances=(1e-3,)) for n in (40, 1_000_000))
-    assert Compliance(short).cells == [0, 20, 39] and Compliance(long).cells == [0, 500_000, 999_999]
-    infinite = Compliance(long, infinite=True).at(1023.27 - 0.1j)
-    assert largest(Compliance(long).at(1023.27 - 0.1j) - infinite, infinite) < 1e-11
+    assert WaveCompliance(short).cells == [0, 20, 39] and WaveCompliance(long).cells == [0, 500_000, 999_999]
+    infinite = WaveCompliance(long, infinite=True).at(1023.27 - 0.1j)
+    assert largest(WaveCompliance(long).at(1023.27 - 0.1j) - infinite, infinite) < 1e-11
     ring = Chain(long.cell, 30_011, "periodic", (5,), (1e-3,))
     kappa = 2 * np.pi * np.arange(ring.cells) / ring.cells
     waves = bloch(ring.cell, kappa)
     weight = np.abs(waves.vectors[:, 2] - waves.vectors[:, 1]) ** 2
     expected = np.mean(np.sum(weight / (waves.frequency**2 - 1023.27**2), axis=1))
-    assert Compliance(ring).at(1023.27)[0, 0, 0] == pytest.approx(expected, rel=1e-7)
+    assert WaveCompliance(ring).at(1023.27)[0, 0, 0] == pytest.approx(expected, rel=1e-7)

@@ -16,7 +16,15 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import Chain, Variation, bloch, diatomic, four_band, max_group_velocity
-from vipetsc.lattice.damped import KAPPAS, absorber, damped_bloch, decay_length, fitted_dashpots, reflection, waves_of
+from vipetsc.lattice.damped import (
+    KAPPAS,
+    absorber,
+    damped_bloch,
+    damped_waves,
+    decay_length,
+    fitted_dashpots,
+    reflection,
+)
 
 KAPPA = np.linspace(0.2, 3.0, 7)
 
@@ -40,7 +48,7 @@ def test_rayleigh_damping_has_its_closed_form(cell):
     zeta = 1e-3 * (alpha / frequency + beta * frequency) / 2
     assert decay_length(weak, frequency) == pytest.approx(speed / (zeta * frequency), rel=1e-4)
     assert decay_length(cell, frequency) == np.inf
-    waves = waves_of(cell, frequency)
+    waves = damped_waves(cell, frequency)
     for factor, shape in zip(waves.factor, waves.shape.T, strict=True):
         residual = cell.stiffness_matrix(np.angle(factor)) @ shape - frequency**2 * np.array(cell.masses) * shape
         assert np.abs(residual).max() < 1e-8 * frequency**2

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from vipetsc.lattice import Chain, Spring, ToneBurst, UnitCell, diatomic, four_band, modes, modes_of, pass_bands
+from vipetsc.lattice import Chain, Spring, ToneBurst, UnitCell, diatomic, four_band, linear_modes, modes, pass_bands
 from vipetsc.spectra import ModalParts, upper_share
-from vipetsc.spectra.modal import cluster_samples
+from vipetsc.spectra.modal_energies import cluster_samples
 
 CELLS = {
     "four-band": four_band("calibrated"),
@@ -75,7 +75,7 @@ def test_modes_are_in_bands_but_for_those_of_the_ends(name, ends):
 def test_inverse_iteration_gives_the_modes_of_a_dense_solution():
     for name, cell in CELLS.items():
         chain = Chain(cell, 60)
-        found = modes_of(chain)
+        found = linear_modes(chain)
         root = 1 / np.sqrt(chain.masses())
         matrix = chain.stiffness_matrix().toarray() * root[:, None] * root
         squared = np.linalg.eigvalsh(matrix)
@@ -86,7 +86,7 @@ def test_inverse_iteration_gives_the_modes_of_a_dense_solution():
 
 def test_modes_are_those_of_all_chains_that_differ_in_contacts_alone():
     chain = Chain(CELLS["diatomic"], 20)
-    assert modes_of(replace(chain, sites=(3,), clearances=(1e-3,))) is modes_of(chain)
+    assert linear_modes(replace(chain, sites=(3,), clearances=(1e-3,))) is linear_modes(chain)
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
@@ -97,14 +97,14 @@ def test_the_burst_drives_the_modes_as_its_force_does(ends):
         s, weights = np.polynomial.legendre.leggauss(200)
         last = min(stop, drive.duration)
         t = start + (last - start) * (s + 1) / 2
-        frequency = modes_of(chain).frequency[:, None]
+        frequency = linear_modes(chain).frequency[:, None]
         integrand = np.exp(1j * frequency * (stop - t)) * drive.force(t) * (start < drive.duration)
         expected = integrand @ weights * (last - start) / 2
-        assert modes_of(chain).driven(drive, start, stop) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        assert linear_modes(chain).driven(drive, start, stop) == pytest.approx(expected, rel=1e-9, abs=1e-12)
     # A velocity that 1 N s gives to a mass.
     u, v = np.zeros((2, 1, 12, 4))
     v[0, 7, 1] = 1 / chain.cell.masses[1]
-    assert modes_of(chain).amplitudes(u, v)[0] == pytest.approx(modes_of(chain).force(7, 1), abs=1e-12)
+    assert linear_modes(chain).amplitudes(u, v)[0] == pytest.approx(linear_modes(chain).force(7, 1), abs=1e-12)
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free"])

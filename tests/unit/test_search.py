@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipetsc.lattice import BlochPoint, bloch, four_band
-from vipetsc.lattice.search import COSTS, search, signed_deflection
+from vipetsc.lattice.cell_search import COSTS, search_cells, signed_deflection
 
 KAPPA = np.linspace(0, np.pi, 41)
 GRID = np.round(np.linspace(0.1, 1.0, 37), 12)
@@ -19,7 +19,7 @@ READINGS = tuple(SPRING)
 @pytest.fixture(scope="module")
 def found():
     """The default grid in both readings."""
-    return {reading: search(reading, GRID, GRID[:-1], KAPPA) for reading in READINGS}
+    return {reading: search_cells(reading, GRID, GRID[:-1], KAPPA) for reading in READINGS}
 
 
 def slow(reading, lam, eta):
@@ -80,7 +80,7 @@ def test_best_velocities_where_bands_three_and_four_touch(found, reading):
         assert row == 0
         assert abs(GRID[column] - eta) <= 0.5 * (GRID[1] - GRID[0])
     # Finer in eta, the optimum closes in on it, as far as the spacing in kappa lets the touching bands be seen.
-    fine = search(reading, [lam], np.arange(0.4, 0.55, 5e-4), KAPPA)
+    fine = search_cells(reading, [lam], np.arange(0.4, 0.55, 5e-4), KAPPA)
     assert fine.eta[fine.optimum("weighted")[1]] == pytest.approx(eta, abs=1e-3)
 
 
@@ -88,19 +88,19 @@ def test_paper_choice(found):
     """C10: (.1, .5) is what a grid of spacing .1 gives; finer, .45 as printed and .475 calibrated."""
     tenths = np.round(np.linspace(0.1, 0.9, 9), 12)
     for reading, eta in (("printed", 0.45), ("calibrated", 0.475)):
-        row, column = search(reading, tenths, tenths, KAPPA).optimum("weighted")
+        row, column = search_cells(reading, tenths, tenths, KAPPA).optimum("weighted")
         assert (tenths[row], tenths[column]) == (0.1, 0.5)
         best = found[reading].optimum("weighted")
         assert (GRID[best[0]], GRID[best[1]]) == (0.1, eta)
         assert found[reading].out_of_phase[best]
-        paper = search(reading, 0.1, 0.5, KAPPA)
+        paper = search_cells(reading, 0.1, 0.5, KAPPA)
         assert paper.out_of_phase.all()
         assert paper.cost("weighted").item() > 0.97 * found[reading].cost("weighted")[best]
 
 
 def test_no_cell_is_out_of_phase():
     """A stiff spring carries its resonator along: deflections are negative, and there is no optimum."""
-    stiff = search("printed", [5.0, 50.0], [0.3, 0.5], KAPPA)
+    stiff = search_cells("printed", [5.0, 50.0], [0.3, 0.5], KAPPA)
     assert not stiff.out_of_phase.any()
     assert all(stiff.optimum(cost) is None for cost in COSTS)
     assert np.all(stiff.signed_deflection[1, :, 1:-1] < 0)
@@ -115,7 +115,7 @@ def test_weighted_cost_is_the_product(found):
 @pytest.mark.parametrize("eta", [0.0, 1.0])
 def test_a_massless_host_or_resonator_is_refused(eta):
     with pytest.raises(ValueError, match="must be positive"):
-        search("printed", [0.1], [eta], KAPPA)
+        search_cells("printed", [0.1], [eta], KAPPA)
 
 
 @settings(max_examples=25)

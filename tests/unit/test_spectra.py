@@ -90,7 +90,7 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
     total = kinetic_energy(velocity, MASSES).sum(axis=1)
     assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
     for memory in (1.0, 2e4):
-        monkeypatch.setattr("vipetsc.spectra.bands.COLUMNS", 6)
+        monkeypatch.setattr("vipetsc.spectra.band_energies.COLUMNS", 6)
         assert np.allclose(part_energies(velocity, MASSES, 0.1, edges, memory=memory), energy, rtol=1e-12)
     (middle,) = split(velocity, 0.1, edges[1:3])
     assert np.allclose(kinetic_energy(middle, MASSES).sum(axis=1), energy[1], rtol=1e-12)

@@ -15,10 +15,10 @@ from vipetsc.dynamics import simulate
 from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import bloch
-from vipetsc.lattice.modes import mode_frequency, modes_of
+from vipetsc.lattice.modes import linear_modes, mode_frequency
 from vipetsc.modes.condensed_follow import CondensedFollower
 from vipetsc.modes.follow import follow_all
-from vipetsc.spectra.modal import ModalParts
+from vipetsc.spectra.modal_energies import ModalParts
 
 ENGINES = ("ts", "propagator")
 
@@ -51,7 +51,7 @@ def test_a_mode_stays_a_mode(engine, ends):
     work = data["energy/work"].values
     assert work == pytest.approx(2e-3, rel=1e-12)
     assert np.ptp(work) == 0.0
-    modes = modes_of(chain)
+    modes = linear_modes(chain)
     energy = 0.5 * np.abs(modes.amplitudes(data["displacement"].values, data["velocity"].values)) ** 2
     own = np.abs(modes.frequency - omega) < 1e-6 * omega  # on a ring, both ways
     assert own.sum() == (2 if ends == "periodic" else 1)

@@ -23,7 +23,7 @@ from vipetsc.case.resolve import (
 from vipetsc.case.schema import Finite, LatticeTable, Positive, once
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Contact, contact_stiffness, pass_bands
-from vipetsc.lattice.cell import groups_of
+from vipetsc.lattice.cell import connected_groups
 
 # Masses solved for with dense matrices, and without any; of a lattice, beyond which "auto" does without.
 MOST_MASSES, MOST_OF_LATTICE, FEW_MASSES = 4000, 40_000, 100
@@ -180,7 +180,7 @@ class NnmCase(CaseFile):
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:
-                group = groups_of(dofs + 1, tuple((s.start, s.end) for s in nnm.custom.springs))
+                group = connected_groups(dofs + 1, tuple((s.start, s.end) for s in nnm.custom.springs))
                 rigid = len(set(group)) - 1
         else:
             cell, wrong = check_cell(lattice)

@@ -15,7 +15,7 @@ from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.variation import variation_of
 from vipetsc.case.varied import designed_end
 from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
-from vipetsc.lattice.cell import cell_problems, groups_of
+from vipetsc.lattice.cell import cell_problems, connected_groups
 
 # A key of a case file takes the place of these keys of the preset.
 REPLACES = {
@@ -115,7 +115,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     if not cell.springs:
         return cell, problems
     next_cell = tuple((0, s.start + 1) for s in cell.springs if s.next_cell)
-    group = groups_of(cell.dofs + 1, (*next_cell, *((s.start + 1, s.end + 1) for s in cell.springs)))
+    group = connected_groups(cell.dofs + 1, (*next_cell, *((s.start + 1, s.end + 1) for s in cell.springs)))
     if loose := [str(mass) for mass, number in enumerate(group) if number != group[0]]:
         remedy = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
         problems.append(Problem("lattice.cell.springs", None, remedy))

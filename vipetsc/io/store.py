@@ -29,7 +29,7 @@ from vipetsc.io.chunks import LOSSES, Recording
 from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run
-from vipetsc.parallel import on_every_rank, on_root, spread
+from vipetsc.parallel import on_every_rank, on_root, sort_over_ranks
 
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
 
@@ -180,7 +180,7 @@ class RunFolder:
             # A rank that cannot must not leave the others creating a file.
             parts = on_every_rank(self.comm, read_chunks)
             if parts:
-                data, (log, first, total) = parts[0], spread(chunks.writers(self), parts[1], ("onset", "site"))
+                data, (log, first, total) = parts[0], sort_over_ranks(chunks.writers(self), parts[1], ("onset", "site"))
             on_every_rank(self.comm, write if parts else lambda: None)
             on_root(self.comm, conclude)
         finally:
@@ -248,7 +248,7 @@ class RunMemory:
         """Make the dataset; all ranks must call it."""
         if self.comm.rank == 0:
             self.dataset = chunks.small_dataset(self, attributes)
-            log, *_ = spread(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
+            log, *_ = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
             fields = dict(zip(self.recording.fields, self._fields[:, : self._rows].swapaxes(2, 3), strict=True))
             if self.end is not None:
                 last = np.split(self.end[self.recording.given["cell"] - 1], 2, axis=1)

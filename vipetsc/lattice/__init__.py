@@ -3,8 +3,8 @@
 from vipetsc.lattice.bands import Band, BlochPoint, bloch, gaps, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.compliance import Compliance, DenseCompliance, IncidentWave
+from vipetsc.lattice.compliance import DenseCompliance, IncidentWave, WaveCompliance
 from vipetsc.lattice.contact import Contact, contact_stiffness
 from vipetsc.lattice.drive import Drive, Pieces, ToneBurst, Waveform
-from vipetsc.lattice.modes import Modes, modes_of
+from vipetsc.lattice.modes import Modes, linear_modes
 from vipetsc.lattice.variation import Coefficients, Variation

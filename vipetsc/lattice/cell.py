@@ -149,7 +149,7 @@ def cell_problems(
 
 
 @lru_cache
-def groups_of(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
+def connected_groups(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
     """Of each of ``n`` nodes (0-based) the number of the group that ``pairs`` tie it to."""
     graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
     return connected_components(graph, directed=False)[1].tolist()

@@ -15,7 +15,7 @@ from scipy.linalg import eigh
 
 from vipetsc.lattice.bands import waves_at
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.waves import NEUTRAL, BlochWaves, between, bloch_waves, blocks_of, flux_of
+from vipetsc.lattice.waves import NEUTRAL, BlochWaves, between, bloch_waves, coupling_blocks, energy_flux
 
 
 class DenseCompliance:
@@ -80,7 +80,7 @@ class Stretch(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Compliance:
+class WaveCompliance:
     """Of the sites of ``chain``; ``infinite``: its cells go on beyond both ends. ``points`` are (cell, mass), from 0.
 
     Relative displacements w = u_resonator - u_host of the contact pairs are made by pairs of opposite forces, and by
@@ -168,7 +168,7 @@ class Compliance:
             raise ValueError(f"the contact pair does not move in the wave of band {band} at {omega:g} rad/s")
         origin = self.chain.sites[0]
         phases = factor ** (np.array(self.chain.sites) - origin)
-        flux = abs(flux_of(omega, state)) / abs(relative) ** 2
+        flux = abs(energy_flux(omega, state)) / abs(relative) ** 2
         return IncidentWave(omega, band, direction, number, phases, flux, shape / relative, factor, origin, channel % r)
 
     def outgoing(
@@ -189,7 +189,7 @@ class Compliance:
             scale = wave.shape[self.chain.cell.host] / shape[self.chain.cell.host]
             steps = self.cells[-1] + 1 - wave.origin if way == 0 else self.cells[0] - wave.origin
             amplitudes[way, wave.channel] += amplitude * scale * wave.factor**steps
-        each = np.array([[flux_of(omega, waves.state[0, :, n + way * r]) for n in range(r)] for way in range(2)])
+        each = np.array([[energy_flux(omega, waves.state[0, :, n + way * r]) for n in range(r)] for way in range(2)])
         travels = np.abs(1 - np.abs(waves.factor[0].reshape(2, r))) < NEUTRAL
         return np.where(travels, np.abs(each), 0) * np.abs(amplitudes) ** 2
 
@@ -201,7 +201,7 @@ class Compliance:
     def _solve(self, omega: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, BlochWaves]:
         """Displacements of the loaded cells, then amplitudes of the stretches (omega, unknown, load), and the waves."""
         chain, cells = self.chain, self.cells
-        (k, p, q, left, right), d = blocks_of(chain.cell), chain.cell.dofs
+        (k, p, q, left, right), d = coupling_blocks(chain.cell), chain.cell.dofs
         waves, b = bloch_waves(chain.cell, omega), p @ q.T
         r, size = p.shape[1], len(cells) * d
         dynamic = k - omega[:, None, None] ** 2 * np.diag(chain.cell.masses)

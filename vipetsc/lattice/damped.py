@@ -87,7 +87,7 @@ class Waves(NamedTuple):
     coupling: np.ndarray
 
 
-def waves_of(cell: UnitCell, omega: float) -> Waves:
+def damped_waves(cell: UnitCell, omega: float) -> Waves:
     """The waves at ``omega`` in rad/s."""
     d, kappa = cell.dofs, np.array([0.0, np.pi / 2, np.pi])
     zero, quarter, half = cell.stiffness_matrix(kappa) + 1j * omega * cell.damping_matrix(kappa)
@@ -109,7 +109,7 @@ def waves_of(cell: UnitCell, omega: float) -> Waves:
 
 def decay_length(cell: UnitCell, omega: float) -> float:
     """Cells in which the wave of ``omega`` (rad/s) that goes farthest decays by 1/e; inf without damping."""
-    growth = np.abs(np.log(np.abs(waves_of(cell, omega).factor)))
+    growth = np.abs(np.log(np.abs(damped_waves(cell, omega).factor)))
     return float(1 / growth.min()) if growth.min() > NEUTRAL else np.inf
 
 
@@ -119,7 +119,7 @@ def reflection(chain: Chain, omega: float, cells: int, end: Literal["left", "rig
     The cells before go on for ever, as the reference cell; the outermost of ``cells`` must be one of them. Incoming
     are waves that do not decay, in a damped cell the one that decays least. NaN in a gap.
     """
-    d, n, waves = chain.cell.dofs, chain.cells, waves_of(chain.cell, omega)
+    d, n, waves = chain.cell.dofs, chain.cells, damped_waves(chain.cell, omega)
     r, size, right = len(waves.factor) // 2, cells * chain.cell.dofs, end == "right"
     a, b = ((n - cells) * d, n * d) if right else (0, size)
     rows = chain.stiffness_rows(a // d, b // d) + 1j * omega * chain.damping_rows(a // d, b // d)

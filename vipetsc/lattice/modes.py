@@ -82,7 +82,7 @@ class Modes:
         return drive.response(self.frequency, start, stop)
 
 
-def modes_of(chain: Chain) -> Modes:
+def linear_modes(chain: Chain) -> Modes:
     """The modes of ``chain`` without its sites and dashpots, computed once: 1200 DoFs take about a second and 12 MB.
 
     Raises ValueError for more than ``MOST_DOFS`` of a lattice whose cells differ: no wave is a mode of that.

@@ -11,16 +11,16 @@ from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import pass_bands
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.compliance import Compliance
+from vipetsc.lattice.compliance import WaveCompliance
 
 # Frequencies above this times the top of the bands, and terms of the series: 4^-28 is below rounding.
 FROM, TERMS = 2.0, 28
 
 
-class QuickCompliance:
+class SeriesCompliance:
     """``compliance`` of a finite lattice between its sites, with the series where it converges fast."""
 
-    def __init__(self, compliance: Compliance) -> None:
+    def __init__(self, compliance: WaveCompliance) -> None:
         self.compliance, self.chain = compliance, compliance.chain
         self.top = pass_bands(self.chain.cell)[-1].high
 

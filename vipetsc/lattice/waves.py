@@ -48,7 +48,7 @@ class Blocks(NamedTuple):
 
 
 @lru_cache
-def blocks_of(cell: UnitCell) -> Blocks:
+def coupling_blocks(cell: UnitCell) -> Blocks:
     """K_nn, the factors P and Q of K_{n,n+1}, and what the springs to the cells before and after add to K_nn."""
     d = cell.dofs
     inside, coupling, left, right = (np.zeros((d, d)) for _ in range(4))
@@ -64,7 +64,7 @@ def blocks_of(cell: UnitCell) -> Blocks:
 
 def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
     """The waves at ``omegas`` in rad/s with parts Re >= 0 and Im <= 0."""
-    k, p, q, *_ = blocks_of(cell)
+    k, p, q, *_ = coupling_blocks(cell)
     r = p.shape[1]
     s = 1j
     dynamic = k - omegas[:, None, None] ** 2 * np.diag(cell.masses)
@@ -91,7 +91,7 @@ def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
 
 def _make_static(cell: UnitCell, waves: BlochWaves, i: int) -> None:
     """Put the shift in common and the linear displacement in the place of the double root at omega = 0."""
-    k, p, q, *_ = blocks_of(cell)
+    k, p, q, *_ = coupling_blocks(cell)
     r, ones = p.shape[1], np.ones(cell.dofs)
     first, second = r - 1, r
     b = p @ q.T
@@ -107,12 +107,12 @@ def _make_static(cell: UnitCell, waves: BlochWaves, i: int) -> None:
 
 def between(cell: UnitCell, waves: BlochWaves, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Displacement (dofs,) of a cell between two states (2r,)."""
-    _, p, q, *_ = blocks_of(cell)
+    _, p, q, *_ = coupling_blocks(cell)
     r = p.shape[1]
     return np.asarray(-waves.inner[0] @ (p @ (after[:r] - waves.port * after[r:]) + q @ before[r:]))
 
 
-def flux_of(omega: float, state: np.ndarray) -> float:
+def energy_flux(omega: float, state: np.ndarray) -> float:
     """Energy in W that a ``state`` (2r,) carries to higher cells."""
     r = len(state) // 2
     return float(omega / 2 * np.imag(state[r:].conj() @ state[:r]))

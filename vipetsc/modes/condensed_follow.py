@@ -10,8 +10,8 @@ import numpy as np
 from vipetsc.case.nnm import NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.io.netcdf import Variables, open_netcdf, variable
-from vipetsc.lattice import Compliance, DenseCompliance, pass_bands
-from vipetsc.lattice.moments import QuickCompliance
+from vipetsc.lattice import DenseCompliance, WaveCompliance, pass_bands
+from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.branch import KINDS, Branch, with_multipliers
 from vipetsc.modes.breather import CondensedContinuation, CondensedPoint, CondensedProblem, CondensedSegment
 from vipetsc.modes.floquet import judge
@@ -106,7 +106,7 @@ class CondensedFollower(Follower):
         case, options = self.case, self.options
         if options.system == "condensed":
             self.chain = build_chain(case.lattice, case.contacts)
-            compliance: Any = QuickCompliance(Compliance(self.chain))
+            compliance: Any = SeriesCompliance(WaveCompliance(self.chain))
             forces = SiteForces([(case.contact(), clearance) for clearance in self.chain.clearances])
         else:
             system = self.system = System.from_case(case)
@@ -238,7 +238,7 @@ def state_of(problem: Any, point: Point) -> dict[int, np.ndarray]:
     return {cell: u for cell, u in total.items() if np.abs(u).max() > NEGLIGIBLE * largest}
 
 
-def _field(compliance: Compliance, omega: float, forces: np.ndarray) -> dict[int, np.ndarray]:
+def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict[int, np.ndarray]:
     """Displacement of the cells around the sites that ``forces`` (pairs,) move, as far as it is not negligible."""
     chain, reach = compliance.chain, FIRST_REACH
     while True:

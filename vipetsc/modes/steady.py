@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.lattice import Compliance, IncidentWave
+from vipetsc.lattice import IncidentWave, WaveCompliance
 from vipetsc.modes.condensed import Balance
 from vipetsc.modes.continuation import ContinuationError
 from vipetsc.modes.flow import FlowError
@@ -52,7 +52,7 @@ class SteadyStates:
         model, self.options = case.model(), case.nfrc
         options, point = self.options, (model.drive_cell, model.drive_mass)
         self.wave = options.source == "wave"
-        self.compliance = Compliance(model.chain, options.infinite, () if self.wave else (point,))
+        self.compliance = WaveCompliance(model.chain, options.infinite, () if self.wave else (point,))
         self.clearance, self.point, last = model.chain.clearances[0], point, options.harmonics
         contact = case.contact(restitution)
         self.forces = SiteForces([(contact, clearance) for clearance in model.chain.clearances])

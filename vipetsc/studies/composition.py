@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from vipetsc.case import Model
-from vipetsc.lattice import Compliance, ToneBurst, bloch
+from vipetsc.lattice import ToneBurst, WaveCompliance, bloch
 from vipetsc.studies.response import DECAY, SiteResponse, in_contact, power_per_area, self_response
 
 WIDTH = 14  # of the burst's line, half of what is followed around a frequency
@@ -70,7 +70,7 @@ class Network:
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
         """Of w at the sites to forces at the sites and the drive (frequency, site, site and 1); of a site alone."""
         omega, drive = middle + self.offset - 1j * self.decay, (self.model.drive_cell, self.model.drive_mass)
-        return Compliance(self.model.chain, points=(drive,)).response(omega), self_response(self.cell, omega)
+        return WaveCompliance(self.model.chain, points=(drive,)).response(omega), self_response(self.cell, omega)
 
     def _propagates(self, middle: float) -> np.ndarray:
         """Whether a wave of each frequency around ``middle`` exists."""

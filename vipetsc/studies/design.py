@@ -17,7 +17,7 @@ from vipetsc.io.folder import SEARCH, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band
-from vipetsc.lattice.search import COSTS, Search, search, signed_deflection, unit_vectors
+from vipetsc.lattice.cell_search import COSTS, CellSearch, search_cells, signed_deflection, unit_vectors
 
 logger = logging.getLogger(__name__)
 PAPER = 0.1, 0.5  # the (lambda, eta) that the paper takes
@@ -82,7 +82,7 @@ def _search(case: DesignCase) -> xr.Dataset:
     sys.audit("vipetsc.set-up", case.name)
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
     lam, eta = options.lam.values(), options.eta.values()
-    searches = {reading: search(reading, lam, eta, wavenumber) for reading in options.readings}
+    searches = {reading: search_cells(reading, lam, eta, wavenumber) for reading in options.readings}
     results = list(searches.values())
     bands = np.arange(1, results[0].frequency.shape[-1] + 1)
     values: dict[str, Any] = {"reading": list(searches), "lambda": results[0].lam, "eta": results[0].eta}
@@ -92,7 +92,7 @@ def _search(case: DesignCase) -> xr.Dataset:
     values["out_of_phase"] = np.stack([result.out_of_phase for result in results]).astype(np.int8)
     values |= {name: np.stack([result.cost(name) for result in results]) for name in COSTS}
     values |= _optima(searches, values)
-    paper = (search(reading, *PAPER, wavenumber) for reading in options.readings)
+    paper = (search_cells(reading, *PAPER, wavenumber) for reading in options.readings)
     values["paper_value"] = np.array([[result.cost(name).item() for name in COSTS] for result in paper])
     about = provenance(MPI.COMM_SELF) | {"case": case.to_toml()}
     if options.eta.last == 1:
@@ -100,7 +100,7 @@ def _search(case: DesignCase) -> xr.Dataset:
     return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
 
 
-def _optima(searches: Mapping[Reading, Search], grids: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _optima(searches: Mapping[Reading, CellSearch], grids: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Where each cost is largest, and the Bloch vectors there; NaN in a reading in which no cell is out of phase."""
     dims = {name: dims.split() for name, (dims, *_) in LAYOUT.items() if name.startswith("optimum_")}
     optima = {name: np.full([len(grids[dim]) for dim in dims[name]], np.nan) for name in dims}

@@ -17,7 +17,7 @@ from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.store import GATHER_LIMIT
 from vipetsc.lattice import Chain, pass_bands
 from vipetsc.parallel import on_root
-from vipetsc.spectra.modal import EDGE
+from vipetsc.spectra.modal_energies import EDGE
 
 END = 0.1  # share of the cells that count as one end
 LAYOUT = {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vipetsc.spectra.modal import ModalParts, cluster_samples
+from vipetsc.spectra.modal_energies import ModalParts, cluster_samples
 from vipetsc.studies.velocity import VelocityRecord
 
 MOST_BRACKETS = 1000  # samples around contacts; where there were more, clusters begin and end at every n-th alone

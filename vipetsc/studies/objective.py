@@ -14,7 +14,7 @@ from vipetsc.case import Case, Model, case_id
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.lattice import pass_bands
 from vipetsc.parallel import StopRequest, on_root
-from vipetsc.spectra.modal import ModalParts
+from vipetsc.spectra.modal_energies import ModalParts
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.recorded import Key, RecordedRuns, run_in_memory
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from mpi4py import MPI
 
-from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, meet, on_root
+from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
 
 FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # no other member could be written either
 BLOCKS = 100  # that each team draws, at least, so that none waits long for the last
@@ -65,7 +65,7 @@ class TaskPool:
             ending = LEFT
         if ending in (LEFT, ENDED):
             drawn.draw(len(jobs))  # so that no team begins another block
-        meet(self.comm)
+        wait_for_all(self.comm)
         shares = self.comm.allgather((ending, reason, made if leader else 0))
         self.stopped = any(ending == LEFT for ending, *_ in shares)
         if progress:

@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 
 from vipetsc.io.read import select
-from vipetsc.lattice.modes import modes_of
+from vipetsc.lattice.modes import linear_modes
 from vipetsc.paper.claims.criteria import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MeasuredRun, Measurement, MissingEvidence
 
@@ -140,7 +140,7 @@ def modal_error(run: MeasuredRun) -> float:
     and of Om^-1 V^T (V Om^2 V^T - A) V Om^-1: the Frobenius norms, which are not smaller, from random fields.
     """
     chain = run.case.model().chain
-    modes, root = modes_of(chain), 1 / np.sqrt(chain.masses())[:, None]
+    modes, root = linear_modes(chain), 1 / np.sqrt(chain.masses())[:, None]
     v, frequency = modes.vectors, modes.frequency[:, None]
     x = np.random.default_rng(0).standard_normal((len(v), FIELDS))
     y = v @ (x / frequency)

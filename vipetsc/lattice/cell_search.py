@@ -16,7 +16,7 @@ AT_REST = 1e-12  # of the product of two unit-norm displacements, which then hav
 
 
 @dataclass(frozen=True)
-class Search:
+class CellSearch:
     """Bloch bands over a grid of four-band cells, and what makes a cell good.
 
     Over the grid ``lam`` (lambda), ``eta`` (eta) and wavenumbers (kappa, rad per cell) of the irreducible Brillouin
@@ -59,7 +59,7 @@ class Search:
         return int(row), int(column)
 
 
-def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLike) -> Search:
+def search_cells(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLike) -> CellSearch:
     """Solve the Bloch problem of every four-band cell of the grid ``lam`` x ``eta`` at every ``wavenumber``.
 
     Raises ValueError if a lambda is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
@@ -73,7 +73,7 @@ def search(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLi
         deflection = signed_deflection(cell, point)[:, DRIVEN - 1]
         cells.append((point.frequency, deflection, np.abs(point.group_velocity).max(axis=0)))
     fields = (np.reshape(values, (len(lams), len(etas), *values[0].shape)) for values in zip(*cells, strict=True))
-    return Search(lams, etas, kappa, *fields)
+    return CellSearch(lams, etas, kappa, *fields)
 
 
 def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:

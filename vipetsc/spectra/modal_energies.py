@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 
 from vipetsc.lattice import Chain, Drive, Waveform, pass_bands
-from vipetsc.lattice.modes import Modes, modes_of
-from vipetsc.spectra.bands import Parts
+from vipetsc.lattice.modes import Modes, linear_modes
+from vipetsc.spectra.band_energies import Parts
 from vipetsc.spectra.pooling import blocks
 from vipetsc.spectra.wavelet import BINS
 
@@ -31,7 +31,7 @@ class ModalParts:
     @classmethod
     def of(cls, chain: Chain) -> Self:
         """Those of ``chain`` without its sites; the modes are computed once."""
-        modes, parts = modes_of(chain), Parts.of(pass_bands(chain.cell))
+        modes, parts = linear_modes(chain), Parts.of(pass_bands(chain.cell))
         is_band, near = np.array([bool(inside) for inside in parts.bands]), EDGE * parts.edges[-2]
         part, below, above = (_index(parts.edges, modes.frequency + shift) for shift in (0.0, -near, near))
         for other in (below, above):
