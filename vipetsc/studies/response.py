@@ -15,7 +15,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from vipetsc.io.records import Record
-from vipetsc.lattice import Band, Chain, Compliance, UnitCell, bloch, pass_bands, waves_at
+from vipetsc.lattice import Band, Chain, UnitCell, WaveCompliance, bloch, pass_bands, waves_at
 
 LOWEST = 0.15  # z of the first of the bins
 BINS = 40
@@ -24,7 +24,7 @@ DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that nothing c
 
 def self_response(cell: UnitCell, omega: np.ndarray) -> np.ndarray:
     """g (omega) in m/N of an infinite lattice at frequencies ``omega`` in rad/s, below the real axis."""
-    return Compliance(Chain(cell, 1, sites=(0,)), infinite=True).at(omega)[:, 0, 0]
+    return WaveCompliance(Chain(cell, 1, sites=(0,)), infinite=True).at(omega)[:, 0, 0]
 
 
 def power_per_area(cell: UnitCell, omega: float) -> tuple[int, float, float] | None:
