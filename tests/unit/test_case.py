@@ -11,7 +11,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vipetsc.case import Case, CaseError, DesignCase, case_id
+from vipetsc.case import Case, CaseError, DesignCase, LawCase, case_id
 from vipetsc.case.resolve import _round_down
 from vipetsc.lattice import Contact
 
@@ -73,6 +73,36 @@ def test_every_case_file_is_sound_and_survives_a_round_trip(path):
     case = Case.load(path)
     assert Case.from_toml(case.to_toml()) == case
     assert case.model().samples > 1
+
+
+def test_the_model_of_a_case_is_built_once_and_not_carried_by_copies():
+    case = Case.load()
+    model = case.model()
+    assert case.model() is model
+    assert case == Case.load()
+    weaker = case.model_copy(update={"drive": case.drive.model_copy(update={"amplitude": 1.0})})
+    assert weaker.model().drive.amplitude == 1.0
+    sent = pickle.loads(pickle.dumps(case))
+    assert sent == case
+    assert sent.__dict__.keys() == case.model_dump().keys() == Case.model_fields.keys()
+
+
+def test_a_varied_case_is_that_of_a_run_with_other_values():
+    law = LawCase.load(RUNS / "law.toml", ["output.stride=2", "time.rtol=1e-9"])
+    varied = law.varied(name="ring", without=("output",), lattice={"ends": "periodic"}, drive={"amplitude": 3.0})
+    assert type(varied) is Case
+    assert (varied.name, varied.lattice.ends, varied.drive.amplitude) == ("ring", "periodic", 3.0)
+    assert (varied.output.stride, varied.time) == (1, law.time)
+    assert varied.drive.frequency == law.drive.frequency
+    assert law.varied(overrides=["output.stride=4"]).output.stride == 4
+
+
+def test_a_varied_case_is_resolved_again():
+    case = Case.load()
+    nine = case.varied(contacts={"sites": 9, "clearance": None})
+    assert nine.contacts == Case.load(overrides=["contacts.sites=9"]).contacts
+    with pytest.raises(CaseError, match="outside the lattice"):
+        case.varied(lattice={"cells": 10})
 
 
 def test_tolerances_scale_with_the_drive():

@@ -4,8 +4,9 @@ A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -138,7 +139,11 @@ class Case(CaseFile):
             yield Problem("output.window", window, f"must be [first, last] within cells 1 to {length}")
 
     def model(self) -> Model:
-        """The case in the terms of ``vipetsc.lattice``."""
+        """The case in the terms of ``vipetsc.lattice``, made once: a case does not change."""
+        return self._model
+
+    @cached_property
+    def _model(self) -> Model:
         contacts, drive, time = self.contacts, self.drive, self.time
         assert drive.frequency is not None and time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
@@ -167,6 +172,28 @@ class Case(CaseFile):
             laws=laws_of_sites(contacts, len(chain.sites)),
             gaps=gaps_of_sites(contacts, list(chain.clearances)),
         )
+
+    def varied(
+        self,
+        *,
+        name: str | None = None,
+        without: Iterable[str] = (),
+        overrides: Iterable[str] = (),
+        **changes: Mapping[str, Any],
+    ) -> "Case":
+        """A lattice run like this case but for some values; a case of another verb loses that verb's own section.
+
+        ``changes`` are keys by section, as in ``drive={"amplitude": 2.0}``; the value None takes a key out. Sections
+        named in ``without`` begin with their defaults instead of the values of this case. ``overrides`` are as those of
+        ``load``. The new case is checked and resolved as any other; raises CaseError.
+        """
+        table = self.model_dump(by_alias=True, exclude_none=True, include={*Case.model_fields})
+        for section in without:
+            table.pop(section, None)
+        for section, values in changes.items():
+            merged = table.get(section, {}) | values
+            table[section] = {key: value for key, value in merged.items() if value is not None}
+        return Case.from_table(table | ({} if name is None else {"name": name}), overrides)
 
     @property
     def contact_radius(self) -> float | None:

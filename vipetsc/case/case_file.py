@@ -140,6 +140,18 @@ class CaseFile(Section):
         """What is allowed but likely not meant, one sentence each."""
         return []
 
+    def __copy__(self) -> Self:
+        # A copy may get other fields (``model_copy``), and what cached properties hold follows from the old ones.
+        copied = super().__copy__()
+        for name in copied.__dict__.keys() - type(self).model_fields.keys():
+            del copied.__dict__[name]
+        return copied
+
+    def __getstate__(self) -> dict[Any, Any]:
+        # Cases are sent to other ranks; what cached properties hold is larger than the case, and is made again there.
+        fields = {name: value for name, value in self.__dict__.items() if name in type(self).model_fields}
+        return super().__getstate__() | {"__dict__": fields}
+
     def to_toml(self) -> str:
         """The resolved case as TOML; reading it back gives the same case."""
         return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
