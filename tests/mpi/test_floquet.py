@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.unit.test_floquet import case
-from vipetsc.modes.branch import Branch
-from vipetsc.modes.follow import follow_all
-from vipetsc.modes.lattice_follow import LatticeFollower
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.lattice_follow import LatticeFollower
 
 COMM = MPI.COMM_WORLD
 

@@ -10,7 +10,7 @@ import pytest
 from tests.conftest import on_two
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
-from vipetsc.modes.lattice_flow import LatticeFlow
+from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 
 COMM = MPI.COMM_WORLD
 

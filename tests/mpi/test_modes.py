@@ -8,8 +8,8 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case.nnm import NnmCase
-from vipetsc.modes.branch import Branch
-from vipetsc.modes.follow import follow_all
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import StopRequest
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from tests.unit.test_nfrc import case
-from vipetsc.modes.nfrc import follow_curves
+from vipetsc.modes.response.nfrc import follow_curves
 from vipetsc.parallel import on_root
 
 

@@ -18,14 +18,14 @@ from vipetsc.figures.breather import branches as draw
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Contact, DenseCompliance, WaveCompliance, contact_stiffness, four_band, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
-from vipetsc.modes.breather import CondensedContinuation, CondensedProblem
-from vipetsc.modes.condensed_follow import CondensedBranch, CondensedFollower, state_of
-from vipetsc.modes.continuation import ContinuationError
-from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.follow import claim_branches, follow_all
-from vipetsc.modes.harmonics import SiteForces
+from vipetsc.modes.balance.breather import CondensedContinuation, CondensedProblem
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.branches.condensed_follow import CondensedBranch, CondensedFollower, state_of
+from vipetsc.modes.branches.follow import claim_branches, follow_all
 from vipetsc.modes.point import Point, resonance
-from vipetsc.modes.shooting import MAPS, Relative, Shooting
+from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.shooting import MAPS, Relative, Shooting
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
 

@@ -96,7 +96,7 @@ def test_a_chosen_folder_holds_them(package, tmp_path):
 
 def test_tables_of_numbers_come_with_the_package():
     declared = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    assert set(ROOT.rglob("*.csv")) == {*(ROOT / "modes").glob(*declared["vipetsc.modes"])}
+    assert set(ROOT.rglob("*.csv")) == {*(ROOT / "modes" / "shooting").glob(*declared["vipetsc.modes.shooting"])}
 
 
 def test_importing_the_package_changes_no_environment():

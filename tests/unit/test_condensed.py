@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.lattice import Contact
-from vipetsc.modes.condensed import Balance
-from vipetsc.modes.harmonics import SiteForces, arcs
+from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.modes.balance.harmonics import SiteForces, arcs
 
 CONSERVATIVE = [Contact("bilinear", 3.0), Contact("hertz", 3.0)]
 DISSIPATIVE = [

@@ -11,13 +11,13 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
-from vipetsc.modes.branch import Branch
-from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.follow import follow_all
-from vipetsc.modes.lattice_follow import LatticeFollower
-from vipetsc.modes.lattice_shooting import LatticeShooting
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.lattice_follow import LatticeFollower
+from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import linear_start
-from vipetsc.modes.shooting import MAPS, Shooting
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.shooting import MAPS, Shooting
 from vipetsc.modes.system import System
 
 CELLS, SITE = 14, 5
@@ -50,7 +50,7 @@ def test_the_breather_is_the_one_of_the_specification(breather):
 
 
 def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
-    from vipetsc.modes.floquet import largest_multipliers
+    from vipetsc.modes.lattice.floquet import largest_multipliers
 
     problem, point = breather
     flow, n = problem.lattice_flow, problem.system.dofs

@@ -15,12 +15,12 @@ from tests.unit.test_floquet import case
 from tests.unit.test_nfrc import case as forced
 from tests.unit.test_nfrc import start_of
 from vipetsc.case import CaseError, NnmCase
-from vipetsc.modes import floquet
-from vipetsc.modes.condensed_follow import CondensedBranch, CondensedFollower
-from vipetsc.modes.follow import follow_all
-from vipetsc.modes.lattice_follow import LatticeFollower
-from vipetsc.modes.nfrc import _first
-from vipetsc.modes.steady import SteadyStates
+from vipetsc.modes.branches.condensed_follow import CondensedBranch, CondensedFollower
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.lattice_follow import LatticeFollower
+from vipetsc.modes.lattice import floquet
+from vipetsc.modes.response.nfrc import _first
+from vipetsc.modes.response.steady import SteadyStates
 
 CONDENSED = {"system": "condensed", "points": 1, "truncation": 1e-7}
 

@@ -11,8 +11,8 @@ from scipy.linalg import eigh
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
 from vipetsc.lattice.chain import Pair
-from vipetsc.modes.flow import FlowError
-from vipetsc.modes.lattice_flow import LatticeFlow
+from vipetsc.modes.lattice.lattice_flow import LatticeFlow
+from vipetsc.modes.problem import FlowError
 
 CELLS, DOFS, CLEARANCE, PERIOD = 14, 4, 10**-2.75, 2 * np.pi / 1600
 STIFFNESS = {"hertz": contact_stiffness(1e8, 0.005, 0.3), "bilinear": 2e4}

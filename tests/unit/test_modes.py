@@ -19,17 +19,17 @@ from scipy.integrate import DOP853
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import Guards, NnmCase, NnmTable
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
-from vipetsc.modes import dop853
-from vipetsc.modes.branch import Branch, slope_laws, tell_regions
-from vipetsc.modes.branch_checks import BranchMonitor, is_jump, sampled, suspects
-from vipetsc.modes.changes import CROSSING, EXTREMUM, NONE, first_rise
-from vipetsc.modes.continuation import Continuation, half_trace_change, relative_turn, unit
-from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.follow import follow_all
+from vipetsc.modes.branches.branch import Branch, slope_laws, tell_regions
+from vipetsc.modes.branches.branch_checks import BranchMonitor, is_jump, sampled, suspects
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.continuation.arclength import Continuation, half_trace_change, relative_turn, unit
+from vipetsc.modes.continuation.special import Segment, locate, switch
 from vipetsc.modes.point import Point, half_traces, linear_start, multipliers, repetitions, sample_orbit
-from vipetsc.modes.reference import Newmark
-from vipetsc.modes.shooting import MAPS, Chart, Grazing, Logarithmic, Relative, Shooting
-from vipetsc.modes.special import Segment, locate, switch
+from vipetsc.modes.shooting import dop853
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.landing import CROSSING, EXTREMUM, NONE, first_rise
+from vipetsc.modes.shooting.reference import Newmark
+from vipetsc.modes.shooting.shooting import MAPS, Chart, Grazing, Logarithmic, Relative, Shooting
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
 
@@ -663,7 +663,7 @@ def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
 
 
 def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
-    monkeypatch.setattr("vipetsc.modes.follow.SAVE_EVERY", 0.0)
+    monkeypatch.setattr("vipetsc.modes.branches.follow.SAVE_EVERY", 0.0)
     nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05], "switch": ["period-doubling"]}
     nnm |= {"switch_points": 3}
     stop, saved = StopRequest(), set()

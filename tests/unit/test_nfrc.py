@@ -17,11 +17,11 @@ from vipetsc.dynamics import simulate
 from vipetsc.figures.registry import draw
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import DenseCompliance
-from vipetsc.modes.condensed import Balance
-from vipetsc.modes.harmonics import SiteForces
-from vipetsc.modes.hill import Hill
-from vipetsc.modes.nfrc import Curve, _first, follow_curves, swept
-from vipetsc.modes.steady import SteadyPoint, SteadyStates
+from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.hill import Hill
+from vipetsc.modes.response.nfrc import Curve, _first, follow_curves, swept
+from vipetsc.modes.response.steady import SteadyPoint, SteadyStates
 
 pytestmark = pytest.mark.parallel(1)
 

@@ -16,8 +16,8 @@ from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import bloch
 from vipetsc.lattice.modes import linear_modes, mode_frequency
-from vipetsc.modes.condensed_follow import CondensedFollower
-from vipetsc.modes.follow import follow_all
+from vipetsc.modes.branches.condensed_follow import CondensedFollower
+from vipetsc.modes.branches.follow import follow_all
 from vipetsc.spectra.modal_energies import ModalParts
 
 ENGINES = ("ts", "propagator")

@@ -10,14 +10,15 @@ import pytest
 
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.lattice import Chain, Contact, contact_stiffness, four_band
-from vipetsc.modes import special as special_points
-from vipetsc.modes.branch_checks import BranchMonitor, is_jump, suspects
-from vipetsc.modes.continuation import Continuation, ContinuationError
-from vipetsc.modes.dop853 import Dop853Flow
+from vipetsc.modes.branches.branch_checks import BranchMonitor, is_jump, suspects
+from vipetsc.modes.continuation import special as special_points
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.special import Segment, locate, switch
 from vipetsc.modes.point import Point, linear_start, resonance
-from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
-from vipetsc.modes.shooting import MAPS, Relative, Shooting
-from vipetsc.modes.special import Segment, locate, switch
+from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
+from vipetsc.modes.shooting.shooting import MAPS, Relative, Shooting
 from vipetsc.modes.system import SmoothSpring, System
 
 D = 10**-2.75

@@ -17,11 +17,11 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from vipetsc.lattice import Contact
-from vipetsc.modes.condensed import Balance
-from vipetsc.modes.harmonics import SiteForces
-from vipetsc.modes.hill import Hill
+from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.newton import BorderedNewton
-from vipetsc.modes.steady import SteadyStates
+from vipetsc.modes.response.steady import SteadyStates
 
 K, STOP, GAP, FORCE, OFFSET, LAST = np.array([[1.0, -1.0], [-1.0, 2.0]]), 100.0, 1.0, 0.1, 10.0, 101
 C = 0.03 * K

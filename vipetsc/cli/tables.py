@@ -25,7 +25,7 @@ from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands, wave
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
-    from vipetsc.modes.branch import Branch
+    from vipetsc.modes.branches.branch import Branch
     from vipetsc.modes.point import Point
     from vipetsc.studies.sweep import SweepResult
 

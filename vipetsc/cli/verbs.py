@@ -116,8 +116,8 @@ def sweep(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
 def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Nonlinear normal modes: the branches of a case, their files and pictures."""
-    from vipetsc.modes.follow import claim_branches, follow_all
-    from vipetsc.modes.lattice_follow import follower_of
+    from vipetsc.modes.branches.follow import claim_branches, follow_all
+    from vipetsc.modes.branches.lattice_follow import follower_of
 
     case = _load(NnmCase, options, comm)
     folder = _output(options, case.name)
@@ -137,7 +137,7 @@ def nnm(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 
 def nfrc(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Steady states of sites under a wave or a force, with their stability: curves, their files and pictures."""
-    from vipetsc.modes.nfrc import claim_curves, follow_curves
+    from vipetsc.modes.response.nfrc import claim_curves, follow_curves
 
     case = _load(NfrcCase, options, comm)
     folder = _output(options, case.name)

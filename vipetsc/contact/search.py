@@ -2,8 +2,8 @@
 
 Method and references: the package's docstring. The trajectory is known at the end of a step only, and each engine takes
 its own kind of step. What they share is the safeguarded Newton iteration on the switching function at the end of the
-repeated step. (``vipetsc.modes.changes`` keeps a bracket instead: it lands to the rounding of the time, where a
-residual no longer halves.)
+repeated step. (``vipetsc.modes.shooting.landing`` keeps a bracket instead: it lands to the rounding of the time, where
+a residual no longer halves.)
 """
 
 from typing import NamedTuple

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from vipetsc.modes.flow import FlowError
+from vipetsc.modes.problem import FlowError
 
 # A Newton step below this, in unknowns of order one, is rounding.
 STEP_TOLERANCE = 1e-14

@@ -5,8 +5,9 @@ from typing import Self
 
 import numpy as np
 
-from vipetsc.modes.flow import Arc
-from vipetsc.modes.shooting import Attempt, Chart, Shooting
+from vipetsc.modes.problem import StartError
+from vipetsc.modes.shooting.flow import Arc
+from vipetsc.modes.shooting.shooting import Attempt, Chart, Shooting
 
 # An orbit that passes a part of its period again to this share of its size repeats it.
 SAME = 1e-6
@@ -28,10 +29,6 @@ QUANTITIES: dict[str, tuple[str, type, str, str]] = {
     "index": ("number", int, "1", "number of the regular point, or of the one after a special point"),
     "resonance": ("resonance", int, "1", "k of the k:1 tongue of an energy fold; else 1 or 0"),
 }
-
-
-class StartError(ValueError):
-    """There is no periodic orbit to begin a branch with; all ranks that seek one together find that out together."""
 
 
 def half_traces(problem: Shooting, arc: Arc) -> np.ndarray:

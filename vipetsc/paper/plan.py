@@ -25,7 +25,7 @@ from vipetsc.case.predict import PredictCase
 from vipetsc.io.folder import NEW, FolderError, provenance
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, outdated
-from vipetsc.modes.follow import Follower, claim_branches
+from vipetsc.modes.branches.follow import Follower, claim_branches
 from vipetsc.modes.system import System
 from vipetsc.paper.claims import measure_claims
 from vipetsc.paper.claims.criteria import CLAIMS

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.modes import flow
-from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
-from vipetsc.modes.flow import Flow, FlowError
+from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting import flow
+from vipetsc.modes.shooting.flow import Flow
+from vipetsc.modes.shooting.landing import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
 from vipetsc.modes.system import System
 
 # Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed.

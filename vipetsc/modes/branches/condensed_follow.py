@@ -12,13 +12,13 @@ from vipetsc.case.resolve import build_chain
 from vipetsc.io.netcdf import Variables, open_netcdf, variable
 from vipetsc.lattice import DenseCompliance, WaveCompliance, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
-from vipetsc.modes.branch import KINDS, Branch, with_multipliers
-from vipetsc.modes.breather import CondensedContinuation, CondensedPoint, CondensedProblem, CondensedSegment
-from vipetsc.modes.floquet import judge
-from vipetsc.modes.follow import FAILURES, Follower
-from vipetsc.modes.harmonics import SiteForces
-from vipetsc.modes.hill import Hill
-from vipetsc.modes.lattice_flow import LatticeFlow
+from vipetsc.modes.balance.breather import CondensedContinuation, CondensedPoint, CondensedProblem, CondensedSegment
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.hill import Hill
+from vipetsc.modes.branches.branch import KINDS, Branch, with_multipliers
+from vipetsc.modes.branches.follow import FAILURES, Follower
+from vipetsc.modes.lattice.floquet import judge
+from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import QUANTITIES, Point
 from vipetsc.modes.system import System
 from vipetsc.parallel import StoppedError

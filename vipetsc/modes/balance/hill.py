@@ -25,7 +25,7 @@ from typing import Protocol
 import numpy as np
 from scipy.integrate import trapezoid
 
-from vipetsc.modes.harmonics import ForceSeries
+from vipetsc.modes.balance.harmonics import ForceSeries
 
 # Growth rate over Om up to which a motion counts as stable: in a finite system, whose poles lie at Re lambda = 0, D is
 # smooth over this length of the line, and 1 % a period is told. Lines on which the fastest growth is looked for first.

@@ -25,7 +25,7 @@ from typing import Protocol
 
 import numpy as np
 
-from vipetsc.modes.harmonics import ForceSeries, SiteForces
+from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 
 # Radius, over the frequency, of a circle on which Cauchy's formula gives the derivative of a real compliance, and the
 # lower half of its nodes; relative step of a difference for a complex compliance.

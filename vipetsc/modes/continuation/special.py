@@ -9,10 +9,11 @@ from functools import cache, partial
 import numpy as np
 from scipy.optimize import brentq
 
-from vipetsc.modes.continuation import ContinuationError, Frame, unit
-from vipetsc.modes.graze import graze
+from vipetsc.modes.continuation.arclength import Frame, unit
+from vipetsc.modes.continuation.graze import graze
 from vipetsc.modes.point import Point, repetitions, resonance
-from vipetsc.modes.shooting import MAPS, Relative, Shooting
+from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.shooting.shooting import MAPS, Relative, Shooting
 
 Test = Callable[[Point], float]
 Knot = tuple[np.ndarray, np.ndarray]  # the unknowns of a branch and their slope at an arclength

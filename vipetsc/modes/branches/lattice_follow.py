@@ -7,16 +7,15 @@ import numpy as np
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.case.resolve import build_chain
-from vipetsc.modes.branch import Branch
-from vipetsc.modes.condensed_follow import CondensedFollower, stored_states
-from vipetsc.modes.continuation import ContinuationError
-from vipetsc.modes.floquet import judge
-from vipetsc.modes.flow import FlowError
-from vipetsc.modes.follow import Follower
-from vipetsc.modes.lattice_shooting import LatticeShooting
-from vipetsc.modes.point import Point, StartError
-from vipetsc.modes.shooting import MAPS, Shooting
-from vipetsc.modes.special import locate
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.condensed_follow import CondensedFollower, stored_states
+from vipetsc.modes.branches.follow import Follower
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.lattice.floquet import judge
+from vipetsc.modes.lattice.krylov import LatticeShooting
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import ContinuationError, FlowError, StartError
+from vipetsc.modes.shooting.shooting import MAPS, Shooting
 from vipetsc.modes.system import System
 
 

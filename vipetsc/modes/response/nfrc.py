@@ -19,9 +19,8 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
-from vipetsc.modes.continuation import ContinuationError
-from vipetsc.modes.flow import FlowError
-from vipetsc.modes.steady import Steady, SteadyPoint, SteadyStates
+from vipetsc.modes.problem import ContinuationError, FlowError
+from vipetsc.modes.response.steady import Steady, SteadyPoint, SteadyStates
 from vipetsc.parallel import StoppedError, StopRequest
 
 SAVE_EVERY = 10.0  # s between two writings of a growing curve

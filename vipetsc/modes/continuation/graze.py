@@ -12,10 +12,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vipetsc.modes.continuation import Frame
-from vipetsc.modes.flow import Arc, FlowError
+from vipetsc.modes.continuation.arclength import Frame
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Grazing
+from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting.flow import Arc
+from vipetsc.modes.shooting.shooting import Grazing
 
 # Newton steps at most; none is longer than this, and behind one below that rounding is left, in unknowns of order one.
 STEPS, FURTHEST, CLOSE = 10, 0.5, 1e-9

@@ -8,10 +8,11 @@ import numpy as np
 
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.modes.continuation import Continuation, ContinuationError, half_trace_change, relative_turn
-from vipetsc.modes.flow import Flow, FlowError
+from vipetsc.modes.continuation.arclength import Continuation, half_trace_change, relative_turn
 from vipetsc.modes.point import Point, repetitions, sample_orbit
-from vipetsc.modes.shooting import Relative, Shooting
+from vipetsc.modes.problem import ContinuationError, FlowError
+from vipetsc.modes.shooting.flow import Flow
+from vipetsc.modes.shooting.shooting import Relative, Shooting
 
 # Points between two looks whether a branch has passed on to another one.
 REPETITIONS_EVERY = 50

@@ -21,12 +21,11 @@ import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import IncidentWave, WaveCompliance
-from vipetsc.modes.condensed import Balance
-from vipetsc.modes.continuation import ContinuationError
-from vipetsc.modes.flow import FlowError
-from vipetsc.modes.harmonics import SiteForces
-from vipetsc.modes.hill import Hill
+from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.newton import Attempt, BorderedNewton
+from vipetsc.modes.problem import ContinuationError, FlowError
 
 TURN, CORRECTION = 0.25, 0.1  # largest angle in rad between tangents, and correction over the step
 SLOPE = 1e-6  # relative step of a difference in frequency

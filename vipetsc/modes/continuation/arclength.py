@@ -11,12 +11,8 @@ from scipy.sparse.linalg import spsolve
 from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.newton import Attempt
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting import Shooting
-
-
-class ContinuationError(RuntimeError):
-    """The branch cannot go on; the message says where, why, and which option to turn."""
-
+from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.shooting.shooting import Shooting
 
 # What a guard holds down, for messages, and where it is set.
 GUARDED = {

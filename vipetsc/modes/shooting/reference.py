@@ -11,9 +11,10 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.compiled import njit
-from vipetsc.modes import flow
-from vipetsc.modes.changes import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
-from vipetsc.modes.flow import CompiledSystem, Flow, FlowError, close, restore
+from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting import flow
+from vipetsc.modes.shooting.flow import CompiledSystem, Flow, close, restore
+from vipetsc.modes.shooting.landing import EXTREMUM, MOST_ATTEMPTS, NONE, Change, correct
 from vipetsc.modes.system import System
 
 # Errors that TSRK allows per step, relative to the size of the orbit and of each variation.

@@ -12,7 +12,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel, njit
 from vipetsc.contact.law import elastic_force_and_slope
-from vipetsc.modes.changes import EXTREMUM, NONE, Change, first_rise, hermite
+from vipetsc.modes.shooting.landing import EXTREMUM, NONE, Change, first_rise, hermite
 from vipetsc.modes.system import System
 
 CONTACT = np.dtype([("clearance", np.float64), ("stiffness", np.float64), ("exponent", np.float64)])
@@ -156,10 +156,6 @@ def switch(step: Step, change: Change) -> int:
     onset = step.side[change.contact] == 0
     step.side[change.contact] = change.side if onset else 0
     return 1 if onset else -1
-
-
-class FlowError(RuntimeError):
-    """The flow could not cover the requested time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,15 +17,16 @@ from mpi4py import MPI
 from vipetsc.case import NnmCase
 from vipetsc.case.nnm import NnmTable
 from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
-from vipetsc.modes.branch import Branch
-from vipetsc.modes.branch_checks import BranchMonitor, compare, jumps, sampled
-from vipetsc.modes.continuation import Continuation, ContinuationError
-from vipetsc.modes.dop853 import Dop853Flow
-from vipetsc.modes.flow import Flow, FlowError
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, jumps, sampled
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.special import at_energy, locate, switch
 from vipetsc.modes.point import Point, linear_start
-from vipetsc.modes.reference import FiniteDifferences, Newmark, Tsrk
-from vipetsc.modes.shooting import MAPS, Shooting
-from vipetsc.modes.special import at_energy, locate, switch
+from vipetsc.modes.problem import ContinuationError, FlowError
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.flow import Flow
+from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
+from vipetsc.modes.shooting.shooting import MAPS, Shooting
 from vipetsc.modes.system import System
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 

@@ -23,7 +23,7 @@ from vipetsc.dynamics.propagator.engine import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.lattice import Chain, Contact, Drive, ToneBurst
-from vipetsc.modes.flow import FlowError
+from vipetsc.modes.problem import FlowError
 
 # Errors allowed in a contact's substep, relative to its speed.
 RTOL = 1e-13

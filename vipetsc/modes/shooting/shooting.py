@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from vipetsc.modes.flow import Arc, Flow, FlowError
 from vipetsc.modes.newton import Attempt, BorderedNewton
+from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting.flow import Arc, Flow
 from vipetsc.modes.system import System
 
 

@@ -18,12 +18,13 @@ from scipy.sparse import diags, spmatrix
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
-from vipetsc.modes.breather import describing
-from vipetsc.modes.harmonics import SiteForces
-from vipetsc.modes.lattice_flow import LatticeArc, LatticeFlow
+from vipetsc.modes.balance.breather import describing
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton
-from vipetsc.modes.point import Point, StartError
-from vipetsc.modes.shooting import Chart, Shooting, ShootingMap
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import StartError
+from vipetsc.modes.shooting.shooting import Chart, Shooting, ShootingMap
 from vipetsc.modes.system import System
 
 # Residual of GMRES over the right side, its vectors before a restart, its products.

@@ -12,13 +12,13 @@ import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.case.nnm import NnmTable
-from vipetsc.modes.condensed import Balance, Compliance
-from vipetsc.modes.continuation import Continuation, ContinuationError, Frame, unit
-from vipetsc.modes.flow import FlowError
-from vipetsc.modes.harmonics import SiteForces
+from vipetsc.modes.balance.harmonic_balance import Balance, Compliance
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.continuation.arclength import Continuation, Frame, unit
+from vipetsc.modes.continuation.special import Segment
 from vipetsc.modes.newton import Attempt, BorderedNewton
 from vipetsc.modes.point import Point
-from vipetsc.modes.special import Segment
+from vipetsc.modes.problem import ContinuationError, FlowError
 
 # Harmonics at the start; their number changes where the harmonics left out are outside these shares of what is
 # allowed, and then so that they become the share AIM of it.

@@ -1,0 +1,7 @@
+"""Steady responses to a harmonic force or wave, over its amplitude or frequency: nonlinear frequency response curves.
+
+``steady`` has their equations, on those of harmonic balance; ``nfrc`` follows the curves of a case and writes them.
+"""
+
+from vipetsc.modes.response.nfrc import Curve, follow_curves
+from vipetsc.modes.response.steady import SteadyStates
