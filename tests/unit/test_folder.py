@@ -1,10 +1,13 @@
 """Claiming output folders: what may be begun, replaced, gone on with; whatever had happened in them before."""
 
+import logging
 import os
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
 
 from mpi4py import MPI
 
@@ -12,7 +15,7 @@ import pytest
 
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, FolderError, claimed
-from vipetsc.io.lock import locked
+from vipetsc.io.lock import PATIENCE, locked
 
 ROOT = Path(__file__).parents[2]
 SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
@@ -221,8 +224,9 @@ def held(folder):
         ("paper", "--quick"),
     ],
 )
-def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command):
+def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command, monkeypatch):
     """The other is named with its host; a lock that a killed process has left is nobody's."""
+    monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.1)
 
     def state():
         return sorted((path, path.stat().st_mtime_ns) for path in run.rglob("*"))
@@ -239,6 +243,31 @@ def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, c
         with claim(run, RUN, OLD):
             pass
         assert not (run / ".lock").exists()
+
+
+@pytest.mark.parametrize("folder_is_new", [False, True])
+def test_a_command_waits_for_a_process_that_ends_and_says_so(run, tmp_path, caplog, folder_is_new):
+    """As after ``kill -9`` of a rank: mpirun returns while another rank, which has the lock, is still ending."""
+    folder = tmp_path / "new" if folder_is_new else run
+    with held(folder) as process, caplog.at_level(logging.INFO, logger="vipetsc"):
+        Timer(0.3, process.stdin.close).start()
+        begin = time.monotonic()
+        with locked(MPI.COMM_SELF, folder):
+            assert 0.2 < time.monotonic() - begin < PATIENCE
+            assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} ")
+    assert folder.exists() != folder_is_new  # created by the other, removed by it, and again by this one
+    (told,) = caplog.messages
+    assert f"{folder}: process {process.pid} on {os.uname().nodename} is working in it; waiting up to 5 s" in told
+
+
+def test_a_command_waits_no_longer_than_it_says_for_a_process_that_stays(run, caplog, monkeypatch):
+    monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.4)
+    with held(run), caplog.at_level(logging.INFO, logger="vipetsc"):
+        begin = time.monotonic()
+        with pytest.raises(FolderError, match="is working in it; wait until it has ended"), locked(MPI.COMM_SELF, run):
+            pass
+        assert 0.4 <= time.monotonic() - begin < 1.5
+    assert len(caplog.messages) == 1  # said once, however often it looks
 
 
 def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch):

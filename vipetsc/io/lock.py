@@ -1,10 +1,12 @@
 """Folders that one command at a time works in."""
 
 import fcntl
+import logging
 import os
 import platform
 import secrets
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -13,8 +15,14 @@ from mpi4py import MPI
 
 from vipetsc.parallel import on_root
 
+logger = logging.getLogger(__name__)
+
 LOCK = ".lock"
 TOKEN = secrets.token_hex(8)  # this process: in two containers on one host, two may have the same number
+# s. Where a rank is killed, mpirun returns before its other ranks are gone, and the same command may be typed at once:
+# it sends them SIGTERM and, a second later, SIGKILL, and one with much memory takes a moment more.
+PATIENCE = 5.0
+LOOK_EVERY = 0.05  # s between two attempts while a holder may be ending
 
 
 class FolderError(ValueError):
@@ -23,11 +31,12 @@ class FolderError(ValueError):
 
 @contextmanager
 def locked(comm: MPI.Comm, *paths: Path) -> Iterator[None]:
-    """Keep other commands out of the folders ``paths`` within the block; those that are missing are made.
+    """Keep other commands out of the folders ``paths`` within the block; those that are missing are created.
 
     A lock lies on ``.lock`` in the folder, held by rank 0, and ends with its process, so that none is left behind;
-    it may be taken again within the block by the same process. Folders that stay empty go again. All ranks must call
-    it. Raises FolderError if another process has the lock, and names it.
+    it may be taken again within the block by the same process. Folders that stay empty are removed again. Rank 0 waits
+    up to ``PATIENCE`` s for another process that has the lock, and says so. All ranks must call it. Raises FolderError
+    on all of them if the other process keeps the lock, and names it.
     """
     with ExitStack() as stack:
         on_root(comm, lambda: [stack.enter_context(_lock(path)) for path in paths])
@@ -36,41 +45,67 @@ def locked(comm: MPI.Comm, *paths: Path) -> Iterator[None]:
 
 @contextmanager
 def _lock(path: Path) -> Iterator[None]:
+    """Hold the lock of one folder on this rank; folders that were created for it and stayed empty are removed."""
     if path.exists() and not path.is_dir():
         raise FolderError(f"{path}: is a file, not a folder; choose another --out")
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+
+    created: list[Path] = []
     descriptor = None
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        descriptor = _acquire(path)
+        descriptor = _acquire(path, created)
         yield
     finally:
         if descriptor is not None:
             (path / LOCK).unlink(missing_ok=True)
             os.close(descriptor)
-        for folder in made:
+        for folder in created:
             with suppress(OSError):
                 folder.rmdir()
 
 
-def _acquire(path: Path) -> int | None:
-    """The descriptor that holds the lock; None if this process has it already, or the file system knows no locks."""
+def _acquire(path: Path, created: list[Path]) -> int | None:
+    """Lock the folder ``path``, which is created where it is missing; the folders ``created`` are added to the list.
+
+    Returns the descriptor that holds the lock, or None where none is needed or possible: this process has it already,
+    or the file system knows no locks. Raises FolderError if another process still has it after ``PATIENCE``.
+    """
     sys.audit("vipetsc.lock", str(path))
-    holder = f"process {os.getpid()} on {platform.node()}"
+    deadline = None
+    while True:
+        # Inside the loop, because a holder that ends removes the folder if it created it and left nothing there.
+        created += [folder for folder in (path, *path.parents) if not folder.exists()]
+        path.mkdir(parents=True, exist_ok=True)
+
+        descriptor, holder = _try_to_lock(path)
+        if holder is None:
+            return descriptor
+
+        now = time.monotonic()
+        if deadline is None:
+            deadline = now + PATIENCE
+            logger.info("vipetsc: %s: %s is working in it; waiting up to %g s for its end", path, holder, PATIENCE)
+        elif now >= deadline:
+            remedy = "wait until it has ended, or choose another --out"
+            raise FolderError(f"{path}: {holder} is working in it; {remedy}")
+        time.sleep(LOOK_EVERY)
+
+
+def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
+    """The descriptor that holds the lock (None: none is needed or possible), and who else has it (None: nobody)."""
     while True:
         descriptor = os.open(path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # One that ended meanwhile has removed the file that was opened.
-            if (path / LOCK).exists() and os.path.samestat(os.fstat(descriptor), (path / LOCK).stat()):
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, f"{holder} {TOKEN}\n".encode())
-                return descriptor
-            os.close(descriptor)
         except OSError as error:
-            other, _, token = os.read(descriptor, 1000).decode().strip().rpartition(" ")
+            holder, _, token = os.read(descriptor, 1000).decode().strip().rpartition(" ")
             os.close(descriptor)
-            if not isinstance(error, BlockingIOError) or token == TOKEN:
-                return None
-            message = f"{other or 'another process'} is working in it; wait until it has ended, or choose another --out"
-            raise FolderError(f"{path}: {message}") from None
+            if token == TOKEN or not isinstance(error, BlockingIOError):
+                return None, None
+            return None, holder or "another process"
+
+        # A holder that ended after the file was opened has removed it: a lock on a file without name is none.
+        if (path / LOCK).exists() and os.path.samestat(os.fstat(descriptor), (path / LOCK).stat()):
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f"process {os.getpid()} on {platform.node()} {TOKEN}\n".encode())
+            return descriptor, None
+        os.close(descriptor)
