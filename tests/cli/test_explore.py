@@ -11,7 +11,7 @@ import pytest
 from tests.cli.browser import NEEDED, browsing
 from vipetsc.figures import panels
 from vipetsc.figures.style import new_figure, rc_style, save
-from vipetsc.paper.figures import PaperFigure
+from vipetsc.paper.paper_figures import PaperFigure
 from vipetsc.paper.report import write_report
 
 CELLS = 100

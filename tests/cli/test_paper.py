@@ -19,8 +19,8 @@ from tests.cli.tiny_paper import DRAWN, drawing, tiny_plan
 from tests.conftest import clean_environment
 from vipetsc.figures.sweep_members import Files
 from vipetsc.paper.claims.criteria import CLAIMS
-from vipetsc.paper.figures import PAPER_FIGURES
 from vipetsc.paper.make import make_paper
+from vipetsc.paper.paper_figures import PAPER_FIGURES
 from vipetsc.paper.plan import DONE, paper_plan
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ import pytest
 from tests.conftest import TWO, StopAt, assert_same_bits, datasets, on_two, search_table
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.parallel import StoppedError, StopRequest
-from vipetsc.studies.optimise import run_search
+from vipetsc.studies.optimum_search import run_search
 
 
 def plan(*changes):

@@ -144,8 +144,8 @@ def test_after_a_request_on_one_rank_no_rank_begins_another_job():
         time.sleep(0.01)
         stop.requested = comm.rank == 1
 
-    assert pool.share(list(range(100)), work) < 50
-    assert pool.stopped and pool.share([1, 2], work) == 0
+    assert pool.run(list(range(100)), work) < 50
+    assert pool.stopped and pool.run([1, 2], work) == 0
 
 
 @pytest.mark.parallel([1, 2, 3])
@@ -157,9 +157,7 @@ def test_blocks_of_jobs_hold_every_job_once():
         if job % 10 == 3:
             raise ValueError("three")
 
-    made = TaskPool(comm, MPI.COMM_SELF, StopRequest()).share(
-        range(1007), work, fail=lambda job, why: failed.append(job)
-    )
+    made = TaskPool(comm, MPI.COMM_SELF, StopRequest()).run(range(1007), work, fail=lambda job, why: failed.append(job))
     assert sorted(job for jobs in comm.allgather(done) for job in jobs) == list(range(1007))
     assert sorted(job for jobs in comm.allgather(failed) for job in jobs) == list(range(3, 1007, 10))
     assert made == 1007 - 101

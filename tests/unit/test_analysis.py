@@ -11,9 +11,9 @@ from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
-from vipetsc.studies import velocity as velocities
+from vipetsc.studies import velocity_record as velocities
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.members import leading_cell
+from vipetsc.studies.sweep_runs import leading_cell
 
 
 @pytest.fixture

@@ -19,13 +19,13 @@ from vipetsc.lattice.modes import linear_modes
 from vipetsc.paper.claims import criteria as constants
 from vipetsc.paper.claims import interband, measure_claims, write_claims
 from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
+from vipetsc.paper.claims.diatomic import BRANCHES
 from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MissingEvidence
 from vipetsc.paper.claims.interband import modal_error
 from vipetsc.paper.claims.measure import measure_claim, rounded
-from vipetsc.paper.claims.scattering import BRANCHES
-from vipetsc.paper.figures import READINGS
+from vipetsc.paper.paper_figures import READINGS
 from vipetsc.spectra import FEWEST, Parts, dispersion, part_energies, power_law
-from vipetsc.studies.linear import MEASURES
+from vipetsc.studies.linear_run import MEASURES
 
 IDS = [f"C{i}" for i in range(1, 19)]
 SITES = [1, 2, 3, 5, 10, 20]

@@ -16,7 +16,7 @@ from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import open_ensemble, over_samples
 from vipetsc.lattice import pass_bands
-from vipetsc.studies.linear import linear_name
+from vipetsc.studies.linear_run import linear_name
 
 BASE = {"name": "small", "lattice": {"preset": "four-band", "cells": 40}, "drive": {"cycles": 4}}
 SITES = {"sites": list(range(5, 15)), "clearance": 2e-3}

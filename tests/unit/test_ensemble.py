@@ -14,7 +14,7 @@ from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, fit_curve
-from vipetsc.studies.linear import LinearRun, leading_cell, linear_name, read_linear
+from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name, read_linear
 from vipetsc.studies.sweep import conclude, summarise
 
 SWEEP = {

@@ -15,7 +15,7 @@ from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Spring, UnitCell, bloch, four_band
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
 from vipetsc.lattice.packet import gaussian_packet
-from vipetsc.studies.linear import linear_case
+from vipetsc.studies.linear_run import linear_case
 
 PACKET = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width": 2, "energy": 1e-3}
 TABLE = {"name": "t", "lattice": {"preset": "four-band", "cells": 24}, "contacts": {"sites": 0}}

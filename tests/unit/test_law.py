@@ -21,7 +21,7 @@ from vipetsc.lattice import Chain, ToneBurst, bloch, four_band, waves_at
 from vipetsc.lattice.packet import packet_speeds
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra import by_direction, upper_share, wave_energies
-from vipetsc.studies.one_site import Runs, largest_between, make_law
+from vipetsc.studies.one_site import ScatteringRuns, largest_between, make_law
 from vipetsc.studies.scattering_law import OF_POINT, Outcome, ScatteringLaw, matched_clearances
 
 THREE = {
@@ -52,7 +52,7 @@ def case(lattice="four-band", law=COARSE, **sections) -> LawCase:
     return LawCase.from_table(table)
 
 
-def shares(runs: Runs, *points: float) -> np.ndarray:
+def shares(runs: ScatteringRuns, *points: float) -> np.ndarray:
     """Shares (point, ...) of single runs: band and direction, then dissipated and contact."""
     runs.make([*points])
     runs.jittered = lambda z: [z]
@@ -60,8 +60,8 @@ def shares(runs: Runs, *points: float) -> np.ndarray:
     return np.array([[*row["share"].ravel(), row["dissipated"], row["contact"]] for row in rows])
 
 
-def make_runs(folder, of: LawCase) -> Runs:
-    return Runs(of, folder, MPI.COMM_SELF, StopRequest())
+def make_runs(folder, of: LawCase) -> ScatteringRuns:
+    return ScatteringRuns(of, folder, MPI.COMM_SELF, StopRequest())
 
 
 @pytest.mark.parametrize("cell", [case(name).lattice.unit_cell() for name in LATTICES], ids=[*LATTICES])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import small_case
-from vipetsc.studies.linear import LinearRun, factor, is_proportional, linear_case
+from vipetsc.studies.linear_run import LinearRun, factor, is_proportional, linear_case
 
 CUBIC = {
     "masses": [0.01, 0.02],

@@ -18,9 +18,9 @@ from vipetsc.case.disorder import Deviation
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.objective import Judge
-from vipetsc.studies.optimise import Search
-from vipetsc.studies.recorded import RecordedRuns
+from vipetsc.studies.objective import ObjectiveRuns
+from vipetsc.studies.optimum_search import OptimumSearch
+from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.sampler import CmaEs, Nsga2, front, knee, smooth
 
 BOUNDS = {"budget": 12, "variables": {"clearance": [1e-5, 1e-2]}}
@@ -239,7 +239,7 @@ class Recorder(CmaEs):
 
 
 def spent(search):
-    while search.go_on():
+    while search.tell_and_ask():
         search.runs()
     return search
 
@@ -250,7 +250,7 @@ def recorder(searched):
 
 def test_a_search_spends_its_budget_and_keeps_the_best():
     small = plan("optimise.budget=200")
-    search = spent(Search(small, Bowl(), recorder(small), small.begin()))
+    search = spent(OptimumSearch(small, Bowl(), recorder(small), small.begin()))
     assert len(search.designs) == 200 and search.designs[0].case is small.base
     compared = search.compared()
     assert compared["case"] == 0 and search.losses()[compared["best"]] == search.losses().min() < 1e-3
@@ -261,7 +261,7 @@ def test_a_search_spends_its_budget_and_keeps_the_best():
 def test_a_design_that_fails_or_cannot_be_is_told_to_be_worst_and_the_search_goes_on():
     small = plan("optimise.budget=60")
     sampler = recorder(small)
-    search = Search(small, Bowl(lambda case: case.contacts.clearance[0] > 2e-4), sampler, small.begin())
+    search = OptimumSearch(small, Bowl(lambda case: case.contacts.clearance[0] > 2e-4), sampler, small.begin())
     impossible, design = [], search.plan.design
 
     def sometimes(self, values):
@@ -287,7 +287,7 @@ def test_a_design_that_fails_or_cannot_be_is_told_to_be_worst_and_the_search_goe
 
 def test_a_start_that_is_not_the_case_is_a_design_too():
     small = plan()
-    search = Search(small, Bowl(), recorder(small), small.begin([1e-3, 1e-3, 1e-3]))
+    search = OptimumSearch(small, Bowl(), recorder(small), small.begin([1e-3, 1e-3, 1e-3]))
     assert [d.case.contacts.clearance for d in search.designs][1] == pytest.approx([1e-3] * 3)
     assert len(search.runs()) == 2
 
@@ -296,7 +296,7 @@ def test_the_runs_of_a_design_are_its_amplitudes_times_what_scatters():
     """A scatter is that of [disorder] with the next seeds; the design itself is without."""
     objective = "optimise.objective=[{amplitudes=[2.0, 5.0]}, {measure='transmitted', amplitudes=[5.0, 9.0]}]"
     small = plan(objective, "optimise.samples=2", "disorder={seed=7, clearance={relative=0.01}}")
-    runs = Judge.runs(Scarce(small), small.base)
+    runs = ObjectiveRuns.runs(Scarce(small), small.base)
     assert [*runs] == [(a, lot) for a in (2.0, 5.0, 9.0) for lot in (0, 1)]
     assert {run.drive.amplitude for run in runs.values()} == {2.0, 5.0, 9.0}
     drawn = Deviation(relative=0.01).draw(np.array(small.base.contacts.clearance), 8, "clearance")
@@ -304,7 +304,7 @@ def test_the_runs_of_a_design_are_its_amplitudes_times_what_scatters():
     assert runs[5.0, 1].contacts.clearance == runs[2.0, 1].contacts.clearance != runs[5.0, 0].contacts.clearance
 
 
-class Scarce(Judge):
+class Scarce(ObjectiveRuns):
     """Without ranks and files: what is known is given."""
 
     def __init__(self, plan, known=()):
@@ -315,7 +315,7 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
     objective = "optimise.objective=[{amplitudes=[2.0, 5.0]}, {measure='transmitted', goal='minimise', over='mean'}]"
     small = plan(objective, "optimise.samples=2", "disorder.clearance.relative=0.01", "drive.amplitude=5.0")
     share = {(2.0, 0): 0.1, (2.0, 1): 0.3, (5.0, 0): 0.5, (5.0, 1): 0.2}
-    runs = Judge.runs(Scarce(small), small.base)
+    runs = ObjectiveRuns.runs(Scarce(small), small.base)
     known = {
         case_id(run): {"values": {"upper_share_at_end": share[key], "transmitted": 0.4}} for key, run in runs.items()
     }

@@ -20,7 +20,7 @@ from vipetsc.case import Case
 from vipetsc.figures.lattice import lattice_page, reduced_model
 from vipetsc.figures.style import NOTE, SCREEN, draw_each, new_figure, rc_style, save
 from vipetsc.paper.claims.criteria import CLAIMS
-from vipetsc.paper.figures import PAPER_FIGURES, describe
+from vipetsc.paper.paper_figures import PAPER_FIGURES, describe
 from vipetsc.paper.report import numbers, sources
 
 

@@ -19,11 +19,11 @@ from vipetsc.case import Case, case_id
 from vipetsc.io.folder import SEARCH, FolderError, claimed
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import draw, make, steps
-from vipetsc.paper.figures import TRANSFER, PaperFigure
-from vipetsc.paper.made import read_made
+from vipetsc.paper.build_record import read_record
+from vipetsc.paper.cell_search import search_design
+from vipetsc.paper.paper_figures import TRANSFER, PaperFigure
 from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
 from vipetsc.parallel import StoppedError, StopRequest
-from vipetsc.studies.design import search_design
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(vipetsc.__file__).parent
@@ -125,7 +125,7 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
     assert not old.exists() and other.exists()
     old.touch()  # drawn from the inputs of now
     record = draw._drop_stale(plan, root, plan.inputs(root))
-    assert old.exists() and record == read_made(root)
+    assert old.exists() and record == read_record(root)
 
 
 def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
@@ -170,7 +170,8 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
     whole = make.make_paper(plan, root)
     assert whole.made == ("other",) and whole.complete and not whole.drawn
     assert (
-        set(read_made(root)["cpu"]["steps"]) == {"other", "design"} and "CPU time" in (root / "report.html").read_text()
+        set(read_record(root)["cpu"]["steps"]) == {"other", "design"}
+        and "CPU time" in (root / "report.html").read_text()
     )
     found, claims = datasets(root / "design" / "design.h5"), (root / "claims.json").read_bytes()
     picture = next((root / "figures").glob("*.png"))
@@ -235,7 +236,7 @@ def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_p
     made = make.make_paper(plan, root)
     assert ordered[0] == "figS3-design-cost-maps" and len(ordered) == 6  # the dearest first
     assert sorted(offered) == ["fig10", "figS3"] and len(encoded) == 6 and len(made.drawn) == 18
-    cpu = read_made(root)["cpu"]
+    cpu = read_record(root)["cpu"]
     assert min(cpu["steps"]["design"], cpu["figures"], cpu["report"]) > 0
     offered.clear()
     encoded.clear()
@@ -249,7 +250,7 @@ def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_p
 
 def test_parts_of_all_steps_are_shared_the_longest_first(tmp_path, monkeypatch):
     shared: list[tuple[float, str, int]] = []
-    monkeypatch.setattr(steps.TaskPool, "share", lambda pool, jobs, *rest, **options: shared.extend(jobs) or {})
+    monkeypatch.setattr(steps.TaskPool, "run", lambda pool, jobs, *rest, **options: shared.extend(jobs) or {})
     plan = paper_plan(FULL)
     parted = [step.name for step in plan.steps if step.parts]
     plan = replace(plan, steps=[step for step in plan.steps if step.parts], figures=[], measure=lambda root: [])

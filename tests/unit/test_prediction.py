@@ -13,7 +13,7 @@ from vipetsc.dynamics import simulate
 from vipetsc.io.records import read_records
 from vipetsc.io.store import RunMemory
 from vipetsc.studies.composition import Network
-from vipetsc.studies.prediction import LINEAR, SITE, Study, amplitudes_of, composed, predict, site_points
+from vipetsc.studies.prediction import LINEAR, SITE, PredictionRuns, amplitudes_of, composed, predict, site_points
 from vipetsc.studies.response import BINS, SiteResponse, in_contact
 
 SMALL = {
@@ -143,7 +143,7 @@ def test_runs_that_are_there_are_not_made_again(made, tmp_path, monkeypatch):
     folder, case, data = made
     (tmp_path / "prediction-runs.jsonl").write_bytes((folder / "prediction-runs.jsonl").read_bytes())
     (tmp_path / "case.toml").write_text(case.to_toml())
-    monkeypatch.setattr(Study, "_run", lambda *_: pytest.fail("a run was made"))
+    monkeypatch.setattr(PredictionRuns, "_run", lambda *_: pytest.fail("a run was made"))
     again = predict(case, tmp_path)
     for name in ("predicted/bands", "simulated/bands"):
         np.testing.assert_array_equal(again[name], data[name])

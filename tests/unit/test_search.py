@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipetsc.lattice import BlochPoint, bloch, four_band
-from vipetsc.lattice.cell_search import COSTS, search_cells, signed_deflection
+from vipetsc.paper.cell_costs import COSTS, search_cells, signed_deflection
 
 KAPPA = np.linspace(0, np.pi, 41)
 GRID = np.round(np.linspace(0.1, 1.0, 37), 12)

@@ -12,7 +12,7 @@ from vipetsc.io.folder import FolderError
 from vipetsc.io.netcdf import tabulated
 from vipetsc.io.records import RecordFile
 from vipetsc.studies.backbone import BRANCH, FEWEST, LAYOUT, align, initiation_of, read_slope, relate_folders
-from vipetsc.studies.linear import LinearRun, linear_name
+from vipetsc.studies.linear_run import LinearRun, linear_name
 
 GRAZING = 0.03
 EXPONENT = -0.9

@@ -14,7 +14,7 @@ from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice.chain import Pair
 from vipetsc.studies.analysis import FULL, analyse
-from vipetsc.studies.velocity import VelocityRecord
+from vipetsc.studies.velocity_record import VelocityRecord
 
 TWO_DRIVES = {"more": [{"amplitude": 1.0, "frequency": 1500.0, "cycles": 6, "cell": 2}]}
 

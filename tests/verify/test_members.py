@@ -14,10 +14,10 @@ from vipetsc.case import Case, Sweep
 from vipetsc.io.read import open_ensemble
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.ensemble import COMPLETE, SCALED
-from vipetsc.studies.linear import linear_case, linear_name
-from vipetsc.studies.members import MemberStore
+from vipetsc.studies.linear_run import linear_case, linear_name
 from vipetsc.studies.reanalysis import reanalyse_folders
 from vipetsc.studies.sweep import run_sweep
+from vipetsc.studies.sweep_runs import MemberStore
 
 TABLE = {
     "name": "margin",

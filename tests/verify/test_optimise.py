@@ -15,8 +15,8 @@ from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import gaps, pass_bands
-from vipetsc.studies import optimise
-from vipetsc.studies.linear import LinearRun, linear_case
+from vipetsc.studies import optimum_search
+from vipetsc.studies.linear_run import LinearRun, linear_case
 from vipetsc.studies.objective import measured
 
 SEARCH = {"budget": 30, "curve": [12.0], "variables": {"clearance": [3e-5, 3e-3]}}
@@ -72,7 +72,7 @@ def test_what_is_beyond_the_last_site_is_what_came_through(drive):
 
 def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
     plan = OptimiseCase.from_table(TABLE)
-    optimise.run_search(plan, tmp_path)
+    optimum_search.run_search(plan, tmp_path)
     found = datasets(tmp_path / "optimum.h5")
     value, best = found["value"][:, 0], int(found["comparison/number"][1])
     assert len(value) == 30 and np.isfinite(value).all() and best == np.argmax(value)
@@ -94,11 +94,11 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
             return 1.25, 0.64
 
     asked = []
-    monkeypatch.setattr(optimise, "make_law", lambda *given, **options: asked.append(given) or Law())
+    monkeypatch.setattr(optimum_search, "make_law", lambda *given, **options: asked.append(given) or Law())
     table = copy.deepcopy(TABLE)
     table["optimise"] |= {"start": "matched", "budget": 2}
     table["contacts"]["sites"] = [12, 6, 13]
-    optimise.run_search(OptimiseCase.from_table(table), tmp_path)
+    optimum_search.run_search(OptimiseCase.from_table(table), tmp_path)
     ((law, folder, _),) = asked
     assert law.drive.amplitude == 24.33 and folder == tmp_path / "law"
     memory = RunMemory()

@@ -199,12 +199,12 @@ def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
 def design(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """The (lambda, eta) search of the four-band cell: ``design.h5``, its pictures, a table of the optima."""
-    from vipetsc.studies.design import search_design
+    from vipetsc.paper.cell_search import search_design
 
     case = _load(DesignCase, options, comm)
     folder = _output(options, case.name)
     with locked(comm, folder):
-        echo(comm, on_root(comm, lambda: search_design(case, folder, options.force, options.resume)))
+        echo(comm, search_design(case, folder, comm, force=options.force, resume=options.resume))
         echo_paths(comm, draw_source("design", [folder], comm, afresh=False))
     return DONE
 
@@ -228,7 +228,7 @@ def law(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 def optimise(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """The best clearances, sites, restitution or cell for an objective: ``optimum.h5``, ``best.toml``, pictures."""
     from vipetsc.dynamics.options import check_options
-    from vipetsc.studies.optimise import run_search
+    from vipetsc.studies.optimum_search import run_search
 
     plan = _load(OptimiseCase, options, comm)
     on_root(comm, lambda: check_options(plan.base))

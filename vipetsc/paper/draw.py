@@ -9,7 +9,7 @@ from mpi4py import MPI
 from vipetsc.figures import style
 from vipetsc.figures.style import Drawing, draw_each
 from vipetsc.figures.sweep_members import Files
-from vipetsc.paper.made import FORMATS, Made, is_drawn, read_made, write_made
+from vipetsc.paper.build_record import FORMATS, BuildRecord, is_drawn, read_record, write_record
 from vipetsc.paper.plan import Plan
 from vipetsc.parallel import SharedCounter, StopRequest, on_every_rank, on_root
 
@@ -43,7 +43,7 @@ def draw_paper(
     if drawn:
         every = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
         record["cpu"]["figures"] = spent + (0.0 if every else record["cpu"]["figures"])
-    on_root(comm, lambda: write_made(root, record))
+    on_root(comm, lambda: write_record(root, record))
     return tuple(drawn)
 
 
@@ -63,19 +63,19 @@ def _draw_shared(drawings: Sequence[Drawing], root: Path, comm: MPI.Comm, stop: 
     return sorted(path for paths in comm.allgather(mine) for path in paths)
 
 
-def _is_complete(key: str, record: Made, root: Path) -> bool:
+def _is_complete(key: str, record: BuildRecord, root: Path) -> bool:
     """Whether a figure's pictures are there, all of them."""
     stems = record["figures"][key]["pictures"]
     return bool(stems) and all(is_drawn(root, stem) for stem in stems)
 
 
-def _drop_stale(plan: Plan, root: Path, inputs: Mapping[str, str]) -> Made:
+def _drop_stale(plan: Plan, root: Path, inputs: Mapping[str, str]) -> BuildRecord:
     """Remove pictures of other ``inputs``, so that every picture that is there is up to date."""
-    record = read_made(root)
+    record = read_record(root)
     for figure in plan.figures:
         if record["figures"].get(figure.id, {}).get("inputs") != inputs[figure.id]:
             for path in (root / "figures").glob(f"{figure.id}-*"):
                 path.unlink()
             record["figures"][figure.id] = {"inputs": inputs[figure.id], "pictures": []}
-    write_made(root, record)
+    write_record(root, record)
     return record

@@ -16,10 +16,10 @@ from typing import Any
 from mpi4py import MPI
 
 from vipetsc.io.folder import PAPER, Claim, claimed, provenance
+from vipetsc.paper.build_record import FORMATS, is_whole, read_record, write_record
 from vipetsc.paper.claims import write_claims
 from vipetsc.paper.draw import draw_paper
-from vipetsc.paper.figures import RELATED, TRANSFER
-from vipetsc.paper.made import FORMATS, is_whole, read_made, write_made
+from vipetsc.paper.paper_figures import RELATED, TRANSFER
 from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, fingerprint, read_json
 from vipetsc.paper.report import write_report
 from vipetsc.paper.steps import duration, make_steps, noted
@@ -111,7 +111,7 @@ def _relate(folders: Mapping[str, Path]) -> None:
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell, inputs: str) -> list[dict[str, Any]]:
     """``claims.json`` and ``report.html`` as far as their ``inputs`` changed; returns the claims."""
-    record, begin = read_made(root), time.process_time()
+    record, begin = read_record(root), time.process_time()
     path, report = root / "claims.json", root / "report.html"
     if read_json(path) is None or record.get("claims") != inputs:
         tell("claims")
@@ -133,7 +133,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell, inputs: str) -
         statistics = {step.name: step.statistics(root) for step in plan.steps if step.state(root) == DONE}
         write_report(report, plan.note, json.loads(text), pictures, statistics, about, cpu)
         record["report"], record["cpu"]["report"] = inputs, time.process_time() - begin
-    write_made(root, record)
+    write_record(root, record)
     return json.loads(text)
 
 
@@ -146,7 +146,7 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
         lines.append(f"{step.name:<26}{step.state(root):<10}{duration(left):>9}  {' '.join(plan.claims_of(step))}")
     lines += [f"{'all steps on ' + str(ranks) + (' ranks' if ranks > 1 else ' rank'):<36}{duration(total):>9}", ""]
     lines.append(f"{'figure':<8}{'paper':<9}{'pictures':<10}{'state':<9}claims      shows")
-    record, inputs = read_made(root)["figures"], plan.inputs(root)
+    record, inputs = read_record(root)["figures"], plan.inputs(root)
     for figure in plan.figures:
         unrecorded = {path.stem for path in (root / "figures").glob(f"{figure.id}-*")}
         entry = record.get(figure.id, {"inputs": "", "pictures": unrecorded})

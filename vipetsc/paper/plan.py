@@ -27,11 +27,11 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, outdated
 from vipetsc.modes.branches.follow import Follower, claim_branches
 from vipetsc.modes.system import System
+from vipetsc.paper.cell_search import search_design
 from vipetsc.paper.claims import measure_claims
 from vipetsc.paper.claims.criteria import CLAIMS
-from vipetsc.paper.figures import PAPER_FIGURES, RELATED, PaperFigure
+from vipetsc.paper.paper_figures import PAPER_FIGURES, RELATED, PaperFigure
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.design import search_design
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, Results
 from vipetsc.studies.prediction import predict
@@ -62,7 +62,7 @@ class Claimed(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Step:
+class PaperStep:
     """One case made in ``root/<name>``: a sweep, branches or a search.
 
     ``kind`` of case and its ``file``, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time
@@ -118,7 +118,7 @@ class Step:
                 yield Claimed(lambda mode: follower().follow(mode - 1), claim.publish)
         else:
             assert isinstance(case, DesignCase)
-            yield Claimed(lambda part: search_design(case, folder, afresh))
+            yield Claimed(lambda part: search_design(case, folder, MPI.COMM_SELF, force=afresh))
 
     def sweep(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
         """Make what is missing of a sweep or prediction on all ranks, all if ``afresh``; may leave early on ``stop``.
@@ -194,7 +194,7 @@ class Plan:
     """
 
     grid: str
-    steps: tuple[Step, ...]
+    steps: tuple[PaperStep, ...]
     figures: Sequence[PaperFigure] = PAPER_FIGURES
     note: str = ""
     measure: Callable[[Path], Sequence[Mapping[str, Any]]] = measure_claims
@@ -223,7 +223,7 @@ class Plan:
         """The folders of the steps that are done, by name."""
         return {step.name: step.folder(root) for step in self.steps if step.state(root) == DONE}
 
-    def claims_of(self, step: Step) -> list[str]:
+    def claims_of(self, step: PaperStep) -> list[str]:
         """The claims that rest on a step."""
         claims = {claim for figure in self.figures if step.name in figure.steps for claim in figure.claims}
         claims |= {claim for claim, steps in FURTHER_STEPS.items() if step.name in steps}
@@ -250,7 +250,9 @@ def paper_plan(grid: str = FULL) -> Plan:
         changes = [*row.get("changes", ()), *(row.get("quick", ()) if grid == QUICK else ())]
         if row["kind"] == "sweep":  # the figures of the paper are drawn from all sweeps together
             changes.insert(0, "output.figures=false")
-        steps.append(Step(name, KINDS[row["kind"]], file, tuple(changes), row["cost"], sample=row.get("sample", 0)))
+        steps.append(
+            PaperStep(name, KINDS[row["kind"]], file, tuple(changes), row["cost"], sample=row.get("sample", 0))
+        )
     steps += [replace(s, name=f"{s.name}-ts", cost=TS_COST, checks=s.name) for s in steps if s.sample]
     return Plan(grid, tuple(steps), note=COARSE if grid == QUICK else "")
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
-from vipetsc.paper.figures import READINGS, PaperFigure, describe
+from vipetsc.paper.paper_figures import READINGS, PaperFigure, describe
 from vipetsc.studies.engines import COMPARED
 
 COLOURS = 256  # of a picture of lines in the page

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from vipetsc.paper.made import read_made, write_made
-from vipetsc.paper.plan import STALE, Plan, Step
+from vipetsc.paper.build_record import read_record, write_record
+from vipetsc.paper.plan import STALE, PaperStep, Plan
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.pool import FULL, TaskPool
 
@@ -63,7 +63,7 @@ def make_steps(
 
 
 def _make_parts(
-    steps: Sequence[Step], stale: Collection[str], root: Path, comm: MPI.Comm, stop: StopRequest, notes: list[str]
+    steps: Sequence[PaperStep], stale: Collection[str], root: Path, comm: MPI.Comm, stop: StopRequest, notes: list[str]
 ) -> list[str]:
     """Share all parts of ``steps`` over the ranks, the longest first; returns the steps without failures."""
     cpu = dict[str, float]()
@@ -82,7 +82,7 @@ def _make_parts(
 
         pool = TaskPool(comm, MPI.COMM_SELF, stop)
         reasons: dict[str, str] = {}
-        pool.share(sorted(jobs, reverse=True), work, fail=lambda job, reason: reasons.update({job[1]: reason}))
+        pool.run(sorted(jobs, reverse=True), work, fail=lambda job, reason: reasons.update({job[1]: reason}))
         failed = {name: reason for share in comm.allgather(reasons) for name, reason in share.items()}
         notes += [f"failed: {name}: {reason}" for name, reason in failed.items()]
         made = [name for name in begun if name not in failed]
@@ -100,10 +100,10 @@ def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: boo
         spent.update(share)
 
     def write() -> None:
-        record = read_made(root)
+        record = read_record(root)
         before = {} if afresh else record["cpu"]["steps"]
         record["cpu"]["steps"] |= {name: before.get(name, 0.0) + seconds for name, seconds in spent.items()}
-        write_made(root, record)
+        write_record(root, record)
 
     on_root(comm, write)
 

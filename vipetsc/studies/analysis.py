@@ -21,9 +21,9 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import cells_between
-from vipetsc.studies.bands import BANDS, band_energies
-from vipetsc.studies.modal import MODAL, modal_energies
-from vipetsc.studies.velocity import VelocityRecord, options_of
+from vipetsc.studies.band_measures import BANDS, band_energies
+from vipetsc.studies.modal_measures import MODAL, modal_energies
+from vipetsc.studies.velocity_record import VelocityRecord, options_of
 
 FORMAT_VERSION = 3
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
@@ -94,7 +94,7 @@ def analyse(
     about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
     about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}
     options = options or options_of(run)
-    about["analysis"] = told(options)
+    about["analysis"] = describe_options(options)
     if "velocity" not in run:
         return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
     record = VelocityRecord(run, options)
@@ -122,7 +122,7 @@ def analyse(
     return data
 
 
-def told(options: AnalysisTable) -> str:
+def describe_options(options: AnalysisTable) -> str:
     """The ``options`` that results depend on, as the attribute ``analysis`` of a file tells them."""
     return json.dumps(options.model_dump(exclude={"memory"}))
 

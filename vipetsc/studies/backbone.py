@@ -19,7 +19,7 @@ from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble
 from vipetsc.spectra import power_law
-from vipetsc.studies.linear import leading_cell, read_linear
+from vipetsc.studies.linear_run import leading_cell, read_linear
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots

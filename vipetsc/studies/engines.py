@@ -9,7 +9,7 @@ from vipetsc.case import Sweep
 from vipetsc.case.case_file import put
 from vipetsc.io.read import axes, open_ensemble, select
 from vipetsc.studies.ensemble import AMPLITUDE
-from vipetsc.studies.linear import FITTED
+from vipetsc.studies.linear_run import FITTED
 
 COMPARED = {name: 1e-3 for name in FITTED} | {"dissipated_fraction": 1e-3}
 """Measures that are compared, and by how much they may differ (1, bit) where the motion is not chaotic."""

@@ -17,8 +17,8 @@ from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
 from vipetsc.io.records import Line, Record, merge_records, read_records
 from vipetsc.spectra import FEWEST, doubt, normalised, power_law
-from vipetsc.studies.linear import FITTED, MEASURES, RECORDS, LinearRun, record_files
-from vipetsc.studies.samples import over_samples
+from vipetsc.studies.linear_run import FITTED, MEASURES, RECORDS, LinearRun, record_files
+from vipetsc.studies.sample_statistics import over_samples
 
 FORMAT_VERSION = 2
 STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached before a stop

@@ -16,12 +16,12 @@ from vipetsc.lattice import pass_bands
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.modal_energies import ModalParts
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.recorded import Key, RecordedRuns, run_in_memory
+from vipetsc.studies.recorded_runs import Key, RecordedRuns, run_in_memory
 
 ANALYSED = {"ibtet": ("bands", "ibtet"), "entropy": ("entropy", "entropy/energy_weighted")}  # of ``analyse``
 
 
-class Judge:
+class ObjectiveRuns:
     """Makes ``recorded`` runs of designs in ``folder`` on the ranks of ``comm``, and tells what they came to.
 
     The record of a run by the hash of its case: its ``values``, or why it failed (``reason``).

@@ -43,7 +43,7 @@ from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.directions import by_direction, wave_energies
-from vipetsc.studies.recorded import RecordedRuns, run_in_memory
+from vipetsc.studies.recorded_runs import RecordedRuns, run_in_memory
 from vipetsc.studies.scattering_law import FORWARD, LAYOUT, NEAR, OF_POINT, ScatteringLaw
 
 LINEAR = 0.0  # the z of the run without a site
@@ -73,7 +73,7 @@ def make_law(
     with claimed(comm, folder, LAW, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "law.h5"
         if not on_root(comm, path.exists):
-            runs = Runs(case, claim.folder, comm, stop)
+            runs = ScatteringRuns(case, claim.folder, comm, stop)
             grid = refine(runs, progress)
             runs.recorded.finish()
             on_root(comm, lambda: write_netcdf(path, runs.dataset(grid)))
@@ -81,7 +81,7 @@ def make_law(
         return on_root(comm, lambda: ScatteringLaw.read(claim.path / "law.h5"))
 
 
-class Runs:
+class ScatteringRuns:
     """The runs of a law, made by its ``recorded`` by z."""
 
     def __init__(self, case: LawCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
@@ -208,7 +208,7 @@ class Runs:
         }  # fmt: skip
 
 
-def refine(runs: Runs, progress: bool = False) -> dict[float, float]:
+def refine(runs: ScatteringRuns, progress: bool = False) -> dict[float, float]:
     """Make the points of the law: the distance of each from the line between the neighbours it came between (NaN)."""
     options = runs.case.law
     first = np.geomspace(1, options.largest, 1 + max(int(np.ceil(np.log(options.largest) / np.log(STEP))), 1)).tolist()

@@ -31,7 +31,7 @@ class TaskPool:
         self.comm, self.team, self.stop, self.failures = comm, team, stop, failures
         self.stopped, self.busy = False, 0.0
 
-    def share(
+    def run(
         self,
         jobs: Sequence[Job],
         work: Callable[[Job], None],

@@ -27,7 +27,7 @@ from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra import ModalParts
 from vipetsc.studies.composition import Network
 from vipetsc.studies.one_site import largest_between
-from vipetsc.studies.recorded import RecordedRuns, run_in_memory
+from vipetsc.studies.recorded_runs import RecordedRuns, run_in_memory
 from vipetsc.studies.response import Burst, SiteResponse
 
 RECORDS, PARTS = "prediction.jsonl", "prediction-*.jsonl"
@@ -72,7 +72,7 @@ def predict(
     with claimed(comm, folder, PREDICTION, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "prediction.h5"
         if not on_root(comm, path.exists):
-            study = Study(case, claim.folder, comm, stop or StopRequest(), progress)
+            study = PredictionRuns(case, claim.folder, comm, stop or StopRequest(), progress)
             linear = study.make([(LINEAR, 1.0)])[0]
             amplitudes = amplitudes_of(case, linear)
             largest = max(float(amplitudes[-1] * max(linear["reached"])), HIGH) * 1.01
@@ -111,7 +111,7 @@ def site_points(case: PredictCase, largest: float) -> list[float]:
     return [1 + z for z in NEAR] + np.unique(high).tolist()
 
 
-class Study:
+class PredictionRuns:
     """The runs of a prediction over the ranks of ``comm``, one rank a run, and their records in ``folder``.
 
     The one site's have ``largest`` as the largest z.

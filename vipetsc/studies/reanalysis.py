@@ -13,12 +13,12 @@ from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run, outdated
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
-from vipetsc.studies.analysis import FULL, analyse, told
+from vipetsc.studies.analysis import FULL, analyse, describe_options
 from vipetsc.studies.ensemble import MISSING, Results
-from vipetsc.studies.linear import PARTS, leading_cell, measured, read_linear
-from vipetsc.studies.members import keeps_all, measures_of
+from vipetsc.studies.linear_run import PARTS, leading_cell, measured, read_linear
 from vipetsc.studies.sweep import conclude
-from vipetsc.studies.velocity import options_of
+from vipetsc.studies.sweep_runs import keeps_all, measures_of
+from vipetsc.studies.velocity_record import options_of
 
 
 def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str] = ()) -> list[Path]:
@@ -98,7 +98,7 @@ def is_measured(folder: Path) -> bool:
     """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
     with open_run(folder / "run.h5") as run:
         expected = {key: run.attrs.get(key) for key in ("case", "status")} | {"vipetsc_version": vipetsc.__version__}
-        expected["analysis"] = told(options_of(run, folder))
+        expected["analysis"] = describe_options(options_of(run, folder))
         with suppress(OSError), open_netcdf(folder / "analysis.h5", "analysis") as analysis:  # it is there, and whole
             return all(analysis.attrs.get(key) == value for key, value in expected.items())
     return False

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.studies.linear import LinearRun
+from vipetsc.studies.linear_run import LinearRun
 
 FORWARD, BACKWARD = 0, 1
 LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency is judged

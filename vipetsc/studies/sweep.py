@@ -22,9 +22,9 @@ from vipetsc.io.folder import SWEEP, FolderError, claimed
 from vipetsc.io.read import outdated
 from vipetsc.parallel import Progress, StopRequest, on_root
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
-from vipetsc.studies.linear import LinearRun, leading_cell, linear_name
-from vipetsc.studies.members import MemberStore
+from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name
 from vipetsc.studies.pool import TaskPool
+from vipetsc.studies.sweep_runs import MemberStore
 
 MOST_SURVEYED = 10_000  # members whose cases are made beforehand, for their linear runs and what they will cost
 
@@ -106,12 +106,12 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
         return survey.needed, dict(survey.results.linear if len(survey.missing) else {})
 
     linear, store.linear = on_root(comm, look)
-    pool.share(list(linear), lambda name: store.make_linear(*linear[name]))
+    pool.run(list(linear), lambda name: store.make_linear(*linear[name]))
     for name, run in (item for known in comm.allgather(store.linear) for item in known.items()):
         store.linear[name] = run if isinstance(run, str) else run.joined(store.linear.get(name))
     order = on_root(comm, lambda: survey.order(store.linear))
     bar = Progress(comm, len(order), "runs", show=progress)
-    made = pool.share(order, store.make, bar, store.fail)
+    made = pool.run(order, store.make, bar, store.fail)
     store.file.close()
 
     seconds = time.perf_counter() - begin

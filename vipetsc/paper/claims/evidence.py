@@ -37,7 +37,7 @@ class Measurement:
     figure: str = ""
 
 
-class MeasuredRun:
+class AnalysedMember:
     """A member of a sweep whose fields were kept: its case, folder, ``analysis.h5`` and number of contacts.
 
     ``amplitude`` is that of the drive in N.
@@ -144,7 +144,7 @@ class Evidence(ExitStack):
             raise MissingEvidence(f"{step} holds no members over the amplitude")
         return members.isel({axis: 0 for axis in axes(members) if axis != "amplitude"}).sortby("amplitude")
 
-    def runs(self, step: str, reading: str, *needs: str, **wanted: Any) -> list[MeasuredRun]:
+    def runs(self, step: str, reading: str, *needs: str, **wanted: Any) -> list[AnalysedMember]:
         """The members of ``select`` with their analyses, which must hold ``needs``."""
         members = self.select(step, reading, **wanted)[["member", "contact_episodes"]]
         runs = []
@@ -154,5 +154,5 @@ class Evidence(ExitStack):
             if not (folder / "analysis.h5").exists():
                 raise MissingEvidence(f"{step}: the member at {member['amplitude']:g} N failed or is missing")
             analysis = self.open(step, folder.name, "analysis.h5", needs=needs)
-            runs.append(MeasuredRun(folder, analysis, int(member["contact_episodes"])))
+            runs.append(AnalysedMember(folder, analysis, int(member["contact_episodes"])))
         return runs

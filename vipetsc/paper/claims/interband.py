@@ -8,7 +8,7 @@ import numpy as np
 from vipetsc.io.read import select
 from vipetsc.lattice.modes import linear_modes
 from vipetsc.paper.claims.criteria import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
-from vipetsc.paper.claims.evidence import AmplitudeCurve, Evidence, MeasuredRun, Measurement, MissingEvidence
+from vipetsc.paper.claims.evidence import AmplitudeCurve, AnalysedMember, Evidence, Measurement, MissingEvidence
 
 STEP, AMPLITUDES, DESIGN, SCATTER = "interband", "interband-amplitudes", "design", "interband-scatter"
 FIELDS = 16  # random ones, for norms
@@ -133,7 +133,7 @@ def bands_sum(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.reasons.append(f"{text} by {100 * beat:.2g} % on the average in the worst run; {modal}")
 
 
-def modal_error(run: MeasuredRun) -> float:
+def modal_error(run: AnalysedMember) -> float:
     """Bound on how far the linear modes' energies miss kinetic and spring energy, relative to these, in any motion.
 
     With V the modes and A the stiffness over the masses (``lattice.modes``) it is the larger of the norms of V^T V - 1
@@ -149,7 +149,7 @@ def modal_error(run: MeasuredRun) -> float:
     return float(max(np.sqrt(np.sum(error**2) / FIELDS) for error in errors))
 
 
-def split_errors(run: MeasuredRun) -> dict[str, float]:
+def split_errors(run: AnalysedMember) -> dict[str, float]:
     """How the parts of one run (energies over time, by frequency filters) miss what they should add up to.
 
     The means over the record agree for any complete split without overlap (Parseval). Over a period of the drive they

@@ -68,7 +68,7 @@ class RecordedRuns:
                 failed.append(f"{key}: {reason}")
 
         pool = TaskPool(self.comm, self.team, self.stop, FAILURES)
-        pool.share(missing, one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
+        pool.run(missing, one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
         self.file.close()
         for more in self.comm.allgather(made):
             self.known |= more

@@ -11,22 +11,22 @@ MADE = "made.json"
 FORMATS = ("png", "pdf", "json")
 LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".json": b"]", ".html": b"</html>"}  # what such files end with
 
-Made = dict[str, Any]
+BuildRecord = dict[str, Any]
 """Hashes of inputs of "claims" and "report", of "figures" by id with the stems of their pictures.
 
 "cpu": CPU time in s of all ranks that "steps" by name, "figures", "claims" and "report" took.
 """
 
 
-def read_made(root: Path) -> Made:
+def read_record(root: Path) -> BuildRecord:
     """``made.json``, or an empty record, after which everything is made again."""
     cpu = {"steps": {}, "figures": 0.0, "claims": 0.0, "report": 0.0}
     return {"figures": {}, "cpu": cpu} | (read_json(root / MADE) or {})
 
 
-def write_made(root: Path, record: Made) -> None:
+def write_record(root: Path, record: BuildRecord) -> None:
     """Write ``made.json`` if it holds another record."""
-    if record != read_made(root):
+    if record != read_record(root):
         write_text(root / MADE, json.dumps(record, indent=1) + "\n")
 
 

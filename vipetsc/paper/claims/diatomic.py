@@ -4,7 +4,7 @@ import numpy as np
 
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.paper.claims.criteria import BESIDE, NATIVE
-from vipetsc.paper.claims.evidence import EXCITED, Evidence, MeasuredRun, Measurement, MissingEvidence
+from vipetsc.paper.claims.evidence import EXCITED, AnalysedMember, Evidence, Measurement, MissingEvidence
 from vipetsc.spectra import Dispersion, ridge
 
 BRANCHES = f"share within {100 * BESIDE:g} % of the top edge from the Bloch branches"
@@ -34,7 +34,7 @@ class AmplitudeTriple:
         self.lobe = 2 * drive.frequency / (drive.cycles * self.speed)
         self.duration, self.distance = drive.duration, int(np.min(np.abs(sites - model.drive_cell)))
 
-    def new_share(self, run: MeasuredRun) -> tuple[float, float]:
+    def new_share(self, run: AnalysedMember) -> tuple[float, float]:
         """Share of the kinetic energy outside the main lobe, and its deviation over time.
 
         From when the middle of the burst passes the first site.
@@ -109,7 +109,7 @@ def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> No
     triple.explain_medium(result)
 
 
-def _branch_share(run: MeasuredRun) -> float:
+def _branch_share(run: AnalysedMember) -> float:
     """Share of the 2-D spectrum's energy within ``BESIDE`` times the top edge of a branch."""
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
     cell = run.case.lattice.unit_cell()
@@ -135,7 +135,7 @@ def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
         result.reasons.append(f"{triple.high.amplitude:g} N is {ratio:.3g} times first contact")
 
 
-def _reflected_share(triple: AmplitudeTriple, run: MeasuredRun) -> tuple[float, float]:
+def _reflected_share(triple: AmplitudeTriple, run: AnalysedMember) -> tuple[float, float]:
     """Kinetic energy before the first site over the incident, when the reflected packet is half-way back to the drive.
 
     The mean and the deviation over half a burst's length about that time: the incident packet has passed then, and the

@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc import spectra
 from vipetsc.lattice import pass_bands
-from vipetsc.studies.velocity import VelocityRecord
+from vipetsc.studies.velocity_record import VelocityRecord
 
 ENDS = 0.02  # share of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 

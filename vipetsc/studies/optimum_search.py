@@ -22,10 +22,10 @@ from vipetsc.io.folder import OPTIMUM, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import Progress, StopRequest, on_root
-from vipetsc.studies.linear import LinearRun, linear_case
-from vipetsc.studies.objective import Judge
+from vipetsc.studies.linear_run import LinearRun, linear_case
+from vipetsc.studies.objective import ObjectiveRuns
 from vipetsc.studies.one_site import make_law
-from vipetsc.studies.recorded import run_in_memory
+from vipetsc.studies.recorded_runs import run_in_memory
 from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, front, knee, smooth
 from vipetsc.studies.scattering_law import matched_clearances
 from vipetsc.studies.sweep import is_whole
@@ -76,10 +76,10 @@ class Design:
     losses: list[float] = field(default_factory=list)
 
 
-class Search:
+class OptimumSearch:
     """The ``designs`` tried so far, on one rank; 0 is the case to begin with, 1 the start if that differs."""
 
-    def __init__(self, plan: OptimiseCase, judge: Judge, sampler: Sampler, start: np.ndarray) -> None:
+    def __init__(self, plan: OptimiseCase, judge: ObjectiveRuns, sampler: Sampler, start: np.ndarray) -> None:
         self.plan, self.judge, self.sampler = plan, judge, sampler
         self.designs = [Design(plan.begin(), 0, plan.base, [*judge.runs(plan.base).values()])]
         other = self._design(start, 0)
@@ -97,8 +97,8 @@ class Search:
         """Those of the designs that are not judged yet."""
         return [run for design in self.asked for run in design.runs]
 
-    def go_on(self) -> bool:
-        """Judge the designs whose runs were made, tell the sampler, and ask for more; whether there are any."""
+    def tell_and_ask(self) -> bool:
+        """ObjectiveRuns the designs whose runs were made, tell the sampler, and ask for more; whether there are any."""
         for design in self.asked:
             design.losses = [np.nan] * len(self.plan.options.objective)
             if design.case:
@@ -164,18 +164,18 @@ def run_search(
 
 def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> None:
     """Try designs until the budget is spent, compare the best with the case, and write what was found."""
-    judge = Judge(plan, folder, comm, stop)
+    judge = ObjectiveRuns(plan, folder, comm, stop)
     bar = Progress(comm, plan.options.budget, "designs", show=progress)
 
-    searches: list[Search] = []  # on rank 0
+    searches: list[OptimumSearch] = []  # on rank 0
 
     try:
         start = _start(plan, folder, comm, stop)
-        on_root(comm, lambda: searches.append(Search(plan, judge, _sampler(plan, start), start)))
+        on_root(comm, lambda: searches.append(OptimumSearch(plan, judge, _sampler(plan, start), start)))
         more = True
         while more:
             judge.make(on_root(comm, lambda: searches[0].runs()))
-            more = on_root(comm, lambda: searches[0].go_on())
+            more = on_root(comm, lambda: searches[0].tell_and_ask())
             bar.update(sum(len(search.designs) for search in searches))
         judge.make(on_root(comm, lambda: [run for row in _curves(searches[0]).values() for run in row]))
         judge.recorded.finish()
@@ -215,7 +215,7 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
     return CmaEs(point, steps, directions, options.step, options.seed, options.population)
 
 
-def _curves(search: Search) -> dict[str, list[Case]]:
+def _curves(search: OptimumSearch) -> dict[str, list[Case]]:
     """The runs of the compared designs over the amplitude."""
     options = search.plan.options
     asked = [a for o in options.objective for a in o.amplitudes or [search.judge.amplitude]]
@@ -228,7 +228,7 @@ def _curves(search: Search) -> dict[str, list[Case]]:
     }
 
 
-def _write(search: Search, folder: Path) -> None:
+def _write(search: OptimumSearch, folder: Path) -> None:
     """The best cases, then ``optimum.h5``."""
     sys.audit("vipetsc.conclude", str(folder))
     plan, designs, judge = search.plan, search.designs, search.judge

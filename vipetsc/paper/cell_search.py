@@ -17,13 +17,16 @@ from vipetsc.io.folder import SEARCH, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band
-from vipetsc.lattice.cell_search import COSTS, CellSearch, search_cells, signed_deflection, unit_vectors
+from vipetsc.paper.cell_costs import COSTS, CellSearch, search_cells, signed_deflection, unit_vectors
+from vipetsc.parallel import StopRequest, on_root
 
 logger = logging.getLogger(__name__)
-PAPER = 0.1, 0.5  # the (lambda, eta) that the paper takes
+PAPER = (0.1, 0.5)  # the (lambda, eta) that the paper takes
 UNITS = {"deflection": "1", "group_velocity": "cells/s", "weighted": "cells/s"}
-GRID, OPTIMUM = "reading lambda eta", "reading cost"
-BEST = "optimum_lambda", "optimum_eta", "optimum_value"
+BEST = ("optimum_lambda", "optimum_eta", "optimum_value")
+# Dimensions of what is known of every cell of the grid, and of every cost's best cell.
+GRID = "reading lambda eta"
+OPTIMUM = "reading cost"
 
 # Dimensions, units and description of every variable.
 LAYOUT = {
@@ -50,30 +53,43 @@ LAYOUT = {
 }
 
 
-def search_design(case: DesignCase, folder: str | Path, force: bool = False, resume: bool = False) -> str:
+def search_design(
+    case: DesignCase,
+    folder: str | Path,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    *,
+    force: bool = False,
+    resume: bool = False,
+    stop: StopRequest | None = None,
+    progress: bool = False,
+) -> str:
     """Search the grid of ``case`` in each of its readings; writes ``design.h5``, returns a table of the optima.
 
-    Call it on one rank. A search of the same case that is in ``folder`` is not made again unless ``force`` replaces
-    it; ``resume`` needs one. Raises FolderError if the folder holds anything else.
+    All ranks of ``comm`` must call it; rank 0 searches. That takes seconds, so ``stop`` and ``progress``, which every
+    study takes, are not asked. A search of the same case that is in ``folder`` is kept unless ``force`` replaces it;
+    ``resume`` needs one. Raises FolderError if the folder holds anything else.
     """
-    with claimed(MPI.COMM_SELF, folder, SEARCH, case.to_toml(), force=force, resume=resume) as claim:
-        path = claim.folder / "design.h5"
-        if not _is_search(path):
-            write_netcdf(path, _search(case))
+    with claimed(comm, folder, SEARCH, case.to_toml(), force=force, resume=resume) as claim:
+        on_root(comm, lambda: _make_search(case, claim.folder / "design.h5"))
         claim.publish()
-        with open_netcdf(claim.path / "design.h5", "search", BEST) as data:
-            return _table(data)
+
+        def summary() -> str:
+            with open_netcdf(claim.path / "design.h5", "search", BEST) as data:
+                return _table(data)
+
+        return on_root(comm, summary)
 
 
-def _is_search(path: Path) -> bool:
-    """Whether a search is there; one that cannot be read is named."""
+def _make_search(case: DesignCase, path: Path) -> None:
+    """Write the search of ``case`` to ``path`` unless it is there; names a file that cannot be read."""
     try:
         with open_netcdf(path, "search", BEST):
-            return True
+            return
     except (OSError, ValueError) as error:
         if path.exists():
             logger.warning("vipetsc: warning: %s; made again", error)
-        return False
+
+    write_netcdf(path, _search(case))
 
 
 def _search(case: DesignCase) -> xr.Dataset:
@@ -81,39 +97,64 @@ def _search(case: DesignCase) -> xr.Dataset:
     options = case.design
     sys.audit("vipetsc.set-up", case.name)
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
-    lam, eta = options.lam.values(), options.eta.values()
-    searches = {reading: search_cells(reading, lam, eta, wavenumber) for reading in options.readings}
-    results = list(searches.values())
+    grids: dict[Reading, CellSearch] = {}
+    for reading in options.readings:
+        grids[reading] = search_cells(reading, options.lam.values(), options.eta.values(), wavenumber)
+    results = list(grids.values())
+
     bands = np.arange(1, results[0].frequency.shape[-1] + 1)
-    values: dict[str, Any] = {"reading": list(searches), "lambda": results[0].lam, "eta": results[0].eta}
-    values |= {"cost": list(COSTS), "wavenumber": wavenumber, "band": bands, "dof": bands}
+    values: dict[str, Any] = {
+        "reading": list(grids),
+        "lambda": results[0].lam,
+        "eta": results[0].eta,
+        "cost": list(COSTS),
+        "wavenumber": wavenumber,
+        "band": bands,
+        "dof": bands,
+        "out_of_phase": np.stack([result.out_of_phase for result in results]).astype(np.int8),
+    }
     for name in ("frequency", "signed_deflection", "speed"):
         values[name] = np.stack([getattr(result, name) for result in results])
-    values["out_of_phase"] = np.stack([result.out_of_phase for result in results]).astype(np.int8)
-    values |= {name: np.stack([result.cost(name) for result in results]) for name in COSTS}
-    values |= _optima(searches, values)
-    paper = (search_cells(reading, *PAPER, wavenumber) for reading in options.readings)
-    values["paper_value"] = np.array([[result.cost(name).item() for name in COSTS] for result in paper])
+    for name in COSTS:
+        values[name] = np.stack([result.cost(name) for result in results])
+
+    values |= _optima(grids, values)
+    values["paper_value"] = np.array([_paper_costs(reading, wavenumber) for reading in options.readings])
     about = provenance(MPI.COMM_SELF) | {"case": case.to_toml()}
     if options.eta.last == 1:
         about["left_out"] = "eta = 1: the host mass m (1 - eta) vanishes"
     return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
 
 
-def _optima(searches: Mapping[Reading, CellSearch], grids: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Where each cost is largest, and the Bloch vectors there; NaN in a reading in which no cell is out of phase."""
-    dims = {name: dims.split() for name, (dims, *_) in LAYOUT.items() if name.startswith("optimum_")}
-    optima = {name: np.full([len(grids[dim]) for dim in dims[name]], np.nan) for name in dims}
-    for i, (reading, result) in enumerate(searches.items()):
-        for j, name in enumerate(COSTS):
-            best = result.optimum(name)
-            if best is not None:
-                lam, eta = result.lam[best[0]], result.eta[best[1]]
-                cell = four_band(reading, lam, eta)
-                point = bloch(cell, result.wavenumber)
-                waves = np.abs(unit_vectors(point)), signed_deflection(cell, point)
-                for array, value in zip(optima.values(), (lam, eta, result.cost(name)[best], *waves), strict=True):
-                    array[i, j] = value
+def _paper_costs(reading: Reading, wavenumber: np.ndarray) -> list[float]:
+    """The costs (cost) of the cell that the paper takes."""
+    cell = search_cells(reading, *PAPER, wavenumber)
+    return [cell.cost(name).item() for name in COSTS]
+
+
+def _optima(grids: Mapping[Reading, CellSearch], values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Where each cost is largest, and the Bloch vectors there; NaN in a reading in which no cell is out of phase.
+
+    The sizes of the dimensions are those of the coordinates in ``values``.
+    """
+    optima: dict[str, np.ndarray] = {}
+    for name, (dims, *_) in LAYOUT.items():
+        if name.startswith("optimum_"):
+            optima[name] = np.full([len(values[dim]) for dim in dims.split()], np.nan)
+
+    for i, (reading, grid) in enumerate(grids.items()):
+        for j, cost in enumerate(COSTS):
+            best = grid.optimum(cost)
+            if best is None:
+                continue
+            lam, eta = grid.lam[best[0]], grid.eta[best[1]]
+            cell = four_band(reading, lam, eta)
+            waves = bloch(cell, grid.wavenumber)
+            optima["optimum_lambda"][i, j] = lam
+            optima["optimum_eta"][i, j] = eta
+            optima["optimum_value"][i, j] = grid.cost(cost)[best]
+            optima["optimum_amplitude"][i, j] = np.abs(unit_vectors(waves))
+            optima["optimum_deflection"][i, j] = signed_deflection(cell, waves)
     return optima
 
 
@@ -127,6 +168,8 @@ def _table(data: xr.Dataset) -> str:
     ]
     for (i, reading), (j, cost) in product(enumerate(data["reading"].values), enumerate(COSTS)):
         lam, eta, value, paper = (data[name].values[i, j] for name in (*BEST, "paper_value"))
-        optimum = "    none is out of phase   " if np.isnan(value) else f"{lam:8.4g}{eta:8.4g}{value:11.5g}"
+        optimum = f"{lam:8.4g}{eta:8.4g}{value:11.5g}"
+        if np.isnan(value):
+            optimum = "    none is out of phase   "
         lines.append(f"{reading:<12}{cost:<14}{optimum}{paper:14.5g}  {UNITS[cost]}")
     return "\n".join(lines)

@@ -24,8 +24,17 @@ from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
-from vipetsc.studies.linear import MARGIN, PARTS, LinearRun, factor, leading_cell, linear_case, linear_name, measured
-from vipetsc.studies.recorded import completed
+from vipetsc.studies.linear_run import (
+    MARGIN,
+    PARTS,
+    LinearRun,
+    factor,
+    leading_cell,
+    linear_case,
+    linear_name,
+    measured,
+)
+from vipetsc.studies.recorded_runs import completed
 
 FIELDS = "displacement", "velocity"
 # What ``analyse`` calls those of ``[sweep] measures``.

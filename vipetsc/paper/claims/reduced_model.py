@@ -11,7 +11,7 @@ from vipetsc.lattice import pass_bands, waves_at
 from vipetsc.modes.branches.branch import KINDS
 from vipetsc.modes.system import System
 from vipetsc.paper.claims.criteria import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_EXPONENT, SAME_MOTION
-from vipetsc.paper.claims.evidence import Evidence, MeasuredRun, Measurement, MissingEvidence
+from vipetsc.paper.claims.evidence import AnalysedMember, Evidence, Measurement, MissingEvidence
 from vipetsc.studies.backbone import BRANCH, log_slope
 
 INTERBAND, ONE_SITE = "interband", "interband-one-site"
@@ -150,7 +150,7 @@ def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
             result.reasons.append(text)
 
 
-def pair_motion(evidence: Evidence, run: MeasuredRun) -> tuple[np.ndarray, np.ndarray, float]:
+def pair_motion(evidence: Evidence, run: AnalysedMember) -> tuple[np.ndarray, np.ndarray, float]:
     """Velocities (t) in m/s of host and resonator at the only site of a run, and how much of their motion is fast.
 
     That is the share of the pair's kinetic energy at frequencies above the driven band, of the whole record under a

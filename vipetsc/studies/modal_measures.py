@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.spectra.modal_energies import ModalParts, cluster_samples
-from vipetsc.studies.velocity import VelocityRecord
+from vipetsc.studies.velocity_record import VelocityRecord
 
 MOST_BRACKETS = 1000  # samples around contacts; where there were more, clusters begin and end at every n-th alone
 

@@ -48,12 +48,14 @@ class CellSearch:
         """
         deflection = self.signed_deflection.max(axis=-1)
         speed = self.speed[..., DRIVEN - 1 :].sum(axis=-1)
-        return {"deflection": deflection, "group_velocity": speed, "weighted": speed * deflection}[name]
+        costs = {"deflection": deflection, "group_velocity": speed, "weighted": speed * deflection}
+        return costs[name]
 
     def optimum(self, name: str) -> tuple[int, int] | None:
         """Where (lambda, eta) the cost ``name`` is best, of the cells out of phase; None if there is no such cell."""
         if not self.out_of_phase.any():
             return None
+
         cost = np.where(self.out_of_phase, self.cost(name), -np.inf)
         row, column = np.unravel_index(np.argmax(cost), cost.shape)
         return int(row), int(column)
@@ -65,15 +67,27 @@ def search_cells(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: A
     Raises ValueError if a lambda is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
     """
     lams, etas, kappa = (np.atleast_1d(np.asarray(values, float)) for values in (lam, eta, wavenumber))
-    cells = []  # of each, what is kept of its Bloch waves
-    for of_lam, of_eta in itertools.product(lams, etas):
+    frequency = []
+    deflection = []
+    speed = []
+    for one_lam, one_eta in itertools.product(lams, etas):
         sys.audit("vipetsc.step")
-        cell = four_band(reading, of_lam, of_eta)
-        point = bloch(cell, kappa)
-        deflection = signed_deflection(cell, point)[:, DRIVEN - 1]
-        cells.append((point.frequency, deflection, np.abs(point.group_velocity).max(axis=0)))
-    fields = (np.reshape(values, (len(lams), len(etas), *values[0].shape)) for values in zip(*cells, strict=True))
-    return CellSearch(lams, etas, kappa, *fields)
+        cell = four_band(reading, one_lam, one_eta)
+        waves = bloch(cell, kappa)
+        # What the costs ask alone is kept: Bloch vectors of a fine grid would fill the memory.
+        frequency.append(waves.frequency)
+        deflection.append(signed_deflection(cell, waves)[:, DRIVEN - 1])
+        speed.append(np.abs(waves.group_velocity).max(axis=0))
+
+    grid = (len(lams), len(etas))
+    return CellSearch(
+        lam=lams,
+        eta=etas,
+        wavenumber=kappa,
+        frequency=np.reshape(frequency, (*grid, *frequency[0].shape)),
+        signed_deflection=np.reshape(deflection, (*grid, *deflection[0].shape)),
+        speed=np.reshape(speed, (*grid, *speed[0].shape)),
+    )
 
 
 def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
