@@ -1,0 +1,39 @@
+"""What the points of a branch file are: the attribute ``branch_kind`` of the file names it.
+
+Readers of all rooms ask `branch_kind`; the branch format of ``vipetsc.modes.branches`` writes the attribute. The module
+stands here because figures, which read branches, do not load PETSc.
+"""
+
+import xarray as xr
+
+ORBITS = "orbits"
+"""Periodic orbits by shooting: of a reduced system, or of a whole lattice."""
+
+CONDENSED = "condensed"
+"""Periodic motions by harmonic balance, the lattice condensed onto its contacts."""
+
+RESPONSES = "responses"
+"""Steady states under a harmonic drive (nonlinear frequency response)."""
+
+BRANCH_KINDS = (ORBITS, CONDENSED, RESPONSES)
+
+
+def branch_kind(branch: xr.Dataset) -> str:
+    """Return the kind of an open branch file, one of ``BRANCH_KINDS``; raise ValueError for any other.
+
+    Files written before the attribute existed are recognised by variables that only their kind has.
+    """
+    kind = branch.attrs.get("branch_kind")
+    if kind is None:
+        return _kind_by_variables(branch)
+    if kind not in BRANCH_KINDS:
+        raise ValueError(f"branch_kind = {kind!r} is none of {', '.join(BRANCH_KINDS)}: written by a later version?")
+    return str(kind)
+
+
+def _kind_by_variables(branch: xr.Dataset) -> str:
+    if "share" in branch:
+        return RESPONSES
+    if "harmonics" in branch and "states/number" in branch:
+        return CONDENSED
+    return ORBITS
