@@ -9,8 +9,8 @@ from matplotlib.image import imread
 from scipy.integrate import trapezoid
 
 from vipetsc.case import Case
-from vipetsc.figures.lattice import draw_lattice, draw_unit_cell
 from vipetsc.figures.registry import BRANCHES, draw, draw_bands, figure_names
+from vipetsc.figures.schematics import draw_lattice, draw_unit_cell
 from vipetsc.figures.style import SCREEN, new_figure, rc_style
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.spectra import kinetic_energy

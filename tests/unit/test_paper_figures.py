@@ -17,7 +17,7 @@ from matplotlib.image import imread
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vipetsc.case import Case
-from vipetsc.figures.lattice import lattice_page, reduced_model
+from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.style import NOTE, SCREEN, draw_each, new_figure, rc_style, save
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.paper_figures import PAPER_FIGURES, describe

@@ -13,17 +13,17 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.figures import (
-    breather,
-    design,
+    condensed_branches,
+    cost_maps,
     entropy,
-    lattice,
-    law,
+    law_panels,
     modal,
     nfrc,
-    optimise,
-    prediction,
+    optimum,
+    predicted_energies,
     runs,
     scattering,
+    schematics,
     transfer,
     transfer_curves,
 )
@@ -60,7 +60,7 @@ def _specs(source: str, *functions: Callable[..., Any], measure: str = "") -> di
 # The dearest of a run first, so that ranks which share the work finish together.
 FIGURES = {
     **_specs(RUN, modal.modal_energies),
-    **_specs(RUN, runs.spacetime, runs.dispersion, runs.phase, lattice.unit_cell, runs.impacts, runs.ledger),
+    **_specs(RUN, runs.spacetime, runs.dispersion, runs.phase, schematics.unit_cell, runs.impacts, runs.ledger),
     **_specs(SWEEP, scattering.amplitudes, scattering.wavelets, scattering.partition, measure="entropy"),
     **_specs(SWEEP, scattering.partition_explained, scattering.reconstruction, measure="entropy"),
     **_specs(SWEEP, entropy.entropy, entropy.entropy_all, measure="entropy"),
@@ -68,13 +68,13 @@ FIGURES = {
     **_specs(SWEEP, transfer.transfer, transfer.transfer_dispersions, transfer.band_energies, measure="transfer"),
     **_specs(SWEEP, transfer_curves.ibtet, transfer_curves.ibtet_backbone, measure="transfer"),
     **_specs(SWEEP, transfer_curves.phase_regimes, measure="transfer"),
-    "branch": FigureSpec(breather.branches, BRANCHES),
-    **_specs(DESIGN, design.deflections, design.cost_maps),
-    **_specs(LAW, law.law),
-    **_specs(PREDICTION, prediction.prediction),
-    **_specs(OPTIMUM, optimise.convergence, optimise.compared_designs, optimise.compared_curves),
-    "dispersion_against_lambda": FigureSpec(partial(design.dispersions, along="lambda", other="eta"), DESIGN),
-    "dispersion_against_eta": FigureSpec(partial(design.dispersions, along="eta", other="lambda"), DESIGN),
+    "branch": FigureSpec(condensed_branches.branches, BRANCHES),
+    **_specs(DESIGN, cost_maps.deflections, cost_maps.cost_maps),
+    **_specs(LAW, law_panels.law),
+    **_specs(PREDICTION, predicted_energies.prediction),
+    **_specs(OPTIMUM, optimum.convergence, optimum.compared_designs, optimum.compared_curves),
+    "dispersion_against_lambda": FigureSpec(partial(cost_maps.dispersions, along="lambda", other="eta"), DESIGN),
+    "dispersion_against_eta": FigureSpec(partial(cost_maps.dispersions, along="eta", other="lambda"), DESIGN),
 }
 
 

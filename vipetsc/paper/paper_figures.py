@@ -14,8 +14,8 @@ from pydantic import TypeAdapter
 
 from vipetsc.case import Case
 from vipetsc.case.schema import PRESETS
-from vipetsc.figures.lattice import lattice_page, reduced_model
 from vipetsc.figures.registry import FIGURES, drawings
+from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.sweep_members import Files
 
 READINGS = "calibrated", "printed"

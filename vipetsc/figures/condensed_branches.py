@@ -11,7 +11,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import style
-from vipetsc.figures.backbone import MARKS, backbone, line
+from vipetsc.figures.frequency_energy import MARKS, backbone, line
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import pass_bands
 
