@@ -99,8 +99,9 @@ def test_a_varied_case_is_that_of_a_run_with_other_values():
 
 def test_a_varied_case_is_resolved_again():
     case = Case.load()
-    nine = case.varied(contacts={"sites": 9, "clearance": None})
+    nine = case.varied(contacts={"sites": 9, "clearance": None}, time={"rtol": None})
     assert nine.contacts == Case.load(overrides=["contacts.sites=9"]).contacts
+    assert nine.time == case.time
     with pytest.raises(CaseError, match="outside the lattice"):
         case.varied(lattice={"cells": 10})
 
