@@ -308,10 +308,10 @@ def run_shortly(case: Case, seconds: float = 20, samples: int = 100) -> str:
     """
     if case.lattice.cells > 2000:
         return ""
-    table = tomllib.loads(case.to_toml())
-    table["time"]["end"] = min(table["time"]["end"], samples * case.model().sample_interval)
+    model = case.model()
     try:
-        result = simulate(Case.from_table(table), RunMemory(), stop=Deadline(seconds))
+        shortened = case.varied(time={"end": min(model.end, samples * model.sample_interval)})
+        result = simulate(shortened, RunMemory(), stop=Deadline(seconds))
     except CaseError:
         return ""
     except Exception as error:

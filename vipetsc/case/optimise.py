@@ -205,13 +205,13 @@ class OptimiseCase(CaseFile):
             table["lattice"] = with_cell(table["lattice"], cell, {"masses": masses, "springs": stiffness})
         return _case(table | {"contacts": contacts})
 
-    def run(self, design: Case, amplitude: float, lot: int | None = None) -> Case:
-        """A run of a ``design`` at ``amplitude`` in N, recorded whole, and with the scatter number ``lot``."""
-        table = design.model_dump(by_alias=True, exclude_none=True) | {"output": {}}
-        table["drive"] |= {"amplitude": float(amplitude)}
+    def run(self, design: Case, amplitude: float, sample: int | None = None) -> Case:
+        """A run of a ``design`` at ``amplitude`` in N, recorded whole, with the scatter number ``sample`` if given."""
+        changes = {"drive": {"amplitude": float(amplitude)}}
         disorder = self.table.get("disorder")
-        scatter = None if lot is None or disorder is None else disorder | {"seed": disorder.get("seed", 0) + lot}
-        return _case(table, scatter)
+        if sample is not None and disorder is not None:
+            changes["disorder"] = disorder | {"seed": disorder.get("seed", 0) + sample}
+        return design.varied(name="design", without=("output",), **changes)
 
 
 def _case(table: Table, disorder: Any = None) -> Case:

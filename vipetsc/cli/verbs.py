@@ -55,8 +55,8 @@ def _member(options: argparse.Namespace) -> Case:
     path = Path(options.case or "a sweep's case")
     plan = Sweep.load(path / "case.toml" if path.is_dir() else path)
     number = plan.number(options.member)
-    table = plan.case(number).model_dump(by_alias=True, exclude_none=True)
-    return Case.from_table(table | {"name": f"{plan.name}-{plan.ids()[number]}", "output": {}}, options.set)
+    name = f"{plan.name}-{plan.ids()[number]}"
+    return plan.case(number).varied(name=name, without=("output",), overrides=options.set)
 
 
 def _output(options: argparse.Namespace, name: str) -> Path:

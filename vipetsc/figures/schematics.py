@@ -55,10 +55,8 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
     left.set_title(f"(a) Unit cell, {case.lattice.reading} reading")
     band_diagram(right, case.lattice.unit_cell(), case.drive.frequency)
     right.set_title("(b) Bands; gaps shaded, drive dotted")
-    table = case.model_dump(by_alias=True, exclude_none=True, exclude={"contacts": {"clearance"}})
     for i, (axes, count) in enumerate(zip(lower.subplots(len(sites), 1, squeeze=False).flat, sites, strict=True)):
-        table["contacts"]["sites"] = count
-        model = Case.from_table(table).model()
+        model = case.varied(contacts={"sites": count, "clearance": None}).model()
         draw_lattice(axes, model.chain, model.drive_cell)
         axes.set_title(f"(c.{i + 1}) {counted(count, 'contact site')}{f'; {LEGEND}' if i == 0 else ''}")
     return figure

@@ -133,11 +133,13 @@ def linear_case(case: Case) -> Case:
     Unless it ``is_proportional``, the drives are those of the case. Contacts that join other masses than the cell's
     pair may be all that joins the cells: they stay.
     """
-    table = case.model_dump(by_alias=True, exclude_none=True)
-    table["contacts"] = table["contacts"] if _pairs(case) else {"sites": 0}
-    table["drive"]["amplitude"] = 1.0 if is_proportional(case) else case.drive.amplitude
-    table["output"] = {}
-    return Case.from_table(table | {"name": "linear"})
+    amplitude = 1.0 if is_proportional(case) else case.drive.amplitude
+    changes: dict[str, dict[str, Any]] = {"drive": {"amplitude": amplitude}}
+    without = ["output"]
+    if not _pairs(case):
+        changes["contacts"] = {"sites": 0}
+        without.append("contacts")
+    return case.varied(name="linear", without=without, **changes)
 
 
 def linear_name(case: Case) -> str:

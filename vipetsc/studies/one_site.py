@@ -36,7 +36,6 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicHermiteSpline
 
-from vipetsc.case import Case
 from vipetsc.case.law import LawCase
 from vipetsc.io.folder import LAW, claimed, provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
@@ -99,16 +98,16 @@ class ScatteringRuns:
 
     def _run(self, z: float, **output: Any) -> xr.Dataset:
         """A run in memory, without a site for z = 0."""
-        setting, table = self.setting, self.case.model_dump(by_alias=True, exclude_none=True)
-        del table["law"]
-        table["lattice"] |= {"cells": setting.cells, "ends": "periodic"}
-        table["drive"] |= {"cell": 1, "amplitude": self.amplitude(z) if z else 1.0}
-        table["contacts"] |= {"sites": [], "clearance": []}
-        if z:
-            table["contacts"] |= {"sites": [setting.site + 1], "clearance": [setting.clearance]}
-        table["time"]["end"] = setting.end
-        table["output"] = {"stride": setting.samples} | output
-        return run_in_memory(Case.from_table(table), self.recorded.team, self.recorded.stop)[0]
+        setting = self.setting
+        case = self.case.varied(
+            without=("output",),
+            lattice={"cells": setting.cells, "ends": "periodic"},
+            contacts={"sites": [setting.site + 1] if z else [], "clearance": [setting.clearance] if z else []},
+            drive={"cell": 1, "amplitude": self.amplitude(z) if z else 1.0},
+            time={"end": setting.end},
+            output={"stride": setting.samples} | output,
+        )
+        return run_in_memory(case, self.recorded.team, self.recorded.stop)[0]
 
     def amplitude(self, z: float) -> float:
         """Of the drive in N, for a largest linear relative displacement of ``z`` clearances."""

@@ -17,7 +17,6 @@ from mpi4py import MPI
 import numpy as np
 import xarray as xr
 
-from vipetsc.case import Case
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.folder import PREDICTION, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
@@ -133,12 +132,8 @@ class PredictionRuns:
 
     def _run(self, changes: dict[str, dict[str, Any]]) -> tuple[xr.Dataset, dict[str, Any]]:
         """A run in memory of the case with ``changes`` to its sections, and its statistics."""
-        table = self.case.model_dump(by_alias=True, exclude_none=True)
-        del table["law"], table["predict"]
-        table["output"] = {}
-        for section, keys in changes.items():
-            table[section] |= keys
-        data, result = run_in_memory(Case.from_table(table), self.recorded.team, self.recorded.stop)
+        varied = self.case.varied(name=self.case.name, without=("output",), **changes)
+        data, result = run_in_memory(varied, self.recorded.team, self.recorded.stop)
         return data, result.statistics
 
     def _moved(self, run: xr.Dataset, places: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
