@@ -1,4 +1,4 @@
-"""Stiffness, mass and contact Jacobian as shared matrices; linear modes near a frequency, on any number of ranks."""
+"""Stiffness and mass as shared matrices; linear modes near a frequency, on any number of ranks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vipetsc.dynamics.eigen import modes_near
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.matrices import LatticeMatrices
 from vipetsc.dynamics.ts.integrator import Integrator
-from vipetsc.lattice import Chain, Contact, Spring, UnitCell, four_band
+from vipetsc.lattice import Chain, Spring, UnitCell, four_band
 from vipetsc.lattice.modes import mode_frequency, mode_shape
 from vipetsc.studies.linear_modes import find_modes
 
@@ -58,40 +58,6 @@ def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells):
         # Exactly as many entries as were needed are there.
         assert matrices.stiffness.getInfo()["nz_unneeded"] == 0
         matrices.destroy()
-
-
-@pytest.mark.parallel([1, 2, 3])
-@pytest.mark.parametrize(
-    "contact", [*on_two(Contact("hertz", 1e6), Contact("hertz", 1e6, 0.4)), Contact("bilinear", 1e4, 0.1, "clip")]
-)
-def test_the_contact_jacobian_is_the_derivative_of_the_force(contact):
-    sites, rng = (2, 5, 6, 9), np.random.default_rng(1)
-    chain = Chain(four_band(), 12, "fixed", sites, (1e-3,) * 4)
-    u, v = rng.standard_normal((2, 12, 4)) * 2e-3
-    u[2], v[9] = 0, [0, 1, -2, 0]
-    u[9] = [0, 0, 3e-3, 0]
-    approach = np.array([1.0, -1.0, 0.8, 1.2])
-
-    def force(u, v):
-        w, rate = (f[list(sites), 2] - f[list(sites), 1] for f in (u, v))
-        f, out = contact.force(w, 1e-3, rate, approach), np.zeros((12, 4))
-        out[list(sites), 1], out[list(sites), 2] = f, -f
-        return out
-
-    matrices = LatticeMatrices(chain, COMM)
-    mine = slice(matrices.start, matrices.stop)
-    fields = [matrices.vector(f[mine]) for f in (u, v)]
-    jacobians = matrices.contact_jacobian(contact, *fields, approach)
-    assert np.abs(force(u, v)).max() > 0
-    for i, jacobian in enumerate(jacobians):
-        step = rng.standard_normal((12, 4)) * 1e-9
-        ends = [force(u + s * step * (i == 0), v + s * step * (i == 1))[mine] for s in (1, -1)]
-        product = (jacobian * matrices.vector(step[mine])).array_r.reshape(step[mine].shape)
-        assert product == pytest.approx((ends[0] - ends[1]) / 2, abs=1e-6 * np.abs(ends[0]).max(initial=1e-3))
-        jacobian.destroy()
-    plain = matrices.contact_jacobian(contact, *fields)[1]
-    assert plain.norm() == 0.0
-    matrices.destroy()
 
 
 @pytest.mark.parallel([1, 2, 3])

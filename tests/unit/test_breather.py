@@ -111,7 +111,7 @@ def test_the_slope_of_the_energy_is_that_between_points():
 
 
 def reduced(law: str, power: float | None = None) -> System:
-    return System.reduced(four_band(), D, Contact(law, HERTZ.stiffness, power=power))
+    return System.reduced(four_band(), D, Contact(law, HERTZ.stiffness, exponent=power))
 
 
 KERSCHEN = System.assemble(

@@ -181,7 +181,7 @@ def test_force_is_the_slope_of_the_potential(law):
     h = 1e-8
     slope = (contact.potential(w + h, d) - contact.potential(w - h, d)) / (2 * h)
     assert np.allclose(contact.force(w, d), slope, rtol=1e-6, atol=1e-9)
-    assert contact.exponent == {"hertz": 3 / 2, "bilinear": 1}[law]
+    assert contact.onset_exponent == {"hertz": 3 / 2, "bilinear": 1}[law]
     with pytest.raises(KeyError):
         Contact("glue", 1e6).force(w, d)
 

@@ -197,8 +197,9 @@ def oscillator(damping: float = 0.0) -> tuple[Cluster, float]:
     mass, h, speed, rate = 0.02, 1e-4, 0.5, 3e4
     contact = small_case(contacts={"law": "bilinear"}).model().contact
     contacts = create_contacts(contact, [1.0])
-    contacts["mode"], contacts["approach"], contacts["stiffness"] = CLOSED, speed, mass * rate**2
-    contacts["exponent"], contacts["damping"], contacts["floor"] = 1.0, damping, 0.0
+    contacts["mode"], contacts["approach"] = CLOSED, speed
+    contacts["elastic"]["stiffness"] = mass * rate**2
+    contacts["damping"], contacts["floor"] = damping, 0.0
     drives = create_drives((), [])
     response = np.full((1, 1, 1), h**2 / mass)
     cluster = Cluster(

@@ -7,7 +7,6 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.case import Case
-from vipetsc.case.warnings import contact_time
 from vipetsc.lattice import Contact
 
 SILENT = ("diatomic", "four-band", "four-band-bilinear", "interband", "interband-one-site", "packet", "chirp",
@@ -70,14 +69,14 @@ def test_a_drive_that_samples_do_not_show():
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_the_time_of_a_contact(law):
     contact, mass, speed = Contact(law, 1e6), 0.01, 0.3
-    n = contact.exponent
+    n = contact.onset_exponent
     deepest = ((n + 1) * mass * speed**2 / (2e6)) ** (1 / (n + 1))
     x = deepest * (1 - np.linspace(1, 0, 200_001) ** 2)
     rate = speed * np.sqrt(1 - (x / deepest) ** (n + 1) + 1e-300)
     middle = 0.5 * (x[1:] + x[:-1])
     slow = 2 * np.sum(np.diff(x) / (speed * np.sqrt(1 - (middle / deepest) ** (n + 1))))
     assert rate[0] == speed
-    assert contact_time(contact, mass, speed) == pytest.approx(slow, rel=1e-4)
+    assert contact.impact_time(speed, mass) == pytest.approx(slow, rel=1e-4)
 
 
 def test_contacts_that_are_brief():

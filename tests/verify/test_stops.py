@@ -61,7 +61,7 @@ def test_sites_that_are_said_to_differ_and_do_not_are_those_of_one_law():
 @pytest.mark.parametrize("factor", FACTORS)
 def test_two_masses_rebound_as_each_law_predicts(factor, n):
     """A normal impact at asked restitution .5, integrated, against the law's integral; it knows neither n nor mass."""
-    contact = Contact("power", 1e5, 0.5, factor=factor, power=n)
+    contact = Contact("power", 1e5, 0.5, factor=factor, exponent=n)
     sites, mass, speed = create_contacts(contact, [1e-4]), 0.003, 0.2
     sites["mode"], sites["approach"] = CLOSED, speed
 

@@ -11,7 +11,7 @@ from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness
 from vipetsc.lattice.chain import Pair
-from vipetsc.lattice.contact import LEAST_RESTITUTION
+from vipetsc.lattice.contact import LEAST_RESTITUTION, PARAMETERS
 
 MATERIAL = ("modulus", "radius", "poisson")
 SIDES = ("side", "clearance_minus", "precompression")
@@ -89,8 +89,20 @@ def resolved_each(contacts: ContactsTable, count: int) -> Table:
 
 def contact_of(contacts: ContactsTable) -> Contact:
     """The law of all sites of a resolved case; the stiffness is 0 where none is given."""
-    about = contacts.restitution, contacts.adhesion, contacts.approach_floor, contacts.damping or "paper"
-    return Contact(contacts.law, contacts.stiffness or 0.0, *about, contacts.exponent)
+    return Contact(
+        contacts.law,
+        contacts.stiffness or 0.0,
+        restitution=contacts.restitution,
+        adhesion=contacts.adhesion,
+        approach_floor=contacts.approach_floor,
+        factor=contacts.damping or "paper",
+        **parameters_of(contacts),
+    )
+
+
+def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
+    """The values of the parameters that the elastic law of ``contacts`` takes."""
+    return {key: getattr(contacts, key) for key, about in PARAMETERS.items() if about.law == contacts.law}
 
 
 def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
@@ -101,7 +113,7 @@ def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
         return ()
     for values in zip(*(each[key] for key in keys), strict=True):
         of_site = contacts.model_copy(update=dict(zip(keys, values, strict=True)))
-        laws.append(contact_of(of_site.model_copy(update={} if of_site.law == "power" else {"exponent": None})))
+        laws.append(contact_of(of_site))
     return tuple(laws)
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.contacts import check_alike, check_each
+from vipetsc.case.contacts import check_alike, check_each, parameters_of
 from vipetsc.case.resolve import (
     check_cell,
     check_sites,
@@ -238,7 +238,7 @@ class NnmCase(CaseFile):
         given, stiffness = self.contacts, self.contacts.stiffness or 0.0
         if given.modulus and given.radius and given.poisson is not None:
             stiffness = contact_stiffness(given.modulus, given.radius, given.poisson)
-        return Contact(given.law, stiffness, power=given.exponent)
+        return Contact(given.law, stiffness, **parameters_of(given))
 
 
 def _check_options(nnm: NnmTable) -> Iterator[Problem]:

@@ -4,13 +4,13 @@ Waves are those of the first drive, at its group velocity; what contacts send in
 """
 
 from collections.abc import Iterator, Mapping
-from math import gamma, pi, sqrt
+from math import pi
 
 import numpy as np
 
 from vipetsc.case.model import Model
 from vipetsc.case.schema import LatticeTable, OutputTable
-from vipetsc.lattice import Contact, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
 
 SLOW = 0.1  # of the band's fastest group velocity
@@ -122,20 +122,13 @@ def _of_fields(model: Model, output: OutputTable) -> Iterator[str]:
         )
 
 
-def contact_time(contact: Contact, mass: float, speed: float) -> float:
-    """Duration in s of an impact of a reduced ``mass`` in kg at ``speed`` in m/s without dissipation."""
-    power = contact.exponent + 1
-    deepest = float(power * mass * speed**2 / (2 * contact.stiffness)) ** (1 / power)
-    return 2 * deepest / speed * sqrt(pi) * gamma(1 + 1 / power) / gamma(0.5 + 1 / power)
-
-
 def _of_contacts(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     """Contacts that samples, or steps of fixed length, do not see."""
     speed = model.scale * model.drive.frequency
     if not model.chain.sites or not speed:
         return
     laws = {*(model.laws or (model.contact,))}
-    time = min(contact_time(law, model.chain.cell.reduced_mass, speed) for law in laws)
+    time = min(law.impact_time(speed, model.chain.cell.reduced_mass) for law in laws)
     step = float(petsc.get("ts_dt", 0.05 / model.drive.frequency))
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:
         yield (

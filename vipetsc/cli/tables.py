@@ -116,7 +116,7 @@ def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
         contact, (low, high) = case.contact(), case.nnm.energy
         return [
             ("nnm", f"{case.nnm.system} system, modes {_first_few(case.nnm.modes)}, {low:g} to {high:g} J"),
-            ("nnm contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.exponent:g}"),
+            ("nnm contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.onset_exponent:g}"),
         ]
     assert isinstance(case, Case)
     return run_case_rows(case, ranks)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import allocating, kernel
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, LASTING, contact_force, gap_of
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, contact_force, gap_of
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
 # A site has landed on its clearance when |side w - D| is within this share of D (of its ``scale``).
@@ -61,7 +61,7 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> tuple[int, floa
     if site.mode == FREE:
         side = 1 - 2 * function
         return 0, float(side), -gap_of(site, side), tolerance, side * CLOSED
-    if abs(site.mode) == LASTING:
+    if abs(site.mode) == PERMANENT:
         return 1, 0.0, -np.inf, 0.0, site.mode
     side = 1 if site.mode > 0 else -1
     if function == 0:
@@ -90,7 +90,7 @@ def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: fl
     first, b, c = Change(2.0, -1, 0), room[0], room[1]
     for i in range(contacts.size):
         site = contacts[i]
-        if abs(site.mode) == LASTING:
+        if abs(site.mode) == PERMANENT:
             continue
         bernstein(start[i], end[i], h, b)
         room_plus, room_minus = site.clearance - LANDED_W * site.scale, site.clearance_minus - LANDED_W * site.scale

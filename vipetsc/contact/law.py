@@ -1,6 +1,7 @@
 """The compiled contact force: one law for time stepping, for the propagator and for normal modes.
 
-The formulas stand in the package's docstring. ``vipetsc.lattice.Contact`` is the same law on arrays.
+The formulas stand in the package's docstring. ``vipetsc.lattice.Contact`` is the same law on arrays: an elastic law has
+its force, slope and energy there and here, and nowhere else.
 """
 
 from collections.abc import Sequence
@@ -8,33 +9,45 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gamma
 
 from vipetsc.compiled import kernel
 from vipetsc.lattice import Contact
+from vipetsc.lattice.contact import PHASES
 
 # Modes of a site; the sign is the side.
-FREE, CLOSED, CLIPPED, LASTING = 0, 1, 2, 3
+FREE, CLOSED, CLIPPED, PERMANENT = 0, 1, 2, 3
 
-_LAW = ("stiffness", "exponent", "damping", "floor")
-_TIMES = ("inertia", "power", "root", "factor")
+ELASTIC = np.dtype([(name, np.float64) for name in ("stiffness", "exponent", "duration_factor")])
+"""Parameters of an elastic law: kc in N/m^n, the power n with which the force begins, ``Contact.duration_factor``."""
+
 SITE = np.dtype(
     [
         ("mode", np.int64),
-        *((name, np.float64) for name in ("clearance", "clearance_minus", "scale", "approach", *_LAW)),
+        ("clearance", np.float64),
+        ("clearance_minus", np.float64),
+        ("scale", np.float64),
+        ("approach", np.float64),
+        ("elastic", ELASTIC),
+        ("damping", np.float64),
+        ("floor", np.float64),
         ("clip", bool),
-        *((name, np.float64) for name in (*_TIMES, "preload")),
+        ("reduced_mass", np.float64),
+        ("preload", np.float64),
     ],
     align=True,
 )
 """A site: its mode times its side, the clearances in m on the sides + and - (inf: no stop there), the length in m that
-landings are measured by, the signed approach velocity w'_minus in m/s.
-
-Its law F = ``stiffness`` x^``exponent`` g, in N/m^n; ``damping`` c; ``floor``: smallest |w'_minus| in m/s; ``clip``:
-whether g is kept from becoming negative. An isolated impact at speed v without loss takes ``factor`` depth/v, its depth
-is (``inertia`` v^``power``/``stiffness``)^``root``; ``power`` is 2 (Johnson 1985, sec. 11.4). ``preload`` in N is its
-force at w = 0, which a static load balances.
+landings are measured by, the signed approach velocity w'_minus in m/s; its elastic law, the damping c of the factor g,
+the smallest |w'_minus| in m/s, whether g is kept from becoming negative; the reduced mass of its two masses in kg.
+``preload`` in N is its force at w = 0, which a static load balances.
 """
+
+
+def elastic_records(laws: Sequence[Contact]) -> np.ndarray:
+    """Parameters (law,) of dtype ``ELASTIC`` of the elastic laws of ``laws``."""
+    # Sites share few laws, and a factor costs gamma functions: each distinct law is asked once.
+    rows = {law: (law.stiffness, law.onset_exponent, law.duration_factor) for law in dict.fromkeys(laws)}
+    return np.array([rows[law] for law in laws], ELASTIC)
 
 
 def create_contacts(
@@ -47,33 +60,39 @@ def create_contacts(
     """
     gaps = np.array(clearances, float)
     gaps = gaps.reshape(-1, 2) if gaps.ndim == 2 else np.column_stack([gaps, gaps])
-    of_sites = [laws] * len(gaps) if isinstance(laws, Contact) else list(laws)
+    per_site = [laws] * len(gaps) if isinstance(laws, Contact) else list(laws)
+    dampings = {law: law.damping for law in dict.fromkeys(per_site)}
+
     sites = np.zeros(len(gaps), SITE)
     sites["clearance"], sites["clearance_minus"] = gaps.T
     sizes = np.where((gaps != 0) & np.isfinite(gaps), np.abs(gaps), np.inf).min(axis=1)
     sites["scale"] = np.where(np.isfinite(sizes), sizes, scale)
-    sites["approach"], sites["power"] = 1.0, 2.0
-    rows = {law: (law.stiffness, law.exponent, law.damping, law.approach_floor) for law in dict.fromkeys(of_sites)}
-    for name, values in zip(_LAW, zip(*map(rows.__getitem__, of_sites), strict=True), strict=False):
-        sites[name] = values
-    sites["clip"] = [law.adhesion == "clip" for law in of_sites]
-    n = sites["exponent"]
-    # Integral of dx / sqrt(1 - x^(n+1)) over [0, 1]: pi/2 for n = 1, 1.4716 for n = 3/2.
-    integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
-    sites["inertia"], sites["root"], sites["factor"] = (n + 1) / 2 * np.asarray(reduced_mass), 1 / (n + 1), 2 * integral
+    sites["approach"] = 1.0
+    sites["elastic"] = elastic_records(per_site)
+    sites["damping"] = [dampings[law] for law in per_site]
+    sites["floor"] = [law.approach_floor for law in per_site]
+    sites["clip"] = [law.adhesion == "clip" for law in per_site]
+    sites["reduced_mass"] = reduced_mass
     return sites
 
 
-def hold(sites: np.ndarray, which: np.ndarray, speed: float) -> None:
+def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: float) -> None:
     """Let the sites ``which`` act without changes of mode: no loss, and touching at w = 0 or pressed there.
 
-    ``speed`` in m/s is that of relative motion, for what is small beside it.
+    ``laws`` (site,) are those of all ``sites``; ``speed`` in m/s is that of relative motion, for what is small
+    compared with it.
     """
     side = np.where(sites["clearance"] < sites["clearance_minus"], 1, -1)
     pressed = np.maximum(-np.minimum(sites["clearance"], sites["clearance_minus"]), 0.0)
-    load = side * sites["stiffness"] * pressed ** sites["exponent"]
-    sites["mode"][which], sites["preload"][which] = (side * LASTING)[which], load[which]
+    sites["mode"][which] = (side * PERMANENT)[which]
     sites["approach"][which] = side[which] * speed
+    load = np.zeros(len(sites))
+    sites_of_law: dict[Contact, list[int]] = {}
+    for i, law in enumerate(laws):
+        sites_of_law.setdefault(law, []).append(i)
+    for law, numbers in sites_of_law.items():
+        load[numbers] = law.elastic_force(pressed[numbers])
+    sites["preload"][which] = (side * load)[which]
 
 
 @kernel
@@ -83,17 +102,10 @@ def gap_of(site: Any, side: float) -> float:
 
 
 @kernel
-def impact_time(site: Any, speed: float) -> float:
-    """Contact time in s of an isolated conservative impact on a ``SITE`` at ``speed`` in m/s."""
-    depth = (site.inertia * speed**site.power / site.stiffness) ** site.root
-    return site.factor * depth / speed
-
-
-@kernel
 def elastic_force_and_slope(law: Any, x: float) -> tuple[float, float]:
-    """kc x^n in N and its derivative in N/m at the indentation x in m, continued as an odd function to x < 0.
+    """f in N and df/dx in N/m at the indentation x in m, continued as an odd function to x < 0.
 
-    ``law`` is a record with ``stiffness`` and ``exponent``.
+    ``law`` is a record of dtype ``ELASTIC``.
     """
     if law.exponent == 1.0:
         return law.stiffness * x, law.stiffness
@@ -111,7 +123,7 @@ def elastic_force(law: Any, x: float) -> float:
 
 @kernel
 def elastic_energy(law: Any, x: float) -> float:
-    """kc x^(n+1)/(n+1) in J for the indentation x in m; zero for x <= 0."""
+    """The integral of f in J from 0 to the indentation x in m; zero for x <= 0."""
     if x <= 0.0:
         return 0.0
     if law.exponent == 1.5:
@@ -122,6 +134,39 @@ def elastic_energy(law: Any, x: float) -> float:
 
 
 @kernel
+def begins_linearly(law: Any) -> bool:
+    """Whether the force begins in proportion to the indentation; else its derivatives are unbounded at the onset."""
+    return law.exponent == 1.0
+
+
+@kernel
+def impact_time(site: Any, speed: float) -> float:
+    """Contact time in s of an isolated conservative impact on a ``SITE`` at ``speed`` in m/s: see ``Contact``."""
+    law = site.elastic
+    if law.duration_factor > 0.0:
+        inertia = (law.exponent + 1.0) / 2.0 * site.reduced_mass
+        depth = (inertia * (speed * speed) / law.stiffness) ** (1.0 / (law.exponent + 1.0))
+        return law.duration_factor * depth / speed
+
+    energy = 0.5 * site.reduced_mass * speed * speed
+    depth = 1.0
+    while elastic_energy(law, depth) < energy:
+        depth *= 2.0
+    step = depth
+    while step > 1e-14 * depth:
+        step = (elastic_energy(law, depth) - energy) / elastic_force(law, depth)
+        depth -= step
+
+    width = 0.5 * np.pi / PHASES
+    total = 0.0
+    for k in range(PHASES):
+        phase = (k + 0.5) * width
+        kinetic = energy - elastic_energy(law, depth * np.sin(phase))
+        total += depth * np.cos(phase) * np.sqrt(0.5 * site.reduced_mass / kinetic)
+    return 2.0 * total * width
+
+
+@kernel
 def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[float, float]:
     """Force on the host in N and dissipated power in W of site ``i`` in its present mode, at w in m and w' in m/s."""
     site = contacts[i]
@@ -129,9 +174,9 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
         return 0.0, 0.0
     side = 1.0 if site.mode > 0 else -1.0
     x = side * w - gap_of(site, side)
-    if abs(site.mode) == LASTING:
-        return side * elastic_force(site, max(x, 0.0)), 0.0
-    elastic = elastic_force(site, x)
+    if abs(site.mode) == PERMANENT:
+        return side * elastic_force(site.elastic, max(x, 0.0)), 0.0
+    elastic = elastic_force(site.elastic, x)
     g = 0.0
     if abs(site.mode) != CLIPPED:
         g = 1.0 + site.damping * rate / site.approach

@@ -7,7 +7,18 @@ import numpy as np
 
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, LASTING, SITE, contact_force, elastic_force, gap_of, impact_time
+from vipetsc.contact.law import (
+    CLIPPED,
+    CLOSED,
+    FREE,
+    PERMANENT,
+    SITE,
+    contact_force,
+    elastic_energy,
+    elastic_force,
+    gap_of,
+    impact_time,
+)
 
 # Limits of the contact law, of which it is counted how often they acted.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
@@ -47,8 +58,8 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
     episode.indentation = max(episode.indentation, reached.indentation)
     episode.force = max(episode.force, reached.force)
     # No pull is that of the law continued to a landing short of D, or beyond g = 0.
-    none = (1.0 + law.damping) * elastic_force(law, LANDED_W * law.scale)
-    if pull > 0.0 and not site.pulls and pull > none + LANDED_G * elastic_force(law, episode.indentation):
+    none = (1.0 + law.damping) * elastic_force(law.elastic, LANDED_W * law.scale)
+    if pull > 0.0 and not site.pulls and pull > none + LANDED_G * elastic_force(law.elastic, episode.indentation):
         site.pulls = True
         site.counts.pulled += 1
 
@@ -58,7 +69,7 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     for i in range(contacts.size):
         side = 1 if contacts[i].mode > 0 else -1
-        if abs(contacts[i].mode) == LASTING and not side * start[i, 1] > 0.0 > side * end[i, 1]:  # no turn inside
+        if abs(contacts[i].mode) == PERMANENT and not side * start[i, 1] > 0.0 > side * end[i, 1]:  # no turn inside
             episode = tracks.sites[i].episode
             episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
             episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
@@ -130,7 +141,7 @@ class ImpactTracker:
         self.contacts, sites = contacts, np.zeros(len(numbers), TRACKED)
         self.start, self.end = np.zeros((2, len(sites), 3))
         sites["number"] = numbers
-        held = np.flatnonzero(np.abs(contacts["mode"]) == LASTING)
+        held = np.flatnonzero(np.abs(contacts["mode"]) == PERMANENT)
         sites["episode"]["site"][held], sites["episode"]["separation"][held] = sites["number"][held], np.nan
         sites["episode"]["side"][held] = np.sign(contacts["mode"][held])
         self.tracks = Tracks(sites, np.zeros(2 * len(sites), EPISODE), np.zeros(1, np.int64))
@@ -139,7 +150,7 @@ class ImpactTracker:
         """Close the sites that begin beyond their clearance at t = 0; returns their indices.
 
         ``motion`` (site, 2) has w and w' of all numbered sites. When these contacts began is not known: w'_minus is the
-        speed with which two masses alone come to w at w' without loss, mu (w'_minus^2 - w'^2)/2 = kc x^(n+1)/(n+1).
+        speed with which two masses alone come to w at w' without loss: mu (w'_minus^2 - w'^2)/2 is the elastic energy.
         """
         sites, mine = self.contacts, np.flatnonzero(self.tracks.sites["number"] >= 0)
         (w, rate), near = motion[self.tracks.sites["number"][mine]].T, LANDED_W * sites["scale"][mine]
@@ -149,9 +160,8 @@ class ImpactTracker:
         closed = touching & (sites["mode"][mine] == FREE)
         some, side, deep, rate = mine[closed], side[closed], np.maximum(deep[closed], 0.0), rate[closed]
         law = sites[some]
-        # kc x^(n+1)/(n+1) over mu/2, of which a site knows (n+1)/2 times mu.
-        n = law["exponent"]
-        speed = np.sqrt(rate**2 + law["stiffness"] * np.where(n == 1, deep**2, deep ** (n + 1)) / law["inertia"])
+        stored = np.array([elastic_energy(site["elastic"], x) for site, x in zip(law, deep, strict=True)])
+        speed = np.sqrt(rate**2 + 2 * stored / law["reduced_mass"])
         sites["approach"][some] = side * np.maximum(speed, law["floor"])
         sites["mode"][some] = side * CLOSED
         clipped = law["clip"] & (1 + law["damping"] * rate / sites["approach"][some] < 0)

@@ -98,9 +98,11 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
         if lattice.places[i].ledger < 0:
             continue
         w, site = relative_motion(y, lattice, i)[0], contacts[i]
-        elastic[sites] = elastic_energy(site, max(w - site.clearance, -w - site.clearance_minus))
+        elastic[sites] = elastic_energy(site.elastic, max(w - site.clearance, -w - site.clearance_minus))
         if site.preload != 0.0:  # beyond that of the static state, under the load that holds it
-            elastic[sites] -= elastic_energy(site, -min(site.clearance, site.clearance_minus)) + site.preload * w
+            elastic[sites] -= (
+                elastic_energy(site.elastic, -min(site.clearance, site.clearance_minus)) + site.preload * w
+            )
         sites += 1
     _add(sums, _CONTACT, elastic[:sites], unit)
     _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + sites], unit)

@@ -1,4 +1,4 @@
-"""The lattice's stiffness and mass as PETSc matrices shared over ranks, and the Jacobian of its contact forces.
+"""The lattice's stiffness and mass as PETSc matrices shared over ranks.
 
 Degrees of freedom are ordered cell by cell; a rank owns the rows of its cells, the same as in ``dynamics.layout``, and
 assembles them from the couplings that the stencil of the right-hand side has. A row of the matrix sums K_ij u_j with
@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix, diags
 from vipetsc.case import CaseError
 from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.layout import cell_cuts
-from vipetsc.lattice import Chain, Contact
+from vipetsc.lattice import Chain
 from vipetsc.parallel import on_every_rank
 
 
@@ -54,29 +54,6 @@ class LatticeMatrices:
         if cells is not None:
             vector.array[:] = np.ravel(cells)
         return vector
-
-    def contact_jacobian(
-        self, contact: Contact, displacement: PETSc.Vec, velocity: PETSc.Vec, approach: np.ndarray | None = None
-    ) -> tuple[PETSc.Mat, PETSc.Mat]:
-        """Derivatives of the force on the masses, - b F with b = 1 at resonators and -1 at hosts, at a state.
-
-        In N/m by the displacement and in N s/m by the velocity; K minus the first is the stiffness beside that state.
-        ``approach`` (site,) has w'_minus in m/s of all sites, inf for none; without it nothing dissipates.
-        """
-        chain, d = self.chain, self.chain.cell.dofs
-        sites, gaps = np.array(chain.sites, np.int64), np.array(chain.clearances, float)
-        mine = (sites >= self.start) & (sites < self.stop)
-        before = np.full(mine.sum(), np.inf) if approach is None else np.asarray(approach, float)[mine]
-        first = (sites[mine] - self.start) * d
-        pairs = first + chain.cell.host, first + chain.cell.resonator
-        w, rate = (field.array_r[pairs[1]] - field.array_r[pairs[0]] for field in (displacement, velocity))
-        by_w, by_rate = contact.slopes(w, gaps[mine], rate, before)
-        rows, columns = (np.concatenate([pairs[i] for i in order]) for order in ((0, 0, 1, 1), (0, 1, 0, 1)))
-        shape, jacobians = ((self.stop - self.start) * d, chain.cells * d), []
-        for slope in (by_w, by_rate):
-            entries = np.concatenate([-slope, slope, slope, -slope]), (rows, columns + self.start * d)
-            jacobians.append(self._matrix(csr_matrix(entries, shape)))
-        return jacobians[0], jacobians[1]
 
     def destroy(self) -> None:
         """Free the matrices; all ranks must call it."""

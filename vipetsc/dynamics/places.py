@@ -29,12 +29,12 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     """Sites of dtype ``SITE``, free or held together; a number below 0 is a site without stops."""
     numbers, chain = np.maximum(np.asarray(numbers, np.int64), -1), model.chain
     gaps = np.array(model.gaps or [(gap, gap) for gap in chain.clearances]).reshape(-1, 2)
-    laws = [model.laws[i] if i >= 0 else model.contact for i in numbers] if model.laws else model.contact
+    laws = [model.laws[i] if model.laws and i >= 0 else model.contact for i in numbers]
     masses = np.array([*chain.reduced_masses(), chain.cell.reduced_mass])
     gaps = np.vstack([gaps, [[np.inf] * 2]])
     sites = create_contacts(laws, gaps[numbers], masses[numbers], model.scale)
     joins = np.array([*(pair.next_cell for pair in chain.contact_pairs), False])
     least = gaps[numbers].min(axis=1)
     lasts = (least < 0) | ((least == 0) & joins[numbers] & (sites["damping"] == 0))
-    hold(sites, lasts, model.scale * model.drive.frequency)
+    hold(sites, laws, lasts, model.scale * model.drive.frequency)
     return sites

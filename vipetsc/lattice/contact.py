@@ -1,20 +1,49 @@
-"""Vibro-impact contact: Hertz, bilinear and power laws on both sides of a clearance, with restitution.
+"""The law of a vibro-impact contact: an elastic force on both sides of a clearance, with restitution.
 
-With w = u_resonator - u_host and clearance D, the contact force is
-F = kc [(w - D)_+^n - (-w - D)_+^n] g, restoring: -F on the resonator, +F on the host.
+With w = u_resonator - u_host, the clearance D, the elastic force f of the indentation x, and the dissipation factor g,
+the contact force is F = [f((w - D)_+) - f((-w - D)_+)] g, restoring: -F on the resonator, +F on the host.
+
+Everything about an elastic law on arrays stands here: its name and parameters with the texts that case files show,
+force, slope, energy, and the duration of an impact. ``vipetsc.contact.law`` is its compiled twin.
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
+from scipy.special import gamma
 
 Law = Literal["hertz", "bilinear", "power"]
 Adhesion = Literal["allow", "clip"]
 Damping = Literal["paper", "exact", "hunt-crossley", "lankarani-nikravesh", "flores"]
 LEAST_RESTITUTION = 0.05  # where the damping grows without bound towards 0
+
+# Laws whose force is a power of the indentation; that of "power" is a parameter.
+EXPONENTS: Mapping[Law, float] = {"hertz": 1.5, "bilinear": 1.0}
+# Phases at which the duration of an impact is summed; relative errors are below 1e-5 where f begins as x^1.5.
+PHASES = 32
+
+
+class Parameter(NamedTuple):
+    """A number that one elastic ``law`` takes besides its stiffness.
+
+    It is a field of ``Contact`` and the key of that name in ``[contacts]``. ``unit`` and ``text`` describe the key in
+    the manual; a case file may give values from ``least`` to ``most``.
+    """
+
+    law: Law
+    unit: str
+    text: str
+    least: float
+    most: float
+
+
+def parameter(law: Law, unit: str, text: str, least: float, most: float) -> dict[str, Parameter]:
+    """Metadata of a field of ``Contact`` that is a parameter of an elastic law."""
+    return {"parameter": Parameter(law, unit, text, least, most)}
 
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
@@ -32,11 +61,14 @@ def rebound(damping: float, restitution: float) -> float:
 
 @dataclass(frozen=True)
 class Contact:
-    """A ``law`` F = kc x^n, its ``stiffness`` kc in N/m^n and its ``restitution`` r in [0, 1]; 1 conserves energy.
+    """An elastic ``law`` f(x) with its ``stiffness`` kc, and a ``restitution`` r in [0, 1]; 1 conserves energy.
+
+    f = kc x^n for spheres in elastic contact (``hertz``, n = 3/2), a linear stop (``bilinear``, n = 1) and any
+    ``power`` n = ``exponent``; kc in N/m^n.
 
     ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
     smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded. ``factor`` names the damping c in
-    g = 1 + c w'/w'_minus; ``power`` is n of the law "power".
+    g = 1 + c w'/w'_minus.
     """
 
     law: Law
@@ -45,17 +77,80 @@ class Contact:
     adhesion: Adhesion = "allow"
     approach_floor: float = 0.0
     factor: Damping = "paper"
-    power: float | None = None
+    exponent: float | None = field(
+        default=None, metadata=parameter("power", "", "of the law power: n in F = k x^n", least=1, most=10)
+    )
 
     def __str__(self) -> str:
         about = f"restitution {self.restitution:g}, effective {self.effective_restitution:.3f}"
         named = "" if self.factor == "paper" else f" ({self.factor})"
-        return f"{self.law}, {self.stiffness:.6g} N/m^{self.exponent:g}, {about}{named}"
+        return f"{self.law}, {self.stiffness:.6g} N/m^{self.onset_exponent:g}, {about}{named}"
 
     @property
-    def exponent(self) -> float:
-        """n of the law, for spheres in elastic contact (Hertz) or a linear stop; raises KeyError for another."""
-        return {"hertz": 1.5, "bilinear": 1.0}[self.law] if self.power is None else self.power
+    def onset_exponent(self) -> float:
+        """The power of the indentation with which the force begins; raises KeyError for a law that there is not."""
+        if self.law != "power":
+            return EXPONENTS[self.law]
+        if self.exponent is None:
+            raise ValueError("the law power needs an exponent")
+        return self.exponent
+
+    def elastic_force(self, x: ArrayLike) -> np.ndarray:
+        """f in N at the indentation ``x`` in m; zero for x <= 0."""
+        x = np.maximum(x, 0.0)
+        return self.stiffness * x**self.onset_exponent
+
+    def elastic_slope(self, x: ArrayLike) -> np.ndarray:
+        """df/dx in N/m at the indentation ``x`` in m; for x <= 0 that of a contact that has just closed."""
+        x, n = np.maximum(x, 0.0), self.onset_exponent
+        return n * self.stiffness * x ** (n - 1)
+
+    def elastic_energy(self, x: ArrayLike) -> np.ndarray:
+        """The integral of f in J from 0 to the indentation ``x`` in m; zero for x <= 0."""
+        x, n = np.maximum(x, 0.0), self.onset_exponent
+        return self.stiffness * x ** (n + 1) / (n + 1)
+
+    @property
+    def duration_factor(self) -> float:
+        """Duration of an impact without loss over depth/speed where f is a power of x, else 0 (Johnson 1985, sec. 11.4)."""
+        if self.law not in (*EXPONENTS, "power"):
+            return 0.0
+        n = self.onset_exponent
+        # Integral of dx / sqrt(1 - x^(n+1)) over [0, 1]: pi/2 for n = 1, 1.4716 for n = 3/2.
+        integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
+        return float(2 * integral)
+
+    def impact_depth(self, speed: float, reduced_mass: float) -> float:
+        """Deepest indentation in m of two masses that meet at ``speed`` in m/s, without loss.
+
+        ``reduced_mass`` in kg is m_host m_resonator / (m_host + m_resonator).
+        """
+        energy = 0.5 * reduced_mass * speed**2
+        if self.duration_factor:
+            n = self.onset_exponent
+            return float((n + 1) * energy / self.stiffness) ** (1 / (n + 1))
+
+        x = 1.0
+        while self.elastic_energy(x) < energy:
+            x *= 2
+        # From beyond the root Newton's method comes down to it without a bracket: the energy is convex.
+        step = x
+        while step > 1e-14 * x:
+            step = float((self.elastic_energy(x) - energy) / self.elastic_force(x))
+            x -= step
+        return x
+
+    def impact_time(self, speed: float, reduced_mass: float) -> float:
+        """Duration in s of an impact without loss, as in ``impact_depth``: the integral of 2 dx/x'."""
+        depth = self.impact_depth(speed, reduced_mass)
+        if self.duration_factor:
+            return self.duration_factor * depth / speed
+
+        # x = depth sin(phase) takes the root out of the integrand, which is smooth then: midpoints do.
+        phase = (np.arange(PHASES) + 0.5) * (np.pi / 2 / PHASES)
+        kinetic = 0.5 * reduced_mass * speed**2 - self.elastic_energy(depth * np.sin(phase))
+        slowness = np.sqrt(0.5 * reduced_mass / kinetic)
+        return float(2 * np.sum(depth * np.cos(phase) * slowness) * (np.pi / 2 / PHASES))
 
     @property
     def damping(self) -> float:
@@ -95,21 +190,15 @@ class Contact:
     ) -> np.ndarray:
         """Restoring force F in N for relative displacement w in m; g = 1 unless an approach is given."""
         w = np.asarray(w, float)
-        elastic = np.maximum(w - clearance, 0) ** self.exponent - np.maximum(-w - clearance, 0) ** self.exponent
-        return self.stiffness * elastic * self.dissipation_factor(rate, approach)
-
-    def slopes(
-        self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike, approach: ArrayLike
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of ``force`` by w in N/m and by w' in N s/m."""
-        w, approach = np.asarray(w, float), np.asarray(approach, float)
-        x, n, g = np.maximum(np.abs(w) - clearance, 0), self.exponent, self.dissipation_factor(rate, approach)
-        damping = self.damping / np.copysign(np.maximum(np.abs(approach), self.approach_floor), approach)
-        clipped = (g <= 0) if self.adhesion == "clip" else False
-        by_rate = np.where(clipped, 0.0, np.sign(w) * x**n * damping)
-        return self.stiffness * np.where(x > 0, n * x ** (n - 1), 0) * g, self.stiffness * by_rate
+        elastic = self.elastic_force(w - clearance) - self.elastic_force(-w - clearance)
+        return elastic * self.dissipation_factor(rate, approach)
 
     def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
-        """Elastic energy kc x^(n+1)/(n+1) in J stored at relative displacement w in m."""
-        x = np.maximum(np.abs(np.asarray(w, float)) - clearance, 0)
-        return self.stiffness * x ** (self.exponent + 1) / (self.exponent + 1)
+        """Elastic energy in J stored at relative displacement w in m."""
+        return self.elastic_energy(np.abs(np.asarray(w, float)) - clearance)
+
+
+PARAMETERS: Mapping[str, Parameter] = {
+    item.name: item.metadata["parameter"] for item in fields(Contact) if "parameter" in item.metadata
+}
+"""The parameters of elastic laws, by the names of their fields of ``Contact``, which are their keys in case files."""

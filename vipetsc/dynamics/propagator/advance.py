@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import Change, extremes, first_change, switching
-from vipetsc.contact.law import CLOSED, FREE, contact_force, gap_of
+from vipetsc.contact.law import CLOSED, FREE, begins_linearly, contact_force, gap_of
 from vipetsc.contact.search import LANDED, MOST_ATTEMPTS, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.dynamics.drives import drive_end
 from vipetsc.dynamics.propagator.collocation import (
@@ -77,7 +77,7 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     longest = length
     for i in trial.closed:
         # A young contact's force goes as the root of its age.
-        if sites[i].exponent != 1.0 and abs(sites[i].mode) == CLOSED:
+        if not begins_linearly(sites[i].elastic) and abs(sites[i].mode) == CLOSED:
             age = (state.begin - cluster.history[i].onset) / cluster.interval + state.position
             if age * cluster.interval <= 1e-7 * cluster.history[i].duration:
                 return Substep(ONSET, longest)
@@ -153,7 +153,7 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     if change.share > 1.0:
         return substep, False
     site = cluster.contacts[change.site]
-    separates = site.exponent != 1.0 and abs(site.mode) == CLOSED and change.function == 0
+    separates = not begins_linearly(site.elastic) and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
         # The force begins and ends as a root: one substep for each.
         state.length = 0.5 * change.share * substep.length

@@ -5,7 +5,7 @@ Their force is max(x, 0)^n of the indentation x. Nodes see little of a kink near
 
 from vipetsc.compiled import kernel
 from vipetsc.contact.changes import LANDED_W
-from vipetsc.contact.law import LASTING, gap_of
+from vipetsc.contact.law import PERMANENT, gap_of
 from vipetsc.contact.search import bernstein, first_upcrossing_after_start
 from vipetsc.dynamics.propagator.collocation import Cluster, Trial
 
@@ -16,7 +16,7 @@ def first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
     first, c = 2.0, trial.sums.bernstein[0]
     for i in trial.closed:
         site = cluster.contacts[i]
-        if abs(site.mode) != LASTING:
+        if abs(site.mode) != PERMANENT:
             continue
         side, tolerance = 1.0 if site.mode > 0 else -1.0, LANDED_W * site.scale
         bernstein(cluster.site_motion[i], trial.site_motion[i], length * cluster.interval, c)

@@ -5,7 +5,7 @@ import copy
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.law import CLOSED, LASTING
+from vipetsc.contact.law import CLOSED, PERMANENT
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout, create_record
 from vipetsc.dynamics.places import site_records
@@ -42,7 +42,7 @@ class TangentPropagator(Propagator):
     def refusal(cls, model: Model) -> str | None:
         """As of the engine; contacts that touch or are pressed at rest, too."""
         sites = site_records(model, np.arange(len(model.chain.sites)))
-        if (np.abs(sites["mode"]) == LASTING).any():
+        if (np.abs(sites["mode"]) == PERMANENT).any():
             return "contacts touch or are pressed at rest, beside which no variations are moved"
         return super().refusal(model)
 

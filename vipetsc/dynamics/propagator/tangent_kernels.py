@@ -39,7 +39,7 @@ def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, floa
     if abs(row.mode) == CLIPPED:
         return 0.0, 0.0, 0.0
     side = 1.0 if row.mode > 0 else -1.0
-    elastic, slope = elastic_force_and_slope(site, side * w - gap_of(site, side))
+    elastic, slope = elastic_force_and_slope(site.elastic, side * w - gap_of(site, side))
     g = 1.0 + site.damping * v / row.approach
     by_rate = -side * elastic * site.damping / row.approach
     return -slope * g, by_rate, -by_rate * v / row.approach

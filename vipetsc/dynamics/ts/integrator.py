@@ -68,7 +68,7 @@ class Integrator(Engine):
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
         # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
         # as h^(5/2). The shares are those that the controller settles at.
-        exponents = {law.exponent for law in model.laws or (model.contact,)}
+        exponents = {law.onset_exponent for law in model.laws or (model.contact,)}
         share, order = (1 / 20, 8) if exponents == {1} else (1 / 200, 2.5)
         self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
         self.observe(self.tracker.start)

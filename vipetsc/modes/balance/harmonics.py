@@ -248,8 +248,8 @@ class SiteForces:
         at = np.empty((len(theta), 3))
         _evaluate(z[pair], theta, at)
         x, rate = np.maximum(side * at[:, 0] - clearance, 0.0), at[:, 1]
-        elastic = law.stiffness * x**law.exponent
-        g, slope = 1 + c * rate / approach if c else 1.0, law.exponent * law.stiffness * x ** (law.exponent - 1)
+        elastic, slope = law.elastic_force(x), law.elastic_slope(x)
+        g = 1 + c * rate / approach if c else 1.0
         per_rate = side * elastic * c / approach if c else 0 * x
         values = np.array([side * elastic * g, slope * g, per_rate, law.potential(at[:, 0], clearance)])
         answer.add(pair, theta, weights, values, rate)

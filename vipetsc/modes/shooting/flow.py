@@ -11,11 +11,11 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import inlined, kernel, njit
-from vipetsc.contact.law import elastic_force_and_slope
+from vipetsc.contact.law import ELASTIC, elastic_force_and_slope, elastic_records
 from vipetsc.modes.shooting.landing import EXTREMUM, NONE, Change, first_rise, hermite
 from vipetsc.modes.system import System
 
-CONTACT = np.dtype([("clearance", np.float64), ("stiffness", np.float64), ("exponent", np.float64)])
+CONTACT = np.dtype([("clearance", np.float64), ("elastic", ELASTIC)])
 SPRING = np.dtype([("quadratic", np.float64), ("cubic", np.float64)])
 Shape = tuple[int, int, int]  # see restore
 # A step below this fraction of the interval means that the flow is stuck.
@@ -85,7 +85,7 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
             contact = system.contacts[c]
             x = side[c] * elongation(system.rows, c, y, 0, 0, n) - contact.clearance
             # past the exit, which is landed on anyway, the law is odd
-            force, slope = elastic_force_and_slope(contact, x)
+            force, slope = elastic_force_and_slope(contact.elastic, x)
             _add(system.rows, c, (side[c] * force, slope), y, pull, shape)
     for s in range(system.springs.size):
         a, b, z = system.springs[s].quadratic, system.springs[s].cubic, elongation(system.spring_rows, s, y, 0, 0, n)
@@ -183,12 +183,14 @@ class Flow(ABC):
 
     def __init__(self, system: System) -> None:
         self.system = system
-        contacts = [(p.clearance, p.law.stiffness, p.law.exponent) for p in system.contacts]
+        contacts = np.zeros(len(system.contacts), CONTACT)
+        contacts["clearance"] = system.clearances
+        contacts["elastic"] = elastic_records([pair.law for pair in system.contacts])
         self.compiled = CompiledSystem(
             1 / np.asarray(system.masses, float),
             np.ascontiguousarray(system.stiffness, float),
             system.contact_rows,
-            np.array(contacts, CONTACT),
+            contacts,
             system.spring_rows,
             np.array([(s.quadratic, s.cubic) for s in system.springs], SPRING),
         )
