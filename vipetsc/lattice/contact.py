@@ -112,7 +112,7 @@ class Contact:
 
     @property
     def duration_factor(self) -> float:
-        """Duration of an impact without loss over depth/speed where f is a power of x, else 0 (Johnson 1985, sec. 11.4)."""
+        """Duration of an impact without loss over depth/speed (Johnson 1985, sec. 11.4); 0 if f is no power of x."""
         if self.law not in (*EXPONENTS, "power"):
             return 0.0
         n = self.onset_exponent
