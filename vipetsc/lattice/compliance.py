@@ -15,23 +15,34 @@ from scipy.linalg import eigh
 
 from vipetsc.lattice.bands import waves_at
 from vipetsc.lattice.chain import Chain
-from vipetsc.lattice.waves import NEUTRAL, BlochWaves, between, bloch_waves, coupling_blocks, energy_flux
+from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
+
+RIGID = 1e-12  # squared frequencies below this fraction of the largest are those of rigid motions
+UNMOVED = 1e-10  # a rigid motion whose relative displacements are below this fraction of the largest moves no pair
+AT_REST = 1e-12  # a contact pair that moves less than this fraction of its cell does not move
 
 
 class DenseCompliance:
-    """Of a system: ``masses`` (dofs,) in kg, ``stiffness`` (dofs, dofs) in N/m, ``rows`` (pairs, dofs), z = rows u."""
+    """Compliance of a small system, from all its linear modes.
+
+    ``masses`` (dofs,) in kg and ``stiffness`` (dofs, dofs) in N/m; ``rows`` (pairs, dofs) pick the relative
+    displacements z = rows u. ``squared`` (mode,) are the squared frequencies in (rad/s)^2, ``vectors`` (dofs, mode) the
+    mass-normalised modes, ``parts`` (pairs, mode) their relative displacements.
+    """
 
     def __init__(self, masses: np.ndarray, stiffness: np.ndarray, rows: np.ndarray) -> None:
         root = 1 / np.sqrt(masses)
         squared, vectors = eigh(stiffness * np.outer(root, root))
-        rigid = np.abs(squared) < 1e-12 * np.abs(squared).max()
-        self.squared, self.vectors, self.parts = (
-            np.where(rigid, 0, squared),
-            vectors * root[:, None],
-            rows * root @ vectors,
-        )
-        scale = np.abs(self.parts).max(initial=0.0)
-        self.parts[:, rigid & (np.abs(self.parts).max(axis=0, initial=0.0) < 1e-10 * scale)] = 0  # pairs do not move it
+        rigid = np.abs(squared) < RIGID * np.abs(squared).max()
+
+        self.squared = np.where(rigid, 0, squared)
+        self.vectors = vectors * root[:, None]
+        self.parts = rows * root @ vectors
+
+        # Forces of pairs do not move a rigid motion without relative displacement. Rounding would make them do so, and
+        # at omega = 0 without bound.
+        relative = np.abs(self.parts).max(axis=0, initial=0.0)
+        self.parts[:, rigid & (relative < UNMOVED * np.abs(self.parts).max(initial=0.0))] = 0
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, real or complex."""
@@ -39,9 +50,11 @@ class DenseCompliance:
 
     def field(self, omega: complex, forces: np.ndarray) -> np.ndarray:
         """Displacement (dofs,) in m that ``forces`` (pairs,) in N, which pull pairs together, make."""
-        return np.asarray(-self.vectors @ (self._gain(np.array([omega]))[0] * (forces @ self.parts)))
+        gain = self._gain(np.array([omega]))[0]
+        return np.asarray(-self.vectors @ (gain * (forces @ self.parts)))
 
     def _gain(self, omega: np.ndarray) -> np.ndarray:
+        """The factor 1/(Om_n^2 - omega^2) (omega, mode); 0 of a mode at rest that no pair moves."""
         gap = self.squared - omega[:, None] ** 2
         moved = np.any(self.parts != 0, axis=0)
         return np.divide(1, gap, out=np.zeros_like(gap), where=moved | (gap != 0))
@@ -78,13 +91,30 @@ class Stretch(NamedTuple):
     right: int | None
     length: int
 
+    def unknowns(self, half: int) -> int:
+        """How many amplitudes it has, of lattices with ``half`` waves each way; none between neighbouring cells."""
+        if self.left is None or self.right is None:
+            return half
+        return 2 * half if self.length else 0
+
+
+class _Solution(NamedTuple):
+    """Solution of a loaded lattice, and the ``waves`` that its stretches are made of.
+
+    ``unknowns`` (omega, unknown, load): displacements of the loaded cells, then the amplitudes of each stretch.
+    """
+
+    unknowns: np.ndarray
+    waves: BlochWaves
+
 
 @dataclass(frozen=True)
 class WaveCompliance:
-    """Of the sites of ``chain``; ``infinite``: its cells go on beyond both ends. ``points`` are (cell, mass), from 0.
+    """Compliance of the sites of ``chain``, from Bloch waves; ``infinite``: its cells go on beyond both ends.
 
     Relative displacements w = u_resonator - u_host of the contact pairs are made by pairs of opposite forces, and by
-    forces on single masses at the ``points``. At omega = 0 forces on a lattice that is free to move must sum to zero.
+    forces on single masses at the ``points``, which are (cell, mass) from 0. At omega = 0 forces on a lattice that is
+    free to move must sum to zero.
     """
 
     chain: Chain
@@ -94,41 +124,24 @@ class WaveCompliance:
     @property
     def cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
-        ends = [] if self.infinite or self.chain.ends == "periodic" else [0, self.chain.cells - 1]
-        return sorted({*self.chain.sites, *(cell for cell, _ in self.points), *ends}) or [0]
-
-    def _stretches(self) -> list[Stretch]:
-        cells, last = self.cells, len(self.cells) - 1
-        between = [Stretch(i, i + 1, cells[i + 1] - cells[i] - 1) for i in range(last)]
-        if self.infinite:
-            return [Stretch(None, 0, 0), *between, Stretch(last, None, 0)]
-        return (
-            [*between, Stretch(last, 0, cells[0] + self.chain.cells - cells[-1] - 1)]
-            if self.chain.ends == "periodic"
-            else between
-        )
-
-    def _loads(self) -> np.ndarray:
-        """Unit loads (cells and dofs, pairs and points): rows that pick a relative displacement, or one of a mass."""
-        cell, place = self.chain.cell, {c: i * self.chain.cell.dofs for i, c in enumerate(self.cells)}
-        loads = np.zeros((len(place) * cell.dofs, len(self.chain.sites) + len(self.points)))
-        for j, site in enumerate(self.chain.sites):
-            loads[place[site] + cell.resonator, j], loads[place[site] + cell.host, j] = 1, -1
-        for j, (site, mass) in enumerate(self.points, len(self.chain.sites)):
-            loads[place[site] + mass, j] = 1
-        return loads
+        loaded = {*self.chain.sites, *(cell for cell, _ in self.points)}
+        if not self.infinite and self.chain.ends != "periodic":
+            loaded |= {0, self.chain.cells - 1}
+        return sorted(loaded) or [0]
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s, on or below the axis.
 
         Real for a finite lattice at real frequencies.
         """
-        omega, back = _right_half(omegas)
+        omega, mirrored = _right_half(omegas)
         loads = self._loads()
-        answer = loads[:, : len(self.chain.sites)].T @ self._solve(omega, loads)[0][:, : len(loads)]
+        pairs = loads[:, : len(self.chain.sites)]
+        answer = pairs.T @ self._solve(omega, loads).unknowns[:, : len(loads)]
+
         if not self.infinite and np.all(omega.imag == 0):
             return np.asarray(answer.real)
-        return np.where(back[:, None, None], answer.conj(), answer)
+        return np.where(mirrored[:, None, None], answer.conj(), answer)
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N, see ``response``."""
@@ -138,146 +151,246 @@ class WaveCompliance:
         """Displacement (cells, dofs) in m at ``cells`` (from 0), of an infinite lattice any.
 
         ``forces`` in N are those of the pairs, which pull back (-F on the resonator, F on the host), then those on the
-        points, if there are any.
+        points, if there are any. Raises ValueError for a cell that the lattice does not have.
         """
-        (turned,), (back,) = _right_half(omega)
+        right_half, mirrored = _right_half(omega)
         given = np.asarray(forces, complex)
-        solution, waves = self._solve(np.array([turned]), self._given(given.conj() if back else given))
-        u = np.array([self._displacement(int(cell), solution[0, :, 0], waves) for cell in np.atleast_1d(cells)])
-        return u.conj() if back else u
+        if mirrored[0]:
+            given = given.conj()
+
+        solution = self._solve(right_half, self._load_of(given))
+        u = np.array([self._displacement(int(cell), solution) for cell in np.atleast_1d(cells)])
+        return u.conj() if mirrored[0] else u
 
     def incident(self, omega: float, band: int, direction: int = 1) -> IncidentWave:
         """The wave of ``band`` (from 1) at ``omega`` in rad/s that carries energy to higher (+1) or lower (-1) cells.
 
         Raises ValueError if there is none, or if the contact pair does not move relatively in it.
         """
-        cell, waves = self.chain.cell, bloch_waves(self.chain.cell, np.array([omega], complex))
-        number = next((kappa for b, kappa, _ in waves_at(cell, omega) if b == band), None)
-        if number is None:
+        cell = self.chain.cell
+        wavenumbers = [kappa for number, kappa, _ in waves_at(cell, omega) if number == band]
+        if not wavenumbers:
             raise ValueError(f"no wave of band {band} has the frequency {omega:g} rad/s")
-        r = waves.factor.shape[1] // 2
-        channels = range(r) if direction > 0 else range(r, 2 * r)
-        channel = min(
-            channels, key=lambda n: abs(abs(np.angle(waves.factor[0, n])) - number) + abs(1 - abs(waves.factor[0, n]))
-        )
+
+        waves = bloch_waves(cell, np.array([omega], complex))
+        half = waves.factor.shape[1] // 2
+        channel = _propagating_channel(waves.factor[0], direction, wavenumbers[0])
         factor = waves.factor[0, channel] ** direction
         state = waves.state[0, :, channel]
-        shape = between(cell, waves, state, factor * state)
+        shape = cell_between(cell, waves, state, factor * state)
         relative = shape[cell.resonator] - shape[cell.host]
-        if abs(relative) < 1e-12 * np.abs(shape).max():
+        if abs(relative) < AT_REST * np.abs(shape).max():
             raise ValueError(f"the contact pair does not move in the wave of band {band} at {omega:g} rad/s")
+
         origin = self.chain.sites[0]
-        phases = factor ** (np.array(self.chain.sites) - origin)
-        flux = abs(energy_flux(omega, state)) / abs(relative) ** 2
-        return IncidentWave(omega, band, direction, number, phases, flux, shape / relative, factor, origin, channel % r)
+        return IncidentWave(
+            frequency=omega,
+            band=band,
+            direction=direction,
+            wavenumber=wavenumbers[0],
+            relative=factor ** (np.array(self.chain.sites) - origin),
+            flux=abs(energy_flux(omega, state)) / abs(relative) ** 2,
+            shape=shape / relative,
+            factor=factor,
+            origin=origin,
+            channel=channel % half,
+        )
 
     def outgoing(
         self, omega: float, forces: ArrayLike, wave: IncidentWave | None = None, amplitude: complex = 0.0
     ) -> np.ndarray:
         """Energy (direction, wave) in W, to higher cells and to lower ones, that leaves an infinite lattice.
 
-        Of all waves at ``omega`` (rad/s, positive) that ``forces`` (as of ``field``) make beside the ``wave`` that
-        comes in with an ``amplitude`` in m: its energy leaves, if nothing else happens, on its own way.
+        ``forces`` are as for ``field``, at ``omega`` in rad/s, positive. A ``wave`` that comes in with an ``amplitude``
+        in m goes on in its direction, where it interferes with the waves of the forces.
         """
-        solution, waves = self._solve(np.array([omega], complex), self._given(np.asarray(forces, complex)))
-        r, size, u = waves.factor.shape[1] // 2, len(self.cells) * self.chain.cell.dofs, solution[0, :, 0]
-        amplitudes = np.array([u[-r:], u[size : size + r]])
+        solution = self._solve(np.array([omega], complex), self._load_of(np.asarray(forces, complex)))
+        waves = solution.waves
+        half = waves.factor.shape[1] // 2
+        size = len(self.cells) * self.chain.cell.dofs
+
+        # The first stretch goes on to lower cells, the last one to higher ones.
+        u = solution.unknowns[0, :, 0]
+        amplitudes = np.array([u[-half:], u[size : size + half]])
         if wave is not None:
-            way = 0 if wave.direction > 0 else 1
-            state = waves.state[0, :, wave.channel + way * r]
-            shape = between(self.chain.cell, waves, state, wave.factor * state)
-            scale = wave.shape[self.chain.cell.host] / shape[self.chain.cell.host]
-            steps = self.cells[-1] + 1 - wave.origin if way == 0 else self.cells[0] - wave.origin
-            amplitudes[way, wave.channel] += amplitude * scale * wave.factor**steps
-        each = np.array([[energy_flux(omega, waves.state[0, :, n + way * r]) for n in range(r)] for way in range(2)])
-        travels = np.abs(1 - np.abs(waves.factor[0].reshape(2, r))) < NEUTRAL
-        return np.where(travels, np.abs(each), 0) * np.abs(amplitudes) ** 2
+            row = 0 if wave.direction > 0 else 1
+            amplitudes[row, wave.channel] += self._transmitted(wave, amplitude, waves)
 
-    def _given(self, forces: np.ndarray) -> np.ndarray:
-        """The load (cells and dofs, 1) of ``forces``."""
-        loads, pairs = self._loads(), len(self.chain.sites)
-        return np.asarray(loads[:, : len(forces)] @ np.concatenate([-forces[:pairs], forces[pairs:]]))[:, None]
+        unit_flux = np.empty((2, half))
+        for row in range(2):
+            for n in range(half):
+                unit_flux[row, n] = energy_flux(omega, waves.state[0, :, n + row * half])
+        travels = np.abs(1 - np.abs(waves.factor[0].reshape(2, half))) < NEUTRAL
+        return np.where(travels, np.abs(unit_flux), 0) * np.abs(amplitudes) ** 2
 
-    def _solve(self, omega: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, BlochWaves]:
-        """Displacements of the loaded cells, then amplitudes of the stretches (omega, unknown, load), and the waves."""
-        chain, cells = self.chain, self.cells
-        (k, p, q, left, right), d = coupling_blocks(chain.cell), chain.cell.dofs
-        waves, b = bloch_waves(chain.cell, omega), p @ q.T
-        r, size = p.shape[1], len(cells) * d
-        dynamic = k - omega[:, None, None] ** 2 * np.diag(chain.cell.masses)
+    def _transmitted(self, wave: IncidentWave, amplitude: complex, waves: BlochWaves) -> complex:
+        """Amplitude behind the last loaded cell, scaled as ``waves``, of an incident ``wave`` of ``amplitude`` in m."""
+        half = waves.factor.shape[1] // 2
+        channel = wave.channel if wave.direction > 0 else wave.channel + half
+        state = waves.state[0, :, channel]
+        shape = cell_between(self.chain.cell, waves, state, wave.factor * state)
+        scale = wave.shape[self.chain.cell.host] / shape[self.chain.cell.host]
+
+        steps = self.cells[0] - wave.origin
+        if wave.direction > 0:
+            steps = self.cells[-1] + 1 - wave.origin
+        return complex(amplitude * scale * wave.factor**steps)
+
+    def _stretches(self) -> list[Stretch]:
+        """The stretches without loads, from lower cells to higher ones; a ring's last one leads back to the first."""
+        cells = self.cells
+        last = len(cells) - 1
+        stretches = [Stretch(i, i + 1, cells[i + 1] - cells[i] - 1) for i in range(last)]
+        if self.infinite:
+            return [Stretch(None, 0, 0), *stretches, Stretch(last, None, 0)]
+        if self.chain.ends == "periodic":
+            stretches.append(Stretch(last, 0, cells[0] + self.chain.cells - cells[-1] - 1))
+        return stretches
+
+    def _loads(self) -> np.ndarray:
+        """Unit loads (cells and dofs, pairs and points): rows that pick a relative displacement, or one of a mass."""
+        cell = self.chain.cell
+        pairs = len(self.chain.sites)
+        first_row = {number: i * cell.dofs for i, number in enumerate(self.cells)}
+
+        loads = np.zeros((len(first_row) * cell.dofs, pairs + len(self.points)))
+        for j, site in enumerate(self.chain.sites):
+            loads[first_row[site] + cell.resonator, j] = 1
+            loads[first_row[site] + cell.host, j] = -1
+        for j, (number, mass) in enumerate(self.points, pairs):
+            loads[first_row[number] + mass, j] = 1
+        return loads
+
+    def _load_of(self, forces: np.ndarray) -> np.ndarray:
+        """The load (cells and dofs, 1) that ``forces``, as of ``field``, amount to."""
+        pairs = len(self.chain.sites)
+        signed = np.concatenate([-forces[:pairs], forces[pairs:]])
+        return np.asarray(self._loads()[:, : len(forces)] @ signed)[:, None]
+
+    def _solve(self, omega: np.ndarray, loads: np.ndarray) -> _Solution:
+        """The lattice under ``loads`` (cells and dofs, load) at ``omega`` in rad/s, of ``_right_half``."""
+        waves = bloch_waves(self.chain.cell, omega)
+        matrix = self._matrix(omega, waves)
+        padded = np.zeros((1, matrix.shape[1], loads.shape[1]), complex)
+        padded[0, : len(loads)] = loads
+        return _Solution(unknowns=np.linalg.solve(matrix, padded), waves=waves)
+
+    def _matrix(self, omega: np.ndarray, waves: BlochWaves) -> np.ndarray:
+        """The equations (omega, unknown, unknown): balance of each loaded cell, then the states at stretches' ends."""
+        chain = self.chain
+        d = chain.cell.dofs
+        blocks = coupling_blocks(chain.cell)
+        coupling = blocks.out @ blocks.into.T
+        half = blocks.out.shape[1]
         stretches = self._stretches()
-        counts = [(r if None in s[:2] else 2 * r if s.length else 0) for s in stretches]
-        total = size + sum(counts)
-        matrix = np.zeros((len(omega), total, total), complex)
-        at = [slice(i * d, i * d + d) for i in range(len(cells))]
-        for here in at:
-            matrix[:, here, here] += dynamic
-        if chain.ends == "free" and not self.infinite:
-            matrix[:, at[0], at[0]] -= left
-            matrix[:, at[-1], at[-1]] -= right
-        if chain.ends != "fixed" or self.infinite:
-            matrix[omega == 0, chain.cell.host, chain.cell.host] += k[0, 0]  # forces that sum to zero put none on it
-        start = size
-        for stretch, count in zip(stretches, counts, strict=True):
-            unknown = slice(start, start + count)
-            if stretch.left is not None and stretch.right is not None and not count:
-                matrix[:, at[stretch.left], at[stretch.right]] += b
-                matrix[:, at[stretch.right], at[stretch.left]] += b.T
-            row = start
-            if stretch.left is not None and count:
-                first = _states(waves, stretch, 0, stretch.length)
-                matrix[:, at[stretch.left], unknown] += p @ first[:, :r]
-                matrix[:, row : row + r, unknown] = first[:, r:]
-                matrix[:, row : row + r, at[stretch.left]] -= p.T
-                row += r
-            if stretch.right is not None and count:
-                last = _states(waves, stretch, stretch.length, 0)
-                matrix[:, at[stretch.right], unknown] += q @ last[:, r:]
-                matrix[:, row : row + r, unknown] = last[:, :r]
-                matrix[:, row : row + r, at[stretch.right]] -= q.T
-            start += count
-        padded = np.zeros((1, total, loads.shape[1]), complex)
-        padded[0, :size] = loads
-        return np.linalg.solve(matrix, padded), waves
+        size = len(self.cells) * d
+        total = size + sum(stretch.unknowns(half) for stretch in stretches)
 
-    def _displacement(self, cell: int, solution: np.ndarray, waves: BlochWaves) -> np.ndarray:
-        """Displacement (dofs,) of a ``cell`` from a ``solution`` (unknown,)."""
-        cells, d, r = self.cells, self.chain.cell.dofs, waves.factor.shape[1] // 2
+        matrix = np.zeros((len(omega), total, total), complex)
+        at = [slice(i * d, i * d + d) for i in range(len(self.cells))]
+        dynamic = blocks.stiffness - omega[:, None, None] ** 2 * np.diag(chain.cell.masses)
+        for cell in at:
+            matrix[:, cell, cell] += dynamic
+        if chain.ends == "free" and not self.infinite:
+            matrix[:, at[0], at[0]] -= blocks.left
+            matrix[:, at[-1], at[-1]] -= blocks.right
+        if chain.ends != "fixed" or self.infinite:
+            # At omega = 0 such a lattice may move as a whole. A spring to ground stops that: forces that sum to zero
+            # put no load on it.
+            matrix[omega == 0, chain.cell.host, chain.cell.host] += blocks.stiffness[0, 0]
+
+        row = size
+        for stretch in stretches:
+            count = stretch.unknowns(half)
+            amplitudes = slice(row, row + count)
+            if not count:
+                assert stretch.left is not None and stretch.right is not None
+                matrix[:, at[stretch.left], at[stretch.right]] += coupling
+                matrix[:, at[stretch.right], at[stretch.left]] += coupling.T
+                continue
+            if stretch.left is not None:
+                first = _states(waves, stretch, 0)
+                matrix[:, at[stretch.left], amplitudes] += blocks.out @ first[:, :half]
+                matrix[:, row : row + half, amplitudes] = first[:, half:]
+                matrix[:, row : row + half, at[stretch.left]] -= blocks.out.T
+                row += half
+            if stretch.right is not None:
+                last = _states(waves, stretch, stretch.length)
+                matrix[:, at[stretch.right], amplitudes] += blocks.into @ last[:, half:]
+                matrix[:, row : row + half, amplitudes] = last[:, :half]
+                matrix[:, row : row + half, at[stretch.right]] -= blocks.into.T
+                row += half
+        return matrix
+
+    def _displacement(self, cell: int, solution: _Solution) -> np.ndarray:
+        """Displacement (dofs,) of a ``cell`` under the first load, at the first frequency."""
+        cells = self.cells
+        d = self.chain.cell.dofs
+        unknowns = solution.unknowns[0, :, 0]
         if cell in cells:
-            return solution[cells.index(cell) * d :][:d]
+            first = cells.index(cell) * d
+            return unknowns[first : first + d]
+
+        half = solution.waves.factor.shape[1] // 2
         start = len(cells) * d
         for stretch in self._stretches():
-            count = r if None in stretch[:2] else 2 * r if stretch.length else 0
-            n = stretch.length
-            if stretch.left is None:
-                inside, i = cell < cells[0], n + 1 - (cells[0] - cell)
-            else:
-                i = (cell - cells[stretch.left]) % self.chain.cells if not self.infinite else cell - cells[stretch.left]
-                inside = i > 0 and (stretch.right is None or i <= n)
-            if inside:
-                amplitudes = solution[start : start + count]
-                before, after = (_states(waves, stretch, j, n - j)[0] @ amplitudes for j in (i - 1, i))
-                return between(self.chain.cell, waves, before, after)
-            start += count
+            stop = start + stretch.unknowns(half)
+            place = self._place(cell, stretch)
+            if place is not None:
+                before = _states(solution.waves, stretch, place - 1)[0] @ unknowns[start:stop]
+                after = _states(solution.waves, stretch, place)[0] @ unknowns[start:stop]
+                return cell_between(self.chain.cell, solution.waves, before, after)
+            start = stop
         raise ValueError(f"cell {cell + 1} is not one of the lattice's {self.chain.cells}")
+
+    def _place(self, cell: int, stretch: Stretch) -> int | None:
+        """Which cell of a ``stretch`` a ``cell`` is, from 1; of one without a beginning, up to 0. None: not in it."""
+        cells = self.cells
+        if stretch.left is None:
+            return 1 - (cells[0] - cell) if cell < cells[0] else None
+
+        place = cell - cells[stretch.left]
+        if not self.infinite:
+            place %= self.chain.cells
+        inside = place > 0 and (stretch.right is None or place <= stretch.length)
+        return place if inside else None
 
 
 def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (w,) with real parts >= 0, whose answers are the complex conjugate where the second array is true."""
     omega = np.atleast_1d(np.asarray(omegas, complex))
-    back = omega.real < 0
-    return np.where(back, -omega.conj(), omega), back
+    mirrored = omega.real < 0
+    return np.where(mirrored, -omega.conj(), omega), mirrored
 
 
-def _states(waves: BlochWaves, stretch: Stretch, after: int, before: int) -> np.ndarray:
-    """States (omega, 2r, wave) of a stretch's waves ``after`` cells from its beginning, ``before`` its end."""
-    r = waves.factor.shape[1] // 2
-    parts = []
+def _propagating_channel(factor: np.ndarray, direction: int, wavenumber: float) -> int:
+    """Which wave of ``factor`` (2r,) going in a ``direction`` does not decay and has the ``wavenumber`` in (0, pi)."""
+    half = len(factor) // 2
+    channels = range(half) if direction > 0 else range(half, 2 * half)
+
+    def mismatch(n: int) -> float:
+        return float(abs(abs(np.angle(factor[n])) - wavenumber) + abs(1 - abs(factor[n])))
+
+    return min(channels, key=mismatch)
+
+
+def _states(waves: BlochWaves, stretch: Stretch, place: int) -> np.ndarray:
+    """States (omega, 2r, wave) of a stretch's waves behind its cell number ``place`` (0: before the first one).
+
+    Waves to higher cells are counted from its beginning, waves to lower ones from its end.
+    """
+    half = waves.factor.shape[1] // 2
+    states = []
     if stretch.left is not None:
-        parts.append(waves.state[:, :, :r] * waves.factor[:, None, :r] ** after)
+        states.append(waves.state[:, :, :half] * waves.factor[:, None, :half] ** place)
     if stretch.right is not None:
-        state, slope = waves.state[:, :, r:], waves.slope[:, :, r:]
-        if stretch.left is None:  # without an end a shift in common alone is at rest
-            state, slope = np.where(np.any(slope != 0, axis=1, keepdims=True), slope, state), 0 * slope
-        parts.append(state * waves.factor[:, None, r:] ** before - before * slope)
-    return np.concatenate(parts, axis=2)
+        before_end = stretch.length - place
+        state = waves.state[:, :, half:]
+        slope = waves.slope[:, :, half:]
+        if stretch.left is None:
+            # A displacement linear in the cells grows without bound where there is no end: in its place at omega = 0
+            # stands the shift in common.
+            state = np.where(np.any(slope != 0, axis=1, keepdims=True), slope, state)
+            slope = 0 * slope
+        states.append(state * waves.factor[:, None, half:] ** before_end - before_end * slope)
+    return np.concatenate(states, axis=2)

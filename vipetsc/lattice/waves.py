@@ -1,4 +1,4 @@
-r"""Bloch waves at given frequencies, propagating and evanescent, and which way each of them goes.
+r"""Bloch waves at given frequencies, propagating and evanescent, and the direction of each.
 
 Time runs as exp(i omega t) and u obeys (K - omega^2 M) u = f. Cells are tied to the next by B = K_{n,n+1} = P Q^T
 of rank r, so that all that passes between n - 1 and n is the state v = (Q^T u_n, P^T u_{n-1}) of 2r numbers. In a
@@ -21,6 +21,8 @@ from scipy.linalg import lapack
 from vipetsc.lattice.cell import UnitCell
 
 NEUTRAL = 1e-7  # |log |lambda|| below which a wave's direction is that of its energy
+PORT = 1j  # s; any imaginary number will do
+RANK = 1e-13  # singular values of B below this fraction of the largest are rounding
 
 
 class BlochWaves(NamedTuple):
@@ -38,7 +40,11 @@ class BlochWaves(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Of a cell: ``stiffness`` (dofs, dofs) with all springs; B = ``out`` @ ``into``.T; springs' shares by side."""
+    """Stiffness matrices of a cell in N/m: the diagonal block K_nn, and the factors of K_{n,n+1}.
+
+    ``stiffness`` (dofs, dofs) is K_nn with all springs, B = ``out`` @ ``into``.T with the factors P and Q (dofs, r).
+    ``left`` and ``right`` (dofs, dofs) are what the springs to the cells before and after add to K_nn.
+    """
 
     stiffness: np.ndarray
     out: np.ndarray
@@ -49,41 +55,63 @@ class Blocks(NamedTuple):
 
 @lru_cache
 def coupling_blocks(cell: UnitCell) -> Blocks:
-    """K_nn, the factors P and Q of K_{n,n+1}, and what the springs to the cells before and after add to K_nn."""
-    d = cell.dofs
-    inside, coupling, left, right = (np.zeros((d, d)) for _ in range(4))
+    """The blocks of an interior cell; r is the rank of the coupling to the next one."""
+    inside = np.zeros((cell.dofs, cell.dofs))
+    coupling = np.zeros_like(inside)
+    left = np.zeros_like(inside)
+    right = np.zeros_like(inside)
     for mass, offset, other, stiffness, *_ in cell.couplings():
         inside[mass, mass] += stiffness
-        (left if offset < 0 else right)[mass, mass] += stiffness * abs(offset)
-        (coupling if offset > 0 else inside)[mass, other] -= stiffness * (offset >= 0)
+        if offset == 0:
+            inside[mass, other] -= stiffness
+        elif offset > 0:
+            coupling[mass, other] -= stiffness
+            right[mass, mass] += stiffness
+        else:
+            left[mass, mass] += stiffness
+
     u, s, vh = np.linalg.svd(coupling)
-    rank = int((s > 1e-13 * s[0]).sum())
+    rank = int((s > RANK * s[0]).sum())
     root = np.sqrt(s[:rank])
-    return Blocks(inside, u[:, :rank] * root, vh[:rank].T * root, left, right)
+    return Blocks(stiffness=inside, out=u[:, :rank] * root, into=vh[:rank].T * root, left=left, right=right)
 
 
 def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
     """The waves at ``omegas`` in rad/s with parts Re >= 0 and Im <= 0."""
-    k, p, q, *_ = coupling_blocks(cell)
+    blocks = coupling_blocks(cell)
+    p = blocks.out
+    q = blocks.into
     r = p.shape[1]
-    s = 1j
-    dynamic = k - omegas[:, None, None] ** 2 * np.diag(cell.masses)
-    inner = np.linalg.inv(dynamic + s * p @ p.T)
-    (qq, qp), (pq, pp) = ([a.T @ inner @ b for b in (q, p)] for a in (q, p))
+    dynamic = blocks.stiffness - omegas[:, None, None] ** 2 * np.diag(cell.masses)
+    inner = np.linalg.inv(dynamic + PORT * p @ p.T)
+
+    # The eigenvalue problem of the states, as in the module's docstring.
+    qq = q.T @ inner @ q
+    qp = q.T @ inner @ p
+    pq = p.T @ inner @ q
+    pp = p.T @ inner @ p
     one = np.broadcast_to(np.eye(r), qq.shape)
     left = np.block([[one, qq], [np.zeros_like(qq), pq]])
-    right = np.block([[-qp, s * qp], [-pp, s * pp - one]])
+    right = np.block([[-qp, PORT * qp], [-pp, PORT * pp - one]])
+    # Eigenvalues as fractions alpha/beta: lambda is 0 or infinite for waves that do not reach the next cell.
     solved = [lapack.zggev(a, b, compute_vl=0) for a, b in zip(left, right, strict=True)]
-    alpha, beta, states = (np.array([answer[n] for answer in solved]) for n in (0, 1, 3))
+    alpha = np.array([answer[0] for answer in solved])
+    beta = np.array([answer[1] for answer in solved])
+    states = np.array([answer[3] for answer in solved])
     states /= np.linalg.norm(states, axis=1, keepdims=True)
+
+    # Waves to higher cells first: those that decay, and of those that do not, which carry energy there.
     sizes = np.maximum(np.abs([alpha, beta]), 1e-300)
-    growth, flux = np.log(sizes[0] / sizes[1]), np.sum(states[:, r:].conj() * states[:, :r], axis=1).imag
+    growth = np.log(sizes[0] / sizes[1])
+    flux = np.sum(states[:, r:].conj() * states[:, :r], axis=1).imag
     neutral = (np.abs(growth) < NEUTRAL) & (omegas.imag == 0)[:, None]
     order = np.argsort(np.where(neutral, -np.sign(flux) * NEUTRAL, growth), axis=1)
-    alpha, beta = (np.take_along_axis(x, order, axis=1) for x in (alpha, beta))
+    alpha = np.take_along_axis(alpha, order, axis=1)
+    beta = np.take_along_axis(beta, order, axis=1)
     states = np.take_along_axis(states, order[:, None], axis=2)
+
     factor = np.concatenate([alpha[:, :r] / beta[:, :r], beta[:, r:] / alpha[:, r:]], axis=1)
-    waves = BlochWaves(factor, states, np.zeros_like(states), inner, s)
+    waves = BlochWaves(factor=factor, state=states, slope=np.zeros_like(states), inner=inner, port=PORT)
     for i in np.nonzero(omegas == 0)[0]:
         _make_static(cell, waves, int(i))
     return waves
@@ -91,28 +119,34 @@ def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
 
 def _make_static(cell: UnitCell, waves: BlochWaves, i: int) -> None:
     """Put the shift in common and the linear displacement in the place of the double root at omega = 0."""
-    k, p, q, *_ = coupling_blocks(cell)
-    r, ones = p.shape[1], np.ones(cell.dofs)
-    first, second = r - 1, r
-    b = p @ q.T
-    (shape, *_), shift = (
-        np.linalg.lstsq(k + b + b.T, (b.T - b) @ ones, rcond=None),
-        np.concatenate([q.T @ ones, p.T @ ones]),
-    )
+    blocks = coupling_blocks(cell)
+    p = blocks.out
+    q = blocks.into
+    coupling = p @ q.T
+    ones = np.ones(cell.dofs)
+
+    shift = np.concatenate([q.T @ ones, p.T @ ones])
+    # The shape of the linear displacement within a cell, u_n = n + shape; a shift in common of it is free.
+    shape = np.linalg.lstsq(blocks.stiffness + coupling + coupling.T, (coupling.T - coupling) @ ones, rcond=None)[0]
+
+    # Sorted by growth, the double root is the last wave to higher cells and the first one to lower cells.
+    first = p.shape[1] - 1
+    second = p.shape[1]
     waves.factor[i, [first, second]] = 1
     waves.state[i, :, first] = shift
     waves.state[i, :, second] = np.concatenate([q.T @ shape, p.T @ (shape - ones)])
     waves.slope[i, :, second] = shift
 
 
-def between(cell: UnitCell, waves: BlochWaves, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Displacement (dofs,) of a cell between two states (2r,)."""
-    _, p, q, *_ = coupling_blocks(cell)
-    r = p.shape[1]
-    return np.asarray(-waves.inner[0] @ (p @ (after[:r] - waves.port * after[r:]) + q @ before[r:]))
+def cell_between(cell: UnitCell, waves: BlochWaves, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Displacement (dofs,) of a cell between two states (2r,), at the first frequency of ``waves``."""
+    blocks = coupling_blocks(cell)
+    r = blocks.out.shape[1]
+    pull = blocks.out @ (after[:r] - waves.port * after[r:]) + blocks.into @ before[r:]
+    return np.asarray(-waves.inner[0] @ pull)
 
 
 def energy_flux(omega: float, state: np.ndarray) -> float:
-    """Energy in W that a ``state`` (2r,) carries to higher cells."""
+    """Energy in W that a ``state`` (2r,) carries to higher cells at ``omega`` in rad/s."""
     r = len(state) // 2
     return float(omega / 2 * np.imag(state[r:].conj() @ state[:r]))
