@@ -12,6 +12,7 @@ from scipy.optimize import brentq, minimize_scalar
 from vipetsc.lattice.cell import UnitCell
 
 GRID = np.linspace(0, np.pi, 721)  # wavenumbers between which extremes and waves are searched
+OFF_ZERO = 3e-4  # smallest wavenumber at which group velocities are computed
 
 
 @dataclass(frozen=True)
@@ -43,22 +44,26 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     as the limit from kappa > 0 where omega = 0.
     """
     kappa = np.asarray(kappa, float)
-    # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
-    off_zero = np.where(np.abs(kappa) < 3e-4, 3e-4, kappa)
     root = 1 / np.sqrt(cell.masses)
     scale = root[:, None] * root
     squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)
-    frequency = np.sqrt(np.maximum(squared, 0))
+
+    # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
+    off_zero = np.where(np.abs(kappa) < OFF_ZERO, OFF_ZERO, kappa)
     eigenvalue, u = np.linalg.eigh(cell.stiffness_matrix(off_zero) * scale)
     stiffness_slope = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
     for mass, offset, other, stiffness, *_ in cell.couplings():
         stiffness_slope[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * off_zero * offset)
     eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope * scale @ u).real
-    group_velocity = eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny)))
-    return BlochPoint(frequency, vectors * root[:, None], group_velocity)
+    return BlochPoint(
+        frequency=np.sqrt(np.maximum(squared, 0)),
+        vectors=vectors * root[:, None],
+        group_velocity=eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny))),
+    )
 
 
 def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
+    """Frequency in rad/s of ``band`` (from 1) at ``kappa``; ``sign`` -1 makes the lower edge a maximum."""
     return sign * float(bloch(cell, kappa).frequency[band - 1])
 
 
@@ -67,7 +72,10 @@ def _maximum(function: Callable[[float], float], values: np.ndarray) -> tuple[fl
     best = int(np.argmax(values))
     bracket = GRID[max(best - 1, 0)], GRID[min(best + 1, len(GRID) - 1)]
     refined = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
-    return (refined.x, -refined.fun) if -refined.fun > values[best] else (float(GRID[best]), float(values[best]))
+    if -refined.fun > values[best]:
+        return refined.x, -refined.fun
+    # A bounded search does not reach the ends of its bracket, where an extreme at 0 or pi lies.
+    return float(GRID[best]), float(values[best])
 
 
 @lru_cache
@@ -77,7 +85,7 @@ def pass_bands(cell: UnitCell) -> tuple[Band, ...]:
     for number, frequency in enumerate(bloch(cell, GRID).frequency.T, 1):
         _, high = _maximum(partial(_frequency, cell, number), frequency)
         _, low = _maximum(partial(_frequency, cell, number, sign=-1), -frequency)
-        bands.append(Band(number, max(-low, 0.0), high))
+        bands.append(Band(number=number, low=max(-low, 0.0), high=high))
     return tuple(bands)
 
 
@@ -101,7 +109,8 @@ def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float]
     for number, offset in enumerate((bloch(cell, GRID).frequency - frequency).T, 1):
         for i in np.nonzero(offset[:-1] * offset[1:] <= 0)[0]:
             if offset[i] == 0 and i > 0:
-                continue
+                continue  # a root on the grid, which the interval before has given
             root = brentq(lambda x, n=number: _frequency(cell, n, x) - frequency, GRID[i], GRID[i + 1], xtol=1e-13)
-            waves.append((number, root, float(abs(bloch(cell, root).group_velocity[number - 1]))))
+            speed = float(abs(bloch(cell, root).group_velocity[number - 1]))
+            waves.append((number, root, speed))
     return tuple(waves)

@@ -17,8 +17,8 @@ class Spring:
     """A spring between two masses (0-based) of one cell, or from one cell to the next.
 
     Its force at the elongation z is k z + q z^2 + c z^3: ``stiffness`` k in N/m, ``quadratic`` q in N/m^2 and ``cubic``
-    c in N/m^3, which bands and modes leave out. ``damping`` is that of a dashpot beside it in N s/m. With ``next_cell``
-    the spring runs from mass ``start`` of a cell to mass ``end`` of the cell after it.
+    c in N/m^3, which bands and modes leave out. ``damping`` in N s/m is that of a dashpot parallel to it. With
+    ``next_cell`` the spring runs from mass ``start`` of a cell to mass ``end`` of the cell after it.
     """
 
     start: int
@@ -86,8 +86,9 @@ class UnitCell:
         """
         ends = []
         for i, s in enumerate(self.springs):
-            offset, of_spring = int(s.next_cell), (s.stiffness, s.damping, i)
-            ends += [Coupling(s.start, offset, s.end, *of_spring), Coupling(s.end, -offset, s.start, *of_spring)]
+            there = int(s.next_cell)
+            for mass, offset, other in ((s.start, there, s.end), (s.end, -there, s.start)):
+                ends.append(Coupling(mass, offset, other, stiffness=s.stiffness, damping=s.damping, spring=i))
         return sorted(ends, key=lambda c: c.mass)
 
     def stiffness_matrix(self, kappa: ArrayLike) -> np.ndarray:
@@ -100,7 +101,8 @@ class UnitCell:
 
     def damping_matrix(self, kappa: ArrayLike) -> np.ndarray:
         """Bloch damping (..., dofs, dofs) in N s/m of all dashpots, as ``stiffness_matrix``."""
-        return self._bloch(kappa, [c.damping for c in self.couplings()]) + np.diag(self.grounding or [0.0] * self.dofs)
+        grounding = np.diag(self.grounding or [0.0] * self.dofs)
+        return self._bloch(kappa, [c.damping for c in self.couplings()]) + grounding
 
     def _bloch(self, kappa: ArrayLike, values: list[float]) -> np.ndarray:
         """The Bloch matrix of the couplings' ``values``."""
@@ -119,28 +121,18 @@ def cell_problems(
 
     Messages count masses from 1, as case files do.
     """
-    n, problems = len(masses), []
+    n = len(masses)
+    problems = []
     for i, m in enumerate(masses, 1):
         if not 0 < m < np.inf:
             problems.append((f"masses[{i}]", f"mass {m!r} must be positive (kg)"))
     for i, s in enumerate(springs, 1):
-        key = f"springs[{i}]"
-        if not 0 < s.stiffness < np.inf:
-            problems.append((f"{key}.stiffness", f"stiffness {s.stiffness!r} must be positive (N/m)"))
-        if not 0 <= s.damping < np.inf:
-            problems.append((f"{key}.damping", f"damping {s.damping!r} must not be negative (N s/m)"))
-        outside = [end for end in (s.start, s.end) if not 0 <= end < n]
-        problems += [(key, f"mass {end + 1} is not one of the cell's {n}") for end in outside]
-        if s.start == s.end and not s.next_cell:
-            problems.append((key, f"joins mass {s.start + 1} to itself; did you mean next_cell = true?"))
+        problems += _spring_problems(s, f"springs[{i}]", n)
     for name, index in (("host", host), ("resonator", resonator)):
         if not 0 <= index < n:
             problems.append(("contact", f"{name} {index + 1} is not one of the cell's {n} masses"))
-    if len(grounding) not in (0, n):
-        problems.append(("grounding", f"one dashpot for each of the {n} masses is needed, 0 for none"))
-    for i, c in enumerate(grounding, 1):
-        if not 0 <= c < np.inf:
-            problems.append((f"grounding[{i}]", f"damping {c!r} must not be negative (N s/m)"))
+    problems += _dashpot_problems(grounding, n)
+
     if host == resonator and n > 1:
         problems.append(("contact", "host and resonator must be two different masses"))
     if springs and not any(s.next_cell for s in springs):
@@ -148,9 +140,35 @@ def cell_problems(
     return problems
 
 
+def _spring_problems(spring: Spring, key: str, n: int) -> list[tuple[str, str]]:
+    """Everything wrong with a ``spring`` of a cell of ``n`` masses, as ``cell_problems``."""
+    problems = []
+    if not 0 < spring.stiffness < np.inf:
+        problems.append((f"{key}.stiffness", f"stiffness {spring.stiffness!r} must be positive (N/m)"))
+    if not 0 <= spring.damping < np.inf:
+        problems.append((f"{key}.damping", f"damping {spring.damping!r} must not be negative (N s/m)"))
+    for end in (spring.start, spring.end):
+        if not 0 <= end < n:
+            problems.append((key, f"mass {end + 1} is not one of the cell's {n}"))
+    if spring.start == spring.end and not spring.next_cell:
+        problems.append((key, f"joins mass {spring.start + 1} to itself; did you mean next_cell = true?"))
+    return problems
+
+
+def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, str]]:
+    """Everything wrong with the dashpots to ground of a cell of ``n`` masses, as ``cell_problems``."""
+    problems = []
+    if len(grounding) not in (0, n):
+        problems.append(("grounding", f"one dashpot for each of the {n} masses is needed, 0 for none"))
+    for i, c in enumerate(grounding, 1):
+        if not 0 <= c < np.inf:
+            problems.append((f"grounding[{i}]", f"damping {c!r} must not be negative (N s/m)"))
+    return problems
+
+
 @lru_cache
 def connected_groups(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
-    """Of each of ``n`` nodes (0-based) the number of the group that ``pairs`` tie it to."""
+    """Numbers of the groups into which ``pairs`` tie ``n`` nodes (0-based): that of each node, in their order."""
     graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
     return connected_components(graph, directed=False)[1].tolist()
 
@@ -162,7 +180,8 @@ def diatomic(reading: Reading = "printed") -> UnitCell:
     amplitudes that the paper reports (.58 N instead of 5.3 N).
     """
     k = {"printed": 9e4, "calibrated": 9e3}[reading]
-    return UnitCell((0.01, 0.08), (Spring(0, 0, k, next_cell=True), Spring(0, 1, k)), host=0, resonator=1)
+    springs = (Spring(0, 0, k, next_cell=True), Spring(0, 1, k))
+    return UnitCell(masses=(0.01, 0.08), springs=springs, host=0, resonator=1)
 
 
 def four_band(reading: Reading = "printed", lam: float = 0.1, eta: float = 0.5) -> UnitCell:
@@ -171,7 +190,9 @@ def four_band(reading: Reading = "printed", lam: float = 0.1, eta: float = 0.5) 
     ``lam`` and ``eta`` set the resonator's spring and mass. The printed reading has the spring
     lam k = 2000 N/m; the calibrated one lam k2 = 1000 N/m, which meets the paper's transfer of .30-.35.
     """
-    m, k, k2 = 0.005, 2e4, 1e4
+    m = 0.005
+    k = 2e4
+    k2 = 1e4
     k3 = lam * {"printed": k, "calibrated": k2}[reading]
     springs = (Spring(3, 0, k, next_cell=True), Spring(0, 1, k2), Spring(1, 3, k2), Spring(1, 2, k3))
-    return UnitCell((m, m * (1 - eta), m * eta, m), springs, host=1, resonator=2)
+    return UnitCell(masses=(m, m * (1 - eta), m * eta, m), springs=springs, host=1, resonator=2)

@@ -12,6 +12,7 @@ lack the spring that a ring has between them. A wave that meets an end is seen i
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh, eigvals_banded, lapack
@@ -22,9 +23,11 @@ from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Waveform
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size
-CLOSE = 1e-3  # modes nearer than this share of the largest Om^2 are made orthogonal one by one
+CLOSE = 1e-3  # modes nearer than this fraction of the largest Om^2 are made orthogonal one by one
 EPS = float(np.finfo(float).eps)
-ORTHONORMAL = 2e-13  # error of the norm of any field in all modes up to which they are taken
+ORTHONORMAL = 2e-13  # error of the norm of any field in all modes up to which they are accepted
+AT_REST = 1e-13  # squared frequencies below this fraction of the largest are those of a shift in common
+ITERATIONS = 3  # of inverse iteration; few, since its shift is an eigenvalue to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +48,25 @@ class Modes:
 
     def amplitudes(self, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Amplitudes z (t, mode) in sqrt(J) of fields (t, cell, dof) in m and m/s."""
-        root, nt = np.sqrt(self.chain.cell.masses), len(velocity)
+        nt = len(velocity)
         if self.vectors.ndim == 2:
             root = np.sqrt(self.chain.masses()).reshape(self.chain.cells, -1)
-        fields = np.concatenate([velocity * root, displacement * root])
-        if self.vectors.ndim == 2:
+            fields = np.concatenate([velocity * root, displacement * root])
             parts = fields.reshape(2 * nt, -1) @ self.vectors
             return np.asarray(parts[:nt] + 1j * self.frequency * parts[nt:])
+
+        root = np.sqrt(self.chain.cell.masses)
+        fields = np.concatenate([velocity * root, displacement * root])
         spectrum = np.fft.rfft(fields, self.cells, axis=1, norm="ortho").swapaxes(0, 1)
         waves = (spectrum @ self.vectors.conj()).swapaxes(0, 1)
-        rate, turned = waves[:nt], 1j * self.frequency[: waves[0].size].reshape(waves.shape[1:]) * waves[nt:]
-        back = self._backward(waves.shape[1])
-        pairs = rate + turned, (rate - turned)[:, back].conj()
-        return np.concatenate([z.reshape(nt, -1) for z in pairs], axis=1)
+        rate = waves[:nt]
+        frequency = self.frequency[: waves[0].size].reshape(waves.shape[1:])
+        turned = 1j * frequency * waves[nt:]
+
+        # A real field has conjugate transforms at k and -k: one transform gives the waves of both directions.
+        there = rate + turned
+        back = (rate - turned)[:, self._backward(waves.shape[1])].conj()
+        return np.concatenate([there.reshape(nt, -1), back.reshape(nt, -1)], axis=1)
 
     def _backward(self, count: int) -> slice:
         """Of ``count`` wavenumbers k >= 0 those whose opposites are others."""
@@ -68,10 +77,12 @@ class Modes:
         root = np.sqrt(self.chain.coefficients(cell, cell + 1).masses[0, mass])
         if self.vectors.ndim == 2:
             return np.asarray(self.vectors[cell * self.chain.cell.dofs + mass] / root)
+
         k = np.arange(len(self.vectors))
         shift = np.exp(-2j * np.pi * k * cell / self.cells) / np.sqrt(self.cells)
         waves = self.vectors[:, mass].conj() * shift[:, None]
-        return np.concatenate([waves.ravel(), waves[self._backward(len(k))].conj().ravel()]) / root
+        back = waves[self._backward(len(k))].conj()
+        return np.concatenate([waves.ravel(), back.ravel()]) / root
 
     def later(self, amplitudes: np.ndarray, interval: float) -> np.ndarray:
         """Free ``amplitudes`` (mode) after an ``interval`` in s."""
@@ -92,53 +103,86 @@ def linear_modes(chain: Chain) -> Modes:
 
 @lru_cache(maxsize=4)
 def _modes(chain: Chain) -> Modes:
-    ring, many = chain.ends == "periodic", chain.cells * chain.cell.dofs > MOST_DOFS
+    ring = chain.ends == "periodic"
+    many = chain.cells * chain.cell.dofs > MOST_DOFS
     if chain.is_uniform() and (ring or many):
-        return _ring(chain, chain.cells + (chain.ends == "fixed"), ring)
+        # A wall on both sides is a cell of the ring that is at rest.
+        return _ring(chain, chain.cells + (chain.ends == "fixed"), exact=ring)
     if many:
         raise ValueError(f"modes of {chain.cells} cells that differ, more than {MOST_DOFS} masses")
+
     matrix = _scaled(chain)
-    squared, vectors = eigh(matrix.toarray(), driver="evr") if ring else _near_diagonal(matrix)
-    x = np.random.default_rng(0).standard_normal((2, len(squared)))
-    if np.any(np.abs(np.sum((x @ vectors) ** 2, axis=1) / np.sum(x**2, axis=1) - 1) > ORTHONORMAL):
+    if ring:
         squared, vectors = eigh(matrix.toarray(), driver="evr")
-    squared[squared < 1e-13 * squared[-1]] = 0.0  # free ends
-    return Modes(chain, np.sqrt(squared), _wavenumbers(vectors, chain), vectors, True, chain.cells)
+    else:
+        squared, vectors = _near_diagonal(matrix)
+    # The norm of two random fields shows whether inverse iteration has left modes that are not orthogonal.
+    x = np.random.default_rng(0).standard_normal((2, len(squared)))
+    norm = np.sum((x @ vectors) ** 2, axis=1) / np.sum(x**2, axis=1)
+    if np.any(np.abs(norm - 1) > ORTHONORMAL):
+        squared, vectors = eigh(matrix.toarray(), driver="evr")
+
+    squared[squared < AT_REST * squared[-1]] = 0.0  # free ends
+    return Modes(
+        chain=chain,
+        frequency=np.sqrt(squared),
+        wavenumber=_wavenumbers(vectors, chain),
+        vectors=vectors,
+        exact=True,
+        cells=chain.cells,
+    )
 
 
 def _ring(chain: Chain, cells: int, exact: bool) -> Modes:
+    """The Bloch waves on a ring of ``cells``: k >= 0, to lower cells, then those of k < 0 that are not among them."""
     kappa = 2 * np.pi * np.arange(cells // 2 + 1) / cells
     waves = bloch(chain.cell, kappa)
-    vectors = waves.vectors * np.sqrt(chain.cell.masses)[:, None]
     back = slice(1, len(kappa) - (cells % 2 == 0))
     # exp(i (k x + Om t)) goes to lower cells.
     number = np.concatenate([-kappa, kappa[back]])
-    frequency = np.concatenate([waves.frequency, waves.frequency[back]]).ravel()
-    return Modes(chain, frequency, np.repeat(number, chain.cell.dofs), vectors, exact, cells)
+    return Modes(
+        chain=chain,
+        frequency=np.concatenate([waves.frequency, waves.frequency[back]]).ravel(),
+        wavenumber=np.repeat(number, chain.cell.dofs),
+        vectors=waves.vectors * np.sqrt(chain.cell.masses)[:, None],
+        exact=exact,
+        cells=cells,
+    )
 
 
 def number_near(chain: Chain, omega: float) -> int:
     """The number (from 1, lowest first) of the mode whose frequency is nearest to ``omega`` in rad/s."""
     if chain.ends == "periodic":
-        return int(np.argmin(np.abs(np.sort(_ring(chain, chain.cells, True).frequency) - omega))) + 1
-    below = _counter(chain)[0](omega**2)
-    around = range(max(below, 1), min(below + 1, chain.cells * chain.cell.dofs) + 1)
-    return min(around, key=lambda number: abs(mode_frequency(chain, number) - omega))
+        frequency = np.sort(_ring(chain, chain.cells, exact=True).frequency)
+        return int(np.argmin(np.abs(frequency - omega))) + 1
+
+    below = _spectrum_counter(chain).below(omega**2)
+    neighbours = range(max(below, 1), min(below + 1, chain.cells * chain.cell.dofs) + 1)
+    return min(neighbours, key=lambda number: abs(mode_frequency(chain, number) - omega))
 
 
 @lru_cache(maxsize=4)
 def mode_frequency(chain: Chain, number: int) -> float:
     """Frequency in rad/s of mode ``number`` (from 1, lowest first) of a chain of any length, with ends by bisection."""
     if chain.ends == "periodic":
-        every = np.sort(_ring(chain, chain.cells, True).frequency)
-        low, high, top = 0.0, every[number - 1] ** 2, every[-1] ** 2
+        frequencies = np.sort(_ring(chain, chain.cells, exact=True).frequency)
+        squared = frequencies[number - 1] ** 2
+        top = frequencies[-1] ** 2
     else:
-        count, top = _counter(chain)
-        low, high = 0.0, top
-        while high > 64 * EPS * top and high - low > 2 * EPS * high:
-            middle = (low + high) / 2
-            low, high = (middle, high) if count(middle) < number else (low, middle)
-    return 0.0 if high <= 64 * EPS * top else float(np.sqrt(high))  # free ends
+        counter = _spectrum_counter(chain)
+        top = counter.top
+        low = 0.0
+        squared = top
+        while squared > 64 * EPS * top and squared - low > 2 * EPS * squared:
+            middle = (low + squared) / 2
+            if counter.below(middle) < number:
+                low = middle
+            else:
+                squared = middle
+
+    if squared <= 64 * EPS * top:
+        return 0.0  # a shift in common, of free ends
+    return float(np.sqrt(squared))
 
 
 @lru_cache(maxsize=4)
@@ -147,35 +191,53 @@ def mode_shape(chain: Chain, number: int) -> np.ndarray:
 
     Of a wave that a ring carries both ways, the standing one that is largest at cell 1 has the lower number.
     """
-    if chain.ends == "periodic":
-        ring = _ring(chain, chain.cells, True)
-        place = np.argsort(ring.frequency, kind="stable")[number - 1]
-        kappa, dofs = ring.wavenumber[place], chain.cell.dofs
-        wave = bloch(chain.cell, kappa).vectors[:, place % dofs]
-        turned = wave / wave[np.argmax(np.abs(wave))] * np.exp(1j * kappa * np.arange(chain.cells))[:, None]
-        shape = turned.imag if kappa > 0 else turned.real
-    else:
-        band, root = _band(_scaled(chain)), 1 / np.sqrt(chain.masses())
-        width = len(band) // 3
-        band[2 * width] -= mode_frequency(chain, number) ** 2 + 4 * EPS * _counter(chain)[1]
-        factor, pivots, _ = lapack.dgbtrf(band, width, width, overwrite_ab=True)
-        x = np.random.default_rng(number).standard_normal(len(root))
-        for _ in range(3):
-            x, _ = lapack.dgbtrs(factor, width, width, x, pivots)
-            x /= np.linalg.norm(x)
-        shape = (x * root).reshape(chain.cells, -1)
+    shape = _ring_shape(chain, number) if chain.ends == "periodic" else _standing_shape(chain, number)
     return np.asarray(shape / shape.flat[np.argmax(np.abs(shape))])
 
 
+def _ring_shape(chain: Chain, number: int) -> np.ndarray:
+    """Shape (cell, dof) of a mode of a ring: real or imaginary part of its Bloch wave."""
+    ring = _ring(chain, chain.cells, exact=True)
+    place = np.argsort(ring.frequency, kind="stable")[number - 1]
+    kappa = ring.wavenumber[place]
+    wave = bloch(chain.cell, kappa).vectors[:, place % chain.cell.dofs]
+    # Turned so that its largest mass is largest at the first cell.
+    turned = wave / wave[np.argmax(np.abs(wave))] * np.exp(1j * kappa * np.arange(chain.cells))[:, None]
+    return turned.imag if kappa > 0 else turned.real
+
+
+def _standing_shape(chain: Chain, number: int) -> np.ndarray:
+    """Shape (cell, dof) of a mode of a lattice with ends, by inverse iteration."""
+    band = _band(_scaled(chain))
+    root = 1 / np.sqrt(chain.masses())
+    # A hair above the eigenvalue, so that the shifted matrix can be inverted.
+    shift = mode_frequency(chain, number) ** 2 + 4 * EPS * _spectrum_counter(chain).top
+    shifted = _BandFactor(band, shift)
+    x = np.random.default_rng(number).standard_normal(len(root))
+    for _ in range(ITERATIONS):
+        x = shifted.solve(x)
+        x /= np.linalg.norm(x)
+    return (x * root).reshape(chain.cells, -1)
+
+
+class _SpectrumCounter(NamedTuple):
+    """``below`` counts squared frequencies below a number; ``top`` in (rad/s)^2 is a bound of all of them."""
+
+    below: Callable[[float], int]
+    top: float
+
+
 @lru_cache(maxsize=1)
-def _counter(chain: Chain) -> tuple[Callable[[float], int], float]:
-    """What counts squared frequencies below a number, and a bound of all (Gershgorin's circles)."""
-    from vipetsc.lattice.inertia import count_below  # numba
+def _spectrum_counter(chain: Chain) -> _SpectrumCounter:
+    """The counter of a chain with ends, by the inertia of its band matrix; the bound is of Gershgorin's circles."""
+    from vipetsc.lattice.inertia import count_below  # numba, which takes long to import
 
     matrix = _scaled(chain)
-    top, upper = float(abs(matrix).sum(axis=0).max()), _band(matrix)
-    band = np.ascontiguousarray(upper[2 * (len(upper) // 3) :].T)
-    return lambda shift: count_below(band.copy(), shift, EPS**2 * top), top
+    top = float(abs(matrix).sum(axis=0).max())
+    with_room = _band(matrix)
+    width = len(with_room) // 3
+    band = np.ascontiguousarray(with_room[2 * width :].T)
+    return _SpectrumCounter(below=lambda shift: count_below(band.copy(), shift, EPS**2 * top), top=top)
 
 
 def _scaled(chain: Chain) -> csc_matrix:
@@ -185,37 +247,55 @@ def _scaled(chain: Chain) -> csc_matrix:
 
 
 def _band(matrix: csc_matrix) -> np.ndarray:
-    """The band of ``matrix`` (3 width + 1, n) as LAPACK's factors want it, with room above."""
+    """The band of ``matrix`` (3 width + 1, n) in the layout of LAPACK's ``dgbtrf``, which fills the ``width`` above."""
     width = int(np.abs(np.subtract(*matrix.nonzero())).max())
     band = np.zeros((3 * width + 1, matrix.shape[0]))
     for k in range(-width, width + 1):
         diagonal = matrix.diagonal(k)
-        band[2 * width - k, max(k, 0) : max(k, 0) + len(diagonal)] = diagonal
+        first = max(k, 0)
+        band[2 * width - k, first : first + len(diagonal)] = diagonal
     return band
+
+
+class _BandFactor:
+    """LU factors of ``band`` - ``shift``, of a matrix as ``_band`` lays it out; ``band`` itself is overwritten."""
+
+    def __init__(self, band: np.ndarray, shift: float) -> None:
+        self._width = len(band) // 3
+        band[2 * self._width] -= shift
+        self._factor, self._pivots, _ = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
+
+    def solve(self, x: np.ndarray) -> np.ndarray:
+        """The solution (n,) for the right-hand side ``x``."""
+        solution, _ = lapack.dgbtrs(self._factor, self._width, self._width, x, self._pivots)
+        return solution
 
 
 def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues, lowest first, and vectors of a symmetric banded ``matrix``, by inverse iteration.
 
-    Vectors of eigenvalues closer than ``CLOSE`` are made orthogonal to one another; whether that made all so, the
-    caller finds out. It takes a fifth of the time of a dense solution.
+    Vectors of eigenvalues closer than ``CLOSE`` are made orthogonal to one another, which does not make sure that all
+    are: the caller has to check. It takes a fifth of the time of a dense solution.
     """
-    n, band = matrix.shape[0], _band(matrix)
-    width = len(band) // 3
-    squared = eigvals_banded(band[2 * width :], lower=True)
-    vectors, noise = np.zeros((n, n), order="F"), np.random.default_rng(1).standard_normal((n, n))
-    first, shift = 0, -np.inf
+    n = matrix.shape[0]
+    band = _band(matrix)
+    squared = eigvals_banded(band[2 * (len(band) // 3) :], lower=True)
+    vectors = np.zeros((n, n), order="F")
+    noise = np.random.default_rng(1).standard_normal((n, n))
+
+    first = 0  # of the vectors that are close to the one that is sought
+    shift = -np.inf
     for j, value in enumerate(squared):
         first += int(np.searchsorted(squared[first:j], value - CLOSE * squared[-1]))
+        close = vectors[:, first:j]
+        # Equal eigenvalues get shifts apart, or inverse iteration would give the same vector again.
         shift = max(value, shift + 4 * EPS * squared[-1])
-        shifted = band.copy(order="F")
-        shifted[2 * width] -= shift
-        factor, pivots, _ = lapack.dgbtrf(shifted, width, width, overwrite_ab=True)
-        x, close = noise[j], vectors[:, first:j]
-        for _ in range(3):
-            x, _ = lapack.dgbtrs(factor, width, width, x, pivots)
+        shifted = _BandFactor(band.copy(order="F"), shift)
+        x = noise[j]
+        for _ in range(ITERATIONS):
+            x = shifted.solve(x)
             x /= np.linalg.norm(x)
-            for _ in range(2):
+            for _ in range(2):  # once is not enough where little of x is left
                 x -= close @ (close.T @ x)
                 x /= np.linalg.norm(x)
         vectors[:, j] = x
@@ -225,10 +305,12 @@ def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
 def _wavenumbers(vectors: np.ndarray, chain: Chain) -> np.ndarray:
     """Wavenumbers (mode): of a standing wave two neighbours of a cell sum to 2 cos(kappa) times itself."""
     shapes = vectors.reshape(chain.cells, -1, vectors.shape[1])
-    inside = slice(1, -1) if chain.cells > 2 else slice(None)
     sums = np.zeros_like(shapes)
     sums[1:] += shapes[:-1]
     sums[:-1] += shapes[1:]
+
+    # The cells at the ends have a neighbour less.
+    inside = slice(1, -1) if chain.cells > 2 else slice(None)
     products = np.einsum("xdn,xdn->n", shapes[inside], sums[inside])
     norms = np.einsum("xdn,xdn->n", shapes[inside], shapes[inside])
     # A mode may be at rest in the one cell between two others.

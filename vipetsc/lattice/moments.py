@@ -13,59 +13,79 @@ from vipetsc.lattice.bands import pass_bands
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.compliance import WaveCompliance
 
-# Frequencies above this times the top of the bands, and terms of the series: 4^-28 is below rounding.
-FROM, TERMS = 2.0, 28
+# Frequencies above FAST_FROM times the top of the bands, and terms of the series: 4^-28 is below rounding.
+FAST_FROM = 2.0
+TERMS = 28
 
 
 class SeriesCompliance:
-    """``compliance`` of a finite lattice between its sites, with the series where it converges fast."""
+    """Compliance of a finite lattice between its sites: by the series where it converges fast, else ``compliance``."""
 
     def __init__(self, compliance: WaveCompliance) -> None:
-        self.compliance, self.chain = compliance, compliance.chain
+        self.compliance = compliance
+        self.chain = compliance.chain
         self.top = pass_bands(self.chain.cell)[-1].high
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N at frequencies in rad/s, real or complex."""
         omega = np.atleast_1d(omegas)
-        high, pairs = np.abs(omega) > FROM * self.top, len(self.chain.sites)
-        out = np.zeros((len(omega), pairs, pairs), omega.dtype if np.iscomplexobj(omega) else float)
+        high = np.abs(omega) > FAST_FROM * self.top
+        pairs = len(self.chain.sites)
+        compliance = np.zeros((len(omega), pairs, pairs), omega.dtype if np.iscomplexobj(omega) else float)
         if not high.all():
-            out[~high] = self.compliance.at(omega[~high])
+            compliance[~high] = self.compliance.at(omega[~high])
         ratio = (self.top / omega[high]) ** 2
-        out[high] = -np.einsum("nij,nw->wij", self._moments, ratio ** np.arange(1, TERMS + 1)[:, None])
-        return out
+        powers = ratio ** np.arange(1, TERMS + 1)[:, None]
+        compliance[high] = -np.einsum("nij,nw->wij", self._moments, powers)
+        return compliance
 
     @cached_property
     def _moments(self) -> np.ndarray:
         """b^T (M^-1 K)^n M^-1 b (terms, pair, pair) over top^(2n + 2), in cells near the sites alone."""
-        chain, moments = self.chain, np.zeros((TERMS, len(self.chain.sites), len(self.chain.sites)))
+        chain = self.chain
+        d = chain.cell.dofs
+        moments = np.zeros((TERMS, len(chain.sites), len(chain.sites)))
         for group in self._groups():
-            first, last = chain.sites[group[0]] - TERMS, chain.sites[group[-1]] + TERMS
-            if chain.ends != "periodic":
-                first, last = max(first, 0), min(last, chain.cells - 1)
-            if last - first + 1 >= chain.cells:
-                first, last = 0, chain.cells - 1
-            piece, d = Chain(chain.cell, last - first + 1, chain.ends), chain.cell.dofs
+            first, piece = self._piece(group)
             rows = np.zeros((piece.cells * d, len(group)))
-            for j, site in enumerate(group):
-                at = (chain.sites[site] - first) * d
-                rows[at + chain.cell.resonator, j], rows[at + chain.cell.host, j] = 1.0, -1.0
+            for j, number in enumerate(group):
+                start = (chain.sites[number] - first) * d
+                rows[start + chain.cell.resonator, j] = 1.0
+                rows[start + chain.cell.host, j] = -1.0
+
+            # Scaled by the top of the bands, terms neither grow nor vanish.
             scale = 1 / (piece.masses()[:, None] * self.top**2)
-            stiffness, moved = piece.stiffness_matrix(), rows * scale
+            stiffness = piece.stiffness_matrix()
+            moved = rows * scale
             for n in range(TERMS):
                 moments[np.ix_([n], group, group)] = rows.T @ moved
                 moved = scale * (stiffness @ moved)
         return moments
 
+    def _piece(self, group: list[int]) -> tuple[int, Chain]:
+        """The first cell, and the chain, of what the series of a ``group`` of sites reaches: a cell each term."""
+        chain = self.chain
+        first = chain.sites[group[0]] - TERMS
+        last = chain.sites[group[-1]] + TERMS
+        if chain.ends != "periodic":
+            first = max(first, 0)
+            last = min(last, chain.cells - 1)
+        if last - first + 1 >= chain.cells:
+            first = 0
+            last = chain.cells - 1
+        return first, Chain(chain.cell, last - first + 1, chain.ends)
+
     def _groups(self) -> list[list[int]]:
-        """Sites (places in the chain's list) whose cells near them overlap, in order; a ring's all together."""
+        """Numbers of the sites in the chain's list, together where their pieces overlap; a ring's all together."""
         order = np.argsort(self.chain.sites, kind="stable").tolist()
         if self.chain.ends == "periodic":
             return [order]
+
         groups = [[order[0]]]
-        for site in order[1:]:
-            if self.chain.sites[site] - self.chain.sites[groups[-1][-1]] <= 2 * TERMS:
-                groups[-1].append(site)
+        for number in order[1:]:
+            distance = self.chain.sites[number] - self.chain.sites[groups[-1][-1]]
+            if distance <= 2 * TERMS:
+                groups[-1].append(number)
             else:
-                groups.append([site])
+                groups.append([number])
         return groups
