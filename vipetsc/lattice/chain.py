@@ -32,8 +32,8 @@ class Chain:
 
     ``ends``: ``fixed`` puts a wall at either end, held by the inter-cell springs; ``free`` cuts those
     springs; ``periodic`` joins the last cell to the first. ``pairs`` are what contacts join, the cell's pair if
-    (). ``variation`` has what differs from ``cell``, which stands for the lattice in all that is said of its bands;
-    raises ValueError if it is not of all cells.
+    (). ``variation`` holds what differs from ``cell``, whose bands are taken for the lattice's. Raises ValueError if
+    it is not of all cells.
     """
 
     cell: UnitCell
@@ -45,23 +45,29 @@ class Chain:
     pairs: tuple[Pair, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, array in self.variation.items() if self.variation else ():
-            if array.shape != (shape := (self.cells, len(getattr(self._reference, name)))):
+        for name, array in self._varied.items():
+            shape = (self.cells, len(getattr(self._reference, name)))
+            if array.shape != shape:
                 raise ValueError(f"variation of {name}: shape {array.shape}, not {shape}")
+
+    @property
+    def _varied(self) -> dict[str, np.ndarray]:
+        """The arrays of ``variation`` by name; empty for a lattice of equal cells."""
+        return dict(self.variation.items()) if self.variation else {}
 
     @cached_property
     def differs(self) -> np.ndarray:
         """Whether each cell (cells,) has a mass, a spring or a dashpot other than the reference cell's."""
         differs = np.zeros(self.cells, bool)
-        for name, array in self.variation.items() if self.variation else ():
+        for name, array in self._varied.items():
             differs |= np.any(array != getattr(self._reference, name), axis=1)
         return differs
 
     @property
     def is_damped(self) -> bool:
         """Whether there is a dashpot anywhere."""
-        varied = [a for n, a in self.variation.items() if n in ("grounding", "damping")] if self.variation else []
-        return self.cell.is_damped or any(array.any() for array in varied)
+        dashpots = [array for name, array in self._varied.items() if name in ("grounding", "damping")]
+        return self.cell.is_damped or any(array.any() for array in dashpots)
 
     @property
     def contact_pairs(self) -> tuple[Pair, ...]:
@@ -75,29 +81,36 @@ class Chain:
 
     def reduced_masses(self) -> list[float]:
         """Mass in kg of each site's relative motion."""
-        varied = self.variation.masses if self.variation else None
-        inverse = 1 / (np.array([self.cell.masses]) if varied is None else varied)
-        host, resonator, joins = np.array(self.contact_pairs, np.int64).reshape(-1, 3).T
+        # One row for all cells where they are equal, so that a long lattice costs no more than its sites.
+        inverse = 1 / self._varied.get("masses", np.array([self.cell.masses]))
+        rows = len(inverse)
         sites = np.array(self.sites, np.int64)
-        of_host = np.where(host >= 0, inverse[sites % len(inverse), host], 0.0)
-        return np.asarray(1 / (of_host + inverse[(sites + joins) % len(inverse), resonator])).tolist()
+        host, resonator, next_cell = np.array(self.contact_pairs, np.int64).reshape(-1, 3).T
+        inverse_host = np.where(host >= 0, inverse[sites % rows, host], 0.0)  # ground does not move
+        inverse_resonator = inverse[(sites + next_cell) % rows, resonator]
+        return np.asarray(1 / (inverse_host + inverse_resonator)).tolist()
 
     def is_uniform(self, start: int = 0, stop: int | None = None) -> bool:
-        """Whether no cell from ``start`` to ``stop`` differs from the reference cell; of a ring they count on."""
+        """Whether no cell from ``start`` to ``stop`` differs from the reference cell; a ring's go on behind."""
         if self.variation is None:
             return True
         cells = np.arange(start, self.cells if stop is None else stop)
         return not self.differs[cells[self._exist(cells)] % self.cells].any()
 
     def _exist(self, cells: np.ndarray) -> np.ndarray:
-        """Which of ``cells`` there are; of a ring all, counted on beyond its ends."""
+        """Whether the lattice has each of ``cells``; a ring has all, as those behind its last are its first again."""
         return (cells >= 0) & (cells < self.cells) | (self.ends == "periodic")
 
     @property
     def _reference(self) -> Coefficients:
+        """Masses (dof,), springs (spring,) and dashpots of the reference cell."""
         cell = self.cell
-        of_springs = np.array([(s.stiffness, s.damping) for s in cell.springs]).reshape(-1, 2).T
-        return Coefficients(np.array(cell.masses), np.array(cell.grounding or np.zeros(cell.dofs)), *of_springs)
+        return Coefficients(
+            masses=np.array(cell.masses),
+            grounding=np.array(cell.grounding or np.zeros(cell.dofs)),
+            stiffness=np.array([s.stiffness for s in cell.springs], float),
+            damping=np.array([s.damping for s in cell.springs], float),
+        )
 
     def coefficients(self, start: int, stop: int) -> Coefficients:
         """Masses, springs and dashpots of the cells ``start`` to ``stop``.
@@ -108,19 +121,20 @@ class Chain:
         cells = np.arange(start, stop)
         exists = self._exist(cells)
         arrays = [np.tile(reference, (len(cells), 1)) for reference in self._reference]
-        for array, name in zip(arrays, Coefficients._fields, strict=True):
-            if self.variation and (varied := getattr(self.variation, name)) is not None:
-                array[exists] = varied[cells[exists] % self.cells]
-        return Coefficients(*arrays)
+        coefficients = Coefficients(*arrays)
+        for name, varied in self._varied.items():
+            getattr(coefficients, name)[exists] = varied[cells[exists] % self.cells]
+        return coefficients
 
     def mean_cell(self, start: int, stop: int) -> UnitCell:
         """The reference cell with the mean masses, springs and dashpots of the cells ``start`` to ``stop``."""
         if self.is_uniform(start, stop):
             return self.cell
-        masses, grounding, *of_springs = (values.mean(axis=0).tolist() for values in self.coefficients(start, stop))
-        rows = zip(self.cell.springs, *of_springs, strict=True)
+        means = [values.mean(axis=0).tolist() for values in self.coefficients(start, stop)]
+        mean = Coefficients(*means)
+        rows = zip(self.cell.springs, mean.stiffness, mean.damping, strict=True)
         springs = tuple(replace(spring, stiffness=k, damping=c) for spring, k, c in rows)
-        return replace(self.cell, masses=tuple(masses), springs=springs, grounding=tuple(grounding))
+        return replace(self.cell, masses=tuple(mean.masses), springs=springs, grounding=tuple(mean.grounding))
 
     def stiffness_matrix(self) -> csc_matrix:
         """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; needs little for <= 1e6."""
@@ -131,31 +145,41 @@ class Chain:
         return self._rows(start, stop, self.coefficients(start - 1, stop).stiffness)
 
     def damping_rows(self, start: int, stop: int) -> csr_matrix:
-        """The same rows of the damping in N s/m."""
-        of_cells = self.coefficients(start - 1, stop)
-        shape = (stop - start) * self.cell.dofs, self.cells * self.cell.dofs
-        ground = diags([of_cells.grounding[1:].ravel()], [start * self.cell.dofs], shape)
-        return (self._rows(start, stop, of_cells.damping) + ground).tocsr()
+        """The rows ((stop - start) dofs, cells dofs) of the damping in N s/m of cells ``start`` to ``stop``."""
+        d = self.cell.dofs
+        coefficients = self.coefficients(start - 1, stop)
+        ground = diags([coefficients.grounding[1:].ravel()], [start * d], ((stop - start) * d, self.cells * d))
+        return (self._rows(start, stop, coefficients.damping) + ground).tocsr()
 
     def _rows(self, start: int, stop: int, values: np.ndarray) -> csr_matrix:
-        """Rows made of ``values`` (cell, spring) of the cells from ``start`` - 1 on."""
-        n, d = self.cells, self.cell.dofs
-        rows, columns, entries = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
-        index, every = np.arange(start, stop, dtype=np.int64), np.ones(stop - start, bool)
-        for mass, offset, other, _, _, spring in self.cell.couplings():
-            neighbour = index + offset
+        """Rows of a matrix that couples masses by springs, from ``values`` (cell, spring) of cells ``start`` - 1 on.
+
+        A spring to the next cell belongs to the cell in which it begins, hence the cell before ``start``.
+        """
+        n = self.cells
+        d = self.cell.dofs
+        rows = [np.zeros(0, np.int64)]
+        columns = [np.zeros(0, np.int64)]
+        entries = [np.zeros(0)]
+        index = np.arange(start, stop, dtype=np.int64)
+        every = np.ones(stop - start, bool)
+        for coupling in self.cell.couplings():
+            neighbour = index + coupling.offset
             inside = every if self.ends == "periodic" else (neighbour >= 0) & (neighbour < n)
-            held = every if self.ends == "fixed" else inside
-            here = index * d + mass
+            held = every if self.ends == "fixed" else inside  # a wall holds, and does not move
+            owner = 1 + min(coupling.offset, 0)
+            value = values[owner : owner + stop - start, coupling.spring]
+
+            here = index * d + coupling.mass
             rows += [here[held] - start * d, here[inside] - start * d]
-            columns += [here[held], neighbour[inside] % n * d + other]
-            value = values[1 + min(offset, 0) :][: stop - start, spring]
+            columns += [here[held], neighbour[inside] % n * d + coupling.other]
             entries += [value[held], -value[inside]]
-        of_springs = np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))
-        return coo_matrix(of_springs, shape=((stop - start) * d, n * d)).tocsr()
+
+        places = (np.concatenate(rows), np.concatenate(columns))
+        return coo_matrix((np.concatenate(entries), places), shape=((stop - start) * d, n * d)).tocsr()
 
     def masses(self) -> np.ndarray:
-        """Masses (cells dofs,) in kg, ordered cell by cell."""
+        """Masses (cells dofs,) in kg of all cells, in their order."""
         return self.coefficients(0, self.cells).masses.ravel()
 
     def wave_scale(self, drive: Waveform, cell: int = 0, mass: int = 0) -> float:
@@ -166,7 +190,10 @@ class Chain:
         longer than LONGEST cells is cut there: the wave is evanescent at that frequency.
         """
         cut = Chain(self.cell, min(self.cells, LONGEST), self.ends)
-        driven = cell if cell < cut.cells // 2 else max(cut.cells - (self.cells - cell), 0)
+        driven = cell
+        if cell >= cut.cells // 2:
+            driven = max(cut.cells - (self.cells - cell), 0)  # as far from the right end as in the whole lattice
+
         omega = drive.frequency * (1 - 1j / drive.cycles)
         dynamic = cut.stiffness_matrix() - diags(cut.masses() * omega**2)
         force = np.zeros(cut.cells * self.cell.dofs, complex)
@@ -176,6 +203,8 @@ class Chain:
 
 
 def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:
-    """Number of cells from ``cell`` to ``other`` in a lattice of ``cells``; the shorter way around a ring."""
-    way = np.abs(np.asarray(cell, np.int64) - other)
-    return np.asarray(np.minimum(way, cells - way) if ends == "periodic" else way)
+    """Number of cells from ``cell`` to ``other`` in a lattice of ``cells``; in a ring the shorter direction."""
+    distance = np.abs(np.asarray(cell, np.int64) - other)
+    if ends == "periodic":
+        distance = np.minimum(distance, cells - distance)
+    return np.asarray(distance)

@@ -15,9 +15,12 @@ def count_below(band: np.ndarray, shift: float, smallest: float) -> int:
 
     A pivot smaller than ``smallest`` is taken for minus that.
     """
-    count, n = 0, band.shape[0]
+    n = band.shape[0]
+    count = 0
     for j in range(n):
-        pivot, width = band[j, 0] - shift, min(band.shape[1], n - j)
+        pivot = band[j, 0] - shift
+        width = min(band.shape[1], n - j)
+        # Without an exchange of rows a pivot may vanish: moved by less than rounding, the count stays right.
         if abs(pivot) < smallest:
             pivot = -smallest
         count += pivot < 0.0

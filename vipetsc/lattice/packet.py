@@ -18,13 +18,16 @@ def packet_speeds(cell: UnitCell, burst: Waveform, mass: int, beyond: float = 1e
     """Band (from 0) that takes most of the energy, and the speeds in cells/s of its slow and of its fast waves.
 
     A force F on one ``mass`` (0-based) gives the Bloch wave of frequency w and mass-normalised vector u an energy in
-    proportion to |F^(w)|^2 |u_mass|^2; all but a share ``beyond`` of the band's is faster than the slow speed, all but
-    such a share slower than the fast one.
+    proportion to |F^(w)|^2 |u_mass|^2; all but a fraction ``beyond`` of the band's is faster than the slow speed, all
+    but such a fraction slower than the fast one.
     """
     point = bloch(cell, WAVENUMBERS)
     weights = np.abs(burst.spectrum(point.frequency) * point.vectors[:, mass]) ** 2
     band = int(np.argmax(weights.sum(axis=0)))
-    speed, weight = np.abs(point.group_velocity[:, band]), weights[:, band]
+
+    # Quantiles of the speed, weighted by energy.
+    speed = np.abs(point.group_velocity[:, band])
+    weight = weights[:, band]
     order = np.argsort(speed)
     slow, fast = np.interp([beyond, 1 - beyond], np.cumsum(weight[order]) / weight.sum(), speed[order])
     return band, float(slow), float(fast)
@@ -44,35 +47,43 @@ class Packet(NamedTuple):
     def on(self, chain: Chain, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
         """Displacement and velocity (cell, dof) of cells ``start`` to ``stop``; what lies beyond an end is left out."""
         cells = self.centre - len(self.velocity) // 2 + np.arange(len(self.velocity))
-        cells = cells % chain.cells if chain.ends == "periodic" else cells
+        if chain.ends == "periodic":
+            cells = cells % chain.cells
         inside = (cells >= start) & (cells < stop)
+        # In a ring shorter than the packet, cells occur more than once.
         u, v = np.zeros((2, stop - start, chain.cell.dofs))
-        for field, values in ((u, self.displacement), (v, self.velocity)):
-            np.add.at(field, cells[inside] - start, values[inside])
+        np.add.at(u, cells[inside] - start, self.displacement[inside])
+        np.add.at(v, cells[inside] - start, self.velocity[inside])
         return u, v
 
 
 @lru_cache(maxsize=4)
-def gaussian_packet(cell: UnitCell, band: int, kappa: float, centre: int, width: float, way: int = 1) -> Packet:
-    """Waves of ``band`` (1-based) alone about ``kappa`` in (0, pi] that go up (``way`` 1) or down (-1) the cells.
+def gaussian_packet(cell: UnitCell, band: int, kappa: float, centre: int, width: float, direction: int = 1) -> Packet:
+    """Waves of ``band`` (1-based) alone about ``kappa`` in (0, pi], in ``direction`` 1 to higher cells, -1 to lower.
 
     u = Re sum a_k phi_k exp(i (k x - Om_k t)), a_k ~ exp(-(k - kappa)^2 width^2/2), x in cells from ``centre``: the
     envelope is a Gaussian of standard deviation ``width``. Vectors phi_k are turned so that they are in phase with that
-    at ``kappa``; a wave that stands counts as going up.
+    at ``kappa``; a wave that stands counts as going to higher cells.
     """
+    # Long enough for the envelope to be below rounding at the ring's far side.
     ring = 1 << max(int(np.ceil(np.log2(32 * width))), 7)
-    middle = bloch(cell, kappa)
-    main = kappa * way * (1 if middle.group_velocity[band - 1] >= 0 else -1)
     k = 2 * np.pi * np.fft.fftfreq(ring, 1.0)
-    share = np.exp(-0.5 * (((k - main + np.pi) % (2 * np.pi) - np.pi) * width) ** 2)
-    waves = np.flatnonzero(share > 1e-18)
+    backward = bloch(cell, kappa).group_velocity[band - 1] < 0
+    main = -kappa * direction if backward else kappa * direction
+    detuning = (k - main + np.pi) % (2 * np.pi) - np.pi
+    weight = np.exp(-0.5 * (detuning * width) ** 2)
+    waves = np.flatnonzero(weight > 1e-18)
+
     point = bloch(cell, k[waves])
-    vectors, omega = point.vectors[:, :, band - 1], point.frequency[:, band - 1]
+    vectors = point.vectors[:, :, band - 1]
+    omega = point.frequency[:, band - 1]
     overlap = (vectors * np.asarray(cell.masses)) @ bloch(cell, main).vectors[:, band - 1].conj()
     amplitudes = np.zeros((2, ring, cell.dofs), complex)
-    amplitudes[0, waves] = vectors * (share[waves] * np.exp(-1j * np.angle(overlap)))[:, None]
+    amplitudes[0, waves] = vectors * (weight[waves] * np.exp(-1j * np.angle(overlap)))[:, None]
     amplitudes[1, waves] = -1j * omega[:, None] * amplitudes[0, waves]
+
     fields = np.fft.fftshift(np.fft.ifft(amplitudes, axis=1), axes=1)
     peak = np.abs(fields[0]).max()
     u, v = fields.real / peak
-    return Packet(centre, u, v, float(np.sum((share[waves] * omega) ** 2) / (2 * ring * peak**2)))
+    energy = float(np.sum((weight[waves] * omega) ** 2) / (2 * ring * peak**2))
+    return Packet(centre=centre, displacement=u, velocity=v, energy=energy)

@@ -1,4 +1,4 @@
-"""Cells that differ from a lattice's reference cell: masses, springs and dashpots of all cells."""
+"""Masses, springs and dashpots of the cells of a lattice in which not all are as the reference cell."""
 
 import hashlib
 from dataclasses import dataclass, fields
@@ -12,7 +12,7 @@ class Coefficients(NamedTuple):
     """Masses, springs and dashpots of consecutive cells; a spring to the next cell belongs to the one it begins in.
 
     ``masses`` (cell, dof) in kg; ``grounding`` (cell, dof) in N s/m to ground; ``stiffness`` (cell, spring) in N/m;
-    ``damping`` (cell, spring) in N s/m beside the springs.
+    ``damping`` (cell, spring) in N s/m parallel to the springs.
     """
 
     masses: np.ndarray
@@ -41,7 +41,8 @@ class Variation:
 
     def items(self) -> list[tuple[str, np.ndarray]]:
         """Names and arrays of what differs."""
-        return [(f.name, array) for f in fields(self) if (array := getattr(self, f.name)) is not None]
+        arrays = [(f.name, getattr(self, f.name)) for f in fields(self)]
+        return [(name, array) for name, array in arrays if array is not None]
 
     @cached_property
     def _digest(self) -> bytes:
