@@ -25,7 +25,10 @@ COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
 PIECE = np.dtype([(name, float) for name in ("start", *COEFFICIENTS, "phase", "frequency", "rate")])
 """A piece of a waveform: its start in s, c_k in N/s^k, and of its sine p in rad, w in rad/s, r in rad/s^2."""
 SMOOTH = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
-NODES, PANEL = 16, 4.0  # of a quadrature; its panels in rad of what is integrated
+"""Coefficients c_k of a ramp from 0 to 1 over s from 0 to 1."""
+NODES = 16  # of a panel of a Gauss quadrature
+PANEL = 4.0  # largest length of a panel, in rad of the fastest oscillation that is integrated
+MOST_PERIODS = 1e5  # beyond which a waveform's peak is not sought period by period
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class ToneBurst:
 
     @property
     def settled(self) -> float:
-        """Time in s from which on nothing new comes."""
+        """Time in s from which on the force is at rest or repeats itself."""
         return self.duration
 
     @property
@@ -63,12 +66,12 @@ class ToneBurst:
 
     @property
     def highest(self) -> float:
-        """The highest angular frequency in rad/s of its sines."""
+        """The highest angular frequency in rad/s of the burst's three sines."""
         return self.frequency * (1.0 + 1.0 / self.cycles)
 
     @property
     def breaks(self) -> np.ndarray:
-        """Times in s at which it is not smooth, behind the beginning."""
+        """Times in s after the beginning at which the burst is not smooth."""
         return np.array([self.duration])
 
     def force(self, t: ArrayLike) -> np.ndarray:
@@ -89,12 +92,18 @@ class ToneBurst:
         """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), in closed form."""
         end = min(max(stop, 0.0), self.duration)
         begin = min(max(start, 0.0), end)
-        middle, length, total = (begin + end) / 2, end - begin, np.zeros(len(frequency), complex)
-        for share, factor in ((1.0, 1.0), (-0.5, 1 + 1 / self.cycles), (-0.5, 1 - 1 / self.cycles)):
+        middle = (begin + end) / 2
+        length = end - begin
+
+        # [1 - cos(Om t/Nc)] sin(Om t) is three sines, each of two exponentials; the integral of an exponential over the
+        # interval is a sinc, which stays finite where the frequencies agree.
+        lines = ((1.0, 1.0), (-0.5, 1 + 1 / self.cycles), (-0.5, 1 - 1 / self.cycles))
+        total = np.zeros(len(frequency), complex)
+        for weight, factor in lines:
             for sign in (1, -1):
                 detuning = sign * factor * self.frequency - frequency
                 wave = np.exp(1j * (frequency * stop + detuning * middle))
-                total += sign * share / 2j * wave * np.sinc(detuning * length / (2 * np.pi))
+                total += sign * weight / 2j * wave * np.sinc(detuning * length / (2 * np.pi))
         return total * self.window_amplitude * length
 
 
@@ -102,8 +111,9 @@ class ToneBurst:
 class Pieces:
     """A waveform of pieces: ``table`` (piece,) of dtype ``PIECE``, scaled by ``amplitude`` already.
 
-    It begins with the first piece and is over at ``duration`` in s, which may be inf. ``frequency`` in rad/s is the one
-    that it is about, ``cycles`` the length over which it lasts or rises in its periods. Equal are those of one digest.
+    It begins with the first piece and ends at ``duration`` in s, which may be inf. ``frequency`` in rad/s is its main
+    one, ``cycles`` the length over which it lasts or rises, in periods of that. Waveforms are equal if their digests
+    are.
     """
 
     amplitude: float
@@ -120,35 +130,46 @@ class Pieces:
         for name in COEFFICIENTS:
             table[name] *= amplitude
         length = duration if np.isfinite(duration) else table["start"][-1]
-        cycles = max(frequency * length / (2 * np.pi), 1.0)
-        return cls(amplitude, frequency, duration, cycles, table, hashlib.sha256(table.tobytes()).hexdigest())
+        return cls(
+            amplitude=amplitude,
+            frequency=frequency,
+            duration=duration,
+            cycles=max(frequency * length / (2 * np.pi), 1.0),
+            table=table,
+            digest=hashlib.sha256(table.tobytes()).hexdigest(),
+        )
 
     @property
     def settled(self) -> float:
-        """Time in s from which on nothing new comes: its end, or that of the ramp of one that does not end."""
+        """Time in s from which on the force is at rest or repeats itself: the end, or that of the ramp without one."""
         return self.duration if np.isfinite(self.duration) else float(self.table["start"][-1])
 
     @property
     def breaks(self) -> np.ndarray:
-        """Times in s at which it is not smooth, behind the beginning."""
+        """Times in s after the beginning at which the waveform is not smooth."""
         times = np.append(self.table["start"], self.duration)
         return times[(times > 0) & np.isfinite(times)]
 
     @cached_property
     def highest(self) -> float:
-        """The highest angular frequency in rad/s of its sines; 0 of polynomials."""
-        ends = np.append(self.table["start"][1:], min(self.duration, self.settled))
-        w, rate = self.table["frequency"], self.table["rate"]
-        return float(np.max([np.abs(w), np.abs(w + rate * (ends - self.table["start"]))]))
+        """The highest angular frequency in rad/s of the pieces' sines; 0 of polynomials."""
+        starts = self.table["start"]
+        ends = np.append(starts[1:], min(self.duration, self.settled))
+        # A sweep is linear in time: it is fastest at an end of its piece.
+        at_start = self.table["frequency"]
+        at_end = at_start + self.table["rate"] * (ends - starts)
+        return float(np.max([np.abs(at_start), np.abs(at_end)]))
 
     @cached_property
     def peak(self) -> float:
         """The largest force in N, at twenty instants a piece, and twenty a period."""
-        starts, end = self.table["start"], max(self.settled, float(self.table["start"][0]))
-        rest = 2 * np.pi / (self.highest or self.frequency)
-        times = [np.linspace(a, b, 20) for a, b in zip(starts, np.append(starts[1:], end + rest), strict=True)]
-        if (end - starts[0]) / rest < 1e5:
-            times.append(np.arange(starts[0], end + rest, rest / 20))
+        starts = self.table["start"]
+        end = max(self.settled, float(starts[0]))
+        period = 2 * np.pi / (self.highest or self.frequency)
+        ends = np.append(starts[1:], end + period)
+        times = [np.linspace(a, b, 20) for a, b in zip(starts, ends, strict=True)]
+        if (end - starts[0]) / period < MOST_PERIODS:
+            times.append(np.arange(starts[0], end + period, period / 20))
         return float(np.abs(self.force(np.concatenate(times))).max())
 
     def force(self, t: ArrayLike) -> np.ndarray:
@@ -156,14 +177,18 @@ class Pieces:
         t = np.asarray(t, float)
         number = np.searchsorted(self.table["start"], t, side="right") - 1
         piece = self.table[np.maximum(number, 0)]
-        x, value = t - piece["start"], np.zeros_like(t)
+        x = t - piece["start"]
+        value = np.zeros_like(t)
         for name in reversed(COEFFICIENTS):
             value = value * x + piece[name]
         value = value * np.sin(piece["phase"] + x * (piece["frequency"] + 0.5 * piece["rate"] * x))
         return np.where((number >= 0) & (t < self.duration), value, 0.0)
 
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
-        """As that of a burst, by quadrature; raises ValueError for a waveform that does not end."""
+        """Fourier transform in N s at ``frequency`` w in rad/s, by quadrature: the integral of F(t) exp(-i w t).
+
+        Raises ValueError for a waveform that does not end.
+        """
         if not np.isfinite(self.duration):
             raise ValueError("a waveform that does not end has no spectrum; give it a duration")
         w = np.asarray(frequency, float)
@@ -172,17 +197,21 @@ class Pieces:
 
     def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
         """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), by Gauss's quadrature."""
-        starts, total = self.table["start"], np.zeros(len(frequency), complex)
+        starts = self.table["start"]
         end = min(max(stop, 0.0), self.duration)
         begin = min(max(start, float(starts[0])), end)
+        # Panels end where the waveform is not smooth, and are shorter than a period of what is integrated.
         cuts = np.unique([begin, *starts[(starts > begin) & (starts < end)], end])
-        at, weight = leggauss(NODES)
         fastest = float(np.abs(frequency).max(initial=0.0)) + self.highest
+        nodes, weights = leggauss(NODES)
+
+        total = np.zeros(len(frequency), complex)
         for a, b in pairwise(cuts):
             edges = np.linspace(a, b, int(fastest * (b - a) / PANEL) + 2)
             half = np.diff(edges)[:, None] / 2
-            s = edges[:-1, None] + half * (1 + at)
-            for times, values in zip(s, self.force(s) * weight * half, strict=True):
+            s = edges[:-1, None] + half * (1 + nodes)
+            weighted = self.force(s) * weights * half
+            for times, values in zip(s, weighted, strict=True):  # a panel at a time: memory for many frequencies
                 total += np.exp(1j * np.multiply.outer(frequency, stop - times)) @ values
         return total
 
@@ -204,12 +233,15 @@ class Drive:
 
 
 def _table(starts: ArrayLike) -> np.ndarray:
+    """Pieces that begin at ``starts`` in s, all zero; their sine is 1 at all times, so that polynomials are left."""
     table = np.zeros(np.size(starts), PIECE)
-    table["start"], table["phase"] = starts, np.pi / 2
+    table["start"] = starts
+    table["phase"] = np.pi / 2
     return table
 
 
 def _set(row: np.ndarray, coefficients: np.ndarray) -> None:
+    """Write the ``coefficients`` c_k of a piece to its ``row``."""
     for name, value in zip(COEFFICIENTS, coefficients, strict=False):
         row[name] = value
 
@@ -223,23 +255,33 @@ def ramped(
     no sine, but a step. ``ramp`` is at most half the duration.
     """
     ends = np.isfinite(duration)
-    table = _table([0.0, ramp, duration - ramp] if ends else [0.0, ramp])
+    starts = [0.0, ramp, duration - ramp] if ends else [0.0, ramp]
+    table = _table(starts)
     rise = SMOOTH / ramp ** np.arange(6)
     _set(table[0], rise)
     table["c0"][1] = 1.0
     if ends:
         _set(table[2], np.eye(6)[0] - rise)
+
     if sweep is not None:
-        first, rate, x = frequency - sweep / 2, sweep / duration if ends else 0.0, table["start"]
-        table["phase"], table["frequency"], table["rate"] = x * (first + 0.5 * rate * x), first + rate * x, rate
+        lowest = frequency - sweep / 2
+        rate = sweep / duration if ends else 0.0
+        x = table["start"]
+        # Each piece goes on with the phase and the frequency that the sweep has reached.
+        table["phase"] = x * (lowest + 0.5 * rate * x)
+        table["frequency"] = lowest + rate * x
+        table["rate"] = rate
     return Pieces.of(amplitude, frequency, duration, table)
 
 
 def impulse(amplitude: float, duration: float) -> Pieces:
     """Half a sine of ``duration`` s whose integral is ``amplitude``, in N s."""
     table = _table([0.0])
-    table["phase"], table["frequency"], table["c0"] = 0.0, np.pi / duration, np.pi / (2 * duration)
-    return Pieces.of(amplitude, np.pi / duration, duration, table)
+    frequency = np.pi / duration
+    table["phase"] = 0.0
+    table["frequency"] = frequency
+    table["c0"] = np.pi / (2 * duration)
+    return Pieces.of(amplitude, frequency, duration, table)
 
 
 def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: float, hold: bool = False) -> Pieces:
@@ -247,7 +289,8 @@ def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: flo
 
     ``hold``: behind the last one it stays at its value.
     """
-    times, values = np.asarray(times, float), np.asarray(values, float)
+    times = np.asarray(times, float)
+    values = np.asarray(values, float)
     hold &= bool(values[-1] != 0)
     table = _table(times if hold else times[:-1])
     for k, column in enumerate(CubicSpline(times, values).c[::-1]):
@@ -259,8 +302,11 @@ def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: flo
 
 def main_frequency(times: ArrayLike, values: ArrayLike) -> float:
     """The angular frequency in rad/s at which the spectrum of samples is largest, but for 0."""
-    times, values = np.asarray(times, float), np.asarray(values, float)
-    count = int(min(max((times[-1] - times[0]) / np.diff(times).min(), 16), 2**20)) + 1
+    times = np.asarray(times, float)
+    values = np.asarray(values, float)
+    steps = (times[-1] - times[0]) / np.diff(times).min()
+    count = int(min(max(steps, 16), 2**20)) + 1
     even = np.linspace(times[0], times[-1], count)
+    # Padded with zeros, the transform has four times as many frequencies as the record's length resolves.
     content = np.abs(np.fft.rfft(CubicSpline(times, values)(even), 4 * count))
     return float(2 * np.pi * (1 + np.argmax(content[1:])) / (4 * count * (even[1] - even[0])))
