@@ -29,6 +29,28 @@ class Spring:
     quadratic: float = 0.0
     cubic: float = 0.0
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the force has no part beyond k z."""
+        return not (self.quadratic or self.cubic)
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether the force at -z is minus that at z."""
+        return self.quadratic == 0
+
+    def nonlinear_force(self, z: np.ndarray) -> np.ndarray:
+        """The force's part beyond k z in N, at elongations ``z`` in m."""
+        return np.asarray(self.quadratic * z**2 + self.cubic * z**3)
+
+    def nonlinear_slope(self, z: np.ndarray) -> np.ndarray:
+        """Derivative of ``nonlinear_force`` by z in N/m."""
+        return np.asarray(2 * self.quadratic * z + 3 * self.cubic * z**2)
+
+    def nonlinear_energy(self, z: np.ndarray) -> np.ndarray:
+        """Integral of ``nonlinear_force`` from 0 to z in J."""
+        return np.asarray(self.quadratic * z**3 / 3 + self.cubic * z**4 / 4)
+
 
 class Coupling(NamedTuple):
     """A spring as one of its masses sees it: cells to the ``other`` mass, N/m, N s/m, the spring's number (from 0)."""
@@ -77,7 +99,7 @@ class UnitCell:
     @property
     def is_linear(self) -> bool:
         """Whether no spring has a quadratic or a cubic part."""
-        return not any(spring.quadratic or spring.cubic for spring in self.springs)
+        return all(spring.is_linear for spring in self.springs)
 
     def couplings(self) -> list[Coupling]:
         """Every spring seen from both its ends.
@@ -86,8 +108,8 @@ class UnitCell:
         """
         ends = []
         for i, s in enumerate(self.springs):
-            there = int(s.next_cell)
-            for mass, offset, other in ((s.start, there, s.end), (s.end, -there, s.start)):
+            cells = int(s.next_cell)
+            for mass, offset, other in ((s.start, cells, s.end), (s.end, -cells, s.start)):
                 ends.append(Coupling(mass, offset, other, stiffness=s.stiffness, damping=s.damping, spring=i))
         return sorted(ends, key=lambda c: c.mass)
 

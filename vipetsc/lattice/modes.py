@@ -64,9 +64,9 @@ class Modes:
         turned = 1j * frequency * waves[nt:]
 
         # A real field has conjugate transforms at k and -k: one transform gives the waves of both directions.
-        there = rate + turned
+        forward = rate + turned
         back = (rate - turned)[:, self._backward(waves.shape[1])].conj()
-        return np.concatenate([there.reshape(nt, -1), back.reshape(nt, -1)], axis=1)
+        return np.concatenate([forward.reshape(nt, -1), back.reshape(nt, -1)], axis=1)
 
     def _backward(self, count: int) -> slice:
         """Of ``count`` wavenumbers k >= 0 those whose opposites are others."""
