@@ -14,8 +14,9 @@ import pytest
 
 import vipetsc as package
 from vipetsc.case import keys
-from vipetsc.case.case_file import SECTIONS, CaseError, read_section
+from vipetsc.case.case_file import CaseError, read_section, sections_in
 from vipetsc.case.drive import DriveTable
+from vipetsc.case.verb_cases import SECTIONS
 from vipetsc.cli.main import VERBS
 
 ROOT = Path(package.__file__).parents[1]
@@ -24,12 +25,12 @@ CASES = sorted([*(ROOT / "runs").glob("*.toml"), *(ROOT / "vipetsc/paper/cases")
 
 def classes() -> dict[str, set[str]]:
     """The keys that the validator knows of every class of a section, tables within tables as well."""
-    found, left = {}, list(keys.tables().values())
+    found, left = {}, list(SECTIONS.values())
     while left:
         table = left.pop()
         if table.__name__ not in found:
             found[table.__name__] = {field.alias or name for name, field in table.model_fields.items()}
-            left += [inner for field in table.model_fields.values() for inner in keys._within(field.annotation)]
+            left += [inner for field in table.model_fields.values() for inner in sections_in(field.annotation)]
     return found
 
 
@@ -46,7 +47,7 @@ def test_schema_manual_texts_and_validator_name_the_same_keys():
     shown = {}
     for path, text in re.findall(r"^## \[(\S+)\]\n(.*?)(?=^## |\Z)", keys.chapter(), flags=re.M | re.S):
         shown.setdefault(path, set()).update(re.findall(r"^\| `(\w+)` \|", text, flags=re.M))
-    for section, table in keys.tables().items():
+    for section, table in SECTIONS.items():
         assert shown[section] == validator[table.__name__], section
     assert sum(map(len, shown.values())) == sum(map(len, validator.values()))
 

@@ -12,3 +12,4 @@ from vipetsc.case.design import DesignCase
 from vipetsc.case.law import LawCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.sweep import Sweep, SweepMember
+from vipetsc.case.verb_cases import VERB_CASES

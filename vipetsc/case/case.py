@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vipetsc.case.case_file import CaseFile, Problem, Table, Valid, read_section
-from vipetsc.case.contacts import check_alike, check_pairs, contact_of, gaps_of_sites, laws_of_sites
+from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
+from vipetsc.case.contacts import check_pairs, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
 from vipetsc.case.drive import (
     DriveTable,
@@ -23,6 +23,7 @@ from vipetsc.case.drive import (
     driven_wave,
     packet_speed,
 )
+from vipetsc.case.features import FEATURES, refusals
 from vipetsc.case.initial import InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.resolve import (
@@ -44,6 +45,7 @@ from vipetsc.lattice import UnitCell, pass_bands
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
 MOST_SAMPLES = 1e9
+ORDER = ("lattice", "contacts", "disorder", "drive", "initial", "time", "output", "analysis", "petsc")
 
 
 class Case(CaseFile):
@@ -58,8 +60,15 @@ class Case(CaseFile):
     analysis: AnalysisTable | None = None
     petsc: PetscTable | None = None
 
+    verb = "run"
+    takes = FEATURES
     builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}}
-    waveforms: ClassVar[tuple[str, ...]] = ("burst",)  # on a mass, that a subclass takes
+
+    @classmethod
+    def sections(cls) -> dict[str, type[Section]]:
+        """The class of each section that the verb reads, in the order in which the manual shows them."""
+        classes = super().sections() | {"disorder": DisorderTable}  # which a resolved case holds no more
+        return {name: classes.pop(name) for name in ORDER} | classes
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -115,19 +124,13 @@ class Case(CaseFile):
         initial, undriven = sections.get("initial", InitialTable.model_validate({})), sections["drive"].amplitude == 0
         if valid("initial.kind"):
             yield from check_initial(initial, lattice, cell, valid)
-        if cls is not Case and valid("contacts"):
-            yield from check_alike(contacts)
-        if initial.moves and cls is not Case:
-            yield Problem("initial.kind", initial.kind, "this verb is about a wave in a lattice at rest; leave it out")
+        yield from refusals(cls, sections, valid)
         if undriven and not initial.moves and valid("initial") and sections["drive"].kind == "burst":
             yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
         if undriven and sections["time"].atol == "paper":
             yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
         of_drive, drive = list(check_drives(sections["drive"], lattice, cell, length, valid)), sections["drive"]
         yield from of_drive
-        if (drive.kind not in cls.waveforms or drive.end or drive.more) and cls is not Case:
-            remedy = f"this verb is about one {' or '.join(cls.waveforms)} on a mass; run takes all others"
-            yield Problem("drive.waveform", drive.kind, remedy)
         if cell and not of_drive and drive.ways and valid("lattice", "drive", "time.end"):
             yield from check_wave(cell, drive, sections["time"])
         if cell and not cell.springs and valid("drive", "time"):

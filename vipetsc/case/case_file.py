@@ -22,10 +22,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 if TYPE_CHECKING:
     import xarray as xr
 
-SECTIONS = ("lattice", "contacts", "disorder", "drive", "initial", "time", "output", "analysis", "petsc",
-            "sweep", "nnm", "design", "law", "optimise", "predict", "nfrc")  # fmt: skip
-"""Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
-
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
 # The types that pydantic tried a value as, in the path of an error: "float", "list[int]", "Span".
 BRANCH = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
@@ -73,13 +69,31 @@ AnySection = TypeVar("AnySection", bound=Section)
 class CaseFile(Section):
     """What a verb reads from a case file: a ``name`` and the sections that a subclass declares as its fields.
 
-    Hooks of a subclass: ``check`` finds what is wrong between valid keys; ``read`` may fill in the table before its
-    sections are read, and resolve them afterwards. ``builtin_table`` is the case without a file, if there is one.
+    A subclass names its ``verb`` and the ``section`` that this verb alone reads ("" for ``run``), and which features of
+    a lattice run it ``takes`` (``vipetsc.case.features``); ``waveforms`` are the drives that it takes, () for all, and
+    ``premise`` begins the sentence that refuses another lattice. Its hooks: ``check`` finds what is wrong between valid
+    keys; ``read`` may fill in the table before its sections are read, and resolve them afterwards. ``builtin_table`` is
+    the case without a file, if there is one.
     """
 
     name: str
 
+    verb: ClassVar[str] = ""
+    section: ClassVar[str] = ""
+    takes: ClassVar[frozenset[str]] = frozenset()
+    waveforms: ClassVar[tuple[str, ...]] = ()
+    premise: ClassVar[str] = ""
     builtin_table: ClassVar[Table] = {}
+
+    @classmethod
+    def sections(cls) -> dict[str, type[Section]]:
+        """The class of each section that the verb reads, by the section's name."""
+        classes: dict[str, type[Section]] = {}
+        for key, field in cls.model_fields.items():
+            for kind in sections_in(field.annotation):
+                if not issubclass(kind, CaseFile):
+                    classes[cls.section if key == "options" else key] = kind
+        return classes
 
     @classmethod
     def load(cls, path: str | Path | None = None, overrides: Iterable[str] = ()) -> Self:
@@ -102,7 +116,7 @@ class CaseFile(Section):
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
         """The resolved case of a parsed table; raises CaseError with everything that is wrong."""
         table, problems = with_overrides(table, overrides) if overrides else (table, [])
-        valid = ("name", *SECTIONS)
+        valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}  # a section of another verb may stand by
         problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
         if not isinstance(name, str) or not name:
@@ -121,7 +135,7 @@ class CaseFile(Section):
         fields, problems = {}, []
         for key, field in cls.model_fields.items():
             if key != "name" and (key in table or field.is_required()):
-                kind = next(_sections_in(field.annotation))
+                kind = next(sections_in(field.annotation))
                 fields[key], wrong = read_section(kind, table.get(key, {}), key)
                 problems += wrong
         invalid = {problem.key for problem in problems}
@@ -155,6 +169,13 @@ class CaseFile(Section):
     def to_toml(self) -> str:
         """The resolved case as TOML; reading it back gives the same case."""
         return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
+
+
+def _declared_sections(kind: type[CaseFile]) -> Iterator[str]:
+    """The names of the sections that some verb's case reads, ``kind`` and its subclasses among them."""
+    yield from kind.sections()
+    for subclass in kind.__subclasses__():
+        yield from _declared_sections(subclass)
 
 
 def read_toml(path: str | Path) -> Table:
@@ -281,13 +302,14 @@ def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]
     choices: list[type[Section]] = []
     for key in path:
         fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
-        choices = [*_sections_in(fields.get(str(key)))] or choices
+        choices = [*sections_in(fields.get(str(key)))] or choices
         kind = next((choice for choice in choices if choice.__name__ == key), choices[0] if key in fields else kind)
     return kind
 
 
-def _sections_in(annotation: Any) -> Iterator[type[Section]]:
+def sections_in(annotation: Any) -> Iterator[type[Section]]:
+    """The classes of sections in a type, those in a union, list or dictionary among them."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
         yield annotation
     for argument in get_args(annotation):
-        yield from _sections_in(argument)
+        yield from sections_in(argument)

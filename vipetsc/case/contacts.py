@@ -67,16 +67,6 @@ def check_each(contacts: ContactsTable, count: int, gaps: list[float], valid: Va
             return
 
 
-def check_alike(contacts: ContactsTable) -> Iterator[Problem]:
-    """For a verb that knows one law and two equal stops a site: what a case has beyond that."""
-    told = {key: getattr(contacts, key) for key in ("each", *SIDES, *JOINS) if getattr(contacts, key) is not None}
-    for key in told:
-        remedy = "this verb knows one law for all sites, and equal stops on both sides; leave it out"
-        yield Problem(f"contacts.{key}", None if key == "each" else told[key], remedy)
-    if contacts.clearance == 0 or (isinstance(contacts.clearance, list) and 0 in contacts.clearance):
-        yield Problem("contacts.clearance", contacts.clearance, "must be positive for this verb")
-
-
 def resolved_each(contacts: ContactsTable, count: int) -> Table:
     """The lists over sites, with a stiffness in place of a material."""
     each = lists_of(contacts)

@@ -50,6 +50,7 @@ class DesignCase(CaseFile):
 
     design: DesignTable
 
+    verb = section = "design"
     builtin_table: ClassVar[Table] = {"name": "design"}
 
     @classmethod

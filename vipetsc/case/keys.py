@@ -8,37 +8,16 @@ import tomllib
 from collections.abc import Iterator
 from functools import cache
 from importlib.resources import files
-from typing import Any, get_args
+from typing import Any
 
 from pydantic.json_schema import models_json_schema
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import SECTIONS, CaseFile, Section
-from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.schema import MULTIPLE_OF_PI
-from vipetsc.case.verb_cases import OF_SECTION
+from vipetsc.case.verb_cases import SECTIONS
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Schema = dict[str, Any]
-
-
-def tables() -> dict[str, type[Section]]:
-    """The class of each section that a case file may have, in the order of ``SECTIONS``."""
-    of_section: dict[str, type[Section]] = {"disorder": DisorderTable}
-    kinds: dict[str, type[CaseFile]] = {"": Case, **OF_SECTION}
-    for section, kind in kinds.items():
-        for name, field in kind.model_fields.items():
-            for table in _within(field.annotation):
-                if not issubclass(table, CaseFile):
-                    of_section[section if name == "options" and section else name] = table
-    return {name: of_section[name] for name in SECTIONS}
-
-
-def _within(annotation: Any) -> Iterator[type[Section]]:
-    if isinstance(annotation, type) and issubclass(annotation, Section):
-        yield annotation
-    for argument in get_args(annotation):
-        yield from _within(argument)
 
 
 @cache
@@ -56,7 +35,7 @@ def told(name: str, key: str) -> tuple[str, str]:
 
 def json_schema() -> Schema:
     """The JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key."""
-    of_class = {table.__name__: table for table in tables().values()}
+    of_class = {table.__name__: table for table in SECTIONS.values()}
     _, whole = models_json_schema([(table, "validation") for table in of_class.values()])
     classes: Schema = whole["$defs"]
     for name, schema in classes.items():
@@ -71,7 +50,7 @@ def json_schema() -> Schema:
     # What a sweep takes in turn may be lists or ranges of anything.
     varied = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
     classes["SweepTable"]["properties"] |= {key: {"type": "object"} for key in sorted(varied)}
-    sections = {key: {"$ref": f"#/$defs/{table.__name__}"} for key, table in tables().items()}
+    sections = {key: {"$ref": f"#/$defs/{table.__name__}"} for key, table in SECTIONS.items()}
     named = {"type": "string", "description": texts()["CaseFile"]["name"][1]}
     about = {"$schema": DIALECT, "title": "case file of vipetsc", "type": "object", "additionalProperties": False}
     return about | {"properties": {"name": named} | sections, "$defs": classes}

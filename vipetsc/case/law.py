@@ -1,6 +1,5 @@
 """The case of the verb ``law``: a lattice run, of which cell, contact law and burst are taken, and ``[law]``."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -8,8 +7,8 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import Problem, Section, Table, Valid
-from vipetsc.case.resolve import check_undamped, with_preset
+from vipetsc.case.case_file import Problem, Section, Table
+from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import max_group_velocity, waves_at
@@ -65,6 +64,11 @@ class LawCase(Case):
 
     law: LawTable
 
+    verb = section = "law"
+    takes = frozenset({"disorder", "rings"})
+    waveforms = ("burst",)
+    premise = "a law of scattering is that of a lattice"
+
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
@@ -83,13 +87,6 @@ class LawCase(Case):
             remedy = "missing; give it or contacts.modulus, radius and poisson"
             problems.append(Problem("contacts.stiffness", None, remedy))
         return fields, problems or _place(fields)
-
-    @classmethod
-    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """What is wrong between keys."""
-        yield from super().check(sections, valid)
-        if valid("lattice"):
-            yield from check_undamped(sections["lattice"], "a law of scattering is that of a lattice")
 
     def fastest(self) -> float:
         """The largest group velocity of all bands in cells/s."""

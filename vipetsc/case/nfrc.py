@@ -3,13 +3,13 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section, Table, Valid
-from vipetsc.case.resolve import check_stiffness, check_undamped
+from vipetsc.case.resolve import check_stiffness
 from vipetsc.case.schema import Positive, once
 from vipetsc.lattice import Contact, UnitCell, waves_at
 from vipetsc.lattice.contact import LEAST_RESTITUTION
@@ -56,7 +56,10 @@ class NfrcCase(Case):
 
     nfrc: NfrcTable
 
-    waveforms: ClassVar[tuple[str, ...]] = ("burst", "harmonic")
+    verb = section = "nfrc"
+    takes = frozenset({"disorder", "rings"})
+    waveforms = ("burst", "harmonic")
+    premise = "steady states are those of a lattice"
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -78,8 +81,6 @@ class NfrcCase(Case):
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """What is wrong between keys."""
         yield from super().check(sections, valid)
-        if valid("lattice"):
-            yield from check_undamped(sections["lattice"], "steady states are those of a lattice")
         if not valid("nfrc"):
             return
         nfrc = sections["nfrc"]

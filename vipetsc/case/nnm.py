@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.contacts import check_alike, check_each, parameters_of
+from vipetsc.case.contacts import check_each, parameters_of
+from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.resolve import (
     check_cell,
     check_sites,
     check_stiffness,
-    check_undamped,
     clearances,
     site_cells,
     with_default_preset,
@@ -148,6 +148,10 @@ class NnmCase(CaseFile):
     contacts: ContactsTable
     nnm: NnmTable
 
+    verb = section = "nnm"
+    takes = frozenset({"rings"})
+    premise = "normal modes are those of a lattice"
+
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The sections, with the preset's material and clearances, and everything that is wrong with them."""
@@ -157,7 +161,7 @@ class NnmCase(CaseFile):
             stated = table.get("contacts", {})
             table = table | {"contacts": {key: v for key, v in given.items() if key in MATERIAL or key in stated}}
         fields, problems = super().read(with_default_preset(table))
-        problems += [Problem("disorder", None, "normal modes do not take it")] if "disorder" in table else []
+        problems += refuse_disorder(cls, table)
         lattice, contacts = fields["lattice"], fields["contacts"]
         if not (problems or lattice_free or contacts.clearance):
             count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
@@ -175,7 +179,9 @@ class NnmCase(CaseFile):
         if not valid("lattice", "contacts", "nnm"):
             return []
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
-        problems, dofs, rigid = [*_check_options(nnm), *check_alike(contacts)], 2, 0
+        # A system of one's own needs no lattice, whatever stands there.
+        refusable = {"contacts": contacts} if nnm.system == "own" else {"contacts": contacts, "lattice": lattice}
+        problems, dofs, rigid = [*_check_options(nnm), *refusals(cls, refusable, valid)], 2, 0
         problems += [] if contacts.each else check_each(contacts, 0, [], valid)
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
@@ -184,7 +190,7 @@ class NnmCase(CaseFile):
                 rigid = len(set(group)) - 1
         else:
             cell, wrong = check_cell(lattice)
-            problems += [*wrong, *check_undamped(lattice, "normal modes are those of a lattice")]
+            problems += wrong
         if nnm.system in ("chain", "condensed"):
             problems += check_sites(lattice, contacts)
             if not site_cells(lattice, contacts):

@@ -11,8 +11,8 @@ from pydantic import Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
-from vipetsc.case.contacts import check_alike
 from vipetsc.case.disorder import with_cell
+from vipetsc.case.features import refusals
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import Positive
 from vipetsc.lattice import pass_bands
@@ -104,6 +104,9 @@ class OptimiseCase(CaseFile):
     options: OptimiseTable
     base: Case
 
+    verb = section = "optimise"
+    takes = Case.takes - {"unlike sites", "initial motion"}
+
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The fields, and everything that is wrong with the section or with the case to begin with."""
@@ -122,9 +125,7 @@ class OptimiseCase(CaseFile):
         except CaseError as error:
             return {}, problems + error.problems
         wrong = list(_problems(options, base, "disorder" in table))
-        wrong += check_alike(base.contacts)
-        if base.initial:
-            wrong.append(Problem("initial.kind", base.initial.kind, "designs are compared in a lattice at rest"))
+        wrong += refusals(cls, dict(base), lambda *keys: True)
         invalid = tuple(problem.key for problem in problems)
         problems += [p for p in wrong if not invalid or not p.key.startswith(("optimise.variables", *invalid))]
         return {"table": table, "options": options, "base": base}, problems

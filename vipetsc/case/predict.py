@@ -1,11 +1,10 @@
 """The case of the verb ``predict``: a lattice run with its sites, and the amplitudes at which it is predicted."""
 
-from collections.abc import Iterator
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from vipetsc.case.case_file import Problem, Section, Table, Valid
+from vipetsc.case.case_file import Problem, Section, Table
 from vipetsc.case.law import LawCase
 from vipetsc.case.schema import Positive
 
@@ -30,6 +29,9 @@ class PredictCase(LawCase):
 
     predict: PredictTable
 
+    verb = section = "predict"
+    takes = LawCase.takes - {"rings"}
+
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
@@ -38,10 +40,3 @@ class PredictCase(LawCase):
         if isinstance(contacts, dict) and not contacts["sites"]:
             problems = [Problem("contacts.sites", [], "there is no site to predict; list cells or give a count")]
         return fields, problems
-
-    @classmethod
-    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """What is wrong between keys."""
-        yield from super().check(sections, valid)
-        if valid("lattice.ends") and sections["lattice"].ends == "periodic":
-            yield Problem("lattice.ends", "periodic", "waves around a ring are not composed; fixed or free")

@@ -134,19 +134,6 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
         yield Problem("lattice.damping.grounding", fitted[0], "it and springs are fitted to loss; leave them out")
 
 
-def check_undamped(lattice: LatticeTable, what: str) -> Iterator[Problem]:
-    """Dashpots, springs that are not linear and cells that differ, where ``what`` is made of a lattice without."""
-    for key in ("profiles", "scatter", "absorbing"):
-        if getattr(lattice, key):
-            yield Problem(f"lattice.{key}", None, f"{what} whose cells are alike; leave [lattice.{key}] out")
-    if check_cell(lattice)[1] == [] and not lattice.unit_cell().is_linear:
-        yield Problem("lattice.cell.springs", None, f"{what} of linear springs; leave quadratic and cubic out")
-    if check_cell(lattice)[1] == [] and lattice.unit_cell().is_damped:
-        yield Problem(
-            "lattice", "damped", f"{what} without dashpots; leave [lattice.damping] and those of the cell out"
-        )
-
-
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
     """What is wrong with where the contacts are, and with their clearances."""
     sites, clearance = contacts.sites, contacts.clearance

@@ -53,6 +53,9 @@ class Sweep(CaseFile):
     options: SweepTable
     axes: tuple[Values, ...]
 
+    verb = section = "sweep"
+    takes = Case.takes
+
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The fields, and everything that is wrong with ``[sweep]``; the members' cases are made by ``member``."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, CaseFile, Problem, Table, read_section, read_toml, with_overrides
+from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section, read_toml, with_overrides
 from vipetsc.case.design import DesignCase
 from vipetsc.case.disorder import DisorderTable
 from vipetsc.case.law import LawCase
@@ -14,9 +14,13 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import MOST_TRIED, Sweep
 
-OF_SECTION: dict[str, type[CaseFile]]
-OF_SECTION = {"sweep": Sweep, "nnm": NnmCase, "design": DesignCase, "law": LawCase, "optimise": OptimiseCase,
-              "predict": PredictCase, "nfrc": NfrcCase}  # fmt: skip
+VERB_CASES: tuple[type[CaseFile], ...]
+VERB_CASES = (Case, Sweep, NnmCase, DesignCase, LawCase, OptimiseCase, PredictCase, NfrcCase)
+"""The case of every verb that reads one of its own, ``run`` first; sections, schema and manual follow this order."""
+
+OF_SECTION = {kind.section: kind for kind in VERB_CASES if kind.section}
+SECTIONS: dict[str, type[Section]] = {name: table for kind in VERB_CASES for name, table in kind.sections().items()}
+"""Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:
