@@ -8,7 +8,7 @@ amplitudes are q = e_b* M u^ and p = e_b* M v^, of which
 
 is the part that goes as exp(-i omega t); the other part belongs to -kappa. The wave travels as its group velocity
 d omega_b/d kappa says, with the energy |a_b|^2/(2 N). The sum over all waves is the kinetic and spring energy of the
-lattice (Parseval), and each term is constant as long as no contact is closed. So directions are told apart while waves
+lattice (Parseval), and each term is constant as long as no contact is closed. So directions are separated while waves
 still overlap.
 """
 
@@ -25,42 +25,47 @@ def wave_energies(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray
 
     ``displacement`` in m and ``velocity`` in m/s are (cell, dof); wavenumbers are in the order of ``fftfreq``.
     """
-    cells, point = len(displacement), _waves(cell, len(displacement))
-    speed = point.group_velocity.copy()
-    speed[[0, cells // 2] if cells % 2 == 0 else [0]] = 0.0  # standing waves
+    cells = len(displacement)
+    speed = _waves(cell, cells).group_velocity.copy()
+    # Standing waves: 0 and pi are their own opposites.
+    speed[0] = 0.0
+    if cells % 2 == 0:
+        speed[cells // 2] = 0.0
     return np.abs(_amplitudes(cell, displacement, velocity)) ** 2 / (2 * cells), speed
 
 
 def band_envelopes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Energies (band, cell) in J of the envelopes of the same waves, which sum to those of the bands over the cells.
+    """Energies (band, cell) in J of the waves' envelopes, which sum over the cells to the energies of the bands.
 
-    The waves that go as exp(-i omega t) put together again are complex fields of the masses, psi_b(x); a cell has the
-    energy |psi_b|^2/2, without the swing of kinetic and spring energy within a period.
+    ``displacement`` in m and ``velocity`` in m/s are (cell, dof). The waves that go as exp(-i omega t) put together
+    again are complex fields of the masses, psi_b(x); a cell has the energy |psi_b|^2/2, without the swing of kinetic
+    and spring energy within a period.
     """
-    point, masses = _waves(cell, len(displacement)), np.asarray(cell.masses)
+    point = _waves(cell, len(displacement))
+    masses = np.asarray(cell.masses)
     parts = _amplitudes(cell, displacement, velocity)[:, None] * point.vectors * np.sqrt(masses)[:, None]
     return np.asarray(0.5 * (np.abs(np.fft.ifft(parts, axis=0)) ** 2).sum(axis=1).T)
 
 
 @lru_cache(maxsize=4)
 def _waves(cell: UnitCell, cells: int) -> BlochPoint:
+    """The Bloch waves on a ring of ``cells``, in the order of ``fftfreq``."""
     return bloch(cell, 2 * np.pi * np.fft.fftfreq(cells, 1.0))
 
 
 def _amplitudes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """The amplitudes a_b(kappa), (wavenumber, band)."""
-    point, masses = _waves(cell, len(displacement)), np.asarray(cell.masses)
-    q, p = (
-        np.einsum("kdb,kd->kb", point.vectors.conj(), np.fft.fft(field, axis=0) * masses)
-        for field in (displacement, velocity)
-    )
+    """The amplitudes a_b(kappa), (wavenumber, band), of fields (cell, dof)."""
+    point = _waves(cell, len(displacement))
+    masses = np.asarray(cell.masses)
+    q = np.einsum("kdb,kd->kb", point.vectors.conj(), np.fft.fft(displacement, axis=0) * masses)
+    p = np.einsum("kdb,kd->kb", point.vectors.conj(), np.fft.fft(velocity, axis=0) * masses)
     return np.asarray(point.frequency * q + 1j * p)
 
 
 def by_direction(energy: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """Energy (band, direction) in J of the waves (wavenumber, band) that go to higher and to lower cells.
 
-    A standing wave goes half each way.
+    A standing wave goes half to either side.
     """
     sign = np.sign(speed)
     return np.stack([(energy * (1 + side * sign) / 2).sum(axis=0) for side in (1, -1)], axis=1)

@@ -16,6 +16,7 @@ count in it as much as the others.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy import fft
@@ -28,7 +29,7 @@ NODES = 60
 KC = 12.0  # centre wavenumber of the wavelets
 CHUNK = 8  # snapshots that are transformed together
 GROUP = 8  # nodes that are filtered together
-LOUD = 8  # snapshots that are sought for the largest weight, by their energy over as many cells
+STRONGEST = 8  # snapshots in which the largest weight is sought, those of most energy over as many cells
 FLOOR = 0.01
 """Points below this fraction of the largest weight are masked, Eq. (d)."""
 
@@ -65,36 +66,56 @@ def entropy(velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 
     local, weight = local_entropy(velocity[::every], stride)
     largest = 0.0
     if every > 1:
-        energy = uniform_filter1d(np.square(velocity[start:]), LOUD, axis=1).max(axis=1)
-        largest = local_entropy(velocity[start:][np.argsort(energy)[-LOUD:]], stride)[1].max()
-    return averages(local, weight, min(-(-start // every), len(local) - 1), stride, largest)
+        energy = uniform_filter1d(np.square(velocity[start:]), STRONGEST, axis=1).max(axis=1)
+        strongest = np.argsort(energy)[-STRONGEST:]
+        largest = local_entropy(velocity[start:][strongest], stride)[1].max()
+
+    first = min(-(-start // every), len(local) - 1)
+    return averages(local, weight, first, stride, largest)
 
 
 def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, largest: float = 0.0) -> Entropy:
-    """The averages of ``local`` and ``weight`` (t, cell) of every ``stride``-th cell; ``largest`` of other weights."""
-    # Eqs. (b) and (c) over the cells of each snapshot.
+    """The averages of ``local`` and ``weight`` (t, cell) of every ``stride``-th cell, from the sample ``start`` on.
+
+    ``largest`` is the largest weight of samples that are not among them.
+    """
+    # Eqs. (b) and (c) over the cells of each snapshot. Divided by their peak first, weights do not underflow.
     peak = weight.max(axis=1, keepdims=True)
-    share = np.divide(weight, peak, out=np.zeros_like(weight), where=peak > 0)
-    share /= np.maximum(share.sum(axis=1, keepdims=True), 1.0)
-    snapshot = np.einsum("tc,tc->t", share, local)
-    position = -np.sum(share * np.log2(share, out=np.zeros_like(share), where=share > 0), axis=1)
-    joint = snapshot + np.where(peak[:, 0] > 0, position + np.log2(stride), 0.0)  # bits of the cells between
-    means = float(snapshot[start:].mean()), float(joint[start:].mean())
+    fraction = np.divide(weight, peak, out=np.zeros_like(weight), where=peak > 0)
+    fraction /= np.maximum(fraction.sum(axis=1, keepdims=True), 1.0)
+    snapshot = np.einsum("tc,tc->t", fraction, local)
+    log_fraction = np.log2(fraction, out=np.zeros_like(fraction), where=fraction > 0)
+    position = -np.sum(fraction * log_fraction, axis=1)
+    # Cells left out would have had as much entropy each: log2(stride) more bits of position.
+    joint = snapshot + np.where(peak[:, 0] > 0, position + np.log2(stride), 0.0)
+
     # Eq. (d), of all cells and of each.
     above_threshold = weight[start:] > FLOOR * max(weight[start:].max(), largest)
     count = above_threshold.sum(axis=0)
     sums = np.where(above_threshold, local[start:], 0.0).sum(axis=0)
     counted = count > 0
-    if not counted.any():
-        return Entropy(local, weight, snapshot, *means, masked=0.0, error=0.0)
-    of_cells = sums[counted] / count[counted]
-    return Entropy(local, weight, snapshot, *means, float(sums.sum() / count.sum()), float(np.std(of_cells)))
+    masked = 0.0
+    error = 0.0
+    if counted.any():
+        masked = float(sums.sum() / count.sum())
+        error = float(np.std(sums[counted] / count[counted]))
+
+    return Entropy(
+        local=local,
+        weight=weight,
+        snapshot=snapshot,
+        energy_weighted=float(snapshot[start:].mean()),
+        joint=float(joint[start:].mean()),
+        masked=masked,
+        error=error,
+    )
 
 
 def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """H (t, cell) in bits and W (t, cell) at every ``stride``-th cell of ``velocity`` (t, cell), in chunks of time.
 
-    Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude.
+    Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude. Raises
+    ValueError for a sample that is not finite.
     """
     nt, cells = velocity.shape
     local, weight = np.empty((2, nt, -(-cells // stride)))
@@ -106,41 +127,60 @@ def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np
             raise ValueError(f"velocity: not finite in samples {first} to {rows.stop - 1}")
         exponent = np.frexp(largest)[1]
         signal = np.ldexp(signal, -exponent[:, None])
+
         total, s_log_s = np.zeros((2, len(signal), local.shape[1]))
-        for length, groups in _octaves(cells, stride):
-            spectrum = fft.rfft(signal, length * stride)
-            for filters in groups:
-                x = np.zeros((len(signal), len(filters[0][1]), length), dtype=complex)
-                for band, values in filters:
-                    first = band.start % length
-                    x[:, :, first : first + values.shape[1]] += spectrum[:, None, band] * values
+        for octave in _octaves(cells, stride):
+            spectrum = fft.rfft(signal, octave.length * stride)
+            for group in octave.groups:
+                x = np.zeros((len(signal), len(group[0].values), octave.length), dtype=complex)
+                for part in group:
+                    # Folded onto the length: wavenumbers a whole number of lengths apart look the same at every
+                    # ``stride``-th cell.
+                    start = part.band.start % octave.length
+                    x[:, :, start : start + part.values.shape[1]] += spectrum[:, None, part.band] * part.values
                 _accumulate(fft.ifft(x, overwrite_x=True), total, s_log_s)
+
         _entropies(total, s_log_s, local[rows])
         weight[rows] = np.ldexp(total, 2 * exponent[:, None])
     return local, weight
 
 
-@lru_cache(maxsize=8)
-def _octaves(cells: int, stride: int) -> list[tuple[int, list[list[tuple[slice, np.ndarray]]]]]:
-    """For each octave of nodes the transforms' length, the padded one over ``stride``, and its filters.
+class _FilterPart(NamedTuple):
+    """A ``band`` of the wavenumbers of a transform, and the ``values`` (kappa, k) of filters in it."""
 
-    The lowest node sets the padded length. The filters come in groups: the bands where any of them lets something
-    through, cut at multiples of the length, and what they are there (kappa, k).
-    """
+    band: slice
+    values: np.ndarray
+
+
+class _Octave(NamedTuple):
+    """An octave of nodes: the ``length`` of its transforms, and its filters in groups, each cut into parts."""
+
+    length: int
+    groups: list[list[_FilterPart]]
+
+
+@lru_cache(maxsize=8)
+def _octaves(cells: int, stride: int) -> list[_Octave]:
+    """The octaves of the nodes; a transform's length is the padded one, which the lowest node sets, over ``stride``."""
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
     octaves = []
     for number in range(int(np.log2(NODES)) + 1):
-        some = kappa[2**number - 1 : 2 ** (number + 1) - 1]
-        length, groups = fft.next_fast_len(-(-padded_length(cells, KC, some[0]) // stride)), []
-        filters = transform_filters(some, KC, length * stride) / stride
-        for first in range(0, len(some), GROUP):
-            group = filters[first : first + GROUP]
-            inside = np.flatnonzero(group.max(axis=0) > np.finfo(float).eps * group.max())
-            cuts = range(inside[0] // length * length, inside[-1] + 1, length)
-            bands = [slice(max(inside[0], cut), min(inside[-1] + 1, cut + length)) for cut in cuts]
-            groups.append([(band, group[:, band]) for band in bands])
-        octaves.append((length, groups))
+        nodes = kappa[2**number - 1 : 2 ** (number + 1) - 1]
+        length = fft.next_fast_len(-(-padded_length(cells, KC, nodes[0]) // stride))
+        filters = transform_filters(nodes, KC, length * stride) / stride
+        groups = [_parts(filters[first : first + GROUP], length) for first in range(0, len(nodes), GROUP)]
+        octaves.append(_Octave(length=length, groups=groups))
     return octaves
+
+
+def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
+    """The bands where any of the ``filters`` (kappa, k) lets something through, cut at multiples of ``length``."""
+    inside = np.flatnonzero(filters.max(axis=0) > np.finfo(float).eps * filters.max())
+    parts = []
+    for cut in range(inside[0] // length * length, inside[-1] + 1, length):
+        band = slice(max(inside[0], cut), min(inside[-1] + 1, cut + length))
+        parts.append(_FilterPart(band=band, values=filters[:, band]))
+    return parts
 
 
 @njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", error_model="numpy", fastmath={"contract"})
@@ -152,15 +192,18 @@ def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
     fdlibm's e_log.c (error below 2^-58).
     """
     cells = weight.shape[1]
-    power, mantissa = np.empty(cells), np.empty(cells)
-    bits, mantissa_bits = power.view(np.int64), mantissa.view(np.int64)
+    power = np.empty(cells)
+    mantissa = np.empty(cells)
+    # The words of the same doubles, whose exponents are integers.
+    bits = power.view(np.int64)
+    mantissa_bits = mantissa.view(np.int64)
     for t in range(x.shape[0]):
         for k in range(x.shape[1]):
             for c in range(cells):
                 z = x[t, k, c]
-                power[c] = z.real * z.real + z.imag * z.imag + 1e-300
+                power[c] = z.real * z.real + z.imag * z.imag + 1e-300  # S log2 S is 0 at S = 0
             for c in range(cells):
-                e = (bits[c] - 0x3FE6A09E667F3BCD) >> 52
+                e = (bits[c] - 0x3FE6A09E667F3BCD) >> 52  # the word of sqrt(1/2)
                 mantissa_bits[c] = bits[c] - (e << 52)
                 u = (mantissa[c] - 1.0) / (mantissa[c] + 1.0)
                 z = u * u
@@ -177,7 +220,7 @@ def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
 
 @njit("void(f8[:,::1], f8[:,::1], f8[:,::1])")
 def _entropies(weight: np.ndarray, s_log_s: np.ndarray, local: np.ndarray) -> None:
-    """Eq. (a) from its sums, kept from rounding below zero; W and H are 0 where S stands at its floor."""
+    """Write H of Eq. (a) to ``local`` (t, cell), kept from rounding below zero; W and H are 0 where S is its floor."""
     for t in range(weight.shape[0]):
         for c in range(weight.shape[1]):
             w = weight[t, c]

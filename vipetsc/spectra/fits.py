@@ -1,7 +1,7 @@
 """Power laws y = a x^b by a straight line through the logarithms or by nonlinear least squares.
 
-Both as in any textbook on regression; intervals are Student's with n - 2 degrees of freedom, and R^2 is adjusted for
-the two parameters.
+Both are as in any textbook on regression; intervals are Student's with n - 2 degrees of freedom, and R^2 is adjusted
+for the two parameters.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
-LEVEL = 0.95
+LEVEL = 0.95  # of confidence
 FEWEST = 4  # points of a power law: three lie near some of them by chance
 
 Method = Literal["log-log", "nonlinear"]
@@ -35,12 +35,16 @@ def doubt(points: float, r2: float) -> str:
     """Why a fit over ``points`` with the adjusted R^2 ``r2`` is not to be called a power law; empty if it is one."""
     if points < FEWEST:
         return f"too few points ({points:g})"
-    return "no fit" if np.isnan(r2) else "" if r2 >= 0 else f"adjusted R² {r2:.2g}"
+    if np.isnan(r2):
+        return "no fit"
+    # Below zero a constant fits better.
+    return "" if r2 >= 0 else f"adjusted R² {r2:.2g}"
 
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
     """1 - (1 - R^2)(n - 1)/(n - 2) of a fit with two parameters, a constant among them; NaN if y is constant."""
-    y, fitted = np.asarray(y, dtype=float), np.asarray(fitted, dtype=float)
+    y = np.asarray(y, dtype=float)
+    fitted = np.asarray(fitted, dtype=float)
     scatter = np.sum((y - y.mean()) ** 2)
     if scatter == 0:
         return float("nan")
@@ -51,53 +55,72 @@ def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
 def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
     """Fit y = a x^b to points (n).
 
-    The log-log line has least relative errors, the nonlinear fit least errors, from the line as its start. A
-    nonlinear fit without a minimum, whose exponent runs away to leave a single point standing, is all NaN.
+    The log-log line minimises relative errors, the nonlinear fit errors, starting from the line. A nonlinear fit
+    without a minimum, whose exponent runs away to leave a single point standing, is all NaN.
 
     Raises
     ------
     ValueError
         For fewer than 3 points, fewer than 2 different x, or values that are not positive and finite.
     """
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    x = np.asarray(x, dtype=float)
+    y = np.asarray(y, dtype=float)
     if x.shape != y.shape or x.ndim != 1:
         raise ValueError(f"power law: x {x.shape} and y {y.shape} are not two lists of the same length")
     if len(x) < 3 or np.ptp(x) == 0:
         raise ValueError(f"power law: {len(x)} points at {len(np.unique(x))} places; 3 at 2 places are needed")
     if not (np.all(x > 0) and np.all(y > 0) and np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
         raise ValueError("power law: x and y must be positive and finite")
-    freedom = len(x) - 2
+
     # Centred and scaled, v = b u and w = c exp(b u), so that neither fit depends on the units of x and y.
-    lx, ly = np.log(x), np.log(y)
-    cx, cy = lx.mean(), ly.mean()
-    u, v, w = lx - cx, ly - cy, y / np.exp(cy)
-    c, b = 1.0, float(u @ v / (u @ u))
+    lx = np.log(x)
+    ly = np.log(y)
+    cx = lx.mean()
+    cy = ly.mean()
+    u = lx - cx
+    v = ly - cy
+    w = y / np.exp(cy)
+
+    freedom = len(x) - 2
+    c = 1.0
+    b = float(u @ v / (u @ u))
     if method == "log-log":
-        r2, variance = r2_adjusted(v, b * u), float(np.sum((v - b * u) ** 2)) / freedom / (u @ u)
+        r2 = r2_adjusted(v, b * u)
+        variance = float(np.sum((v - b * u) ** 2)) / freedom / (u @ u)
     else:
         tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
         try:
             (c, b), covariance = curve_fit(_exponential, u, w, p0=(c, b), jac=_gradient, **tolerances)
-            r2, variance = r2_adjusted(w, _exponential(u, c, b)), covariance[1, 1]
+            r2 = r2_adjusted(w, _exponential(u, c, b))
+            variance = covariance[1, 1]
         except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
             c = b = r2 = variance = float("nan")
+
     half = float(stdtrit(freedom, 0.5 + LEVEL / 2) * np.sqrt(variance))
-    return PowerLaw(float(c * np.exp(cy - b * cx)), float(b), r2, (float(b) - half, float(b) + half))
+    return PowerLaw(
+        factor=float(c * np.exp(cy - b * cx)),
+        exponent=float(b),
+        r2_adjusted=r2,
+        exponent_interval=(float(b) - half, float(b) + half),
+    )
 
 
 def _exponential(u: np.ndarray, c: float, b: float) -> np.ndarray:
+    """The model c exp(b u) (n)."""
     return np.asarray(c * np.exp(b * u))
 
 
 def _gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
+    """Derivatives (n, 2) of the model by c and b."""
     return np.stack([np.exp(b * u), c * u * np.exp(b * u)], axis=1)
 
 
 def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
-    """A curve (n) scaled linearly so that it runs from ``low`` to ``high``; NaN stays, and a constant raises."""
+    """A curve (n) scaled linearly to run from ``low`` to ``high``; NaN stays. Raises ValueError if it is constant."""
     y = np.asarray(y, dtype=float)
-    least, most = np.nanmin(y), np.nanmax(y)
+    least = np.nanmin(y)
+    most = np.nanmax(y)
     if not most > least:
         raise ValueError(f"normalised: the curve is constant, {least:g}")
-    share = (y - least) / (most - least)
-    return np.asarray(low * (1 - share) + high * share)
+    position = (y - least) / (most - least)
+    return np.asarray(low * (1 - position) + high * position)

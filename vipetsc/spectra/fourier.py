@@ -12,7 +12,7 @@ from scipy import fft
 
 from vipetsc.spectra.pooling import block_means, block_sums, blocks
 
-TAPER = 0.1
+TAPER = 0.1  # fraction of a window under cosine flanks, unless asked otherwise
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,19 @@ class Dispersion:
     energy: np.ndarray
 
     def folded(self) -> "Dispersion":
-        """The same with kappa and -kappa added up, on [0, pi]."""
+        """Dispersion with kappa and -kappa added up, on [0, pi]."""
         zero = (len(self.wavenumber) - 1) // 2  # row of kappa = 0 in ascending order over (-pi, pi]
         energy = self.energy[zero:].copy()
         energy[1 : zero + 1] += self.energy[:zero][::-1]
         return Dispersion(self.wavenumber[zero:], self.frequency, energy)
 
     def pooled(self, wavenumbers: int, frequencies: int) -> "Dispersion":
-        """The same with bins ``wavenumbers`` and ``frequencies`` times as wide, at their middles."""
-        energy = block_sums(block_sums(self.energy, wavenumbers, 0), frequencies, 1)
-        middles = block_means(self.wavenumber, wavenumbers, 0), block_means(self.frequency, frequencies, 0)
-        return Dispersion(*middles, energy)
+        """Dispersion with bins ``wavenumbers`` and ``frequencies`` times as wide, at their middles."""
+        return Dispersion(
+            wavenumber=block_means(self.wavenumber, wavenumbers, 0),
+            frequency=block_means(self.frequency, frequencies, 0),
+            energy=block_sums(block_sums(self.energy, wavenumbers, 0), frequencies, 1),
+        )
 
 
 def kinetic_energy(velocity: np.ndarray, masses: ArrayLike) -> np.ndarray:
@@ -59,8 +61,9 @@ def wavenumber_content(velocity: np.ndarray, masses: ArrayLike) -> tuple[np.ndar
     for j, mass in enumerate(np.asarray(masses)):
         spectrum = fft.rfft(np.asarray(velocity[..., j]), axis=1)
         content += 0.5 * mass / cells * (spectrum.real**2 + spectrum.imag**2)
-    content[:, 1 : (cells + 1) // 2] *= 2
-    return 2 * np.pi * np.arange(cells // 2 + 1) / cells, content
+    content[:, 1 : (cells + 1) // 2] *= 2  # -kappa; 0 and pi are their own opposites
+    kappa = 2 * np.pi * np.arange(cells // 2 + 1) / cells
+    return kappa, content
 
 
 def taper(length: int, fraction: float) -> np.ndarray:
@@ -95,40 +98,49 @@ def dispersion(
 
     Returns the energy on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
     """
-    t, x = velocity.shape[0], len(range(velocity.shape[1])[cells])
+    window = range(velocity.shape[1])[cells]
+    t = velocity.shape[0]
+    x = len(window)
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
     taken = range(nt)[: np.count_nonzero(frequency <= highest)][rows]
-    frequency, in_time, in_space = frequency[taken], taper(t, tapers[0])[:, None], taper(x, tapers[1])
-    energy, spectrum = np.zeros((len(taken), nx)), np.empty((len(taken), x), dtype=complex)
-    first = range(velocity.shape[1])[cells].start
+    in_time = taper(t, tapers[0])[:, None]
+    in_space = taper(x, tapers[1])
+
+    energy = np.zeros((len(taken), nx))
+    spectrum = np.empty((len(taken), x), dtype=complex)
     for j, mass in enumerate(np.asarray(masses)):
-        for some in blocks(x, 8 * t, memory):
-            signal = np.asarray(velocity[:, first + some.start : first + some.stop, j])
-            spectrum[:, some] = fft.rfft(signal * in_time * in_space[some], nt, axis=0)[taken]
+        for block in blocks(x, 8 * t, memory):
+            signal = np.asarray(velocity[:, window.start + block.start : window.start + block.stop, j])
+            spectrum[:, block] = fft.rfft(signal * in_time * in_space[block], nt, axis=0)[taken]
         # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
         waves = fft.ifft(spectrum, nx, axis=1, norm="forward")
         energy += mass * (waves.real**2 + waves.imag**2)
     energy /= 2 * t * nt * nx
-    energy[[0 < row < (nt + 1) // 2 for row in taken]] *= 2
+    has_opposite = [0 < row < (nt + 1) // 2 for row in taken]
+    energy[has_opposite] *= 2
+
+    # From the transform's order of wavenumbers to ascending ones over (-pi, pi].
     order = np.roll(np.arange(nx), (nx - 1) // 2)
     wavenumber = 2 * np.pi * np.where(order > nx // 2, order - nx, order) / nx
-    return Dispersion(wavenumber, frequency, energy.T[order])
+    return Dispersion(wavenumber=wavenumber, frequency=frequency[taken], energy=energy.T[order])
 
 
 def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:
     """Ridge of a dispersion: energetic wavenumbers (k) and the frequency (k) in rad/s of each one's peak.
 
     A wavenumber counts when its peak exceeds ``floor`` times the largest; the peak is refined by the
-    parabola through the logarithms of the three samples around it.
+    parabola through the logarithms of itself and its two neighbours, which is exact for a Gaussian line.
     """
-    energy, frequency = spectrum.energy, spectrum.frequency
-    peak = np.argmax(energy[:, 1:-1], axis=1) + 1
+    energy = spectrum.energy
+    frequency = spectrum.frequency
     rows = np.arange(len(energy))
-    above_threshold = np.nonzero(energy[rows, peak] > floor * energy.max())[0]
-    around = energy[above_threshold[:, None], peak[above_threshold, None] + np.array([-1, 0, 1])]
-    left, top, right = np.log(np.maximum(around, np.finfo(float).tiny)).T
+    peak = np.argmax(energy[:, 1:-1], axis=1) + 1  # with a neighbour on either side
+    energetic = np.nonzero(energy[rows, peak] > floor * energy.max())[0]
+
+    neighbours = energy[energetic[:, None], peak[energetic, None] + np.array([-1, 0, 1])]
+    left, top, right = np.log(np.maximum(neighbours, np.finfo(float).tiny)).T
     offset = 0.5 * (left - right) / (left - 2 * top + right)
     step = frequency[1] - frequency[0]
-    refined = frequency[peak[above_threshold]] + np.clip(offset, -0.5, 0.5) * step
-    return spectrum.wavenumber[above_threshold], refined
+    refined = frequency[peak[energetic]] + np.clip(offset, -0.5, 0.5) * step
+    return spectrum.wavenumber[energetic], refined

@@ -13,14 +13,15 @@ from vipetsc.spectra.pooling import blocks
 from vipetsc.spectra.wavelet import BINS
 
 Rows = Sequence[int] | np.ndarray
-EDGE = 1e-9  # modes nearer to a pass band than this share of the top one's edge are in it
+EDGE = 1e-9  # modes nearer to a pass band than this fraction of the top one's edge are in it
+BLOCK = 2**26  # bytes of fields that are transformed together
 
 
 @dataclass(frozen=True, eq=False)
 class ModalParts:
-    """The modes of a lattice, to which of ``parts`` (bands, gaps, above) and which of ``BINS`` wavenumber bins, from 0.
+    """Modes of a lattice, sorted into ``parts`` (bands, gaps, above) and ``BINS`` wavenumber bins.
 
-    Modes in a gap are those of the lattice's ends. ``part`` and ``bin`` (mode).
+    ``part`` and ``bin`` (mode) are the numbers, from 0, of each mode's. Modes in a gap are those of the lattice's ends.
     """
 
     modes: Modes
@@ -30,21 +31,29 @@ class ModalParts:
 
     @classmethod
     def of(cls, chain: Chain) -> Self:
-        """Those of ``chain`` without its sites; the modes are computed once."""
-        modes, parts = linear_modes(chain), Parts.of(pass_bands(chain.cell))
-        is_band, near = np.array([bool(inside) for inside in parts.bands]), EDGE * parts.edges[-2]
-        part, below, above = (_index(parts.edges, modes.frequency + shift) for shift in (0.0, -near, near))
-        for other in (below, above):
-            part = np.where(is_band[other] & ~is_band[part], other, part)
-        number = np.minimum((np.abs(modes.wavenumber) * (BINS / np.pi)).astype(int), BINS - 1)
-        return cls(modes, parts, part, number)
+        """The modes of ``chain`` without its sites, sorted; they are computed once."""
+        modes = linear_modes(chain)
+        parts = Parts.of(pass_bands(chain.cell))
+        is_band = np.array([bool(numbers) for numbers in parts.bands])
+
+        # Rounding may put a mode at a band's edge into the gap.
+        near = EDGE * parts.edges[-2]
+        part = _index(parts.edges, modes.frequency)
+        for shift in (-near, near):
+            neighbour = _index(parts.edges, modes.frequency + shift)
+            part = np.where(is_band[neighbour] & ~is_band[part], neighbour, part)
+
+        wavenumber_bin = np.minimum((np.abs(modes.wavenumber) * (BINS / np.pi)).astype(int), BINS - 1)
+        return cls(modes=modes, parts=parts, part=part, bin=wavenumber_bin)
 
     def sums(self, energies: np.ndarray) -> np.ndarray:
-        """``energies`` (t, mode) as sums (part, bin, t)."""
-        shape = len(self.parts.names), BINS
+        """Sums (part, bin, t) of ``energies`` (t, mode)."""
+        parts = len(self.parts.names)
         index = self.part * BINS + self.bin
-        rows = [np.bincount(index, row, shape[0] * BINS).reshape(shape) for row in energies]
-        return np.stack(rows, axis=-1) if rows else np.zeros((*shape, 0))
+        sums = np.zeros((parts, BINS, len(energies)))
+        for t, row in enumerate(energies):
+            sums[:, :, t] = np.bincount(index, row, parts * BINS).reshape(parts, BINS)
+        return sums
 
     def energies(
         self, displacement: Any, velocity: Any, rows: Sequence[int] | np.ndarray, memory: float = np.inf
@@ -53,46 +62,53 @@ class ModalParts:
 
         Fields may be stored; no more than ``memory`` bytes of both are read at once.
         """
-        parts = [np.zeros((len(self.parts.names), BINS, 0))]
-        for some in blocks(len(rows), 16 * np.prod(velocity.shape[1:]), min(memory, 2**26)):
-            u, v = (np.asarray(field[rows[some]]) for field in (displacement, velocity))
-            parts.append(self.sums(0.5 * np.abs(self.modes.amplitudes(u, v)) ** 2))
-        return np.concatenate(parts, axis=-1)
+        energies = [np.zeros((len(self.parts.names), BINS, 0))]
+        for block in blocks(len(rows), 16 * np.prod(velocity.shape[1:]), min(memory, BLOCK)):
+            u = np.asarray(displacement[rows[block]])
+            v = np.asarray(velocity[rows[block]])
+            energies.append(self.sums(0.5 * np.abs(self.modes.amplitudes(u, v)) ** 2))
+        return np.concatenate(energies, axis=-1)
 
     def driven_change(self, state: np.ndarray, drives: Sequence[Drive], span: np.ndarray) -> np.ndarray:
-        """What ``drives`` change in the energies (part) in J of a lattice without contacts within a ``span`` in s.
+        """Change, by ``drives``, of the energies (part) in J of a lattice without contacts within a ``span`` in s.
 
-        ``state`` are the amplitudes (mode) at its begin. Exact.
+        ``state`` are the amplitudes (mode) at the beginning of the span. The result is exact.
         """
         begin, end = span
         later = self.modes.later(state, end - begin)
         for drive in drives:
             force = self.modes.force(drive.cell, drive.mass) * (drive.stiffness or 1.0)
             later += force * self.modes.driven(drive.waveform, begin, end)
-        return np.asarray(self.sums(0.5 * (np.abs(later) ** 2 - np.abs(state) ** 2)[None]).sum(axis=(1, 2)))
+        change = 0.5 * (np.abs(later) ** 2 - np.abs(state) ** 2)
+        return np.asarray(self.sums(change[None]).sum(axis=(1, 2)))
 
 
 def cluster_samples(
     onset: np.ndarray, separation: np.ndarray, time: np.ndarray, stride: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Contact episodes put together that touch between the same samples, by the times in s of all.
+    """Clusters of contact episodes that overlap between samples, from ``onset`` and ``separation`` (episode) in s.
 
-    Returns the numbers (cluster, 2) of the samples, of those that ``stride`` divides and the last one, between which
-    each cluster lies, and the cluster (episode) of every episode, from 0. Episodes without an end (NaN) last.
+    Returns the numbers (cluster, 2) of the samples between which each cluster lies, and the cluster (episode) of every
+    episode, from 0. Samples are those at ``time`` whose number ``stride`` divides, and the last one. An episode without
+    an end (NaN) lasts to the last sample.
     """
     first = np.maximum(np.searchsorted(time, onset, side="right") - 1, 0) // stride * stride
     stop = -(-np.searchsorted(time, separation) // stride) * stride
     stop = np.minimum(np.maximum(stop, first + stride), len(time) - 1)
+
+    # In the order of their beginnings, a cluster begins where all earlier episodes have ended.
     order = np.argsort(first, kind="stable")
     reach = np.maximum.accumulate(stop[order])
     begins = np.flatnonzero(np.append(True, first[order][1:] >= reach[:-1])[: len(order)])
     ends = np.append(begins[1:], len(order))[: len(begins)] - 1
     cluster = np.zeros(len(order), np.int64)
     cluster[order] = np.repeat(np.arange(len(begins)), ends - begins + 1)
+
     return np.column_stack([first[order][begins], reach[ends]]), cluster
 
 
 def _index(edges: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """The parts (mode) between whose ``edges`` the frequencies lie."""
     return np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, len(edges) - 2)
 
 

@@ -1,4 +1,4 @@
-"""Blocks of arrays: of those that do not fit into memory, and of rows that are one in a map."""
+"""Blocks of an array's rows: those that fit into memory together, and those that are one row of a map."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,8 @@ def block_sums(values: np.ndarray, size: int, axis: int) -> np.ndarray:
 
 
 def block_means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """As ``block_sums``, means."""
+    """Means of each ``size`` consecutive ``values`` along ``axis``; the last block may be shorter."""
     shape = [1] * values.ndim
     shape[axis] = -1
-    return block_sums(values, size, axis) / block_sums(np.ones(values.shape[axis]), size, 0).reshape(shape)
+    counts = block_sums(np.ones(values.shape[axis]), size, 0)
+    return block_sums(values, size, axis) / counts.reshape(shape)

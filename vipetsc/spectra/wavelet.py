@@ -16,7 +16,7 @@ from scipy import fft
 from vipetsc.spectra.pooling import block_means
 
 LOWEST = np.pi / 60
-"""Lowest node in rad per cell; what lies below it belongs to the first bin."""
+"""Lowest node in rad per cell; wavenumbers below it belong to the first bin."""
 
 BINS = 12  # wavenumber bins of equal width in [0, pi]
 VOICES = 256  # nodes an octave
@@ -25,14 +25,14 @@ CHUNK = 16  # snapshots that are partitioned together
 
 @dataclass(frozen=True)
 class Nodes:
-    """Wavenumbers ``kappa`` (node) in rad per cell on a log grid, and their common weight dkappa/kappa."""
+    """Nodes of the transform: ``kappa`` (node) in rad per cell on a log grid, ``weight`` dkappa/kappa of each."""
 
     kappa: np.ndarray
     weight: float
 
     @classmethod
     def log(cls, kc: float, voices: float = VOICES) -> Self:
-        """From pi/60 to pi (1 + 4/kc), both included, with ``voices`` nodes an octave or a few more.
+        """Nodes from pi/60 to pi (1 + 4/kc), both included, ``voices`` an octave or a few more.
 
         Raises ValueError below .65 kc voices, where the sum over the nodes would ripple.
         """
@@ -41,7 +41,7 @@ class Nodes:
         ratio = np.pi * (1 + 4 / kc) / LOWEST
         steps = int(np.ceil(voices * np.log2(ratio)))
         kappa = LOWEST * ratio ** (np.arange(steps + 1) / steps)
-        return cls(kappa, float(np.log(ratio) / steps))
+        return cls(kappa=kappa, weight=float(np.log(ratio) / steps))
 
     @property
     def bins(self) -> np.ndarray:
@@ -57,7 +57,8 @@ def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
     if kc < 5:
         raise ValueError(f"kc = {kc}: the Morlet wavelet is admissible from 5 on")
     eta = np.asarray(eta, dtype=float)
-    return np.where(eta > 0, np.exp(-0.5 * (kc * eta / np.asarray(kappa)[..., None] - kc) ** 2), 0.0)
+    s = kc * eta / np.asarray(kappa)[..., None]
+    return np.where(eta > 0, np.exp(-0.5 * (s - kc) ** 2), 0.0)
 
 
 @lru_cache
@@ -88,7 +89,7 @@ def transform_filters(kappa: np.ndarray, kc: float, length: int) -> np.ndarray:
     """sqrt(kc/kappa) Psi(kc eta/kappa) (kappa, k) over the wavenumbers of a real transform of ``length``."""
     filters = np.sqrt(kc / kappa)[:, None] * wavelet_spectrum(kappa, kc, wavenumbers(length))
     if length % 2 == 0:
-        filters[:, -1] *= 0.5
+        filters[:, -1] *= 0.5  # eta = pi belongs to both signs
     return filters
 
 
@@ -101,7 +102,8 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
     """
     kappa = np.asarray(kappa, dtype=float)
     cells = signal.shape[-1]
-    length = padded_length(cells, kc, float(kappa.min())) if length is None else length
+    if length is None:
+        length = padded_length(cells, kc, float(kappa.min()))
     if length < cells:
         raise ValueError(f"length = {length}: below the {cells} cells of the signal")
     spectrum = np.zeros((*signal.shape[:-1], len(kappa), length), dtype=complex)
@@ -119,15 +121,15 @@ def inverse(x: np.ndarray, nodes: Nodes, kc: float) -> np.ndarray:
     weights = nodes.weight / constant(kc) * np.sqrt(nodes.kappa / kc)
     filters = weights[:, None] * wavelet_spectrum(nodes.kappa, kc, wavenumbers(length))
     if length % 2 == 0:
-        filters[:, -1] *= 2
+        filters[:, -1] *= 2  # ``transform`` has halved eta = pi
     spectrum = fft.fft(x)[..., : length // 2 + 1] * filters
-    bin_of = nodes.bins
-    return np.stack([fft.irfft(spectrum[..., bin_of == b, :].sum(axis=-2), length) for b in range(BINS)])
+    parts = [fft.irfft(spectrum[..., nodes.bins == b, :].sum(axis=-2), length) for b in range(BINS)]
+    return np.stack(parts)
 
 
 @dataclass(frozen=True)
 class Bank:
-    """The FFT filters that transform, binning and inverse amount to: a mask of bins does not vary along x.
+    """Bank of FFT filters to which transform, binning and inverse amount: a mask of bins does not vary along x.
 
     ``transfer`` (bin, k) over the wavenumbers of the padded ``length``:
     T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2. The sum over b is 1
@@ -140,18 +142,19 @@ class Bank:
     def split(self, signal: np.ndarray) -> np.ndarray:
         """Parts (bin, ..., cell) of real signals (..., cell), on the lattice alone."""
         spectrum = fft.rfft(signal, self.length)
-        return np.stack([fft.irfft(t * spectrum, self.length)[..., : signal.shape[-1]] for t in self.transfer])
+        cells = signal.shape[-1]
+        return np.stack([fft.irfft(transfer * spectrum, self.length)[..., :cells] for transfer in self.transfer])
 
 
 @lru_cache(maxsize=16)
 def filter_bank(cells: int, kc: float = 6.0) -> Bank:
     """The bank of filters of all bins for lattices of ``cells``."""
-    length, nodes = padded_length(cells, kc), Nodes.log(kc)
+    length = padded_length(cells, kc)
+    nodes = Nodes.log(kc)
     gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, wavenumbers(length)) ** 2
-    bin_of = nodes.bins
-    transfer = np.stack([gain[bin_of == b].sum(axis=0) for b in range(BINS)])
-    transfer.flags.writeable = False
-    return Bank(transfer, length)
+    transfer = np.stack([gain[nodes.bins == b].sum(axis=0) for b in range(BINS)])
+    transfer.flags.writeable = False  # all who ask get the same array
+    return Bank(transfer=transfer, length=length)
 
 
 @dataclass(frozen=True)
@@ -182,21 +185,27 @@ def partition(velocity: np.ndarray, masses: ArrayLike, mean_over: int = 0) -> Pa
     nt, cells = velocity.shape[:2]
     if mass_list.shape != (velocity.shape[2:] or (1,)):
         raise ValueError(f"masses: {len(mass_list)} given for velocities of shape {velocity.shape}")
+
     bank = filter_bank(cells)
-    energy, kinetic, reconstructed = np.zeros((BINS, nt)), np.zeros(nt), np.zeros(nt)
+    energy = np.zeros((BINS, nt))
+    kinetic = np.zeros(nt)
+    reconstructed = np.zeros(nt)
     field = np.zeros((BINS, nt, -(-cells // mean_over))) if mean_over else None
     for first in range(0, nt, CHUNK):
         rows = slice(first, min(first + CHUNK, nt))
         block = np.asarray(velocity[rows], dtype=float).reshape(-1, cells, len(mass_list))
         for j, mass in enumerate(mass_list):
-            of_mass = np.ascontiguousarray(block[..., j])
-            parts = bank.split(of_mass)
+            signal = np.ascontiguousarray(block[..., j])
+            parts = bank.split(signal)
             whole = parts.sum(axis=0)
-            kinetic[rows] += 0.5 * mass * np.einsum("tc,tc->t", of_mass, of_mass)
+            kinetic[rows] += 0.5 * mass * np.einsum("tc,tc->t", signal, signal)
             energy[:, rows] += 0.5 * mass * np.einsum("btc,btc->bt", parts, parts)
             reconstructed[rows] += 0.5 * mass * np.einsum("tc,tc->t", whole, whole)
             if field is not None:
                 field[:, rows] += 0.5 * mass * block_means(parts**2, mean_over, 2)
+
     missing = np.stack([np.abs(reconstructed - kinetic), kinetic - energy.sum(axis=0)])
-    shares = np.divide(missing, kinetic, out=np.zeros_like(missing), where=kinetic > 0)
-    return Partition(energy, field, kinetic, reconstructed, *shares)
+    error, cross_share = np.divide(missing, kinetic, out=np.zeros_like(missing), where=kinetic > 0)
+    return Partition(
+        energy=energy, field=field, kinetic=kinetic, reconstructed=reconstructed, error=error, cross_share=cross_share
+    )
