@@ -13,10 +13,15 @@ from scipy.linalg import expm
 from tests.conftest import small_case
 from vipetsc.case import Model
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.clusters import create_dof_tables, create_responses, group_dofs
+from vipetsc.dynamics.propagator.clusters import (
+    apply_impulses,
+    create_dof_tables,
+    create_responses,
+    expand_free_motion,
+    group_dofs,
+)
 from vipetsc.dynamics.propagator.series import StepSeries, evaluate
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
-from vipetsc.dynamics.propagator.tables import apply_impulses, expand_free_motion
 from vipetsc.lattice import Chain, Variation
 from vipetsc.lattice.chain import Pair
 

@@ -16,16 +16,16 @@ from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout, create_record
-from vipetsc.dynamics.propagator.clusters import Groups, create_dof_tables, create_responses, group_dofs
+from vipetsc.dynamics.propagator.clusters import (
+    Groups,
+    create_dof_tables,
+    create_responses,
+    expand_free_motion,
+    group_dofs,
+)
 from vipetsc.dynamics.propagator.collocation import (
-    HISTORY,
-    SUBSTEP_STATE,
-    Cluster,
-    Substep,
-    Trial,
     accumulate_moments,
     collocate,
-    create_trial,
     error_ratio,
     evaluate_site_motion,
     node_responses,
@@ -35,8 +35,15 @@ from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
 from vipetsc.dynamics.propagator.series import StepSeries, evaluate, shift
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
-from vipetsc.dynamics.propagator.tables import expand_free_motion
-from vipetsc.dynamics.propagator.tape import create_tape
+from vipetsc.dynamics.propagator.substeps import (
+    HISTORY,
+    SUBSTEP_STATE,
+    Cluster,
+    Substep,
+    Trial,
+    create_tape,
+    create_trial,
+)
 from vipetsc.dynamics.samples import Samples
 from vipetsc.dynamics.vectors import LANES
 
@@ -179,14 +186,14 @@ def test_a_shifted_series_is_the_same_function():
 
 def test_nodes_have_the_order_of_gauss_and_follow_roots():
     table = collocation(4)
-    share, weight = table.share, table.weight
-    assert weight[PLAIN] @ share[PLAIN] ** 15 == pytest.approx(1 / 16, rel=1e-14)
-    assert abs(weight[PLAIN] @ share[PLAIN] ** 16 - 1 / 17) > 1e-12
-    assert weight[ONSET] @ share[ONSET] ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
-    assert weight[EXIT] @ (1 - share[EXIT]) ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
-    assert abs(weight[PLAIN] @ share[PLAIN] ** 1.5 - 1 / 2.5) > 1e-8
+    position, weight = table.position, table.weight
+    assert weight[PLAIN] @ position[PLAIN] ** 15 == pytest.approx(1 / 16, rel=1e-14)
+    assert abs(weight[PLAIN] @ position[PLAIN] ** 16 - 1 / 17) > 1e-12
+    assert weight[ONSET] @ position[ONSET] ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
+    assert weight[EXIT] @ (1 - position[EXIT]) ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
+    assert abs(weight[PLAIN] @ position[PLAIN] ** 1.5 - 1 / 2.5) > 1e-8
     # The last two coefficients of a polynomial of lower degree vanish; those of Legendre's own are found.
-    x = share[PLAIN]
+    x = position[PLAIN]
     assert np.abs(table.tail @ x ** (NODES - 3)).max() < 1e-14
     legendre = np.polynomial.legendre.legval(2 * x - 1, np.eye(NODES)[NODES - 1])
     np.testing.assert_allclose(table.tail @ legendre, [0, 1], atol=1e-13)
@@ -273,7 +280,7 @@ def test_responses_are_added_up_over_all_terms():
     cluster = cluster._replace(response=response, taylor=np.zeros((1, 2 * terms)), nodes=nodes, omega_max_h=turn)
     to_w, to_v = np.zeros((2, NODES, NODES))
     assert node_responses(cluster, Substep(PLAIN, 0.9), 0, 0, to_w, to_v)
-    phase, h = turn * 0.9 * nodes.share[PLAIN], cluster.interval
+    phase, h = turn * 0.9 * nodes.position[PLAIN], cluster.interval
     np.testing.assert_allclose(to_w.sum(axis=0), (1 - np.cos(phase)) * h**2 / (mass * turn**2), rtol=1e-11)
     np.testing.assert_allclose(to_v.sum(axis=0), np.sin(phase) * h / (mass * turn), rtol=1e-11)
 

@@ -254,13 +254,13 @@ def test_no_onset_is_missed(coefficients, length, clearance):
 def test_nodes_integrate_what_they_should():
     table = collocation(6)
     for kind in range(3):
-        share, weight = table.share[kind], table.weight[kind]
+        position, weight = table.position[kind], table.weight[kind]
         for power in range(4):
-            assert weight @ share**power == pytest.approx(1 / (power + 1), rel=1e-13)
+            assert weight @ position**power == pytest.approx(1 / (power + 1), rel=1e-13)
         for lag in range(6):
-            # Of the constant 1: (share_j)^(lag + 1) / (lag + 1).
+            # Of the constant 1: (position_j)^(lag + 1) / (lag + 1).
             whole = table.powers[kind, lag].sum(axis=0)
-            np.testing.assert_allclose(whole, share ** (lag + 1) / (lag + 1), rtol=1e-12)
+            np.testing.assert_allclose(whole, position ** (lag + 1) / (lag + 1), rtol=1e-12)
 
 
 @pytest.mark.parametrize("interval", [1e-4, 5e-4])

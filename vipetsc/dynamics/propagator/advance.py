@@ -1,58 +1,86 @@
 """Compiled advance of a cluster of contact sites through one linear step, from change to change.
 
-Sec. 2 to 4 of the derivation in the package's docstring.
+A step (sec. 4 of the derivation in the package's docstring) is a chain of substeps: collocate one of a length that
+seems right (sec. 3), search it for the first time at which a site changes its mode, and if there is one, repeat the
+substep so that it ends there, since the force law inside a substep must be smooth. Then judge its error, take it or try
+a shorter one. ``advance_cluster`` returns at each change, at which ``forces`` switches the site, and at the end of the
+step. While no site is closed and no drive is on, the motion is a polynomial and the cluster goes to its first onset at
+once (sec. 2).
+
+Contacts that touch or are pressed at rest have no modes to switch: their force is that of max(x, 0), x the indentation,
+and not smooth where they open or close. Substeps end on such a *kink* as well, but without a landing: near an end of
+the substep the nodes see little of it.
 """
 
 import numpy as np
 
 from vipetsc.compiled import inlined, kernel
-from vipetsc.contact.changes import Change, extremes, first_change, switching
-from vipetsc.contact.law import CLOSED, FREE, begins_linearly, contact_force, gap_of
-from vipetsc.contact.search import LANDED, MOST_ATTEMPTS, RETRY, SEARCH, Landing, correct, shorten
+from vipetsc.contact.changes import LANDED_W, Change, extremes, first_change, switching
+from vipetsc.contact.law import CLOSED, FREE, PERMANENT, begins_linearly, contact_force, gap_of
+from vipetsc.contact.search import (
+    LANDED,
+    MOST_ATTEMPTS,
+    RETRY,
+    SEARCH,
+    Landing,
+    bernstein,
+    correct,
+    first_upcrossing_after_start,
+    shorten,
+)
 from vipetsc.dynamics.drives import drive_end
 from vipetsc.dynamics.propagator.collocation import (
-    Cluster,
-    Substep,
-    Trial,
     accumulate_moments,
     collocate,
     error_ratio,
     evaluate_site_motion,
     update_taylor,
 )
-from vipetsc.dynamics.propagator.kinks import first_kink
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, write_on_tape
 
 # How an advance ended: at the end of the step, on a change of modes, or without progress.
 DONE, CHANGED, FAILED = range(3)
 
 MOST_SUBSTEPS = 20_000
-# Longest substeps in radians of the fastest oscillation: searched for changes; only driven.
-SEARCHED, DRIVEN = 0.4, 1.25
-# Longest substep of a contact in ages of the contact.
+# Longest substep in radians of the fastest oscillation, where sites are searched for changes: the quintic that the
+# search sees misses (omega h)^6/46080 of an oscillation's amplitude, 9e-8 at this length.
+SEARCHED = 0.4
+# ... and where a drive alone acts: nothing is searched, and eight nodes integrate longer waves to rounding.
+DRIVEN = 1.25
+# Longest substep of a contact in ages of the contact. Hertz's force goes as the power 3/2 of the age: plain nodes
+# integrate that over 1.5 ages to 3e-14 of it, over 3 ages to 1e-11.
 MOST_AGES = 1.5
-# Share of a step that is too short for anything to happen.
+# A contact is new below this fraction of its duration.
+NEW = 1e-7
+# Fraction of a step that is too short for anything to happen.
 BLIND = 1e-7
-# Shortest substep, as a share of the step, that is rejected for its error or cut for an onset.
+# Shortest substep, as a fraction of the step, that is rejected for its error or cut for an onset.
 SHORTEST = 1e-9
-# Order by which the substep follows its error, and bounds of its growth.
+# Order by which the substep follows its error: the last coefficients fall as h^6 and h^7, times the substep's length.
 ORDER = 8.0
+# What of the length that would just be allowed is tried, and bounds of its growth.
+SAFETY = 0.9
 LEAST_GROWTH, MOST_GROWTH = 0.2, 2.0
-# A substep that could not be collocated is repeated at this share of its length.
+# A substep that could not be collocated is repeated at this fraction of its length.
 CUT = 0.4
+# Landings go on to this fraction of their tolerance, the rounding of w, as long as Newton's steps help.
+LANDING_GOAL = 1e-4
 
 
 @kernel
 def _advance_freely(cluster: Cluster) -> int:
     """Go to the first onset, or to the end of the step, while no force acts."""
     state = cluster.state[0]
-    rest, first = 1.0 - state.position, 2.0
+    remaining = 1.0 - state.position
+    first = 2.0
     for i in range(cluster.contacts.size):
-        first = min(first, first_onset(cluster.taylor[i], cluster.contacts[i], rest))
-    if first > rest:
+        first = min(first, first_onset(cluster.taylor[i], cluster.contacts[i], remaining))
+    if first > remaining:
         state.position = 1.0
         return DONE
+
     shift(cluster.taylor, first, cluster.taylor)
     state.position += first
     evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
@@ -63,23 +91,24 @@ def _advance_freely(cluster: Cluster) -> int:
 @inlined
 def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     """The next substep: as long as its error allows, to where a drive is not smooth, short while a contact is young."""
-    state, sites = cluster.state[0], cluster.contacts
+    state = cluster.state[0]
+    sites = cluster.contacts
     highest = 0.0
     for i in range(sites.size, cluster.taylor.shape[0]):
         highest = max(highest, cluster.drives.rows[i].highest)
     fastest = cluster.omega_max_h + highest * cluster.interval
-    length = min(1.0 - state.position, state.length, (SEARCHED if sites.size > 0 else DRIVEN) / fastest)
+    radians = SEARCHED if sites.size > 0 else DRIVEN
+    length = min(1.0 - state.position, state.length, radians / fastest)
     for j in range(trial.closed.size, trial.active.size):
-        length = min(
-            length,
-            drive_end(cluster.drives, trial.active[j], state.begin, cluster.interval, state.position) - state.position,
-        )
+        end = drive_end(cluster.drives, trial.active[j], state.begin, cluster.interval, state.position)
+        length = min(length, end - state.position)
+
     longest = length
     for i in trial.closed:
-        # A young contact's force goes as the root of its age.
+        # Forces that begin linearly are smooth from the onset on.
         if not begins_linearly(sites[i].elastic) and abs(sites[i].mode) == CLOSED:
             age = (state.begin - cluster.history[i].onset) / cluster.interval + state.position
-            if age * cluster.interval <= 1e-7 * cluster.history[i].duration:
+            if age * cluster.interval <= NEW * cluster.history[i].duration:
                 return Substep(ONSET, longest)
             length = min(length, MOST_AGES * age)
     return Substep(PLAIN, length)
@@ -87,15 +116,47 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
 
 @inlined
 def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
-    """Leave the end of a substep in ``trial``; whether it could be collocated."""
+    """Compute a substep and leave its end in ``trial``; whether it could be collocated."""
     if not collocate(cluster, trial, substep):
         return False
     update_taylor(cluster, trial, substep)
     state = cluster.state[0]
+    # Drives are evaluated at the cluster's position: for a moment that is the substep's end.
     state.position += substep.length
     evaluate_site_motion(cluster, trial.taylor, trial.site_motion)
     state.position -= substep.length
     return True
+
+
+@kernel
+def _first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
+    """Position, as a fraction of a substep tried, at which the first contact without modes opens or closes.
+
+    2 if none does inside.
+    """
+    first = 2.0
+    c = trial.sums.bernstein[0]
+    for i in trial.closed:
+        site = cluster.contacts[i]
+        if abs(site.mode) != PERMANENT:
+            continue
+        side = 1.0 if site.mode > 0 else -1.0
+        gap = gap_of(site, side)
+        tolerance = LANDED_W * site.scale
+        bernstein(cluster.site_motion[i], trial.site_motion[i], length * cluster.interval, c)
+
+        # It opens if it is closed at the beginning; on the kink itself the direction decides.
+        depth = side * c[0] - gap
+        opens = depth > tolerance or (depth >= -tolerance and side * (c[1] - c[0]) > 0.0)
+        largest = 0.0
+        for k in range(6):
+            c[k] = (gap - side * c[k]) * (1.0 if opens else -1.0)
+            largest = max(largest, c[k])
+
+        # None inside if no coefficient is beyond the kink, or if the substep already ends on it.
+        if largest > tolerance and abs(c[5]) > tolerance:
+            first = min(first, first_upcrossing_after_start(c, tolerance))
+    return first
 
 
 @inlined
@@ -106,10 +167,10 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
     """
     state = cluster.state[0]
     for _ in range(MOST_ATTEMPTS):
-        share = first_kink(cluster, trial, substep.length)
-        if share > 1.0 or share * substep.length < SHORTEST:
+        fraction = _first_kink(cluster, trial, substep.length)
+        if fraction > 1.0 or fraction * substep.length < SHORTEST:
             break
-        substep = Substep(substep.kind, share * substep.length)
+        substep = Substep(substep.kind, fraction * substep.length)
         if not _try_substep(cluster, trial, substep):
             state.rejected += 1
             state.length = CUT * substep.length
@@ -120,23 +181,26 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
 @kernel
 def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> tuple[float, bool]:
     """Repeat a substep to end on a ``change``; the length taken, negative if it could not be, whether it was met."""
-    contacts, site, h = cluster.contacts, change.site, cluster.interval
-    landing = Landing(change.share * substep.length, substep.length, np.inf, 0)
+    contacts = cluster.contacts
+    site = change.site
+    h = cluster.interval
+    landing = Landing(length=change.share * substep.length, longest=substep.length, residual=np.inf, attempts=0)
     while True:
         if landing.length <= ROUNDING:
             begin = switching(contacts, site, change.function, cluster.site_motion[site])
-            return 0.0, begin.value > begin.tolerance or (begin.value >= -begin.tolerance and begin.rate > 0.0)
+            is_met = begin.value > begin.tolerance or (begin.value >= -begin.tolerance and begin.rate > 0.0)
+            return 0.0, is_met
         if not _try_substep(cluster, trial, Substep(substep.kind, landing.length)):
             return -landing.length, False
+
         end = switching(contacts, site, change.function, trial.site_motion[site])
-        # Landings come to the rounding of w where Newton's steps still help.
-        landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, 1e-4 * end.tolerance)
+        landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, LANDING_GOAL * end.tolerance)
         if outcome == SEARCH:
-            motion = cluster.site_motion, trial.site_motion
-            share = first_change(contacts, *motion, h * landing.length, trial.sums.bernstein).share
-            if share > 1.0:
+            seconds = h * landing.length
+            earlier = first_change(contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein)
+            if earlier.share > 1.0:
                 return landing.length, False
-            landing = shorten(landing, share)
+            landing = shorten(landing, earlier.share)
         elif outcome != RETRY:
             return landing.length, outcome == LANDED
 
@@ -148,14 +212,15 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     A substep of negative length was rejected; ``state.length`` has the next one to try.
     """
     state = cluster.state[0]
-    motion, h = (cluster.site_motion, trial.site_motion), cluster.interval
-    change = first_change(cluster.contacts, *motion, h * substep.length, trial.sums.bernstein)
+    seconds = cluster.interval * substep.length
+    change = first_change(cluster.contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein)
     if change.share > 1.0:
         return substep, False
+
     site = cluster.contacts[change.site]
     separates = not begins_linearly(site.elastic) and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
-        # The force begins and ends as a root: one substep for each.
+        # The force begins and ends as a power 3/2, and nodes suit one end: a substep for each.
         state.length = 0.5 * change.share * substep.length
         return Substep(ONSET, -1.0), False
     kind = EXIT if separates else substep.kind
@@ -172,51 +237,38 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
     """Set the next substep's length by the error of the one ``taken``; whether that is small enough."""
     state = cluster.state[0]
     ratio = error_ratio(cluster, trial, taken)
-    factor = min(max(0.9 * (1.0 / max(ratio, 1e-30)) ** (1.0 / ORDER), LEAST_GROWTH), MOST_GROWTH)
+    factor = min(max(SAFETY * (1.0 / max(ratio, 1e-30)) ** (1.0 / ORDER), LEAST_GROWTH), MOST_GROWTH)
     if ratio > 1.0 and taken > SHORTEST:
         state.rejected += 1
         state.length = factor * taken
         return False
+    # A substep that was cut short, by the end of the step say, is no reason for a shorter one after it. After a landing
+    # a site has another mode, for which this error says nothing.
     if not landed and trial.closed.size > 0:
         state.length = max(factor * taken, state.length if taken < state.length else 0.0)
     return True
 
 
 @kernel
-def _take_down(cluster: Cluster, trial: Trial, substep: Substep) -> None:
-    """Write a substep that is taken onto the cluster's tape, for each closed site; on a full tape they are counted."""
-    tape, state = cluster.tape, cluster.state[0]
-    if tape.rows.shape[1] == 0:
-        return
-    for i in trial.closed:
-        k, site, motion = tape.used[0], cluster.contacts[i], cluster.site_motion[i]
-        tape.used[0] += 1
-        if k < tape.rows.shape[1]:
-            row = tape.rows[0, k]
-            row.begin, row.position, row.length, row.kind = state.begin, state.position, substep.length, substep.kind
-            row.site, row.mode, row.approach = i, site.mode, site.approach
-            row.rate, row.acceleration = motion[1], motion[2]
-            # Trials leave the position to a rounding.
-            time = state.begin + state.position * cluster.interval
-            row.onset = abs(time - cluster.history[i].onset) <= 4.0 * ROUNDING * (time + cluster.interval)
-            for node in range(NODES):
-                tape.motion[0, k, 0, node], tape.motion[0, k, 1, node] = trial.w[i, node], trial.v[i, node]
-
-
-@kernel
 def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> None:
     """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
-    start, end, history = cluster.site_motion[i], trial.site_motion[i], cluster.history[i]
+    start = cluster.site_motion[i]
+    end = trial.site_motion[i]
+    history = cluster.history[i]
     side = 1.0 if cluster.contacts[i].mode > 0 else -1.0
     depth = max(side * start[0], side * end[0]) - gap_of(cluster.contacts[i], side)
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]
-    force, smallest, largest = max(first, last), min(first, last), max(first, last)
+    force = max(first, last)
+
+    smallest = min(first, last)
+    largest = max(first, last)
     for node in range(NODES):
         inside = -side * (trial.force[i, node] - cluster.contacts[i].preload)
-        smallest, largest = min(smallest, inside), max(largest, inside)
+        smallest = min(smallest, inside)
+        largest = max(largest, inside)
+    # The costly search within the substep only where a turn lies inside.
     if largest > force or (side * start[1] > 0.0 and side * end[1] < 0.0):
-        # A turn lies inside.
         depth, force, smallest = extremes(cluster.contacts, i, cluster.site_motion, trial.site_motion, seconds)
     history.indentation = max(history.indentation, depth)
     history.force = max(history.force, force)
@@ -225,19 +277,45 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
 
 @kernel
 def _select_active(cluster: Cluster) -> Trial:
-    """The room for a substep of a cluster, of those DoFs on which forces act."""
-    state, sites, room, closed = cluster.state[0], cluster.contacts, cluster.trial, 0
+    """The workspace for a substep of a cluster, of those DoFs on which forces act."""
+    state = cluster.state[0]
+    sites = cluster.contacts
+    room = cluster.trial
+    closed = 0
     for i in range(sites.size):
         if sites[i].mode != FREE:
-            room.active[closed] = room.closed[closed] = i
+            room.active[closed] = i
+            room.closed[closed] = i
             closed += 1
+
     count = closed
     for i in range(sites.size, cluster.taylor.shape[0]):
         if state.position < drive_end(cluster.drives, i, state.begin, cluster.interval, state.position):
             room.active[count] = i
             count += 1
-    values = room.force, room.w, room.v, room.taylor, room.site_motion, room.sums
-    return Trial(room.active[:count], room.closed[:closed], *values)
+    return Trial(
+        active=room.active[:count],
+        closed=room.closed[:closed],
+        force=room.force,
+        w=room.w,
+        v=room.v,
+        taylor=room.taylor,
+        site_motion=room.site_motion,
+        sums=room.sums,
+    )
+
+
+@inlined
+def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """Take the substep of ``trial``: add its moments, energies and extremes; the cluster then stands at its end."""
+    state = cluster.state[0]
+    accumulate_moments(cluster, trial, substep)
+    write_on_tape(cluster, trial, substep)
+    for i in trial.closed:
+        _update_extremes(cluster, trial, i, cluster.interval * substep.length)
+    state.position += substep.length
+    copy(trial.taylor, cluster.taylor)
+    copy(trial.site_motion, cluster.site_motion)
 
 
 @kernel
@@ -246,8 +324,13 @@ def advance_cluster(cluster: Cluster) -> int:
 
     Returns ``DONE``, ``CHANGED`` (``cluster`` stands behind it) or ``FAILED``.
     """
-    state, blind, room = cluster.state[0], False, cluster.trial
-    room.force[:] = room.w[:] = room.v[:] = 0.0
+    state = cluster.state[0]
+    room = cluster.trial
+    # The workspace has served other clusters, on each rank others: the iteration must begin alike on all.
+    room.force[:] = 0.0
+    room.w[:] = 0.0
+    room.v[:] = 0.0
+    blind = False
     for _ in range(MOST_SUBSTEPS):
         if 1.0 - state.position <= ROUNDING:
             state.position = 1.0
@@ -255,6 +338,7 @@ def advance_cluster(cluster: Cluster) -> int:
         trial = _select_active(cluster)
         if trial.active.size == 0:
             return _advance_freely(cluster)
+
         evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
         substep = _choose_substep(cluster, trial)
         if blind:
@@ -266,26 +350,23 @@ def advance_cluster(cluster: Cluster) -> int:
             if substep.length < ROUNDING:
                 return FAILED
             continue
-        landed, substep = False, _end_on_kink(cluster, trial, substep)
+
+        substep = _end_on_kink(cluster, trial, substep)
         if substep.length < 0.0:
             continue
+        landed = False
         if not blind:
             substep, landed = _search_and_land(cluster, trial, substep)
             if substep.length < 0.0:
                 continue
+
         # A change at the very start that is none: past it.
         blind = substep.length == 0.0 and not landed
         if substep.length > 0.0:
             # Judged only now: a force continued beyond its end is no smooth function.
             if not _control_length(cluster, trial, substep.length, landed):
                 continue
-            accumulate_moments(cluster, trial, substep)
-            _take_down(cluster, trial, substep)
-            for i in trial.closed:
-                _update_extremes(cluster, trial, i, cluster.interval * substep.length)
-            state.position += substep.length
-            copy(trial.taylor, cluster.taylor)
-            copy(trial.site_motion, cluster.site_motion)
+            _take(cluster, trial, substep)
         if landed:
             return CHANGED
     return FAILED

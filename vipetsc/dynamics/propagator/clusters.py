@@ -1,6 +1,11 @@
-"""Contacts and driven masses as rows of the lattice's displacements: which of them feel one another, their tables.
+"""Contact sites and driven masses as rows of the lattice's displacements: which form a cluster, and their tables.
 
-Sec. 2, 5 and 6 of the derivation in the package's docstring.
+A force acts on the lattice along a DoF x = c u, a relative displacement or a mass's own (sec. 2 of the derivation in
+the package's docstring). DoFs so close that one feels the other within a step form a cluster (sec. 6). Two tables hold
+all that a step must know of the lattice around them: the rows c (-A)^m, by which ``expand_free_motion`` finds the
+Taylor series of x(s) and, since they serve both ways by Maxwell's reciprocity, ``apply_impulses`` adds what forces
+leave in the lattice (sec. 5); and the responses G of ``create_responses``, by which one DoF moves another (sec. 3).
+With dashpots (sec. 7) the rows are c P_k and c Q_k, one for each power of time.
 """
 
 from typing import NamedTuple
@@ -8,34 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
+from vipetsc.compiled import njit
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.propagator.tables import DofTables, owned_cells
 
-
-def contact_dofs(model: Model) -> np.ndarray:
-    """The relative displacements of the contact sites and the displacements of driven masses, the first drive's last.
-
-    A site has its number, the n-th drive -n. Each has its ``cell`` and the ``last`` one, that or the next; the weights
-    ``form`` (cell, mass) of the displacements there, of one cell where no contact joins cells; its lesser
-    ``clearance`` in m.
-    """
-    lattice, drives, unit = model.chain, model.drives[::-1], np.eye(model.chain.cell.dofs + 1)[:, :-1]
-    shape, sites = (1 + lattice.is_joined, lattice.cell.dofs), np.arange(len(lattice.sites))
-    fields = [("cell", int), ("last", int), ("form", float, shape), ("clearance", float)]
-    dofs = np.zeros(len(sites) + len(drives), fields)
-    dofs["cell"] = *lattice.sites, *(drive.cell for drive in drives)
-    pairs = lattice.pairs or [(lattice.cell.host, lattice.cell.resonator, 0)]
-    host, resonator, joins = np.broadcast_to(np.array(pairs, np.int64), (len(sites), 3)).T
-    dofs["form"][sites, joins] = unit[resonator]
-    dofs["form"][sites, 0] -= unit[host]  # the last row, of ground, is zero
-    dofs["form"][len(sites) :, 0] = unit[[drive.mass for drive in drives]]
-    dofs["last"] = dofs["cell"]
-    dofs["last"][sites] += joins
-    gaps = np.min(model.gaps, axis=1) if model.gaps else lattice.clearances
-    dofs["clearance"] = *gaps, *[np.inf] * len(drives)
-    return dofs
+# The tables' clearances are less by this fraction: ``first_onset`` takes an approach to 1e-10 of it for an onset, and
+# the sum by which a site is judged unable to touch is rounded.
+NEARLY_TOUCHING = 1e-9
 
 
 class Groups(NamedTuple):
@@ -48,91 +33,325 @@ class Groups(NamedTuple):
     first: np.ndarray
 
 
+class DofTables(NamedTuple):
+    """The contact DoFs of a rank, cluster by cluster, and the tables by which they and the lattice move each other.
+
+    ``column`` (dof,) is the first column in the halo of the cells that a DoF reaches, ``owned`` (dof, cell) says which
+    of the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
+    mass, cell, term) and the masses there in ``inverse_masses`` (table, mass, cell) in 1/kg; ``factors`` (2 term,) are
+    H^(k mod 2)/k!. With dashpots rows are (table, 2 mass, cell, 2 term), ``factors`` 1/k! and then H/k!. ``clearance``
+    (dof,) in m is the lesser of a site's two, inf for a driven mass. A cluster has so many ``sites`` (cluster,), which
+    come before its driven masses. The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``; ``ledger`` lists those
+    whose energy the rank's part of the state holds.
+    """
+
+    column: np.ndarray
+    owned: np.ndarray
+    table: np.ndarray
+    rows: np.ndarray
+    factors: np.ndarray
+    inverse_masses: np.ndarray
+    clearance: np.ndarray
+    sites: np.ndarray
+    first: np.ndarray
+    ledger: np.ndarray
+
+
+def contact_dofs(model: Model) -> np.ndarray:
+    """The DoFs on which forces act: relative displacements of the sites, then displacements of driven masses.
+
+    The array (dof,) can be indexed by a site's number or, from the end, by -n for the n-th drive. ``cell`` is a DoF's
+    first cell, ``last`` its last one, the same or the next; ``form`` (cell, mass) are the weights c of the
+    displacements there, of one cell where no contact joins cells; ``clearance`` in m is the lesser of a site's two, inf
+    for a driven mass.
+    """
+    lattice = model.chain
+    drives = model.drives[::-1]
+    sites = np.arange(len(lattice.sites))
+
+    shape = (1 + lattice.is_joined, lattice.cell.dofs)
+    fields = [("cell", int), ("last", int), ("form", float, shape), ("clearance", float)]
+    dofs = np.zeros(len(sites) + len(drives), fields)
+    dofs["cell"] = [*lattice.sites, *(drive.cell for drive in drives)]
+
+    pairs = lattice.pairs or [(lattice.cell.host, lattice.cell.resonator, 0)]
+    host, resonator, joins = np.broadcast_to(np.array(pairs, np.int64), (len(sites), 3)).T
+    # Ground has the number -1, and so the last row, of zeros.
+    unit = np.eye(lattice.cell.dofs + 1)[:, :-1]
+    dofs["form"][sites, joins] = unit[resonator]
+    dofs["form"][sites, 0] -= unit[host]
+    dofs["form"][len(sites) :, 0] = unit[[drive.mass for drive in drives]]
+    dofs["last"] = dofs["cell"]
+    dofs["last"][sites] += joins
+
+    gaps = np.min(model.gaps, axis=1) if model.gaps else lattice.clearances
+    dofs["clearance"] = [*gaps, *[np.inf] * len(drives)]
+    return dofs
+
+
 def group_dofs(model: Model, reach: int) -> Groups:
     """Groups of ``contact_dofs`` of which each is within ``reach`` cells of another, in the lattice's order."""
-    lattice, dofs = model.chain, contact_dofs(model)
+    lattice = model.chain
+    dofs = contact_dofs(model)
     numbers = np.append(np.arange(len(lattice.sites)), np.arange(-len(model.drives), 0))
-    order, group = np.argsort(dofs["cell"]), np.zeros(len(dofs), np.int64)
-    cells, lasts = dofs["cell"][order], np.maximum.accumulate(dofs["last"][order])
+
+    # A group ends where the next DoF begins more than ``reach`` cells beyond the last cell of all before it.
+    order = np.argsort(dofs["cell"])
+    cells = dofs["cell"][order]
+    lasts = np.maximum.accumulate(dofs["last"][order])
+    group = np.zeros(len(dofs), np.int64)
     group[order[1:]] = np.cumsum(cells[1:] - lasts[:-1] > reach)
+
+    # On a ring the last group may reach the first one across the joint.
     if lattice.ends == "periodic" and cells[0] + lattice.cells - lasts[-1] <= reach:
         group[group == group.max()] = 0
+
     first = np.append(0, np.cumsum(np.bincount(group)))
     return Groups(numbers[np.lexsort((np.abs(numbers), numbers < 0, group))], first)
 
 
-def reaching(groups: Groups, dofs: np.ndarray, reach: int, layout: Layout) -> Groups:
-    """Those of ``groups``, of the ``contact_dofs`` ``dofs``, with one within ``reach`` of the rank's cells."""
-    ways, (cells, lasts) = (-layout.cells, 0, layout.cells) if layout.periodic else (0,), (dofs["cell"], dofs["last"])
-    near = [(lasts + way >= layout.start - reach) & (cells + way < layout.stop + reach) for way in ways]
+def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: Layout) -> Groups:
+    """The ``groups`` of which a DoF lies within ``reach`` of the rank's cells; ``dofs`` are theirs, in their order."""
+    # On a ring a DoF also stands one turn before and one turn after its own place.
+    turns = (-layout.cells, 0, layout.cells) if layout.periodic else (0,)
+    near = np.zeros(len(dofs), bool)
+    for turn in turns:
+        near |= (dofs["last"] + turn >= layout.start - reach) & (dofs["cell"] + turn < layout.stop + reach)
+
     sizes = np.diff(groups.first)
-    feels = np.logical_or.reduceat(np.any(near, axis=0), groups.first[:-1]) & (layout.owned > 0)
-    return Groups(groups.numbers[np.repeat(feels, sizes)], np.append(0, np.cumsum(sizes[feels])))
+    selected = np.logical_or.reduceat(near, groups.first[:-1]) & (layout.owned > 0)
+    return Groups(groups.numbers[np.repeat(selected, sizes)], np.append(0, np.cumsum(sizes[selected])))
 
 
 def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> DofTables:
-    """The record of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
-    numbers, dofs, r, width = groups.numbers, contact_dofs(model)[groups.numbers], series.reach, series.width
-    # DoFs share their rows where the cells around them do.
-    ends = np.stack([dofs["cell"], dofs["last"] % layout.cells][: dofs["form"].shape[1]], axis=1)
-    forms = dofs["form"].reshape(len(dofs), ends.shape[1] * layout.dofs)  # of none, too
-    kinds, table = np.unique(
-        np.hstack([series.like(ends.ravel()).reshape(ends.shape), forms]), axis=0, return_inverse=True
-    )
-    cells, forms = np.split(kinds, [ends.shape[1]], axis=1)
-    cells, forms = cells.astype(np.int64), forms.reshape(-1, *dofs["form"].shape[1:])
-    halves = 1 + series.is_damped
-    rows = np.zeros((len(kinds), halves * layout.dofs, width, halves * series.terms))
-    for end in range(ends.shape[1]):
-        for row, form, around in zip(rows, forms[:, end], series.rows(cells[:, end]), strict=True):
-            part = series.cut(around, -r, 2 * r + 1).astype(float)
-            row[:, end : end + 2 * r + 1] += np.einsum("i,imjc->jcm", form, part)
-    masses = [model.chain.coefficients(cell - r, cell - r + width).masses.T for cell in cells[:, 0].tolist()]
-    places = np.full(len(contact_dofs(model)), -1)
+    """Create the tables of the DoFs of ``groups``; adds to ``halo`` the cells that they reach."""
+    numbers = groups.numbers
+    all_dofs = contact_dofs(model)
+    dofs = all_dofs[numbers]
+    joined = dofs["form"].shape[1]
+
+    # DoFs of equal form share their rows where the cells around them have equal rows.
+    ends = np.stack([dofs["cell"], dofs["last"] % layout.cells][:joined], axis=1)
+    forms = dofs["form"].reshape(len(dofs), joined * layout.dofs)
+    examples = series.representatives(ends.ravel()).reshape(ends.shape)
+    kinds, table = np.unique(np.hstack([examples, forms]), axis=0, return_inverse=True)
+    cells = kinds[:, :joined].astype(np.int64)
+    forms = kinds[:, joined:].reshape(len(kinds), joined, layout.dofs)
+
+    firsts = dofs["cell"] - series.reach
+    masses = np.zeros((len(kinds), layout.dofs, series.width))
+    for i, cell in enumerate(cells[:, 0].tolist()):
+        first = cell - series.reach
+        masses[i] = model.chain.coefficients(first, first + series.width).masses.T
+
+    # Sites and drives of the rank's ledger, in its order, by their place in ``numbers``.
+    places = np.full(len(all_dofs), -1)
     places[numbers] = np.arange(len(numbers))
+    ledger = places[[*(-1 - i for i in layout.drives), *layout.sites]]
+
     return DofTables(
-        column=halo.add(dofs["cell"] - r, width),
-        owned=owned_cells(dofs["cell"] - r, width, layout),
+        column=halo.add(firsts, series.width),
+        owned=_owned_cells(firsts, series.width, layout),
         table=table,
-        rows=rows,
+        rows=_form_rows(cells, forms, series),
         factors=series.factors(),
-        inverse_masses=1 / np.array(masses).reshape(len(rows), layout.dofs, width),
-        # An onset within rounding of the clearance is one.
-        clearance=dofs["clearance"] * (1 - 1e-9),
+        inverse_masses=1 / masses,
+        clearance=dofs["clearance"] * (1 - NEARLY_TOUCHING),
+        # np.add.reduceat cannot sum over no groups.
         sites=np.add.reduceat(numbers >= 0, groups.first[:-1], dtype=np.int64) if len(numbers) else numbers[:0],
         first=groups.first,
-        ledger=places[[*(-1 - i for i in layout.drives), *layout.sites]],
+        ledger=ledger,
     )
+
+
+def _owned_cells(firsts: np.ndarray, count: int, layout: Layout) -> np.ndarray:
+    """Local numbers (dof, count) of so many cells from each of ``firsts`` (dof,) on, -1 where nothing is owned."""
+    cells = firsts[:, None] + np.arange(count)
+    if layout.periodic:
+        cells = cells % layout.cells
+    return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
+
+
+def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.ndarray:
+    """Rows c (-A)^m as in ``DofTables`` of the ``forms`` c (table, end, mass) in the ``cells`` (table, end)."""
+    tables, joined, masses = forms.shape
+    halves = 1 + series.is_damped
+    rows = np.zeros((tables, halves * masses, series.width, halves * series.terms))
+
+    band = 2 * series.reach + 1
+    for end in range(joined):
+        for row, form, around in zip(rows, forms[:, end], series.rows(cells[:, end]), strict=True):
+            part = series.cut(around, -series.reach, band).astype(float)
+            # The rows of a mass in the next cell lie one cell further on.
+            row[:, end : end + band] += np.einsum("i,imjc->jcm", form, part)
+    return rows
 
 
 def create_responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
-    """Motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H: ``Cluster.response``."""
-    dofs, n, (first, r) = contact_dofs(model), model.chain.cells, (groups.first, series.reach)
-    cells, d, damped = dofs["cell"][groups.numbers], model.chain.cell.dofs, series.is_damped
-    # From velocities: (table, mass, cell, term); one cell more, of zeros, is for all that are not reached.
-    rows, factors = tables.rows[:, -d:, :, damped:], tables.factors[1::2] * series.interval
-    rows = np.pad(rows, [(0, 0), (0, 0), (0, 1), (0, 0)])
-    if damped:
+    """Create the motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H.
+
+    An impulse on DoF l leaves the velocities M^-1 c_l^T, on which the rows of DoF i act: see ``Cluster.response``.
+    """
+    all_dofs = contact_dofs(model)
+    cells = all_dofs["cell"][groups.numbers]
+    masses = model.chain.cell.dofs
+
+    # What DoFs take from velocities: (table, mass, cell, term).
+    if series.is_damped:
+        rows = tables.rows[:, -masses:, :, 1:]
         factors = tables.factors[2 * series.terms + 1 :] * series.interval
+    else:
+        rows = tables.rows[:, -masses:, :, :]
+        factors = tables.factors[1::2] * series.interval
+    # One cell more, of zeros, stands for all that are not reached.
+    rows = np.pad(rows, [(0, 0), (0, 0), (0, 1), (0, 0)])
+
+    # The velocities after a unit impulse: (table, end, mass).
     _, examples = np.unique(tables.table, return_index=True)
-    forms = dofs["form"][groups.numbers[examples]]
+    forms = all_dofs["form"][groups.numbers[examples]]
     ends = np.arange(forms.shape[1])
-    weights = tables.inverse_masses[:, :, r + ends].swapaxes(1, 2) * forms
-    sizes = np.diff(first)
+    velocities = tables.inverse_masses[:, :, series.reach + ends].swapaxes(1, 2) * forms
+
+    sizes = np.diff(groups.first)
     response = np.zeros((len(cells), max(sizes, default=0), rows.shape[-1]))
     for j in range(response.shape[1]):
+        # The j-th DoF of every cluster that has so many is the source.
         targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
-        sources = np.repeat(first[:-1], sizes)[targets] + j
-        at = r + (cells[sources] - cells[targets])[:, None] + ends
-        at = at % n if model.chain.ends == "periodic" else at
-        at = np.where((at >= 0) & (at < series.width), at, series.width)
-        near = np.any(at < series.width, axis=1)
-        targets, sources, at = targets[near], sources[near], at[near]
-        pairs = np.column_stack([tables.table[targets], tables.table[sources], at])
+        sources = np.repeat(groups.first[:-1], sizes)[targets] + j
+
+        # Columns of the target's rows in which the cells of the source lie.
+        columns = series.reach + (cells[sources] - cells[targets])[:, None] + ends
+        if model.chain.ends == "periodic":
+            columns = columns % model.chain.cells
+        columns = np.where((columns >= 0) & (columns < series.width), columns, series.width)
+        near = np.any(columns < series.width, axis=1)
+        targets = targets[near]
+
+        # Pairs of equal tables at equal distances respond alike: thousands of sites make few kinds of pairs.
+        pairs = np.column_stack([tables.table[targets], tables.table[sources[near]], columns[near]])
         pairs, which = np.unique(pairs, axis=0, return_inverse=True)
-        of_pairs = [
-            factors * sum(weights[source, end] @ rows[target, :, at] for end, at in enumerate(cells_at))
-            for target, source, *cells_at in pairs.tolist()
-        ]
-        response[targets, j] = np.reshape(of_pairs, (-1, rows.shape[-1]))[which]
+        responses = np.zeros((len(pairs), rows.shape[-1]))
+        for out, (target, source, *pair_columns) in zip(responses, pairs.tolist(), strict=True):
+            for end, column in enumerate(pair_columns):
+                out += velocities[source, end] @ rows[target, :, column]
+        response[targets, j] = (factors * responses)[which]
     return response
+
+
+@njit(error_model="numpy")
+def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
+    """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a site may reach its clearance.
+
+    Coefficients in m go into ``taylor`` (dof, 2 term); ``columns`` (2 mass, column) hold the lattice's state at the
+    beginning of the step.
+    """
+    _, masses, width, terms = dofs.rows.shape
+    if masses == columns.shape[0]:
+        return _expand_damped_motion(dofs, c, columns, taylor)
+
+    even = np.empty(terms)
+    odd = np.empty(terms)
+    may_touch = False
+    for i in range(dofs.first[c], dofs.first[c + 1]):
+        rows = dofs.rows[dofs.table[i]]
+        first = dofs.column[i]
+        even[:] = 0.0
+        odd[:] = 0.0
+        for j in range(masses):
+            for k in range(width):
+                u = columns[j, first + k]
+                v = columns[masses + j, first + k]
+                row = rows[j, k]
+                for m in range(terms):
+                    even[m] += u * row[m]
+                    odd[m] += v * row[m]
+
+        bound = 0.0
+        for m in range(terms):
+            taylor[i, 2 * m] = even[m] * dofs.factors[2 * m]
+            taylor[i, 2 * m + 1] = odd[m] * dofs.factors[2 * m + 1]
+            bound += abs(taylor[i, 2 * m]) + abs(taylor[i, 2 * m + 1])
+        # Not ``bound >= clearance``: a state that is not finite must be looked at, too.
+        may_touch |= not bound < dofs.clearance[i]
+    return may_touch
+
+
+@njit(error_model="numpy")
+def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
+    """Expand the free motion as ``expand_free_motion`` does, in a lattice with dashpots."""
+    _, rows, width, terms = dofs.rows.shape
+    # By powers of time: what displacements make, what velocities make.
+    total = np.empty((2, terms))
+    may_touch = False
+    for i in range(dofs.first[c], dofs.first[c + 1]):
+        first = dofs.column[i]
+        total[:] = 0.0
+        for j in range(rows):
+            for k in range(width):
+                x = columns[j, first + k]
+                row = dofs.rows[dofs.table[i], j, k]
+                for m in range(terms):
+                    total[2 * j // rows, m] += x * row[m]
+
+        bound = 0.0
+        for m in range(terms):
+            taylor[i, m] = total[0, m] * dofs.factors[m] + total[1, m] * dofs.factors[terms + m]
+            bound += abs(taylor[i, m])
+        may_touch |= not bound < dofs.clearance[i]
+    return may_touch
+
+
+@njit(error_model="numpy")
+def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
+    """Add to the owned cells ``out`` (2 mass, cell) what forces within the step leave there at its end.
+
+    Row i of ``moments`` (dof, 2 term) belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt.
+    """
+    masses, width, terms = dofs.rows.shape[1:]
+    if masses == out.shape[0]:
+        _apply_damped_impulses(dofs, first, moments, out)
+        return
+
+    for i in range(moments.shape[0]):
+        if not moments[i].any():
+            continue
+        dof = first + i
+        for k in range(width):
+            cell = dofs.owned[dof, k]
+            if cell < 0:
+                continue
+            for j in range(masses):
+                row = dofs.rows[dofs.table[dof], j, k]
+                u = 0.0
+                v = 0.0
+                for m in range(terms):
+                    v += row[m] * dofs.factors[2 * m] * moments[i, 2 * m]
+                    u += row[m] * dofs.factors[2 * m + 1] * moments[i, 2 * m + 1]
+                inverse_mass = dofs.inverse_masses[dofs.table[dof], j, k]
+                out[j, cell] += u * inverse_mass
+                out[masses + j, cell] += v * inverse_mass
+
+
+@njit(error_model="numpy")
+def _apply_damped_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
+    """Add what forces leave as ``apply_impulses`` does, in a lattice with dashpots."""
+    rows, width, terms = dofs.rows.shape[1:]
+    masses = rows // 2
+    for i in range(moments.shape[0]):
+        if not moments[i].any():
+            continue
+        table = dofs.table[first + i]
+        for k in range(width):
+            cell = dofs.owned[first + i, k]
+            if cell < 0:
+                continue
+            for j in range(masses):
+                row = dofs.rows[table, masses + j, k]
+                u = 0.0
+                v = 0.0
+                # An impulse moves nothing at once, Q_0 = 0: u begins with Q_1, and v has the same coefficient.
+                for m in range(1, terms):
+                    v += row[m] * dofs.factors[m - 1] * moments[i, m - 1]
+                    u += row[m] * dofs.factors[terms + m] * moments[i, m]
+                out[j, cell] += u * dofs.inverse_masses[table, j, k]
+                out[masses + j, cell] += v * dofs.inverse_masses[table, j, k]

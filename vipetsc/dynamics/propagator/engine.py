@@ -15,12 +15,11 @@ from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
-from vipetsc.dynamics.propagator.clusters import group_dofs
-from vipetsc.dynamics.propagator.collocation import Cluster
+from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion, group_dofs
 from vipetsc.dynamics.propagator.forces import Forces, follow_contacts
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
-from vipetsc.dynamics.propagator.tables import DofTables, apply_impulses, expand_free_motion
+from vipetsc.dynamics.propagator.substeps import Cluster
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.lattice import ToneBurst
 from vipetsc.parallel import StopRequest, on_every_rank

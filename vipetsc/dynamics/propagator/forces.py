@@ -1,6 +1,11 @@
 """The forces of clusters of contact sites and driven masses within one linear step; their records and log.
 
-Sec. 5 and 6 of the derivation in the package's docstring.
+``Forces`` keeps all clusters that a rank's cells feel (sec. 6 of the derivation in the package's docstring), and
+``follow_contacts`` takes one of them through a step: ``advance`` carries it to the next change of a site's mode, the
+site is switched and the change is written in the log of impacts, until the step is over; the moments of the forces are
+then what the step adds to the lattice (sec. 5). A cluster that several ranks feel is followed by each of them, from the
+same numbers to the same bits, instead of by one that sends the result; one of them, the owner of the cluster's first
+cell, logs it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,20 +20,37 @@ from vipetsc.compiled import njit
 from vipetsc.contact.changes import Extremes
 from vipetsc.contact.law import FREE, impact_time
 from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, switch_sites, update_episode, with_room
-from vipetsc.dynamics.drives import Drives, create_drives
+from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.places import site_records
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
-from vipetsc.dynamics.propagator.clusters import contact_dofs, create_dof_tables, create_responses, group_dofs, reaching
-from vipetsc.dynamics.propagator.collocation import COUNTS, HISTORY, SUBSTEP_STATE, Cluster, create_trial
+from vipetsc.dynamics.propagator.clusters import (
+    DofTables,
+    Groups,
+    contact_dofs,
+    create_dof_tables,
+    create_responses,
+    group_dofs,
+    groups_within_reach,
+)
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.propagator.tables import DofTables
-from vipetsc.dynamics.propagator.tape import create_tape, select_tape
+from vipetsc.dynamics.propagator.substeps import (
+    COUNTS,
+    HISTORY,
+    SUBSTEP_STATE,
+    Cluster,
+    create_tape,
+    create_trial,
+    select_cluster,
+)
 
-# A contact's first substep as a share of its duration at a tolerance of 1e-6.
+# A contact's first substep as a fraction of its duration at a tolerance of 1e-6; it goes with the error as others do.
 FIRST_SUBSTEP = 0.1
+FIRST_TOLERANCE = 1e-6
+# Most by which a loose tolerance lengthens it.
+LONGEST_FIRST = 2.0
 # Changes of one cluster in one step beyond which it counts as stalled.
 MOST_CHANGES = 5_000
 FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY), ("cluster", SUBSTEP_STATE)])
@@ -36,33 +58,7 @@ FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY),
 
 
 @njit(error_model="numpy")
-def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
-    """Cluster ``c`` of all: the same constants, views of its arrays."""
-    first, stop = dofs.first[c], dofs.first[c + 1]
-    sites = first + dofs.sites[c]
-    return Cluster(
-        clusters.contacts[first:sites],
-        Drives(clusters.drives.rows[first:stop], clusters.drives.pieces),
-        clusters.response[first:stop],
-        clusters.nodes,
-        clusters.interval,
-        clusters.omega_max_h,
-        clusters.rtol,
-        clusters.atol,
-        clusters.first_substep,
-        clusters.taylor[first:stop],
-        clusters.site_motion[first:sites],
-        clusters.moments[first:stop],
-        clusters.energy[first:stop],
-        clusters.history[first:stop],
-        clusters.state[c : c + 1],
-        clusters.trial,
-        select_tape(clusters.tape, c),
-    )
-
-
-@njit(error_model="numpy")
-def update_extremes(cluster: Cluster, tracks: Tracks) -> None:
+def _update_open_episodes(cluster: Cluster, tracks: Tracks) -> None:
     """Bring the open episodes of a cluster up to date."""
     for i in range(cluster.contacts.size):
         if cluster.contacts[i].mode != FREE:
@@ -74,15 +70,22 @@ def update_extremes(cluster: Cluster, tracks: Tracks) -> None:
 @njit(error_model="numpy")
 def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     """Switch the sites of a cluster that have landed, ``now`` in s; sets the length of the next substep."""
-    contacts, state = cluster.contacts, cluster.state[0]
-    update_extremes(cluster, tracks)
+    contacts = cluster.contacts
+    state = cluster.state[0]
+    # Before the switch: an episode that ends takes its extremes along.
+    _update_open_episodes(cluster, tracks)
     was_free = contacts["mode"] == FREE
     state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, now)
     is_free = contacts["mode"] == FREE
+
     for i in np.flatnonzero(was_free & ~is_free):
-        duration, history = impact_time(contacts[i], abs(contacts[i].approach)), cluster.history[i]
-        history.onset, history.duration = now, duration
-        history.indentation, history.force, history.smallest_force = 0.0, 0.0, 0.0
+        duration = impact_time(contacts[i], abs(contacts[i].approach))
+        history = cluster.history[i]
+        history.onset = now
+        history.duration = duration
+        history.indentation = 0.0
+        history.force = 0.0
+        history.smallest_force = 0.0
         state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
     if is_free.all():
         state.length = 1.0
@@ -95,8 +98,10 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
     Returns whether that was possible, and ``tracks`` with as much room as was needed.
     """
     cluster = select_cluster(clusters, dofs, c)
-    state, first = cluster.state[0], dofs.first[c]
-    state.begin, state.position = begin, 0.0
+    state = cluster.state[0]
+    first = dofs.first[c]
+    state.begin = begin
+    state.position = 0.0
     cluster.moments[:] = 0.0
     for _ in range(MOST_CHANGES):
         outcome = advance_cluster(cluster)
@@ -112,42 +117,27 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
 class Forces:
     """Clusters that a rank's cells feel; adds to ``halo`` the cells whose motion they need.
 
-    Every rank that a cluster reaches does the same sums on the same numbers; the one that owns its first cell logs it.
+    ``dofs`` are their tables, ``clusters`` the record of all of them, ``tracker`` the modes of their sites and the log.
+    ``logs`` (cluster,) marks those that this rank logs: every rank that a cluster reaches does the same sums on the
+    same numbers, and the one that owns its first cell logs it.
     """
 
     def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
         self._comm = layout.comm
-        all_dofs, every = contact_dofs(model), group_dofs(model, series.reach)
-        groups = reaching(every, all_dofs[every.numbers], series.reach, layout)
-        dofs = all_dofs[groups.numbers]
+        all_dofs = contact_dofs(model)
+        all_groups = group_dofs(model, series.reach)
+        groups = groups_within_reach(all_groups, all_dofs[all_groups.numbers], series.reach, layout)
+        self._numbers = groups.numbers
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
-        count, terms = len(dofs), series.terms
-        self.clusters = Cluster(
-            contacts=site_records(model, groups.numbers),
-            drives=create_drives(model.drives, np.where(groups.numbers < 0, -1 - groups.numbers, -1).tolist()),
-            response=create_responses(groups, self.dofs, model, series),
-            nodes=collocation(2 * terms),
-            interval=series.interval,
-            omega_max_h=series.omega_max_h,
-            rtol=model.rtol,
-            atol=model.atol[1],
-            first_substep=FIRST_SUBSTEP * min((model.rtol / 1e-6) ** (1 / ORDER), 2.0),
-            taylor=np.zeros((count, 2 * terms)),
-            site_motion=np.zeros((count, 3)),
-            moments=np.zeros((count, 2 * terms)),
-            energy=np.zeros(count),
-            history=np.zeros(count, HISTORY),
-            state=np.zeros(len(groups.first) - 1, SUBSTEP_STATE),
-            trial=create_trial(int(np.diff(groups.first).max(initial=0)), terms),
-            tape=create_tape(0, 0),
-        )
-        self.clusters.state["length"] = 1.0
-        leaders = dofs["cell"][groups.first[:-1]]
-        self.logs = (leaders >= layout.start) & (leaders < layout.stop)
-        self._mine = np.repeat(self.logs, np.diff(groups.first))  # DoFs
-        self._numbers, self._logged = groups.numbers, np.zeros(len(all_dofs), bool)
-        self._logged[groups.numbers[self._mine]] = True
+        self.clusters = _create_clusters(groups, self.dofs, model, series)
         self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist())
+
+        leaders = all_dofs["cell"][groups.numbers[groups.first[:-1]]]
+        self.logs = (leaders >= layout.start) & (leaders < layout.stop)
+        # The same by DoF of this rank, and by number in the model.
+        self._is_logged = np.repeat(self.logs, np.diff(groups.first))
+        self._logs_number = np.zeros(len(all_dofs), bool)
+        self._logs_number[groups.numbers[self._is_logged]] = True
 
     def begin(self, motion: np.ndarray, energy: float) -> None:
         """Begin with w and w' of all sites as ``motion`` (site, 2), and so much ``energy`` in J as work."""
@@ -156,42 +146,79 @@ class Forces:
         for i in self.tracker.begin(motion).tolist():
             # As if the contact were old: its force is smooth.
             duration = impact_time(clusters.contacts[i], abs(clusters.contacts["approach"][i]))
-            clusters.history["onset"][i], clusters.history["duration"][i] = -duration, duration
+            clusters.history["onset"][i] = -duration
+            clusters.history["duration"][i] = duration
             c = int(np.searchsorted(self.dofs.first, i, side="right")) - 1
             first = clusters.first_substep * duration / clusters.interval
             clusters.state["length"][c] = min(clusters.state["length"][c], first)
 
     def sites(self, c: int) -> list[int]:
         """The sites, counted from 1, of cluster ``c``; none of -1."""
-        numbers = self._numbers[self.dofs.first[c] : self.dofs.first[c + 1]] if c >= 0 else self._numbers[:0]
+        if c < 0:
+            return []
+        numbers = self._numbers[self.dofs.first[c] : self.dofs.first[c + 1]]
         return (numbers[numbers >= 0] + 1).tolist()
 
     def take_episodes(self, unfinished: bool) -> np.ndarray:
         """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
         if unfinished:
-            update_extremes(self.clusters, self.tracker.tracks)
+            _update_open_episodes(self.clusters, self.tracker.tracks)
         episodes = self.tracker.take_episodes(self.clusters.energy, unfinished)
-        return episodes[self._logged[episodes["site"]]]
+        return episodes[self._logs_number[episodes["site"]]]
 
     def statistics(self) -> dict[str, Any]:
         """Substeps, landings and limits of the contact law, over all ranks; all must call it."""
-        sites = self.tracker.counts[self._mine]
-        total = np.array([*(self.clusters.state[name][self.logs].sum() for name in COUNTS),
-                          *(sites[name].sum() for name in LIMITS)])  # fmt: skip
+        state = self.clusters.state[self.logs]
+        sites = self.tracker.counts[self._is_logged]
+        counts = [state[name].sum() for name in COUNTS] + [sites[name].sum() for name in LIMITS]
+        total = np.array(counts)
         self._comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         return dict(zip((*COUNTS, *LIMITS), total.tolist(), strict=True))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """``forces`` and ``sites`` of the clusters that this rank logs."""
-        clusters, forces = self.clusters, np.zeros(len(self._numbers), FORCE)
-        forces["number"], forces["energy"], forces["history"] = self._numbers, clusters.energy, clusters.history
-        forces["cluster"] = np.repeat(clusters.state, np.diff(self.dofs.first))
-        return {"forces": forces[self._mine], "sites": self.tracker.checkpoint()[self._mine & (self._numbers >= 0)]}
+        forces = np.zeros(len(self._numbers), FORCE)
+        forces["number"] = self._numbers
+        forces["energy"] = self.clusters.energy
+        forces["history"] = self.clusters.history
+        forces["cluster"] = np.repeat(self.clusters.state, np.diff(self.dofs.first))
+        sites = self.tracker.checkpoint()
+        return {"forces": forces[self._is_logged], "sites": sites[self._is_logged & (self._numbers >= 0)]}
 
-    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go back to a checkpoint; all ranks that a cluster reaches go on from the same numbers."""
-        tables = join(shares, {"forces": "number", "sites": "number"})
-        mine = tables["forces"][np.searchsorted(tables["forces"]["number"], self._numbers)]
-        self.clusters.energy[:], self.clusters.history[:] = mine["energy"], mine["history"]
-        self.clusters.state[:] = mine["cluster"][self.dofs.first[:-1]]
+    def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go back to the ``checkpoints`` of all ranks; those that a cluster reaches go on from the same numbers."""
+        tables = join(checkpoints, {"forces": "number", "sites": "number"})
+        forces = tables["forces"][np.searchsorted(tables["forces"]["number"], self._numbers)]
+        self.clusters.energy[:] = forces["energy"]
+        self.clusters.history[:] = forces["history"]
+        self.clusters.state[:] = forces["cluster"][self.dofs.first[:-1]]
         self.tracker.restore(tables["sites"])
+
+
+def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: StepSeries) -> Cluster:
+    """Create the record of all clusters at rest, one for each of ``groups``."""
+    count = len(groups.numbers)
+    terms = series.terms
+    state = np.zeros(len(groups.first) - 1, SUBSTEP_STATE)
+    state["length"] = 1.0
+    tolerance = (model.rtol / FIRST_TOLERANCE) ** (1 / ORDER)
+    drives = np.where(groups.numbers < 0, -1 - groups.numbers, -1)
+    return Cluster(
+        contacts=site_records(model, groups.numbers),
+        drives=create_drives(model.drives, drives.tolist()),
+        response=create_responses(groups, dofs, model, series),
+        nodes=collocation(2 * terms),
+        interval=series.interval,
+        omega_max_h=series.omega_max_h,
+        rtol=model.rtol,
+        atol=model.atol[1],
+        first_substep=FIRST_SUBSTEP * min(tolerance, LONGEST_FIRST),
+        taylor=np.zeros((count, 2 * terms)),
+        site_motion=np.zeros((count, 3)),
+        moments=np.zeros((count, 2 * terms)),
+        energy=np.zeros(count),
+        history=np.zeros(count, HISTORY),
+        state=state,
+        trial=create_trial(int(np.diff(groups.first).max(initial=0)), terms),
+        tape=create_tape(0, 0),
+    )

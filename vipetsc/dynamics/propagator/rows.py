@@ -1,6 +1,15 @@
-"""Rows of the powers that free motion consists of, cell by cell: sec. 1, 7 and 8 of the derivation in the package."""
+"""Rows of the powers of which free motion consists: what a mass's Taylor coefficients take from the cells around it.
+
+A row vector c (-A)^m, A = H^2 M^-1 K, says what the m-th power in the series of c u takes from every displacement
+(sec. 1 of the derivation in the package's docstring); with dashpots c P_k and c Q_k do so for displacements and
+velocities (sec. 7). Rows are multiplied by one power after another from the right, each time for many cells at once,
+and each time they grow by a cell on either side. Where cells differ (sec. 8) every row takes the masses, springs and
+dashpots that lie around its own cell. ``Bounds`` has what no cell exceeds: the largest frequency, from Gershgorin's
+circles, decides how many powers count, the largest entries how far the rows reach.
+"""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -8,77 +17,128 @@ import numpy as np
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.variation import Coefficients
 
-# Cells of a lattice that are looked at together.
+# Cells whose coefficients are looked at together: a lattice of millions is not copied as a whole.
 CHUNK = 65_536
 RowMap = Callable[[np.ndarray], np.ndarray]
 
 
 class PowerRecursion(NamedTuple):
-    """How rows (..., dof, cell) go on by one power: times - H^2 M^-1 K, times - H M^-1 C (None without dashpots)."""
+    """How rows (..., dof, cell) are multiplied: by - H^2 M^-1 K, and by - H M^-1 C (None without dashpots)."""
 
     by_stiffness: RowMap
     by_damping: RowMap | None
 
 
-def power_rows(first: np.ndarray, terms: int, turns: PowerRecursion) -> np.ndarray:
+def power_rows(first: np.ndarray, terms: int, recursion: PowerRecursion) -> np.ndarray:
     """The rows (..., term, dof, cell) of ``terms`` powers from the zeroth, ``first`` (..., dof, cell), on.
 
     With dashpots (..., 2 term, 2 dof, cell): of each power of time, from displacements and from H times velocities.
     """
-    by_stiffness, by_damping = turns
+    by_stiffness, by_damping = recursion
     if by_damping is None:
         rows = [first]
         while len(rows) < terms:
             rows.append(by_stiffness(rows[-1]))
         return np.stack(rows, axis=-3)
-    pairs, p, q = [], first, np.zeros_like(first)
+
+    # P_(k+1) = -Q_k H^2 M^-1 K and Q_(k+1) = P_k - Q_k H M^-1 C, from P_0 = 1 and Q_0 = 0.
+    pairs = []
+    p = first
+    q = np.zeros_like(first)
     for _ in range(2 * terms):
         pairs.append(np.concatenate((p, q), axis=-2))
-        p, q = by_stiffness(q), p + by_damping(q)
+        next_q = p + by_damping(q)
+        p = by_stiffness(q)
+        q = next_q
     return np.stack(pairs, axis=-3)
 
 
-def recursion_around(chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int) -> PowerRecursion:
-    """Those of the cells around each of ``cells`` that ``exists`` (cell, around) tells of, for steps of ``interval``.
+class _Neighbourhoods(NamedTuple):
+    """Cells on either side of each of some cells: ``masses`` (cell, 1, dof, neighbour) in kg.
 
-    Those further away than ``near`` are taken to be as the reference cell.
+    ``exists`` (cell, 1, 1, neighbour) marks the neighbours that the lattice has, ``acts`` (cell, 1, neighbour) those
+    whose springs to the next cell it has.
     """
-    width, unit = exists.shape[1] // 2, Chain(chain.cell, 1).coefficients(-1, 0)
-    around = [np.tile(array, (len(cells), exists.shape[1], 1)).astype(np.longdouble) for array in unit]
-    near = min(near, width)
-    for i, cell in enumerate(() if chain.variation is None else cells.tolist()):
-        for array, varied in zip(around, chain.coefficients(cell - near, cell + near + 1), strict=True):
-            array[i, width - near : width + near + 1] = varied
-    # (cell, mass or spring, around)
-    masses, grounding, stiffness, damping = Coefficients(*(array.swapaxes(1, 2) for array in around))
-    masses, exists, h = masses[:, None], exists[:, None], np.longdouble(interval)
-    # No power reaches the last cells: what is rolled past them is zero.
-    acts = exists & np.roll(exists, -1, axis=-1) if chain.ends == "free" else np.ones_like(exists)
 
-    def turn(values: np.ndarray, ground: np.ndarray | None) -> RowMap:
-        def forces(rows: np.ndarray) -> np.ndarray:
-            x = rows / masses
-            out = np.zeros_like(rows) if ground is None else -ground * x
-            for spring, value in zip(chain.cell.springs, values.swapaxes(0, 1)[:, :, None], strict=True):
-                other = x[:, :, spring.end]
-                pull = (np.roll(other, -1, axis=-1) if spring.next_cell else other) - x[:, :, spring.start]
-                pull *= value * acts if spring.next_cell else value
-                out[:, :, spring.start] += pull
-                out[:, :, spring.end] -= np.roll(pull, 1, axis=-1) if spring.next_cell else pull
-            return np.where(exists[:, :, None], out, 0)
+    chain: Chain
+    masses: np.ndarray
+    exists: np.ndarray
+    acts: np.ndarray
 
-        return forces
 
-    by_damping = turn(h * damping, h * grounding[:, None]) if chain.is_damped else None
-    return PowerRecursion(turn(h**2 * stiffness, None), by_damping)
+def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int) -> PowerRecursion:
+    """The recursion for rows of the masses of ``cells``, each with the coefficients of the cells on either side of it.
+
+    ``exists`` (cell, neighbour), the cell itself in the middle, marks those that the lattice has. Neighbours further
+    away than ``near`` are taken to be as the reference cell: sec. 8 counts what that leaves out. The step is of
+    ``interval`` in s.
+    """
+    width = exists.shape[1] // 2
+    masses, grounding, stiffness, damping = _coefficients_near(chain, cells, width, min(near, width))
+
+    # No power reaches the outermost neighbours: what np.roll carries across them is zero.
+    acts = np.ones_like(exists)
+    if chain.ends == "free":
+        acts = exists & np.roll(exists, -1, axis=-1)
+    neighbours = _Neighbourhoods(chain, masses[:, None], exists[:, None, None], acts[:, None])
+
+    h = np.longdouble(interval)
+    by_stiffness = partial(_multiply, neighbours, h**2 * stiffness, None)
+    by_damping = None
+    if chain.is_damped:
+        by_damping = partial(_multiply, neighbours, h * damping, h * grounding[:, None])
+    return PowerRecursion(by_stiffness, by_damping)
+
+
+def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int) -> Coefficients:
+    """Coefficients (cell, mass or spring, neighbour) of ``width`` neighbours on either side of each of ``cells``.
+
+    They are those of the reference cell beyond the ``near`` ones. In extended precision, since rows are high powers of
+    them and P's entries, good to double precision, are used in every step.
+    """
+    # Beyond its end a chain without variation has the reference cell.
+    reference = Chain(chain.cell, 1).coefficients(-1, 0)
+    shape = (len(cells), 2 * width + 1, 1)
+    arrays = [np.tile(array, shape).astype(np.longdouble) for array in reference]
+
+    if chain.variation is not None:
+        for i, cell in enumerate(cells.tolist()):
+            for array, varied in zip(arrays, chain.coefficients(cell - near, cell + near + 1), strict=True):
+                array[i, width - near : width + near + 1] = varied
+    return Coefficients(*(array.swapaxes(1, 2) for array in arrays))
+
+
+def _multiply(
+    neighbours: _Neighbourhoods, springs: np.ndarray, ground: np.ndarray | None, rows: np.ndarray
+) -> np.ndarray:
+    """The ``rows`` (cell, row, dof, neighbour) times - M^-1 V, V the matrix of ``springs`` (cell, spring, neighbour).
+
+    ``ground`` (cell, 1, dof, neighbour) is added to V's diagonal. V is symmetric, so that a row times V is what springs
+    pull on masses displaced by the row.
+    """
+    x = rows / neighbours.masses
+    out = np.zeros_like(rows) if ground is None else -ground * x
+    for spring, value in zip(neighbours.chain.cell.springs, springs.swapaxes(0, 1)[:, :, None], strict=True):
+        start = x[:, :, spring.start]
+        end = x[:, :, spring.end]
+        if spring.next_cell:
+            pull = (np.roll(end, -1, axis=-1) - start) * (value * neighbours.acts)
+            out[:, :, spring.start] += pull
+            out[:, :, spring.end] -= np.roll(pull, 1, axis=-1)
+        else:
+            pull = (end - start) * value
+            out[:, :, spring.start] += pull
+            out[:, :, spring.end] -= pull
+    # Walls do not move: cells that do not exist take up nothing.
+    return np.where(neighbours.exists, out, 0)
 
 
 class Bounds(NamedTuple):
     """What no cell of a lattice exceeds.
 
-    ``frequency`` of a mode in rad/s and its ``damping``, a rate in 1/s, by Gershgorin's circles of M^-1/2 K M^-1/2 and
-    of M^-1/2 C M^-1/2; the magnitudes of the entries of K M^-1 and C M^-1, ``by_stiffness`` and ``by_damping`` (3, dof,
-    dof), where the other mass is in the cell before, in the same one, in the next one.
+    ``frequency`` of a mode in rad/s and its ``damping``, a rate in 1/s, are by Gershgorin's circles of M^-1/2 K M^-1/2
+    and of M^-1/2 C M^-1/2. ``by_stiffness`` and ``by_damping`` (3, dof, dof) are the magnitudes of the entries of
+    K M^-1 and C M^-1, where the other mass is in the cell before, in the same one, in the next one.
     """
 
     frequency: float
@@ -88,45 +148,69 @@ class Bounds(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Norm in 1/s of what turns the state, in the norm of its energy."""
-        return self.frequency if not self.damping else (self.damping + np.hypot(self.damping, 2 * self.frequency)) / 2
+        """Bound in 1/s on the norm of the system's matrix in the norm of the state's energy: see sec. 7."""
+        if not self.damping:
+            return self.frequency
+        return (self.damping + np.hypot(self.damping, 2 * self.frequency)) / 2
 
-    def turns(self, interval: float) -> PowerRecursion:
-        """Those of rows that are no smaller than the magnitudes of any cell's."""
+    def recursion(self, interval: float) -> PowerRecursion:
+        """The recursion, for steps of ``interval`` in s, of rows that are no smaller than any cell's in magnitude."""
+        by_damping = None
+        if self.damping:
+            by_damping = partial(_multiply_magnitudes, interval * self.by_damping)
+        return PowerRecursion(partial(_multiply_magnitudes, interval**2 * self.by_stiffness), by_damping)
 
-        def turn(entries: np.ndarray) -> RowMap:
-            return lambda rows: sum(entries[1 + o] @ np.roll(rows, -o, axis=-1) for o in (-1, 0, 1))
 
-        by_damping = turn(interval * self.by_damping) if self.damping else None
-        return PowerRecursion(turn(interval**2 * self.by_stiffness), by_damping)
+def _multiply_magnitudes(entries: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The ``rows`` (..., dof, cell) times a matrix with ``entries`` (3, dof, dof) as in ``Bounds`` in every cell."""
+    total = np.zeros_like(rows)
+    for offset in (-1, 0, 1):
+        total = total + entries[1 + offset] @ np.roll(rows, -offset, axis=-1)
+    return total
 
 
 def bounds_of(chain: Chain) -> Bounds:
     """The bounds of all cells of ``chain``."""
     if chain.variation is None:
         chain = Chain(chain.cell, 1)
-    of_chunks = [_bounds(chain, at, min(at + CHUNK, chain.cells)) for at in range(0, chain.cells, CHUNK)]
-    squared, rate, by_stiffness, by_damping = (np.max(part, axis=0) for part in zip(*of_chunks, strict=True))
-    return Bounds(float(np.sqrt(squared)), float(rate), by_stiffness, by_damping)
+    stiffness = []
+    damping = []
+    for start in range(0, chain.cells, CHUNK):
+        stop = min(start + CHUNK, chain.cells)
+        coefficients = chain.coefficients(start - 1, stop + 1)
+        no_ground = np.zeros_like(coefficients.grounding)
+        stiffness.append(_matrix_bounds(chain, coefficients.masses, coefficients.stiffness, no_ground))
+        damping.append(_matrix_bounds(chain, coefficients.masses, coefficients.damping, coefficients.grounding))
 
-
-def _bounds(chain: Chain, start: int, stop: int) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Those of the cells ``start`` to ``stop``, the first one squared."""
-    masses, grounding, stiffness, damping = chain.coefficients(start - 1, stop + 1)
-    root, n, circles, entries = (
-        1 / np.sqrt(masses),
-        stop - start,
-        [],
-        np.zeros((2, 3, chain.cell.dofs, chain.cell.dofs)),
+    # Gershgorin's circles of M^-1/2 K M^-1/2 bound the square of the frequency.
+    return Bounds(
+        frequency=float(np.sqrt(max(circle for circle, _ in stiffness))),
+        damping=max(circle for circle, _ in damping),
+        by_stiffness=np.max([entries for _, entries in stiffness], axis=0),
+        by_damping=np.max([entries for _, entries in damping], axis=0),
     )
-    for values, ground, passed in zip((stiffness, damping), (0 * grounding, grounding), entries, strict=True):
-        diagonal = ground[1:-1] / masses[1:-1]
-        rows = diagonal.copy()
-        for mass, offset, other, _, _, spring in chain.cell.couplings():
-            value, near = values[1 + min(offset, 0) :][:n, spring], slice(1 + offset, n + 1 + offset)
-            rows[:, mass] += value * root[1:-1, mass] * (root[1:-1, mass] + root[near, other])
-            diagonal[:, mass] += value / masses[1:-1, mass]
-            passed[1 + offset, mass, other] += (value / masses[near, other]).max()
-        passed[1] += np.diag(diagonal.max(axis=0))
-        circles.append(float(rows.max()))
-    return *circles, *entries
+
+
+def _matrix_bounds(
+    chain: Chain, masses: np.ndarray, springs: np.ndarray, ground: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Largest circle of M^-1/2 V M^-1/2, and largest entries (3, dof, dof) of V M^-1 in magnitude.
+
+    V is the matrix of ``springs`` (cell, spring), ``ground`` (cell, dof) on its diagonal; all arrays have one cell more
+    on either side than are looked at.
+    """
+    cells = len(masses) - 2
+    inner = slice(1, cells + 1)
+    root = 1 / np.sqrt(masses)
+    diagonal = ground[inner] / masses[inner]
+    circles = diagonal.copy()
+    entries = np.zeros((3, chain.cell.dofs, chain.cell.dofs))
+    for mass, offset, other, _, _, spring in chain.cell.couplings():
+        near = slice(1 + offset, cells + 1 + offset)
+        # A spring to the cell before is stored with that cell.
+        value = springs[1 + min(offset, 0) :][:cells, spring]
+        circles[:, mass] += value * root[inner, mass] * (root[inner, mass] + root[near, other])
+        diagonal[:, mass] += value / masses[inner, mass]
+        entries[1 + offset, mass, other] += (value / masses[near, other]).max()
+    entries[1] += np.diag(diagonal.max(axis=0))
+    return float(circles.max()), entries

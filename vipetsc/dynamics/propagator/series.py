@@ -1,6 +1,11 @@
 """The Taylor series of free motion: how many powers count, how far they reach, which cells share their rows.
 
-Sec. 1, 2, 7 and 8 of the derivation in the package's docstring.
+Within a step nothing but linear springs and dashpots acts on most of the lattice, and its motion is a power series in
+s = (t - t_0)/H whose coefficients are rows of ``rows`` times the state (sec. 1 and 7 of the derivation in the package's
+docstring). ``StepSeries`` cuts it off where the remainder is below the tolerance, in powers as in cells, and sums what
+is left out into ``truncation``, a bound on the relative error of a step. Cells far from the ends and from cells that
+differ share one set of rows; others get their own (sec. 8). The kernels below evaluate and shift such a series and find
+the first time at which a site, moving freely, meets its clearance (sec. 2).
 """
 
 from collections.abc import Iterator
@@ -15,14 +20,17 @@ from numpy.typing import ArrayLike
 from vipetsc.compiled import kernel
 from vipetsc.contact.changes import LANDED_W
 from vipetsc.contact.law import gap_of
-from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, power_rows, recursion_around
+from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, local_recursion, power_rows
 from vipetsc.lattice.chain import Chain
 
+# More than the engine's longest step, omega H = 3.2, needs at its finest tolerance, 1e-15: 15.
 MOST_TERMS = 24
-# Cells whose rows are computed together.
+# Cells whose rows are computed together: they take about 100 kB each, too much for all cells at once.
 BATCH = 64
-# Shares of a step below this are rounding.
+# Lengths below this fraction of the step are rounding.
 ROUNDING = 1e-15
+# Entries of P below this fraction of the tolerance are dropped; ``truncation`` counts them.
+SMALL_ENTRY = 1e-3
 
 
 @dataclass(frozen=True)
@@ -51,12 +59,13 @@ class StepSeries:
 
     @property
     def omega_max_h(self) -> float:
-        """Bound on omega H of the modes of any lattice of these cells; with dashpots on the norm of what turns them."""
+        """Bound theta on omega H of the modes of any lattice of these cells; with dashpots that of sec. 7."""
         return self.bounds.rate * self.interval
 
     @cached_property
     def terms(self) -> int:
         """Number of powers of K in the series, the zeroth included; with dashpots half the powers of time."""
+        # A quarter of the tolerance; ``reach`` takes half of it, the entries that ``interior`` drops have the last one.
         return next((m for m in range(2, MOST_TERMS) if self._remainder(m) <= self.tolerance / 4), MOST_TERMS)
 
     def _remainder(self, terms: int) -> float:
@@ -65,55 +74,61 @@ class StepSeries:
         return self.omega_max_h**k / factorial(k) * (1 + self.omega_max_h)
 
     @property
-    def _width(self) -> int:
-        """Cells each way that no power in the series reaches."""
+    def _outermost(self) -> int:
+        """Distance in cells that no power in the series reaches."""
         return (1 + self.is_damped) * self.terms + 1
 
     @cached_property
-    def _first(self) -> np.ndarray:
-        """The zeroth power's rows (1, dof, dof, cell) over all cells within ``_width``."""
+    def _zeroth(self) -> np.ndarray:
+        """The zeroth power's rows (1, dof, dof, cell) over all cells within ``_outermost``."""
         n = self.chain.cell.dofs
-        rows = np.zeros((1, n, n, 2 * self._width + 1), np.longdouble)
-        rows[..., self._width] = np.eye(n)
+        rows = np.zeros((1, n, n, 2 * self._outermost + 1), np.longdouble)
+        rows[..., self._outermost] = np.eye(n)
         return rows
 
     @cached_property
-    def _interior(self) -> np.ndarray:
-        """Rows (dof, term, dof, cell) of an interior cell over all cells within ``_width``."""
-        alone = replace(self.chain, variation=None)
-        turns = recursion_around(alone, self.interval, np.zeros(1, int), np.ones((1, 2 * self._width + 1), bool), 0)
-        return power_rows(self._first, self.terms, turns)[0]
+    def _interior_rows(self) -> np.ndarray:
+        """Rows (dof, term, dof, cell) of an interior cell over all cells within ``_outermost``."""
+        uniform = replace(self.chain, variation=None)
+        exists = np.ones((1, 2 * self._outermost + 1), bool)
+        recursion = local_recursion(uniform, self.interval, np.zeros(1, int), exists, near=0)
+        return power_rows(self._zeroth, self.terms, recursion)[0]
 
     def _magnitudes(self, rows: np.ndarray) -> np.ndarray:
-        """Magnitudes of P's entries (2 dof, 2 dof, cell) for it, a velocity counted as omega times a displacement."""
-        n, omega = self.chain.cell.dofs, (self.omega_max_h or 1.0) / self.interval  # 1.0: no springs
-        share = np.abs(self.stencil(rows))
-        share[:n, n:] *= omega
-        share[n:, :n] /= omega
-        return share
+        """Magnitudes of P's entries (2 dof, 2 dof, cell) for ``rows``; a velocity counts as omega times u."""
+        n = self.chain.cell.dofs
+        # A lattice without springs has no omega; any rate serves.
+        omega = (self.omega_max_h or 1.0) / self.interval
+        magnitudes = np.abs(self.stencil(rows))
+        magnitudes[:n, n:] *= omega
+        magnitudes[n:, :n] /= omega
+        return magnitudes
 
     @cached_property
-    def _share(self) -> np.ndarray:
-        """Those of an interior cell."""
-        return self._magnitudes(self._interior)
+    def _interior_magnitudes(self) -> np.ndarray:
+        """Magnitudes of P's entries for an interior cell."""
+        return self._magnitudes(self._interior_rows)
 
     @cached_property
-    def _largest_share(self) -> np.ndarray:
-        """Those that no cell's exceed."""
+    def _largest_magnitudes(self) -> np.ndarray:
+        """Magnitudes of P's entries that no cell's exceed."""
         if self.chain.variation is None:
-            return self._share
-        return self._magnitudes(power_rows(self._first, self.terms, self.bounds.turns(self.interval))[0])
+            return self._interior_magnitudes
+        return self._magnitudes(power_rows(self._zeroth, self.terms, self.bounds.recursion(self.interval))[0])
 
     def _beyond(self, distance: int) -> float:
-        """Largest sum of these magnitudes over the cells further away than ``distance``; twice where cells differ."""
-        is_beyond = np.abs(np.arange(-self._width, self._width + 1)) > distance
-        left_out = float(self._largest_share.sum(axis=1)[:, is_beyond].sum(axis=1).max())
-        return left_out * (1 if self.chain.variation is None else 2)
+        """Largest sum of P's magnitudes over the cells further away than ``distance``."""
+        is_beyond = np.abs(np.arange(-self._outermost, self._outermost + 1)) > distance
+        left_out = float(self._largest_magnitudes.sum(axis=1)[:, is_beyond].sum(axis=1).max())
+        if self.chain.variation is None:
+            return left_out
+        # What cells beyond would change in the rows counts once more: sec. 8.
+        return 2 * left_out
 
     @cached_property
     def reach(self) -> int:
-        """Cells each way beyond which the propagator's entries sum to less than the tolerance."""
-        return next(r for r in range(1, self._width + 1) if self._beyond(r) <= self.tolerance / 2)
+        """Distance in cells beyond which the propagator's entries sum to less than half the tolerance."""
+        return next(r for r in range(1, self._outermost + 1) if self._beyond(r) <= self.tolerance / 2)
 
     @property
     def width(self) -> int:
@@ -123,31 +138,34 @@ class StepSeries:
     @cached_property
     def truncation(self) -> float:
         """Bound on the relative error of one step: entries left out and the remainder of the series."""
-        share = self._share[:, :, self._width - self.reach : self._width + self.reach + 1]
-        small = float(np.where(self.interior() == 0.0, share, 0.0).sum(axis=(1, 2)).max())
+        within = slice(self._outermost - self.reach, self._outermost + self.reach + 1)
+        dropped = np.where(self.interior() == 0.0, self._interior_magnitudes[:, :, within], 0.0)
+        small = float(dropped.sum(axis=(1, 2)).max())
         return self._beyond(self.reach) + small + self._remainder(self.terms)
 
     def rows(self, cells: ArrayLike) -> Iterator[np.ndarray]:
-        """Rows (dof, term, dof, 2 width + 1) of the masses of each of ``cells``, centred on it.
+        """Rows (dof, term, dof, cell) of the masses of each of ``cells``, over all cells within ``_outermost`` of it.
 
         Computed in batches, to the same bits in any. Cells beyond an end of the chain get zeros; those of a periodic
         chain count on beyond it.
         """
-        cells, around = np.asarray(cells, np.int64), np.arange(-self._width, self._width + 1)
-        for part in np.split(cells, range(BATCH, len(cells), BATCH)):
-            beside = part[:, None] + around
-            exists = (beside >= 0) & (beside < self.chain.cells) | ~self._is_near_end(part)[:, None]
-            turns = recursion_around(self.chain, self.interval, part, exists, self.reach + 1)
-            yield from power_rows(np.repeat(self._first, len(part), axis=0), self.terms, turns)
+        cells = np.asarray(cells, np.int64)
+        distances = np.arange(-self._outermost, self._outermost + 1)
+        for batch in np.split(cells, range(BATCH, len(cells), BATCH)):
+            neighbours = batch[:, None] + distances
+            exists = (neighbours >= 0) & (neighbours < self.chain.cells) | ~self._is_near_end(batch)[:, None]
+            recursion = local_recursion(self.chain, self.interval, batch, exists, self.reach + 1)
+            yield from power_rows(np.repeat(self._zeroth, len(batch), axis=0), self.terms, recursion)
 
     def cut(self, rows: np.ndarray, first: int, count: int) -> np.ndarray:
         """The part of ``rows`` over ``count`` cells from the one ``first`` cells away on, zero where they end."""
-        begin = first + self._width + count
+        begin = first + self._outermost + count
         return np.pad(rows, [(0, 0), (0, 0), (0, 0), (count, count)])[..., begin : begin + count]
 
     def factors(self) -> np.ndarray:
-        """Those of the tables: H^(k mod 2)/k!; with dashpots 1/k! for displacements, then H/k! for velocities."""
-        h, powers = self.interval, range(2 * self.terms)
+        """Factors of the powers of s, H^(k mod 2)/k!; with dashpots 1/k! of displacements, then H/k! of velocities."""
+        h = self.interval
+        powers = range(2 * self.terms)
         if self.is_damped:
             return np.array([h**i / factorial(k) for i in range(2) for k in powers])
         return np.array([h ** (k % 2) / factorial(k) for k in powers])
@@ -158,11 +176,12 @@ class StepSeries:
         return ((beyond < 0) | (beyond >= self.chain.cells - 2 * self.reach)) & (self.chain.ends != "periodic")
 
     @cached_property
-    def _differing(self) -> np.ndarray:
+    def _differing_before(self) -> np.ndarray:
         """How many cells differ from the reference cell before each one, from ``reach`` + 1 before the first on."""
-        near, differs = self.reach + 1, self.chain.differs.astype(int)
-        around = np.pad(differs, near, mode="wrap") if self.chain.ends == "periodic" else np.pad(differs, near)
-        return np.append(0, np.cumsum(around))
+        near = self.reach + 1
+        differs = self.chain.differs.astype(int)
+        differs = np.pad(differs, near, mode="wrap") if self.chain.ends == "periodic" else np.pad(differs, near)
+        return np.append(0, np.cumsum(differs))
 
     def is_interior(self, cells: ArrayLike) -> np.ndarray:
         """Whether each of ``cells`` has no end within its reach, and no cell that differs there or one further."""
@@ -170,47 +189,60 @@ class StepSeries:
         is_far = ~self._is_near_end(cells)
         if self.chain.variation is None:
             return is_far
-        return is_far & (self._differing[cells + 2 * self.reach + 3] == self._differing[cells])
+        return is_far & (self._differing_before[cells + 2 * self.reach + 3] == self._differing_before[cells])
 
-    def like(self, cells: ArrayLike) -> np.ndarray:
+    def representatives(self, cells: ArrayLike) -> np.ndarray:
         """For each of ``cells`` the first one of them that has the same rows."""
-        cells, near, first = np.array(cells, np.int64), self.reach + 1, dict[bytes, int]()
+        cells = np.array(cells, np.int64)
         interior = self.is_interior(cells)
         cells[interior] = cells[interior][:1]
+
+        # Rows near an end are like no others; elsewhere equal coefficients around a cell make equal rows.
+        near = self.reach + 1
+        first: dict[bytes, int] = {}
         for i in np.flatnonzero(~interior & ~self._is_near_end(cells)):
-            around = self.chain.coefficients(cells[i] - near, cells[i] + near + 1)
-            cells[i] = first.setdefault(b"".join(array.tobytes() for array in around), int(cells[i]))
+            coefficients = self.chain.coefficients(cells[i] - near, cells[i] + near + 1)
+            key = b"".join(array.tobytes() for array in coefficients)
+            cells[i] = first.setdefault(key, int(cells[i]))
         return cells
 
     def own_rows(self) -> tuple[int, int]:
         """How many cells have rows of their own since cells differ, and how many tables these are."""
-        every = np.arange(0 if self.chain.variation is None else self.chain.cells)
-        differing = every[~self.is_interior(every)]
-        return len(differing), len(np.unique(self.like(differing)))
+        if self.chain.variation is None:
+            return 0, 0
+        cells = np.arange(self.chain.cells)
+        differing = cells[~self.is_interior(cells)]
+        return len(differing), len(np.unique(self.representatives(differing)))
 
     def stencil(self, rows: np.ndarray) -> np.ndarray:
         """P's rows (2 dof, 2 dof, cell), displacements before velocities, of masses with ``rows``.
 
         ``rows`` are (dof, term, dof, cell).
         """
-        n, terms = rows.shape[0], self.terms
-        inverse = 1 / np.array([factorial(k) for k in range(2 * terms)], np.longdouble)
-        even, odd, h = inverse[::2], inverse[1::2], np.longdouble(self.interval)
+        n = rows.shape[0]
+        h = np.longdouble(self.interval)
+        inverse = 1 / np.array([factorial(k) for k in range(2 * self.terms)], np.longdouble)
         p = np.zeros((2 * n, 2 * n, rows.shape[-1]), np.longdouble)
-        if rows.shape[1] > terms:
+
+        # The velocity is the derivative by t: each coefficient times its power, one power lower, over H.
+        if rows.shape[1] > self.terms:
             p[:n] = np.einsum("m,imjc->ijc", inverse, rows)
             p[n:] = np.einsum("m,imjc->ijc", inverse[:-1], rows[:, 1:]) / h
             p[:, n:] *= h
         else:
-            p[:n, :n] = p[n:, n:] = np.einsum("m,imjc->ijc", even, rows)
+            even = inverse[::2]
+            odd = inverse[1::2]
+            p[:n, :n] = np.einsum("m,imjc->ijc", even, rows)
+            p[n:, n:] = p[:n, :n]
             p[:n, n:] = h * np.einsum("m,imjc->ijc", odd, rows)
             p[n:, :n] = np.einsum("m,imjc->ijc", odd[:-1], rows[:, 1:]) / h
         return p.astype(float)
 
     def interior(self) -> np.ndarray:
         """P's rows (2 dof, 2 dof, 2 reach + 1) of a cell at least ``reach`` from both ends; small entries are zero."""
-        entries = np.where(self._share > 1e-3 * self.tolerance, self.stencil(self._interior), 0.0)
-        return entries[:, :, self._width - self.reach : self._width + self.reach + 1]
+        is_large = self._interior_magnitudes > SMALL_ENTRY * self.tolerance
+        entries = np.where(is_large, self.stencil(self._interior_rows), 0.0)
+        return entries[:, :, self._outermost - self.reach : self._outermost + self.reach + 1]
 
 
 @kernel
@@ -223,9 +255,10 @@ def copy(source: np.ndarray, target: np.ndarray) -> None:
 
 @kernel
 def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
-    """Series ``taylor`` (dof, coefficient) expanded about ``s`` instead of 0 into ``out``, which may be ``taylor``."""
+    """Expand series ``taylor`` (dof, coefficient) about ``s`` instead of 0, into ``out``, which may be ``taylor``."""
     dofs, coefficients = taylor.shape
     copy(taylor, out[:dofs])
+    # Horner's scheme k times over: the k-th pass leaves the coefficient of (x - s)^k in place.
     for j in range(dofs):
         for k in range(coefficients - 1):
             for i in range(coefficients - 2, k - 1, -1):
@@ -235,7 +268,8 @@ def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
 @kernel
 def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
     """Value and slope of a ``series`` at ``s``, by Horner's scheme."""
-    value = slope = 0.0
+    value = 0.0
+    slope = 0.0
     for k in range(series.size - 1, -1, -1):
         slope = slope * s + value
         value = value * s + series[k]
@@ -249,7 +283,8 @@ def first_onset(series: np.ndarray, site: Any, length: float) -> float:
     |w''| has a bound over the whole length, so that a parabola bounds |w| from above: up to where that meets the
     clearance nothing can have happened.
     """
-    bound = curvature = 0.0
+    bound = 0.0
+    curvature = 0.0
     scale = 1.0
     for k in range(series.size):
         bound += abs(series[k]) * scale
@@ -259,21 +294,28 @@ def first_onset(series: np.ndarray, site: Any, length: float) -> float:
     tolerance = LANDED_W * site.scale
     if bound < min(site.clearance, site.clearance_minus) - tolerance:
         return 2.0
+
     first = 2.0
     for side in (1.0, -1.0):
-        s, clearance = 0.0, gap_of(site, side)
+        clearance = gap_of(site, side)
         if clearance == np.inf:
             continue
+        s = 0.0
         while s <= length:
             w, rate = evaluate(series, s)
-            gap, closing = clearance - side * w, side * rate
+            gap = clearance - side * w
+            closing = side * rate
             if gap < 0.5 * tolerance and closing > 0.0:
+                # A Newton step, where the curvature changes it by less than the tolerance.
                 newton = gap / closing
-                first = min(first, max(s + newton, 0.0) if curvature * newton * newton < tolerance else s)
+                if curvature * newton * newton < tolerance:
+                    s = max(s + newton, 0.0)
+                first = min(first, s)
                 break
+            # The root of curvature/2 d^2 + closing d = gap, without cancellation. The gap is taken larger by the
+            # tolerance, since steps that shrink with it would never reach the clearance.
             gap += tolerance
             root = np.sqrt(max(closing * closing + 2.0 * curvature * gap, 0.0))
-            # The root of curvature/2 d^2 + closing d = gap, without cancellation.
             step = 2.0 * gap / (closing + root) if closing > 0.0 else (root - closing) / curvature
             s += max(step, ROUNDING)
     return first

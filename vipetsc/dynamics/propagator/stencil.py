@@ -1,8 +1,11 @@
 """P(H) on a rank's cells, and the cells of this and other ranks that a step reads.
 
-One stencil serves the interior, rows of their own the cells near the lattice's ends. States are arrays (2 dof, cell),
-displacements before velocities. Every sum runs in an order that depends on the cell alone, so that results have the
-same bits on any partition.
+The exact step of the linear lattice is the product of its state with the banded matrix P(H) (sec. 1 of the derivation
+in the package's docstring). Far from ends and from cells that differ all cells have the same rows of P, one stencil,
+which runs over consecutive cells in vectors of the processor; the others have dense rows of their own (sec. 8). What a
+rank's rows read of other ranks comes with one exchange a step, into the columns of a ``Halo`` (sec. 6). States are
+arrays (2 dof, cell), displacements before velocities. Every sum runs in an order that depends on the cell alone, so
+that results have the same bits on any partition.
 """
 
 from collections.abc import Sequence
@@ -21,7 +24,7 @@ from vipetsc.dynamics.vectors import LANES, add_product, prefetch, store, zeros
 
 
 class HaloRegions:
-    """Copies of ranges of cells that a rank reads, its own and those of other ranks, side by side.
+    """Ranges of cells that a rank reads, its own and those of other ranks, to be copied side by side.
 
     ``add`` the ranges and call ``bind_columns`` once; ``exchange`` then fills the columns of its ``Halo``. Cells beyond
     an end of a lattice that is not periodic are replaced by its last one.
@@ -42,16 +45,22 @@ class HaloRegions:
 
     def bind_columns(self, states: Sequence[PETSc.Vec]) -> "Halo":
         """The columns of all ranges, to be filled from one of the ``states``; all ranks must call it."""
-        layout, rows, cells = self._layout, 2 * self._layout.dofs, np.concatenate(self._ranges)
+        layout = self._layout
+        cells = np.concatenate(self._ranges)
         cells = cells % layout.cells if layout.periodic else np.clip(cells, 0, layout.cells - 1)
-        columns, scatter, vector = np.zeros((rows, len(cells))), 0, 0
+        columns = np.zeros((2 * layout.dofs, len(cells)))
+
+        # One rank has all cells in memory and copies them; its handles stay 0.
+        scatter = 0
+        vector = 0
         if layout.comm.size > 1:
             self._vector = PETSc.Vec().createWithArray(columns, comm=PETSc.COMM_SELF)
             # By component, as the rows of ``columns`` are.
             wanted = PETSc.IS().createGeneral(layout.state_indices(cells).T.ravel(), comm=layout.comm)
             self._scatter = PETSc.Scatter().create(states[0], wanted, self._vector, None)
             wanted.destroy()
-            scatter, vector = self._scatter.handle, self._vector.handle
+            scatter = self._scatter.handle
+            vector = self._vector.handle
         native.bind_symbols()
         return Halo(columns, cells, scatter, vector, np.array([state.handle for state in states]))
 
@@ -93,7 +102,7 @@ def exchange(halo: Halo, which: int, state: np.ndarray) -> int:
 class Stencil(NamedTuple):
     """P(H) on the cells of one rank, as ``apply_propagator`` reads it.
 
-    Owned cells in the ranges ``interior`` (range, 2), half open, see only owned ones, far from the ends and from cells
+    Owned cells in the ranges ``interior`` (range, 2), half open, read only owned ones, far from the ends and from cells
     that differ: output rows are summed four at a time, ``blocks`` (block, 4), of which one may be there twice. The
     terms of block b are ``starts[b]`` to ``starts[b + 1]``: ``values`` (term, 4) times the row ``rows`` at the cell
     ``offsets`` away. ``borders`` (table, 2 dof, 2 reach + 1, 2 dof) are dense rows of the other cells; ``border_cells``
@@ -111,37 +120,86 @@ class Stencil(NamedTuple):
 
 
 def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Stencil:
-    """P(H) on the cells of ``layout``; adds to ``halo`` what borders, ends and cells that differ need around them."""
-    r, n, start, stop, entries = series.reach, layout.cells, layout.start, layout.stop, series.interior()
-    first, last = (start, stop) if layout.periodic else (max(start, r), min(stop, n - r))
+    """Create P(H) on the cells of ``layout``; adds to ``halo`` the cells that rows of borders, ends and others read."""
+    reach = series.reach
+
+    # Cells that no end is within reach of, and among them those whose stencil stays among the rank's own.
+    first = layout.start
+    last = layout.stop
+    if not layout.periodic:
+        first = max(first, reach)
+        last = min(last, layout.cells - reach)
     inner = np.arange(first, max(first, last))
-    interior = _ranges(series.is_interior(inner) & (inner >= start + r) & (inner < stop - r), first)
+    is_own = (inner >= layout.start + reach) & (inner < layout.stop - reach)
+    interior = _ranges(series.is_interior(inner) & is_own, first)
+    # Vectors of cells need so many; shorter ranges are left to the dense rows.
     interior = interior[interior @ [-1, 1] >= LANES]
-    is_border, columns = np.ones(len(inner), bool), [np.zeros(0, np.int64)]
-    for a, b in interior - first:
-        is_border[a:b] = False
-    for a, b in _ranges(is_border, first).tolist():
-        columns.append(int(halo.add(a - r, b - a + 2 * r)) + np.arange(b - a))
+
+    # Consecutive dense cells share their part of the halo.
+    is_dense = np.ones(len(inner), bool)
+    for start, stop in interior - first:
+        is_dense[start:stop] = False
+    columns = [np.zeros(0, np.int64)]
+    for start, stop in _ranges(is_dense, first).tolist():
+        columns.append(int(halo.add(start - reach, stop - start + 2 * reach)) + np.arange(stop - start))
+
+    # Cells near an end all read the same columns, from the end on: (first column's cell, first of the cells, last).
+    left_end = (0, layout.start, min(layout.stop, first))
+    right_end = (layout.cells - 2 * reach, max(layout.start, last), layout.stop)
     ends = []
-    for begin, a, b in ((0, start, min(stop, first)), (n - 2 * r, max(start, last), stop)):
-        columns.append(np.repeat(halo.add(begin, 2 * r + 1 if a < b else 0), max(b - a, 0)))
-        ends += [(begin, cell) for cell in range(a, b)]
-    borders, table = _dense_rows(series, inner[is_border], ends)
-    cells = np.append(inner[is_border], [cell for _, cell in ends]).astype(np.int64)
-    # A mass's displacement and velocity together: they read almost the same cells.
-    masses = np.minimum(np.arange(layout.dofs + layout.dofs % 2), layout.dofs - 1)
-    blocks = np.column_stack([masses, masses + layout.dofs]).reshape(-1, 4)
-    terms = [np.nonzero(entries[block].any(axis=0)) for block in blocks]
-    rows, offsets = np.hstack(terms)
+    for begin, start, stop in (left_end, right_end):
+        if start < stop:
+            columns.append(np.repeat(halo.add(begin, 2 * reach + 1), stop - start))
+        ends += [(begin, cell) for cell in range(start, stop)]
+
+    borders, table = _dense_rows(series, inner[is_dense], ends)
+    cells = np.append(inner[is_dense], [cell for _, cell in ends]).astype(np.int64)
+    sparse = _sparse_rows(series.interior(), layout.dofs, reach)
     return Stencil(
-        interior - start,
-        blocks,
-        np.cumsum([0, *(len(of_block) for of_block, _ in terms)]),
-        rows,
-        offsets - r,
-        np.hstack([entries[block][:, *term] for block, term in zip(blocks, terms, strict=True)]).T.copy(),
-        borders,
-        np.column_stack([np.concatenate(columns), cells - start, table]),
+        interior=interior - layout.start,
+        blocks=sparse.blocks,
+        starts=sparse.starts,
+        rows=sparse.rows,
+        offsets=sparse.offsets,
+        values=sparse.values,
+        borders=borders,
+        border_cells=np.column_stack([np.concatenate(columns), cells - layout.start, table]),
+    )
+
+
+class _SparseRows(NamedTuple):
+    """P's rows of an interior cell without zeros, as ``Stencil`` has them."""
+
+    blocks: np.ndarray
+    starts: np.ndarray
+    rows: np.ndarray
+    offsets: np.ndarray
+    values: np.ndarray
+
+
+def _sparse_rows(entries: np.ndarray, dofs: int, reach: int) -> _SparseRows:
+    """P's rows in blocks of four, from its ``entries`` (2 dof, 2 dof, 2 reach + 1) of an interior cell."""
+    # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Of an odd
+    # number of masses the last one is there twice.
+    masses = np.minimum(np.arange(dofs + dofs % 2), dofs - 1)
+    blocks = np.column_stack([masses, masses + dofs]).reshape(-1, 4)
+
+    starts = [0]
+    rows = []
+    offsets = []
+    values = []
+    for block in blocks:
+        row, column = np.nonzero(entries[block].any(axis=0))
+        starts.append(starts[-1] + len(row))
+        rows.append(row)
+        offsets.append(column - reach)
+        values.append(entries[block][:, row, column].T.copy())
+    return _SparseRows(
+        blocks=blocks,
+        starts=np.array(starts),
+        rows=np.concatenate(rows),
+        offsets=np.concatenate(offsets),
+        values=np.concatenate(values),
     )
 
 
@@ -153,26 +211,35 @@ def _ranges(is_in: np.ndarray, first: int) -> np.ndarray:
 def _dense_rows(series: StepSeries, cells: np.ndarray, ends: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
     """Tables of P's rows (table, 2 dof, 2 reach + 1, 2 dof) and which of them is that of each cell.
 
-    ``cells`` have the cells around them, ``ends`` are (first cell of those it has, cell).
+    ``cells`` read as many cells on either side, ``ends`` are (first cell that is read, cell) near the lattice's ends.
     """
-    r, d = series.reach, series.chain.cell.dofs
-    examples, table = np.unique(series.like(cells), return_inverse=True)
-    tables = np.zeros((len(examples) + len(ends), 2 * d, 2 * r + 1, 2 * d))
+    reach = series.reach
+    dofs = series.chain.cell.dofs
+    band = 2 * reach + 1
+    examples, table = np.unique(series.representatives(cells), return_inverse=True)
+    tables = np.zeros((len(examples) + len(ends), 2 * dofs, band, 2 * dofs))
+
+    # Columns before rows: the sums of ``apply_propagator`` run over one cell's outputs at a time.
     is_shared = series.is_interior(examples)
     tables[: len(examples)][is_shared] = series.interior().transpose(1, 2, 0)
     for i, rows in zip(np.flatnonzero(~is_shared), series.rows(examples[~is_shared]), strict=True):
-        tables[i] = series.stencil(series.cut(rows, -r, 2 * r + 1)).transpose(1, 2, 0)
+        tables[i] = series.stencil(series.cut(rows, -reach, band)).transpose(1, 2, 0)
     for i, rows in enumerate(series.rows([cell for _, cell in ends])):
         begin, cell = ends[i]
-        tables[len(examples) + i, :, : 2 * r] = series.stencil(series.cut(rows, begin - cell, 2 * r)).transpose(1, 2, 0)
+        part = series.cut(rows, begin - cell, 2 * reach)
+        tables[len(examples) + i, :, : 2 * reach] = series.stencil(part).transpose(1, 2, 0)
     return tables, np.append(table, len(examples) + np.arange(len(ends)))
 
 
 @njit(error_model="numpy")
 def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
-    """``out`` (2 dof, owned cell) = P(H) times the lattice's ``state``, whose halo is ``columns``."""
-    cells, x, y, values = state.shape[1], state.reshape(-1), out.reshape(-1), stencil.values
-    to, places = stencil.blocks * cells, stencil.rows * cells + stencil.offsets
+    """Put P(H) times the lattice's ``state``, whose halo is ``columns``, into ``out`` (2 dof, owned cell)."""
+    cells = state.shape[1]
+    x = state.reshape(-1)
+    y = out.reshape(-1)
+    values = stencil.values
+    to = stencil.blocks * cells
+    places = stencil.rows * cells + stencil.offsets
     for first, stop in stencil.interior:
         for a in range(first, stop, LANES):
             # The last vector overlaps the one before.
@@ -180,7 +247,11 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
             for b in range(to.shape[0]):
                 for k in range(4):
                     prefetch(x, to[b, k] + i + 2 * LANES)
-                sum0 = sum1 = sum2 = sum3 = zeros()
+                # Names, not an array: the sums stay in registers.
+                sum0 = zeros()
+                sum1 = zeros()
+                sum2 = zeros()
+                sum3 = zeros()
                 for t in range(stencil.starts[b], stencil.starts[b + 1]):
                     sum0 = add_product(sum0, values[t, 0], x, places[t] + i)
                     sum1 = add_product(sum1, values[t, 1], x, places[t] + i)
@@ -190,6 +261,7 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
                 store(sum1, y, to[b, 1] + i)
                 store(sum2, y, to[b, 2] + i)
                 store(sum3, y, to[b, 3] + i)
+
     total = np.empty(out.shape[0])
     for column, at, table in stencil.border_cells:
         rows = stencil.borders[table]

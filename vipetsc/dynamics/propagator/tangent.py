@@ -9,12 +9,12 @@ from vipetsc.contact.law import CLOSED, PERMANENT
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout, create_record
 from vipetsc.dynamics.places import site_records
+from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
-from vipetsc.dynamics.propagator.tables import expand_free_motion
+from vipetsc.dynamics.propagator.substeps import create_tape
 from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
-from vipetsc.dynamics.propagator.tape import create_tape
 from vipetsc.dynamics.samples import Samples
 from vipetsc.parallel import on_every_rank
 

@@ -18,19 +18,12 @@ import numpy as np
 
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.law import CLIPPED, elastic_force_and_slope, gap_of
-from vipetsc.dynamics.propagator.collocation import (
-    Cluster,
-    Substep,
-    Trial,
-    accumulate_moments,
-    node_responses,
-    update_taylor,
-)
-from vipetsc.dynamics.propagator.forces import select_cluster
+from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
+from vipetsc.dynamics.propagator.collocation import accumulate_moments, node_responses, update_taylor
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.series import copy, shift
 from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
-from vipetsc.dynamics.propagator.tables import DofTables, apply_impulses, expand_free_motion
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_cluster
 
 
 @kernel
@@ -67,7 +60,7 @@ def _force_variations(
         i, row = rows[a].site, rows[a]
         for node in range(NODES):
             slopes[node] = _slopes(cluster.contacts[i], row, motion[a, 0, node], motion[a, 1, node])
-            at = substep.length * cluster.nodes.share[substep.kind, node]
+            at = substep.length * cluster.nodes.position[substep.kind, node]
             for j in range(columns):
                 w = v = 0.0
                 for k in range(terms - 1, -1, -1):  # Horner's scheme

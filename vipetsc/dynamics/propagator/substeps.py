@@ -1,0 +1,240 @@
+"""Records of a cluster that is advanced in substeps: where it stands, a substep that is tried, the tape of those taken.
+
+A cluster (sec. 6 of the derivation in the package's docstring) goes through the step from t_0 to t_0 + H in substeps
+whose length follows its contacts. Each is computed in a ``Trial`` (sec. 3) and thrown away if its error is too large or
+if a site changes its mode inside (sec. 4); only a trial that is taken is written into the ``Cluster``. A lattice whose
+orbit is to be linearised also writes it on a ``Tape``, from which sec. 9 makes the derivative of the step later,
+without solving for the orbit once more. All are named tuples of arrays, because compiled code takes them as arguments
+and changes the arrays in place.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.compiled import kernel, njit
+from vipetsc.dynamics.drives import Drives
+from vipetsc.dynamics.propagator.clusters import DofTables
+from vipetsc.dynamics.propagator.nodes import NODES, Collocation
+from vipetsc.dynamics.propagator.series import ROUNDING
+
+COUNTS = ("substeps", "rejected", "landings", "switches")
+SUBSTEP_STATE = np.dtype(
+    [(name, float) for name in ("begin", "position", "length")] + [(name, np.int64) for name in COUNTS]
+)
+"""Where a cluster stands: the time in s at which the step begins; the position in the step and the length of the next
+substep, both in units of H; counts of substeps tried, of those rejected, of landings and of switches of a mode."""
+
+HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
+"""A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
+
+TAPE_ROW = np.dtype(
+    [(name, float) for name in ("begin", "position", "length", "approach", "rate", "acceleration")]
+    + [(name, np.int64) for name in ("kind", "site", "mode", "onset")]
+)
+"""A closed site in a substep that was taken: the time in s at which the step begins; position and length of the
+substep in units of H; w'_minus of the contact and, at the substep's beginning, w' in m/s and w'' in m/s^2; the kind of
+nodes; the site's number in its cluster; its mode; whether the contact begins with this substep."""
+
+# Two times that were summed in another order differ by a few roundings.
+SAME_TIME = 4.0
+
+
+class Substep(NamedTuple):
+    """A substep: the ``kind`` of its nodes (``PLAIN``, ``ONSET``, ``EXIT``), its ``length`` in units of H."""
+
+    kind: int
+    length: float
+
+
+class Sums(NamedTuple):
+    """Workspace of a substep: compiled code that makes no arrays need not count references to them.
+
+    At the nodes: ``free_w`` and ``free_v`` (dof, node) of the free motion; ``to_w`` and ``to_v`` (dof, source, node of
+    the source, node) of a unit force, for pairs that ``reaches`` (dof, source) marks; ``w`` and ``v`` (node,) of one
+    DoF. Besides, ``forces`` (dof,) at one time, ``moments`` (2 term,) of one DoF's force, their ``series`` (2 term,
+    2 term), and Bernstein coefficients ``bernstein`` (2, 6) of w.
+    """
+
+    free_w: np.ndarray
+    free_v: np.ndarray
+    to_w: np.ndarray
+    to_v: np.ndarray
+    reaches: np.ndarray
+    w: np.ndarray
+    v: np.ndarray
+    forces: np.ndarray
+    moments: np.ndarray
+    series: np.ndarray
+    bernstein: np.ndarray
+
+
+class Trial(NamedTuple):
+    """A substep that has been computed but not yet taken.
+
+    Forces act on the DoFs ``active``, of which those ``closed`` are sites. ``force`` in N, ``w`` in m and ``v`` in m/s
+    (dof, node) are those at its nodes; ``taylor`` and ``site_motion`` are as in ``Cluster``, at its end.
+    """
+
+    active: np.ndarray
+    closed: np.ndarray
+    force: np.ndarray
+    w: np.ndarray
+    v: np.ndarray
+    taylor: np.ndarray
+    site_motion: np.ndarray
+    sums: Sums
+
+
+class Tape(NamedTuple):
+    """Substeps that were taken while contacts were closed: ``rows`` (cluster, row) of dtype ``TAPE_ROW``.
+
+    ``motion`` (cluster, row, 2, node) holds w in m and w' in m/s at the nodes. ``used`` (cluster,) counts the rows that
+    were needed, which may be more than there are.
+    """
+
+    rows: np.ndarray
+    motion: np.ndarray
+    used: np.ndarray
+
+
+class Cluster(NamedTuple):
+    """A cluster, or all clusters of a rank one after another: constants, and what changes as it is advanced.
+
+    The DoFs of a cluster are its sites, which ``contacts`` (site,) describe, and then the driven masses in reach.
+    ``drives`` has a row for every DoF; those of sites drive nothing. ``response`` (dof, dof of the same cluster, term)
+    is the motion of one after an impulse on another, times H, in powers 2 m + 1 of s, with dashpots m + 1 (2 term - 1
+    of them). ``interval`` is H in s; ``rtol`` and ``atol`` (m/s) bound the error of a substep; a contact begins with
+    the fraction ``first_substep`` of its duration.
+
+    ``taylor`` (dof, 2 term) is the series of the free motion about the present position, ``site_motion`` (dof, 3) has
+    w, w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
+    ``energy`` (dof,) in J is what sites dissipated and the work of drives. ``history`` (dof,) is of dtype ``HISTORY``,
+    ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is workspace for the largest cluster, ``tape`` a log.
+    """
+
+    contacts: np.ndarray
+    drives: Drives
+    response: np.ndarray
+    nodes: Collocation
+    interval: float
+    omega_max_h: float
+    rtol: float
+    atol: float
+    first_substep: float
+    taylor: np.ndarray
+    site_motion: np.ndarray
+    moments: np.ndarray
+    energy: np.ndarray
+    history: np.ndarray
+    state: np.ndarray
+    trial: Trial
+    tape: Tape
+
+
+def create_trial(dofs: int, terms: int) -> Trial:
+    """Workspace for a substep of ``dofs`` DoFs, all of which are active."""
+    sums = Sums(
+        free_w=np.zeros((dofs, NODES)),
+        free_v=np.zeros((dofs, NODES)),
+        to_w=np.zeros((dofs, dofs, NODES, NODES)),
+        to_v=np.zeros((dofs, dofs, NODES, NODES)),
+        reaches=np.zeros((dofs, dofs), bool),
+        w=np.zeros(NODES),
+        v=np.zeros(NODES),
+        forces=np.zeros(dofs),
+        moments=np.zeros(2 * terms),
+        series=np.zeros((2 * terms, 2 * terms)),
+        bernstein=np.zeros((2, 6)),
+    )
+    return Trial(
+        active=np.arange(dofs),
+        closed=np.arange(dofs),
+        force=np.zeros((dofs, NODES)),
+        w=np.zeros((dofs, NODES)),
+        v=np.zeros((dofs, NODES)),
+        taylor=np.zeros((dofs, 2 * terms)),
+        site_motion=np.zeros((dofs, 3)),
+        sums=sums,
+    )
+
+
+def create_tape(clusters: int, rows: int, nodes: int = 0) -> Tape:
+    """Create an empty tape; nothing is written on one without ``rows``."""
+    return Tape(
+        rows=np.zeros((clusters, rows), TAPE_ROW),
+        motion=np.zeros((clusters, rows, 2, nodes)),
+        used=np.zeros(clusters, np.int64),
+    )
+
+
+@njit(error_model="numpy")
+def _select_tape(tape: Tape, c: int) -> Tape:
+    """The tape of cluster ``c``."""
+    # A tape without rows has no clusters either: it serves all as it is.
+    if tape.rows.shape[1] == 0:
+        return tape
+    return Tape(rows=tape.rows[c : c + 1], motion=tape.motion[c : c + 1], used=tape.used[c : c + 1])
+
+
+@njit(error_model="numpy")
+def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
+    """Cluster ``c`` of all: the same constants and workspace, views of its part of the other arrays."""
+    first = dofs.first[c]
+    stop = dofs.first[c + 1]
+    last_site = first + dofs.sites[c]
+    return Cluster(
+        contacts=clusters.contacts[first:last_site],
+        drives=Drives(clusters.drives.rows[first:stop], clusters.drives.pieces),
+        response=clusters.response[first:stop],
+        nodes=clusters.nodes,
+        interval=clusters.interval,
+        omega_max_h=clusters.omega_max_h,
+        rtol=clusters.rtol,
+        atol=clusters.atol,
+        first_substep=clusters.first_substep,
+        taylor=clusters.taylor[first:stop],
+        site_motion=clusters.site_motion[first:last_site],
+        moments=clusters.moments[first:stop],
+        energy=clusters.energy[first:stop],
+        history=clusters.history[first:stop],
+        state=clusters.state[c : c + 1],
+        trial=clusters.trial,
+        tape=_select_tape(clusters.tape, c),
+    )
+
+
+@kernel
+def write_on_tape(cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """Write a substep that is taken on the cluster's tape, one row for each closed site."""
+    tape = cluster.tape
+    state = cluster.state[0]
+    if tape.rows.shape[1] == 0:
+        return
+
+    for i in trial.closed:
+        # On a full tape rows are only counted: the caller then knows how many were wanted.
+        k = tape.used[0]
+        tape.used[0] += 1
+        if k >= tape.rows.shape[1]:
+            continue
+
+        site = cluster.contacts[i]
+        row = tape.rows[0, k]
+        row.begin = state.begin
+        row.position = state.position
+        row.length = substep.length
+        row.kind = substep.kind
+        row.site = i
+        row.mode = site.mode
+        row.approach = site.approach
+        row.rate = cluster.site_motion[i, 1]
+        row.acceleration = cluster.site_motion[i, 2]
+
+        # The onset was this same position, but trials since then added their lengths to it and took them off again.
+        time = state.begin + state.position * cluster.interval
+        row.onset = abs(time - cluster.history[i].onset) <= SAME_TIME * ROUNDING * (time + cluster.interval)
+
+        for node in range(NODES):
+            tape.motion[0, k, 0, node] = trial.w[i, node]
+            tape.motion[0, k, 1, node] = trial.v[i, node]
