@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.case import Case, CaseError, LawCase
-from vipetsc.case.varied import lobe_reflection
+from vipetsc.case.inhomogeneity import lobe_reflection
 from vipetsc.case.warnings import losses
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.layout import Layout

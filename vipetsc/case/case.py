@@ -24,6 +24,7 @@ from vipetsc.case.drive import (
     packet_speed,
 )
 from vipetsc.case.features import FEATURES, refusals
+from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.initial import InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.resolve import (
@@ -38,7 +39,6 @@ from vipetsc.case.resolve import (
 from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.variation import check_variation
 from vipetsc.case.warnings import of_losses, warnings_of
 from vipetsc.lattice import UnitCell, pass_bands
 
@@ -89,7 +89,7 @@ class Case(CaseFile):
         try:
             tables = resolved(sections, beginning)
             driven = [one["cell"] for one in drive_tables(tables["drive"])]
-            if problems := list(check_variation(LatticeTable(**tables["lattice"]), driven)):
+            if problems := list(check_inhomogeneity(LatticeTable(**tables["lattice"]), driven)):
                 return sections, problems
         except ValueError as error:
             given = sections["lattice"].absorbing
@@ -115,7 +115,7 @@ class Case(CaseFile):
         yield from problems
         if cell and valid("drive"):
             driven = [one.cell for _, one in sections["drive"].every if one.end is None]
-            yield from check_variation(lattice, driven)
+            yield from check_inhomogeneity(lattice, driven)
         if valid("lattice.cells", "contacts.sites"):
             yield from check_contacts(lattice, contacts, valid)
             if cell and valid("contacts"):

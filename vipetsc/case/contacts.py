@@ -29,7 +29,7 @@ def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
     return lists_of(contacts).get(key) or [getattr(contacts, key)] * count
 
 
-def check_each(contacts: ContactsTable, count: int, gaps: list[float], valid: Valid) -> Iterator[Problem]:
+def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid: Valid) -> Iterator[Problem]:
     """What is wrong with the laws and the stops of ``count`` sites with the clearances ``gaps`` in m."""
     each, where = lists_of(contacts), lambda key: f"contacts.{'each.' if key in lists_of(contacts) else ''}{key}"
     for key, values in each.items():
@@ -67,7 +67,7 @@ def check_each(contacts: ContactsTable, count: int, gaps: list[float], valid: Va
             return
 
 
-def resolved_each(contacts: ContactsTable, count: int) -> Table:
+def resolved_per_site(contacts: ContactsTable, count: int) -> Table:
     """The lists over sites, with a stiffness in place of a material."""
     each = lists_of(contacts)
     if each.keys() & {*MATERIAL}:
@@ -107,7 +107,7 @@ def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
     return tuple(laws)
 
 
-def stops_told(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
+def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
     """What is said of each site's stops, in mm."""
     told = ({"+": plus, "-": minus} for plus, minus in gaps)
     texts = [" ".join(f"{s}{1e3 * gap:.4g}" for s, gap in stops.items() if gap < np.inf) for stops in told]
@@ -127,7 +127,7 @@ def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple
 def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
     """What is wrong with what contacts join, in the ``cells`` (1-based) with sites."""
     if any(len(lists_of(contacts).get(key, cells)) != len(cells) for key in JOINS):
-        return  # as ``check_each`` says
+        return  # as ``check_per_site`` says
     pairs = pairs_of_sites(contacts, cell, len(cells)) or [Pair(cell.host, cell.resonator)] * len(cells)
     for number, (at, pair) in enumerate(zip(cells, pairs, strict=True), 1):
         what = f"site {number} joins masses {pair.host + 1} and {pair.resonator + 1}"

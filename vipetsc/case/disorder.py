@@ -13,9 +13,9 @@ from pydantic import Field
 
 from vipetsc.case.case_file import Problem, Section, Table
 from vipetsc.case.contacts import lists_of, values_of_sites
+from vipetsc.case.inhomogeneity_sections import Deviation
 from vipetsc.case.schema import CONTACTS, LatticeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.varied import Deviation
 from vipetsc.lattice import UnitCell
 
 SEED = "disorder.seed"

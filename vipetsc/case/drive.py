@@ -51,7 +51,7 @@ class OneDrive(Section):
         """The waveform's name."""
         return self.waveform or "burst"
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """A resolved drive in words."""
         unit = "m" if self.end else "N s" if self.kind == "impulse" else "N"
         om, length = f"Om = {self.frequency or 0:.4f} rad/s", self.duration or np.inf

@@ -27,8 +27,8 @@ def texts() -> dict[str, dict[str, list[str]]]:
     return told | {"OneDrive": {key: text for key, text in told["DriveTable"].items() if key != "more"}}
 
 
-def told(name: str, key: str) -> tuple[str, str]:
-    """Unit and text of a key of the class ``name``, empty where nothing is told."""
+def unit_and_text(name: str, key: str) -> tuple[str, str]:
+    """Unit and text of a key of the class ``name``, empty where nothing is said."""
     unit, text = texts().get(name, {}).get(key, ("", ""))
     return unit, text
 
@@ -40,7 +40,7 @@ def json_schema() -> Schema:
     classes: Schema = whole["$defs"]
     for name, schema in classes.items():
         for key, item in schema.get("properties", {}).items():
-            unit, text = told(name, key)
+            unit, text = unit_and_text(name, key)
             item.pop("title", None)
             if key == "wavenumber":
                 item["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
@@ -86,7 +86,7 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
     if rows:
         yield from ("| key | value | unit | default | |", "|---|---|---|---|---|")
     for key, item in rows:
-        unit, text = told(name, key)
+        unit, text = unit_and_text(name, key)
         needed = "needed" if key in schema.get("required", ()) else ""
         default = item.get("default")
         plain = default is not None and "{" not in str(default)  # not a table of its own

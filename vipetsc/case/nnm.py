@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.contacts import check_each, parameters_of
+from vipetsc.case.contacts import check_per_site, parameters_of
 from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.resolve import (
     check_cell,
@@ -182,7 +182,7 @@ class NnmCase(CaseFile):
         # A system of one's own needs no lattice, whatever stands there.
         refusable = {"contacts": contacts} if nnm.system == "own" else {"contacts": contacts, "lattice": lattice}
         problems, dofs, rigid = [*_check_options(nnm), *refusals(cls, refusable, valid)], 2, 0
-        problems += [] if contacts.each else check_each(contacts, 0, [], valid)
+        problems += [] if contacts.each else check_per_site(contacts, 0, [], valid)
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:

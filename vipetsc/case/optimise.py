@@ -60,7 +60,7 @@ class ObjectiveTable(Section):
         of = f" {self.band}" if self.band else ""
         return self.measure + of + (f" {self.part[0]:g}-{self.part[1]:g}" if self.part else "")
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """The objective in words."""
         at = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
         return f"{self.goal} {self.name}" + (f", the {self.over} at {at} N" if at else "")

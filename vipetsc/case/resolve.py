@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case.case_file import Problem, Table, Valid
-from vipetsc.case.contacts import check_each, pairs_of_sites, resolved_each
+from vipetsc.case.contacts import check_per_site, pairs_of_sites, resolved_per_site
 from vipetsc.case.drive import CYCLES, SINES, DriveTable, drive_tables, packet_speed, resolved_drive, waveform_of
+from vipetsc.case.inhomogeneity import cell_variation, designed_end
 from vipetsc.case.initial import Beginning
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
-from vipetsc.case.variation import variation_of
-from vipetsc.case.varied import designed_end
 from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import cell_problems, connected_groups
 
@@ -95,7 +94,7 @@ def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
     gaps = clearances(lattice, contacts, len(sites))
     cell, places = lattice.unit_cell(), tuple(c - 1 for c in sites)
     pairs = pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites))
-    return Chain(cell, lattice.cells, lattice.ends, places, tuple(gaps), variation_of(lattice), pairs)
+    return Chain(cell, lattice.cells, lattice.ends, places, tuple(gaps), cell_variation(lattice), pairs)
 
 
 def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
@@ -167,7 +166,7 @@ def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid)
     placed = contacts.clearance is not None or lattice.preset is not None or not sites
     gaps = clearances(lattice, contacts, len(sites)) if placed else []
     if len(gaps) == len(sites):
-        yield from check_each(contacts, len(sites), gaps, valid)
+        yield from check_per_site(contacts, len(sites), gaps, valid)
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
@@ -189,7 +188,7 @@ def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str,
     if contacts.damping == "paper":
         del law["damping"]  # as if left out: the same case
     law |= {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
-    if each := resolved_each(contacts, len(sites)):
+    if each := resolved_per_site(contacts, len(sites)):
         law["each"] = each
     if contacts.stiffness is None and law.keys() >= REPLACES["stiffness"]:
         law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law["radius"], law.pop("poisson")))

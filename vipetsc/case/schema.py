@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from vipetsc.case.case_file import Section
-from vipetsc.case.varied import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
+from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.damped import fitted_dashpots
 

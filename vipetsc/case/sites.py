@@ -31,7 +31,7 @@ class ClearanceSpan(Section):
     last: Positive
 
 
-class EachTable(Section):
+class PerSiteTable(Section):
     """What differs from site to site: lists, one value a site, in place of the values of ``[contacts]``."""
 
     law: list[Law] | None = None
@@ -73,6 +73,6 @@ class ContactsTable(Section):
     pair: Ends | None = None
     next_cell: bool | None = None
     precompression: Positive | None = None
-    each: EachTable | None = None
+    each: PerSiteTable | None = None
     adhesion: Literal["allow", "clip"] = "allow"
     approach_floor: NotNegative = 0.0

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from vipetsc.case import Case
-from vipetsc.case.varied import lobe_reflection
+from vipetsc.case.inhomogeneity import lobe_reflection
 from vipetsc.case.warnings import losses
 from vipetsc.lattice import UnitCell, max_group_velocity, pass_bands
 from vipetsc.lattice.damped import absorber, damped_bloch, decay_length, reflection

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, CaseError, CaseFile, DesignCase, LawCase, NnmCase, Problem, Sweep
-from vipetsc.case.contacts import stops_told
+from vipetsc.case.contacts import describe_stops
 from vipetsc.case.disorder import DisorderTable, values_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.sweep import MOST_TRIED
@@ -110,7 +110,7 @@ def case_rows(case: CaseFile, ranks: int) -> list[tuple[str, str]]:
         return [("law", f"z to {case.law.largest:g}, {where}; ring of {site.cells} cells, {site.samples} samples")]
     if isinstance(case, OptimiseCase):
         options, searched = case.options, [variable.name for variable in case.variables()]
-        told = [("objective", objective.told()) for objective in options.objective]
+        told = [("objective", objective.describe()) for objective in options.objective]
         return [("optimise", f"{options.budget} designs of {_first_few(searched)}"), *told]
     if isinstance(case, NnmCase):
         contact, (low, high) = case.contact(), case.nnm.energy
@@ -151,9 +151,9 @@ def run_case_rows(case: Case, ranks: int) -> list[tuple[str, str]]:
         ("loss", loss_text(case)),
         ("contact", "; ".join(dict.fromkeys(map(str, model.laws[:8] or (model.contact,))))),
         ("sites", _first_few([c + 1 for c in chain.sites])),
-        ("clearance", _first_few(stops_told(model.gaps, chain.clearances)) + " mm" if chain.sites else "none"),
+        ("clearance", _first_few(describe_stops(model.gaps, chain.clearances)) + " mm" if chain.sites else "none"),
         ("begins with", initial_text(case)),
-        *(("drive", drive.told()) for _, drive in case.drive.every),
+        *(("drive", drive.describe()) for _, drive in case.drive.every),
         ("waves at Om", "; ".join(f"band {b}, kappa = {k / np.pi:.4f} pi, v_g = {v:.2f} cells/s" for b, k, v in waves)
                         or "none: in a gap"),
         ("burst, end", f"{max(drive.waveform.duration for drive in model.drives):.6g} s, {model.end:.6g} s"),

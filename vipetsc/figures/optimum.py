@@ -34,7 +34,7 @@ def convergence(optimum: xr.Dataset) -> Figure:
     """The values of all designs, in their order or over both objectives, and what else became of them."""
     objectives, number = OptimiseCase.of(optimum).options.objective, optimum["design"].values
     value, failed = optimum["value"].values, optimum["reason"].values != ""
-    figure = style.new_figure(style.PAGE, 2.8, "; ".join(objective.told() for objective in objectives))
+    figure = style.new_figure(style.PAGE, 2.8, "; ".join(objective.describe() for objective in objectives))
     left, right = figure.subplots(1, 2)
     compared = {name: int(optimum["comparison/number"].sel(compared=name)) for name in _compared(optimum)}
     if len(objectives) == 1:

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
 from vipetsc.case import Case
-from vipetsc.case.contacts import Gaps, stops_told
+from vipetsc.case.contacts import Gaps, describe_stops
 from vipetsc.figures import style
 from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.style import with_prefix
@@ -259,7 +259,7 @@ def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, gaps: Gaps = ())
     arrow = {"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8}
     axes.annotate("", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), arrowprops=arrow)
     last, width = -np.inf, max(0.006 * n, 1)
-    texts = stops_told(gaps, ()) if gaps else [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
+    texts = describe_stops(gaps, ()) if gaps else [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
     for site, text in sorted(zip(chain.sites, texts, strict=True)):
         axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
         # Labels need about a twentieth of the strip each; neighbouring sites go without.

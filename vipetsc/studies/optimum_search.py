@@ -274,7 +274,7 @@ def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
     reasons = [reason for reason in data["reason"].values if reason]
     lines = [f"{data.sizes['design']} designs, {data.attrs['runs']} runs; {len(reasons)} designs failed"]
     lines += [f"  such as: {reasons[0]}"] if reasons else []
-    lines += [f"  {number}: {objective.told()}" for number, objective in enumerate(plan.options.objective, 1)]
+    lines += [f"  {number}: {objective.describe()}" for number, objective in enumerate(plan.options.objective, 1)]
     columns = [*data["objective"].values, "upper share", "dissipated"]
     lines.append(f"  {'design':<8}{'number':>7}" + "".join(f"{name:>24}" for name in columns))
     for name, number in zip(data["compared"].values, data["comparison/number"].values, strict=True):

@@ -6,18 +6,21 @@ A quantity is named as in a cell's table: ``masses[2]``, ``springs[1].stiffness`
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
 from vipetsc.case.case_file import LARGEST, Problem
+from vipetsc.case.inhomogeneity_sections import AbsorbingTable, AnyProfile, Deviation, Profile
 from vipetsc.case.schema import LatticeTable
-from vipetsc.case.varied import AnyProfile, Deviation, Profile
-from vipetsc.lattice import Chain, Coefficients, UnitCell, Variation
-from vipetsc.lattice.damped import absorber
+from vipetsc.lattice import Chain, Coefficients, ToneBurst, UnitCell, Variation, waves_at
+from vipetsc.lattice.chain import Ends
+from vipetsc.lattice.damped import absorber, reflection
 
 QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping)")
 MOST_VARIED = 10**8  # cells that may differ: every rank holds them all
+# Cells of an absorbing end that are tried, and logarithms of what comes back of the energy along the way.
+LENGTHS, LOSSES = (10, 20, 40, 80, 160), (8.0, 10.0, 13.0, 17.0)
 
 
 def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
@@ -80,7 +83,7 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Prob
     return arrays, problems
 
 
-def variation_of(lattice: LatticeTable) -> Variation | None:
+def cell_variation(lattice: LatticeTable) -> Variation | None:
     """What differs from the reference cell in a valid, resolved case; None if nothing may."""
     if not (lattice.profiles or lattice.scatter or lattice.absorbing):
         return None
@@ -103,7 +106,7 @@ def variation_of(lattice: LatticeTable) -> Variation | None:
     return Variation(**differing) if differing else None
 
 
-def check_variation(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Problem]:
+def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Problem]:
     """What is wrong with what differs from a valid cell; ``driven`` are the cells (from 1) of the drives."""
     if (lattice.profiles or lattice.scatter or lattice.absorbing) and lattice.cells > MOST_VARIED:
         yield Problem("lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ: every rank holds them")
@@ -123,3 +126,37 @@ def check_variation(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Pr
     low, high = n * (absorbing.end != "right"), lattice.cells - n * (absorbing.end != "left")
     if inside := [cell for cell in driven if not low < cell <= high]:
         yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {inside[0]} is in the absorbing end")
+
+
+@lru_cache
+def designed_end(
+    table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[tuple[float, int], ...], most: int
+) -> AbsorbingTable:
+    """``table`` with cells, at ``most`` so many, and a strength; raises ValueError if none will do.
+
+    ``drives`` are frequencies in rad/s and cycles; those in gaps send no wave.
+    """
+    waves = [wave for frequency, _ in drives for wave in waves_at(cell, frequency)]
+    if not waves:
+        raise ValueError("the drive is in a gap: no wave comes to the end")
+    speed, best = max(wave[2] for wave in waves), np.inf
+    for cells in [table.cells] if table.cells else [n for n in LENGTHS if n <= most]:
+        for strength in [table.strength] if table.strength else [2 * speed * loss / cells for loss in LOSSES]:
+            end = absorber(cell, ends, cells, strength)
+            back = float(np.nanmax([lobe_reflection(end, *drive) for drive in drives]))
+            best = min(best, back)
+            if back <= table.reflection:
+                return table.model_copy(update={"cells": cells, "strength": strength})
+    raise ValueError(f"no end of up to {most} cells has it ({best:.2g} comes back): allow more, or more cells")
+
+
+def lobe_reflection(chain: Chain, frequency: float, cycles: int) -> float:
+    """Share of a burst's energy that comes back from the right end of ``chain``.
+
+    Mean over the pass bands in the main lobe of its spectrum, weighted with the square of that; NaN if there are none.
+    """
+    lobe = frequency * (1 + np.linspace(-2, 2, 17)[1:-1] / cycles)
+    lobe = lobe[lobe > 0]
+    shares = np.array([reflection(chain, omega, chain.cells - 1) for omega in lobe.tolist()])
+    waves, weights = np.isfinite(shares), np.abs(ToneBurst(1.0, frequency, cycles).spectrum(lobe)) ** 2
+    return float(np.average(shares[waves], weights=weights[waves])) if waves.any() else np.nan
