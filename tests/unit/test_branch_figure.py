@@ -33,7 +33,7 @@ def test_a_branch_is_drawn_through_its_points_along_its_tangents_and_keeps_a_cor
         assert fine_frequency == pytest.approx(exact, rel=1e-9)
 
 
-def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_told():
+def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_marked():
     """A branch that goes back from 4 J to 2 J at higher frequencies, and on at lower ones."""
     branch = xr.Dataset(
         {

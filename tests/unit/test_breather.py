@@ -14,7 +14,7 @@ from scipy.special import ellipk
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase, NnmTable
 from vipetsc.case.resolve import build_chain
-from vipetsc.figures.condensed_branches import branches as draw
+from vipetsc.figures.registry import branch as draw
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Contact, DenseCompliance, WaveCompliance, contact_stiffness, four_band, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance

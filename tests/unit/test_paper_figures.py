@@ -18,7 +18,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vipetsc.case import Case
 from vipetsc.figures.schematics import lattice_page, reduced_model
-from vipetsc.figures.style import NOTE, SCREEN, draw_each, new_figure, rc_style, save
+from vipetsc.figures.style import NOTE, SCREEN, Drawing, draw_each, new_figure, rc_style, save
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.paper_figures import PAPER_FIGURES, describe
 from vipetsc.paper.report import numbers, sources
@@ -30,7 +30,7 @@ def drawings(count: int, made: list[int]):
         return new_figure(1, 1)
 
     for number in range(count):
-        yield f"page-{number}", lambda number=number: page(number)
+        yield Drawing(f"page-{number}", lambda number=number: page(number))
 
 
 def turned(count: int, turns) -> list[str]:

@@ -53,7 +53,7 @@ def draw_source(
 
     def draw_share() -> list[Path]:
         try:
-            return draw(source, folders, names, formats, (comm.rank, comm.size), newest)
+            return draw(source, folders, names, formats, rank=comm.rank, ranks=comm.size, newest=newest)
         except (OSError, KeyError, ValueError) as error:
             if source not in _NOT_OURS:
                 raise

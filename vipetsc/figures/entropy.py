@@ -57,7 +57,7 @@ def entropy(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Entropy against amplitude for each reading, wavenumber and average: linear above, log-log with fits below."""
     for ensemble, rows, stem in _facets(sweeps):
         for average in _averages(rows):
-            yield f"{stem}-{average}", partial(_entropy, ensemble, rows, average)
+            yield style.Drawing(f"{stem}-{average}", partial(_entropy, ensemble, rows, average))
 
 
 def entropy_all(sweeps: Sweeps) -> Iterator[style.Drawing]:
@@ -65,7 +65,7 @@ def entropy_all(sweeps: Sweeps) -> Iterator[style.Drawing]:
     for ensemble, rows, stem in _facets(sweeps, ("reading",)):
         if len({_driven_wavenumber(row, ensemble) for row in rows}) > 1:
             for average in _averages(rows):
-                yield f"{stem}-{average}", partial(_entropy_all, ensemble, rows, average)
+                yield style.Drawing(f"{stem}-{average}", partial(_entropy_all, ensemble, rows, average))
 
 
 def entropy_history(sweeps: Sweeps) -> Iterator[style.Drawing]:
@@ -73,7 +73,7 @@ def entropy_history(sweeps: Sweeps) -> Iterator[style.Drawing]:
     for ensemble, rows, stem in _facets(sweeps, needs="entropy/history"):
         shown = [row for row in rows if np.isfinite(row["entropy/history"]).any()]
         if shown:
-            yield stem, partial(_history, ensemble, shown)
+            yield style.Drawing(stem, partial(_history, ensemble, shown))
 
 
 def _facets(

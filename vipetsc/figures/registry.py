@@ -4,7 +4,7 @@ import difflib
 import itertools
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from vipetsc.figures import (
     condensed_branches,
     cost_maps,
     entropy,
+    frequency_energy,
     law_panels,
     modal,
     nfrc,
@@ -29,64 +30,115 @@ from vipetsc.figures import (
 )
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.figures.sweep_members import Files, Sweeps, table
+from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 
 MOST_WARNINGS = 4  # below a picture
+
+# The sources: what folders hold.
 RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
 OPTIMUM, LAW, PREDICTION = "optimum", "law", "prediction"
-FILES = {DESIGN: ("design.h5", ("cost", "frequency")), OPTIMUM: ("optimum.h5", ("value", "comparison")),
-         LAW: ("law.h5", ("share", "efficiency")),
-         PREDICTION: ("prediction.h5", ("predicted", "onset_amplitude"))}  # fmt: skip
 
 
-class FigureSpec(NamedTuple):
-    """A figure of what folders of a ``source`` hold; one of sweeps is drawn from those that take the ``measure``.
+class ResultFile(NamedTuple):
+    """The one file that a source is drawn from: its ``name`` in the folder, and variables that it must hold."""
 
-    ``function`` is (run, analysis or None) -> Figure for a run, (search) -> Figure for a design or an optimum,
-    (paths) -> Figure for branches; of sweeps it offers drawings: (ensembles) -> iterator of (suffix, () -> Figure).
-    """
-
-    function: Callable[..., Any]
-    source: str
-    measure: str = ""
+    name: str
+    needs: tuple[str, ...]
 
 
-def _specs(source: str, *functions: Callable[..., Any], measure: str = "") -> dict[str, FigureSpec]:
-    return {f.__name__: FigureSpec(f, source, measure) for f in functions}
-
-
-# The dearest of a run first, so that ranks which share the work finish together.
-FIGURES = {
-    **_specs(RUN, modal.modal_energies),
-    **_specs(RUN, runs.spacetime, runs.dispersion, runs.phase, schematics.unit_cell, runs.impacts, runs.ledger),
-    **_specs(SWEEP, scattering.amplitudes, scattering.wavelets, scattering.partition, measure="entropy"),
-    **_specs(SWEEP, scattering.partition_explained, scattering.reconstruction, measure="entropy"),
-    **_specs(SWEEP, entropy.entropy, entropy.entropy_all, measure="entropy"),
-    **_specs(SWEEP, scattering.entropy_maps, entropy.entropy_history, measure="entropy"),
-    **_specs(SWEEP, transfer.transfer, transfer.transfer_dispersions, transfer.band_energies, measure="transfer"),
-    **_specs(SWEEP, transfer_curves.ibtet, transfer_curves.ibtet_backbone, measure="transfer"),
-    **_specs(SWEEP, transfer_curves.phase_regimes, measure="transfer"),
-    "branch": FigureSpec(condensed_branches.branches, BRANCHES),
-    **_specs(DESIGN, cost_maps.deflections, cost_maps.cost_maps),
-    **_specs(LAW, law_panels.law),
-    **_specs(PREDICTION, predicted_energies.prediction),
-    **_specs(OPTIMUM, optimum.convergence, optimum.compared_designs, optimum.compared_curves),
-    "dispersion_against_lambda": FigureSpec(partial(cost_maps.dispersions, along="lambda", other="eta"), DESIGN),
-    "dispersion_against_eta": FigureSpec(partial(cost_maps.dispersions, along="eta", other="lambda"), DESIGN),
+FILES: Mapping[str, ResultFile] = {
+    DESIGN: ResultFile("design.h5", needs=("cost", "frequency")),
+    OPTIMUM: ResultFile("optimum.h5", needs=("value", "comparison")),
+    LAW: ResultFile("law.h5", needs=("share", "efficiency")),
+    PREDICTION: ResultFile("prediction.h5", needs=("predicted", "onset_amplitude")),
 }
 
 
+class FigureSpec(NamedTuple):
+    """A figure: its ``name``, the ``source`` that it is drawn from, and the ``function`` that draws it.
+
+    ``function`` is (run, analysis or None) -> Figure of a run, (data) -> Figure of a source in ``FILES``, (paths) ->
+    Figure of branches. Of sweeps it is (sweeps) -> iterator of Drawing, called with those sweeps that take ``measure``;
+    the stem of such a drawing follows the figure's name.
+    """
+
+    name: str
+    source: str
+    function: Callable[..., Any]
+    measure: str = ""
+
+
+def branch(paths: Sequence[Path]) -> Figure:
+    """Draw the branches in ``paths``, which are of one kind, side by side."""
+    kinds = []
+    for path in paths:
+        with open_netcdf(path, "branch") as file:
+            kinds.append(branch_kinds.branch_kind(file))
+
+    # Folders that share a page may hold branches of one name and several kinds; the first one decides what is shown.
+    same = [path for path, kind in zip(paths, kinds, strict=True) if kind == kinds[0]]
+    return BRANCH_FIGURES[kinds[0]](same)
+
+
+BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
+    branch_kinds.ORBITS: frequency_energy.backbone,
+    branch_kinds.CONDENSED: condensed_branches.condensed_branches,
+    branch_kinds.RESPONSES: nfrc.frequency_response,
+}
+
+_SPECS = (
+    # The dearest of a run first, so that ranks which divide the work among them finish together.
+    FigureSpec("modal_energies", RUN, modal.modal_energies),
+    FigureSpec("spacetime", RUN, runs.spacetime),
+    FigureSpec("dispersion", RUN, runs.dispersion),
+    FigureSpec("phase", RUN, runs.phase),
+    FigureSpec("unit_cell", RUN, schematics.unit_cell),
+    FigureSpec("impacts", RUN, runs.impacts),
+    FigureSpec("ledger", RUN, runs.ledger),
+    FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy"),
+    FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy"),
+    FigureSpec("partition", SWEEP, scattering.partition, measure="entropy"),
+    FigureSpec("partition_explained", SWEEP, scattering.partition_explained, measure="entropy"),
+    FigureSpec("reconstruction", SWEEP, scattering.reconstruction, measure="entropy"),
+    FigureSpec("entropy", SWEEP, entropy.entropy, measure="entropy"),
+    FigureSpec("entropy_all", SWEEP, entropy.entropy_all, measure="entropy"),
+    FigureSpec("entropy_maps", SWEEP, scattering.entropy_maps, measure="entropy"),
+    FigureSpec("entropy_history", SWEEP, entropy.entropy_history, measure="entropy"),
+    FigureSpec("transfer", SWEEP, transfer.transfer, measure="transfer"),
+    FigureSpec("transfer_dispersions", SWEEP, transfer.transfer_dispersions, measure="transfer"),
+    FigureSpec("band_energies", SWEEP, transfer.band_energies, measure="transfer"),
+    FigureSpec("ibtet", SWEEP, transfer_curves.ibtet, measure="transfer"),
+    FigureSpec("ibtet_backbone", SWEEP, transfer_curves.ibtet_backbone, measure="transfer"),
+    FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer"),
+    FigureSpec("branch", BRANCHES, branch),
+    FigureSpec("deflections", DESIGN, cost_maps.deflections),
+    FigureSpec("cost_maps", DESIGN, cost_maps.cost_maps),
+    FigureSpec("dispersion_against_lambda", DESIGN, partial(cost_maps.dispersions, along="lambda", other="eta")),
+    FigureSpec("dispersion_against_eta", DESIGN, partial(cost_maps.dispersions, along="eta", other="lambda")),
+    FigureSpec("law", LAW, law_panels.law),
+    FigureSpec("prediction", PREDICTION, predicted_energies.prediction),
+    FigureSpec("convergence", OPTIMUM, optimum.convergence),
+    FigureSpec("compared_designs", OPTIMUM, optimum.compared_designs),
+    FigureSpec("compared_curves", OPTIMUM, optimum.compared_curves),
+)
+FIGURES: Mapping[str, FigureSpec] = {spec.name: spec for spec in _SPECS}
+
+
 def figure_names(source: str, names: Sequence[str] | None = None) -> list[str]:
-    """The ``names``, by default those of all figures of ``source``; raises KeyError for one that is not among them."""
+    """Return ``names``, by default those of all figures of ``source``; raise KeyError for one that is not of it."""
     valid = [name for name, spec in FIGURES.items() if spec.source == source]
-    for name in names or ():
+    if names is None:
+        return valid
+    for name in names:
         if name not in valid:
-            (nearest,) = difflib.get_close_matches(name, valid, 1, 0) or valid[:1]
-            of = source if source == BRANCHES else f"a {source}"
-            raise KeyError(f"no figure {name!r} of {of}; did you mean {nearest!r}? There are {', '.join(valid)}")
-    return valid if names is None else list(names)
+            (nearest,) = difflib.get_close_matches(name, valid, n=1, cutoff=0) or valid[:1]
+            holder = source if source == BRANCHES else f"a {source}"
+            listed = ", ".join(valid)
+            raise KeyError(f"no figure {name!r} of {holder}; did you mean {nearest!r}? There are {listed}")
+    return list(names)
 
 
 def draw(
@@ -94,39 +146,44 @@ def draw(
     folders: Sequence[Path],
     names: Sequence[str] | None = None,
     formats: Sequence[str] = ("png",),
-    share: tuple[int, int] = (0, 1),
+    *,
+    rank: int = 0,
+    ranks: int = 1,
     newest: float | None = None,
 ) -> list[Path]:
-    """Draw what the ``folders`` hold into ``figures/`` of the first of them; returns the files, each complete.
+    """Draw what the ``folders`` hold into ``figures/`` of the first of them; return the files, each complete.
 
-    The ``source``, what is in the folders, is "run" (one folder), "sweep" (with branches beside them), "branches" (of
-    the same names, side by side), "design", "optimum" or "law" (one folder); ``names`` are figures, all by default.
-    With a ``share`` (rank, size) every ``size``-th picture from ``rank`` on is drawn; pictures that are not older than
-    the time ``newest`` stay. Raises KeyError for a name that is no figure of ``source`` and for a file that lacks
-    something, OSError or ValueError if a file cannot be read, or a picture not written.
+    Parameters
+    ----------
+    source
+        What is in the folders: "run" (one folder), "sweep" (branches may stand beside), "branches" (of the same
+        names, side by side), "design", "optimum", "law" or "prediction" (one folder).
+    names
+        Figures, by default all.
+    rank, ranks
+        Every ``ranks``-th picture from number ``rank`` on is drawn.
+    newest
+        A time in s since the epoch: pictures that are not older stay.
+
+    Raises
+    ------
+    KeyError
+        For a name that is no figure of ``source``, and for a file that lacks something.
+    OSError, ValueError
+        If a file cannot be read, or a picture not written.
     """
 
     def keep(path: Path) -> bool:
         return newest is not None and path.exists() and path.stat().st_mtime >= newest
 
-    turns = itertools.count(*share)
     with rc_style(), Files() as files:
-        return draw_each(drawings(source, folders, files, names), folders[0] / "figures", formats, turns, keep=keep)
-
-
-def warned(make: Callable[[], Figure], *results: xr.Dataset) -> Callable[[], Figure]:
-    """``make``, whose figure is labelled with the warnings in the ``results``: their attribute ``warnings`` (JSON)."""
-    warnings = (line for data in results for line in json.loads(data.attrs.get("warnings", "[]")))
-    sentences = [*dict.fromkeys(warnings)]
-    if len(sentences) > MOST_WARNINGS:
-        sentences[MOST_WARNINGS - 1 :] = [f"{len(sentences) - MOST_WARNINGS + 1} more warnings are in the file"]
-
-    def labelled() -> Figure:
-        figure = make()
-        figure.set_label("\n".join(sentences))
-        return figure
-
-    return labelled
+        return draw_each(
+            drawings(source, folders, files, names),
+            target=folders[0] / "figures",
+            formats=formats,
+            turns=itertools.count(rank, ranks),
+            keep=keep,
+        )
 
 
 def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None) -> Path:
@@ -139,32 +196,76 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
 def drawings(
     source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None
 ) -> Iterator[Drawing]:
-    """Stems and drawings of what the ``folders`` hold, as ``draw`` draws them; the first of them checks the names.
+    """Return the drawings of what the ``folders`` hold, in the order in which ``draw`` draws them.
 
-    Warnings in the files are the figures' labels. A drawing can be called as long as its ``files`` are open.
+    Warnings in the files are the figures' labels. A drawing can be called as long as its ``files`` are open. Raises
+    KeyError as ``figure_names``.
     """
-    specs = {name: FIGURES[name] for name in figure_names(source, names)}
-    folder = folders[0]
+    specs = [FIGURES[name] for name in figure_names(source, names)]
     if source == SWEEP:
-        ensembles = [files.get(path, open_ensemble) for path in folders if (path / "ensemble.h5").exists()]
-        for name, spec in specs.items():
-            measured = Sweeps((e for e in ensembles if spec.measure in table(e)["sweep"]["measures"]), files)
-            for suffix, make in spec.function(measured):
-                yield f"{name}-{suffix}" if suffix else name, warned(make, *measured)
-    elif source == BRANCHES:
-        for spec, path in itertools.product(specs.values(), sorted(folder.glob("branch-*.h5"))):
-            paths = [other / path.name for other in folders if (other / path.name).exists()]
-            stem = path.stem.replace("branch", "branches" if len(folders) > 1 else "branch", 1)
-            branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
-            function = nfrc.answers if "share" in branches[0] else spec.function  # of the verb nfrc, or nnm
-            yield stem, warned(partial(function, paths), *branches)
-    elif source == RUN:
-        run, analysis = files.get(folder / "run.h5", open_run), None
-        if (folder / "analysis.h5").exists():
-            analysis = files.get(folder / "analysis.h5", partial(open_netcdf, kind="analysis"))
-        of_run = [data for data in (run, analysis) if data is not None]
-        yield from ((name, warned(partial(spec.function, run, analysis), *of_run)) for name, spec in specs.items())
-    else:
-        file, needs = FILES[source]
-        search = files.get(folder / file, partial(open_netcdf, kind="search", needs=needs))
-        yield from ((name, partial(spec.function, search)) for name, spec in specs.items())
+        return _sweep_drawings(specs, folders, files)
+    if source == BRANCHES:
+        return _branch_drawings(specs, folders, files)
+    if source == RUN:
+        return _run_drawings(specs, folders[0], files)
+    return _file_drawings(specs, folders[0], files)
+
+
+def _sweep_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
+    """Yield what the functions of ``specs`` offer; folders without an ensemble hold branches, which they find."""
+    ensembles = [files.get(folder, open_ensemble) for folder in folders if (folder / "ensemble.h5").exists()]
+    for spec in specs:
+        measured = [ensemble for ensemble in ensembles if spec.measure in table(ensemble)["sweep"]["measures"]]
+        sweeps = Sweeps(measured, files)
+        for offered in spec.function(sweeps):
+            stem = f"{spec.name}-{offered.stem}" if offered.stem else spec.name
+            yield Drawing(stem, warned(offered.draw, *sweeps))
+
+
+def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
+    """Yield one drawing a branch of the first folder, beside the branches of its name in the other folders."""
+    for spec, first in itertools.product(specs, sorted(folders[0].glob("branch-*.h5"))):
+        paths = [folder / first.name for folder in folders if (folder / first.name).exists()]
+        stem = first.stem
+        if len(folders) > 1:
+            stem = stem.replace("branch", "branches", 1)
+        branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
+        yield Drawing(stem, warned(partial(spec.function, paths), *branches))
+
+
+def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
+    """Yield every figure of the run in ``folder``, whose analysis may be missing."""
+    run = files.get(folder / "run.h5", open_run)
+    analysis = None
+    results = [run]
+    if (folder / "analysis.h5").exists():
+        analysis = files.get(folder / "analysis.h5", partial(open_netcdf, kind="analysis"))
+        results.append(analysis)
+    for spec in specs:
+        yield Drawing(spec.name, warned(partial(spec.function, run, analysis), *results))
+
+
+def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
+    """Yield every figure of the one file in ``folder`` that holds all of its results."""
+    for spec in specs:
+        file = FILES[spec.source]
+        data = files.get(folder / file.name, partial(open_netcdf, kind="search", needs=file.needs))
+        yield Drawing(spec.name, partial(spec.function, data))
+
+
+def warned(make: Callable[[], Figure], *results: xr.Dataset) -> Callable[[], Figure]:
+    """Return ``make`` so that its figure is labelled with the warnings that the ``results`` carry, each once.
+
+    They stand as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the picture.
+    """
+    warnings = (line for data in results for line in json.loads(data.attrs.get("warnings", "[]")))
+    sentences = list(dict.fromkeys(warnings))
+    if len(sentences) > MOST_WARNINGS:
+        sentences[MOST_WARNINGS - 1 :] = [f"{len(sentences) - MOST_WARNINGS + 1} more warnings are in the file"]
+
+    def labelled() -> Figure:
+        figure = make()
+        figure.set_label("\n".join(sentences))
+        return figure
+
+    return labelled

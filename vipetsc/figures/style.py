@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from textwrap import wrap
+from typing import NamedTuple
 
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -14,22 +15,37 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator
 from matplotlib.transforms import Bbox
 
-from vipetsc.figures.figure_data import drawn
+from vipetsc.figures.figure_data import figure_data
 from vipetsc.io.atomic import atomic_write, write_text
 
-COLUMN, PAGE = 3.4, 7.0  # widths of one and of two journal columns in inches
+COLUMN = 3.4  # width of one journal column in inches
+PAGE = 7.0  # width of two
 NOTE = 0.165  # height in inches of the strip that a line of a note takes below a picture
 LETTERS = 19  # of a note on an inch
 SCREEN = 200  # dots per inch of a PNG, so that a page can hold many; a PDF's maps have more
 
 # Okabe and Ito (2008): told apart with every kind of colour vision.
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, VERMILION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
-GREY, PALE, RED = "#777777", "#DDDDDD", "#CC0000"
-DASHED, DOTTED = (0, (4, 2)), (0, (1, 2))
+BLACK = "#000000"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+YELLOW = "#F0E442"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
 
-Drawing = tuple[str, Callable[[], Figure]]
-"""A picture to come: the stem of its file's name, and what draws it, to be called before the next is asked for."""
+GREY = "#777777"
+PALE = "#DDDDDD"
+RED = "#CC0000"
+DASHED = (0, (4, 2))
+DOTTED = (0, (1, 2))
+
+
+class Drawing(NamedTuple):
+    """A picture to come: the ``stem`` of its file's name; ``draw`` is called before the next drawing is asked for."""
+
+    stem: str
+    draw: Callable[[], Figure]
 
 
 def rc_style() -> AbstractContextManager[None]:
@@ -59,33 +75,49 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine():
         _lay_out(figure)
-    width, height = figure.get_size_inches()
+
+    letters = int(LETTERS * figure.get_figwidth())
     sentences = [*note.splitlines(), *figure.get_label().splitlines()]
-    lines = [line for sentence in sentences for line in wrap(sentence, int(LETTERS * width))]
+    lines = [line for sentence in sentences for line in wrap(sentence, letters)]
+
     if path.suffix == ".json":
-        write_text(path, json.dumps(drawn(figure, NOTE * len(lines)), separators=(",", ":"), allow_nan=False))
-        return path
-    strip, note = Bbox([[0, -NOTE * len(lines)], [width, height]]) if lines else None, "\n".join(lines)
-    text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, note, ha="right", va="top", fontsize=7, color=GREY)
+        panels = figure_data(figure, strip=NOTE * len(lines))
+        write_text(path, json.dumps(panels, separators=(",", ":"), allow_nan=False))
+    else:
+        _print(figure, path, lines)
+    return path
+
+
+def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
+    """Write the picture of a laid-out ``figure`` with ``lines`` of text in a strip below it."""
+    width, height = figure.get_size_inches()
+    look = {"ha": "right", "va": "top", "fontsize": 7, "color": GREY}
+    text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, "\n".join(lines), **look)
+
     with atomic_write(path) as partial_path:
-        if path.suffix == ".pdf" and not strip:
-            FigureCanvasPdf(figure).print_pdf(partial_path)  # ``savefig`` would draw it twice
-        elif path.suffix == ".png" and not strip:
+        # ``savefig`` draws a figure twice; its own canvas suffices where nothing is added to the figure's box.
+        if path.suffix == ".pdf" and not lines:
+            FigureCanvasPdf(figure).print_pdf(partial_path)
+        elif path.suffix == ".png" and not lines:
             figure.set_dpi(SCREEN)
             FigureCanvasAgg(figure).print_png(partial_path)
         else:
+            box = Bbox([[0, -NOTE * len(lines)], [width, height]]) if lines else None
             dpi = SCREEN if path.suffix == ".png" else None
-            figure.savefig(partial_path, format=path.suffix[1:], dpi=dpi, bbox_inches=strip)
+            figure.savefig(partial_path, format=path.suffix[1:], dpi=dpi, bbox_inches=box)
+
+    # The next format of the figure has a strip of its own.
     text.remove()
-    return path
 
 
 def _lay_out(figure: Figure) -> None:
     """Lay the figure out once, with two minor ticks a decade: eight would be most of what a page of panels costs."""
     for axes in figure.get_axes():
         for axis in (axes.xaxis, axes.yaxis):
-            if isinstance(locator := axis.get_minor_locator(), LogLocator):
+            locator = axis.get_minor_locator()
+            if isinstance(locator, LogLocator):
                 locator.set_params(subs=(2.0, 5.0))
+
     figure.set_dpi(SCREEN)
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")
@@ -99,7 +131,7 @@ def draw_each(
     note: str = "",
     keep: Callable[[Path], bool] = lambda path: False,
 ) -> list[Path]:
-    """Draw those of ``drawings`` whose number is among ``turns``, into ``target/<stem>.<format>``; returns the files.
+    """Draw those of ``drawings`` whose number is among ``turns``, into ``target/<stem>.<format>``; return the files.
 
     Parameters
     ----------
@@ -113,13 +145,17 @@ def draw_each(
     """
     written: list[Path] = []
     turn = next(turns, None)
-    for number, (stem, make) in enumerate(drawings):
+    for number, drawing in enumerate(drawings):
         if number != turn:
             continue
-        paths = [target / f"{stem}.{suffix}" for suffix in formats]
-        if not all(map(keep, paths)):
-            sys.audit("vipetsc.draw", stem)
-            figure = make()
-            written += [save(figure, path, note) for path in paths]
+
+        paths = [target / f"{drawing.stem}.{suffix}" for suffix in formats]
+        if not all(keep(path) for path in paths):
+            sys.audit("vipetsc.draw", drawing.stem)
+            figure = drawing.draw()
+            for path in paths:
+                written.append(save(figure, path, note))
+
+        # Asked for only now: a counter that ranks share must not give a number to a rank that is still drawing.
         turn = next(turns, None)
     return written

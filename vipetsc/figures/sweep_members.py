@@ -147,7 +147,7 @@ def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callabl
                 run = series.runs[0].run
                 has_sites = len(recorded_sites(run)) > 0 and run.sizes["cell"] > 1
                 if (series.wave.band or not wave) and (has_sites or not sites):
-                    yield series.suffix, partial(page, series)
+                    yield Drawing(series.suffix, partial(page, series))
 
         return offer
 

@@ -34,7 +34,7 @@ def transfer(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """For every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for member in transfer_members(sweeps):
         if "velocity" in member.run and all(name in member.analysis for name in (FIELD, *SEGMENTS)):
-            yield Labels.of(member.case).member_stem, partial(nine_panels, member)
+            yield style.Drawing(Labels.of(member.case).member_stem, partial(nine_panels, member))
 
 
 def nine_panels(member: MeasuredRun) -> Figure:
@@ -118,7 +118,7 @@ def transfer_dispersions(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Every reading and configuration: laws in rows, amplitudes in columns."""
     members = ((m.case, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis)
     for name, group in grouped(members, lambda pair: Labels.of(pair[0]).page_stem).items():
-        yield name, partial(_dispersion_table, group, sweeps.files)
+        yield style.Drawing(name, partial(_dispersion_table, group, sweeps.files))
 
 
 def _dispersion_table(members: Sequence[tuple[Case, Path]], files: Files) -> Figure:
@@ -148,10 +148,10 @@ def band_energies(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """Energies of all parts and their sum over time for every whole member; mean shares for every sweep."""
     for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and "bands/total" in member.analysis:
-            yield Labels.of(member.case).member_stem, partial(energies_over_time, member)
+            yield style.Drawing(Labels.of(member.case).member_stem, partial(energies_over_time, member))
     with_shares = (curve for curve in transfer_curves(sweeps) if "bands/share" in curve.data)
     for name, curves in grouped(with_shares, lambda curve: Labels.of(curve.case).page_stem).items():
-        yield f"shares-{name}", partial(columns_of_laws, curves, "Mean share of the energy (1)", _shares)
+        yield style.Drawing(f"shares-{name}", partial(columns_of_laws, curves, "Mean share of the energy (1)", _shares))
 
 
 def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndarray:

@@ -80,7 +80,9 @@ def ibtet(sweeps: Sweeps) -> Iterator[style.Drawing]:
     """One page a reading, a column a law: about the peaks on linear scales, all amplitudes in logarithms."""
     points = list(sampled_points(sweeps))
     for reading, of_reading in grouped(transfer_curves(sweeps), lambda curve: curve.case.lattice.reading).items():
-        yield reading, partial(_page, reading, of_reading, [p for p in points if p.case.lattice.reading == reading])
+        yield style.Drawing(
+            reading, partial(_page, reading, of_reading, [p for p in points if p.case.lattice.reading == reading])
+        )
 
 
 def _page(reading: str, of_reading: Sequence[Curve], points: Sequence[Curve]) -> Figure:
@@ -139,7 +141,9 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[style.Drawing]:
         tables = ({name.partition("/")[2]: values[name] for name in of_group} for of_group in names.values())
         aligned = [Curve(Case.from_toml(table["case"]), table) for table in tables]
         for name, columns in grouped(aligned, lambda curve: Labels.of(curve.case).page_stem).items():
-            yield name, partial(columns_of_laws, columns, "Inter-band transfer, normalised slope (1)", _superposition)
+            yield style.Drawing(
+                name, partial(columns_of_laws, columns, "Inter-band transfer, normalised slope (1)", _superposition)
+            )
 
 
 def _superposition(axes: Axes, aligned: Curve) -> str:
@@ -198,7 +202,7 @@ def phase_regimes(sweeps: Sweeps) -> Iterator[style.Drawing]:
             folders.setdefault(_settings(member.case), []).append(member.folder)
     curves = {(_settings(curve.case), *sites_of(curve.case)): curve for curve in transfer_curves(sweeps)}
     for name, of_setting in folders.items():
-        yield name, partial(_regimes, of_setting, sweeps.files, curves)
+        yield style.Drawing(name, partial(_regimes, of_setting, sweeps.files, curves))
 
 
 def _settings(case: Case) -> str:

@@ -38,7 +38,7 @@ def draw_paper(
         undrawn = on_root(comm, lambda: {stem for stem in undrawn if not is_drawn(root, stem)})
         wanted = [picture for pictures in offers.values() for picture in pictures if picture.stem in undrawn]
         wanted.sort(key=lambda picture: -picture.cost)
-        drawn = _draw_shared([(stem, make) for stem, make, _ in wanted], root, comm, stop, plan.note)
+        drawn = _draw_shared([Drawing(stem, make) for stem, make, _ in wanted], root, comm, stop, plan.note)
     spent = comm.allreduce(time.process_time() - begin)
     if drawn:
         every = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
