@@ -323,8 +323,11 @@ on_root(MPI.COMM_WORLD, write)
 """
 
 FAILS_ON_ONE_RANK = """
+import sys
 from mpi4py import MPI
-from vipetsc import Case, simulate
+from vipetsc import Case, install_abort_hook, simulate
+assert sys.excepthook is sys.__excepthook__, "an import has installed a hook"
+install_abort_hook()
 if MPI.COMM_WORLD.rank == 1:
     raise RuntimeError("rank 1 cannot go on")
 simulate(Case.from_table({"time": {"end": 0.01}}), "out")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -10,10 +13,12 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.contact.law import CLOSED
-from vipetsc.dynamics.energies import LARGEST, PARTS, Energies, EnergyMeter, add_energy, measure
+from vipetsc.dynamics import run
+from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, Energies, EnergyMeter, add_energy, measure
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.dynamics.ts.sums import register_sums
+from vipetsc.io.store import RunMemory
 
 CELLS, DRIVEN, SITES = 7, 3, (3, 7)
 
@@ -110,7 +115,7 @@ def test_energies_below_the_unit_of_the_sums_add_up():
 
 
 def test_energies_beyond_all_scales_saturate_the_sums():
-    sums = np.zeros((PARTS, 2), np.int64)
+    sums = np.zeros((ENERGY_SUMS, 2), np.int64)
     for energy in (np.nan, np.inf, 1e300):
         add_energy(sums, energy, 1.0)
     assert sums[1].tolist() == [3 * int(LARGEST), 0]
@@ -138,3 +143,15 @@ def test_stages_are_added_as_petsc_adds_them(size, count):
     assert np.isfinite(ours.array).all()
     for vector in (plain, ours, first, *stages):
         vector.destroy()
+
+
+def test_a_simulation_on_several_ranks_lets_a_rank_that_raises_end_all(monkeypatch):
+    """At its call, not at its import; a hook that is not Python's own stays."""
+    installed = []
+    monkeypatch.setattr(run, "install_abort_hook", lambda: installed.append(1))
+    for size, hook, expected in ((1, sys.__excepthook__, 0), (2, sys.__excepthook__, 1), (2, print, 1)):
+        monkeypatch.setattr(run, "MPI", SimpleNamespace(COMM_WORLD=SimpleNamespace(size=size)))
+        monkeypatch.setattr(sys, "excepthook", hook)
+        with pytest.raises(ValueError, match="cannot be resumed"):
+            run.simulate(small_case(), RunMemory(), resume=True)
+        assert len(installed) == expected

@@ -85,6 +85,28 @@ def test_no_circle():
     assert len(order) == len(MODULES)
 
 
+def room(module):
+    """A folder within a part, such as dynamics.ts, with all its modules; other modules stand for themselves.
+
+    Parts as wholes have no circle: arrows between them point down.
+    """
+    parts = module.split(".")
+    inner = ROOT.joinpath(*parts[:2]).is_dir()
+    return ".".join(parts[:2]) if inner else module
+
+
+def test_no_circle_between_folders():
+    """A folder is imported as a whole: two modules of it may not lie above and below a third one outside."""
+    rooms = {}
+    for module in MODULES:
+        rooms.setdefault(room(module), set()).update(room(other) for other in arrows(module))
+    assert {"dynamics.ts", "dynamics.propagator"} <= rooms.keys()
+    try:
+        TopologicalSorter({name: others - {name} for name, others in rooms.items()}).prepare()
+    except CycleError as error:
+        pytest.fail(f"circle of folders: {' <- '.join(error.args[1])}")
+
+
 @pytest.mark.parametrize("part", SERIAL)
 def test_sources_name_neither_petsc_nor_mpi(part):
     for module, path in MODULES.items():

@@ -15,7 +15,8 @@ from vipetsc.case import Case
 from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.engine import FillResult
-from vipetsc.dynamics.layout import Layout, create_record
+from vipetsc.dynamics.lattice_record import create_record
+from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import (
     Groups,
     create_dof_tables,

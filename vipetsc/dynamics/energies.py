@@ -1,10 +1,11 @@
 """Energies of a distributed state, as sums of integers.
 
-Each cell's energy is a whole number of a unit and a rest in multiples of unit/2^40; both are summed as integers, so
-that neither the order nor the partition shows in the result.
+Each cell's energy is a whole number of a unit and a remainder in multiples of unit/2^40; both are summed as integers,
+so that neither the order nor the partition shows in the result.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 from mpi4py import MPI
 
@@ -13,19 +14,20 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.law import elastic_energy
-from vipetsc.dynamics.layout import LatticeRecord, Layout, create_record
-from vipetsc.dynamics.ts.right_hand_side import relative_motion
-from vipetsc.dynamics.ts.springs import CHUNK, add_smooth_energies, add_squares, displacement, is_varied
+from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.site_dofs import relative_motion
+from vipetsc.dynamics.springs import CHUNK, add_nonlinear_energies, add_squares, displacement, is_varied
 
-_FINE = 2.0**40  # multiples of the finer rest in one unit
+_FINE = 2.0**40  # multiples of the finer remainder in one unit
 LARGEST = 2.0**50
-PARTS = 5  # that are summed
-_KINETIC, _SPRING, _CONTACT, _DISSIPATED, _DAMPING = range(PARTS)
+_KINETIC, _SPRING, _CONTACT, _DISSIPATED, _DAMPING = range(5)
+ENERGY_SUMS = 5
 
 
 @kernel
-def _add(sums: np.ndarray, part: int, energies: np.ndarray, unit: float) -> None:
-    """Add energies in J to ``sums`` (part, 2) as multiples of ``unit`` and of unit/2^40."""
+def _add(sums: np.ndarray, kind: int, energies: np.ndarray, unit: float) -> None:
+    """Add energies in J to row ``kind`` of ``sums`` (energy, 2) as multiples of ``unit`` and of unit/2^40."""
     whole_sum = fine_sum = np.int64(0)
     for i in range(energies.size):
         multiple = energies[i] * (1.0 / unit)
@@ -34,8 +36,8 @@ def _add(sums: np.ndarray, part: int, energies: np.ndarray, unit: float) -> None
         is_small = abs(whole) < LARGEST
         whole_sum += np.int64(whole if is_small else LARGEST)
         fine_sum += np.int64(np.rint((multiple - whole) * _FINE) if is_small else 0.0)
-    sums[part, 0] += whole_sum
-    sums[part, 1] += fine_sum
+    sums[kind, 0] += whole_sum
+    sums[kind, 1] += fine_sum
 
 
 @kernel
@@ -44,15 +46,15 @@ def _kinetic_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energie
     energies[:] = 0.0
     for mass in range(lattice.shape.dofs):
         begin = (lattice.shape.dofs + mass) * lattice.shape.cells + first
-        inverse_mass = lattice.masses[mass].inverse_mass
         v = y[begin : begin + energies.size]
         if is_varied(lattice):
             inverse_masses = lattice.inverse_masses[mass * lattice.shape.cells + first :]
             for i in range(energies.size):
                 energies[i] += 0.5 * v[i] * v[i] / inverse_masses[i]
-            continue
-        for i in range(energies.size):
-            energies[i] += 0.5 * v[i] * v[i] / inverse_mass
+        else:
+            inverse_mass = lattice.masses[mass].inverse_mass
+            for i in range(energies.size):
+                energies[i] += 0.5 * v[i] * v[i] / inverse_mass
 
 
 @kernel
@@ -64,12 +66,16 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
         add_squares(y, lattice, first, 0, lattice.stiffness, energies)
         energies *= 0.5
         return
+
     for s in range(lattice.springs.size):
         spring = lattice.springs[s]
+        # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
         leaves = spring.next_cell == 1 and first + energies.size == n
         inside = energies.size - leaves
-        begin, end = spring.start * n + first, spring.end * n + first + spring.next_cell
+        begin = spring.start * n + first
+        end = spring.end * n + first + spring.next_cell
         here, other = y[begin : begin + inside], y[end : end + inside]
+
         for i in range(inside):
             stretch = other[i] - here[i]
             energies[i] += 0.5 * spring.stiffness * stretch * stretch
@@ -80,32 +86,38 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
             energies[0] += 0.5 * spring.stiffness * y[spring.end * n] * y[spring.end * n]
 
 
+@kernel
+def _contact_energy(site: Any, w: float) -> float:
+    """Elastic energy in J of a ``SITE`` at w, beyond that of the static state where a load holds it pressed."""
+    energy = elastic_energy(site.elastic, max(w - site.clearance, -w - site.clearance_minus))
+    if site.preload != 0.0:
+        energy -= elastic_energy(site.elastic, -min(site.clearance, site.clearance_minus)) + site.preload * w
+    return energy
+
+
 @njit(error_model="numpy")
 def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
     """Kinetic, spring, contact energy, that dissipated in contacts and in dashpots, (5, 2): see ``_add``."""
-    shape, contacts, sites = lattice.shape, lattice.contacts, 0
-    sums, elastic = np.zeros((PARTS, 2), np.int64), np.empty(lattice.places.size)
-    energies = np.empty(min(CHUNK, shape.cells))
+    shape = lattice.shape
+    sums = np.zeros((ENERGY_SUMS, 2), np.int64)
+    room = np.empty(min(CHUNK, shape.cells))
     for first in range(0, shape.cells, CHUNK):
-        of_cells = energies[: shape.cells - first]
-        _kinetic_energies(y, lattice, first, of_cells)
-        _add(sums, _KINETIC, of_cells, unit)
-        _spring_energies(y, lattice, first, of_cells)
-        if lattice.smooth.size > 0:
-            add_smooth_energies(y, lattice, first, of_cells)
-        _add(sums, _SPRING, of_cells, unit)
-    for i in range(lattice.places.size):
-        if lattice.places[i].ledger < 0:
-            continue
-        w, site = relative_motion(y, lattice, i)[0], contacts[i]
-        elastic[sites] = elastic_energy(site.elastic, max(w - site.clearance, -w - site.clearance_minus))
-        if site.preload != 0.0:  # beyond that of the static state, under the load that holds it
-            elastic[sites] -= (
-                elastic_energy(site.elastic, -min(site.clearance, site.clearance_minus)) + site.preload * w
-            )
-        sites += 1
-    _add(sums, _CONTACT, elastic[:sites], unit)
-    _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + sites], unit)
+        energies = room[: shape.cells - first]
+        _kinetic_energies(y, lattice, first, energies)
+        _add(sums, _KINETIC, energies, unit)
+        _spring_energies(y, lattice, first, energies)
+        if lattice.nonlinear.size > 0:
+            add_nonlinear_energies(y, lattice, first, energies)
+        _add(sums, _SPRING, energies, unit)
+
+    elastic, owned = np.empty(lattice.site_dofs.size), 0
+    for i in range(lattice.site_dofs.size):
+        if lattice.site_dofs[i].ledger >= 0:
+            w, _ = relative_motion(y, lattice.site_dofs, i)
+            elastic[owned] = _contact_energy(lattice.contacts[i], w)
+            owned += 1
+    _add(sums, _CONTACT, elastic[:owned], unit)
+    _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + owned], unit)
     if shape.damping >= 0:
         _add(sums, _DAMPING, y[shape.damping : shape.damping + shape.cells], unit)
     return sums
@@ -148,35 +160,38 @@ class EnergyMeter:
     """Measures the energies of a distributed state.
 
     They are summed as integers, whose sums do not depend on their order: multiples of ``unit`` in J, a power of two
-    far below the run's energy scale, and a finer rest.
+    far below the run's energy scale, and a finer remainder. From ``largest`` in J on the sums saturate.
     """
 
     def __init__(self, model: Model, layout: Layout) -> None:
-        self.comm, self._balanced = layout.comm, model.chain.is_damped and not layout.damped
+        self.comm = layout.comm
         self.lattice = create_record(model, layout)
+        self._balanced = model.chain.is_damped and not layout.damped
+
         speed = model.scale * model.drive.frequency
         # Cells that the packet covers; of an initial state, perhaps all.
-        burst = (
-            model.chain.cells
-            if model.initial
-            else min(max(drive.waveform.duration for drive in model.drives), model.end) * model.speed
-        )
-        scale = sum(model.chain.cell.masses) * speed**2 * max(burst, 1.0)
+        cells = float(model.chain.cells)
+        if not model.initial:
+            duration = min(max(drive.waveform.duration for drive in model.drives), model.end)
+            cells = duration * model.speed
+        scale = sum(model.chain.cell.masses) * speed**2 * max(cells, 1.0)
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
-        self.largest = self.unit * LARGEST  # energy in J from which on the sums saturate
+        self.largest = self.unit * LARGEST
 
     def total(self, sums: np.ndarray, work: np.ndarray) -> Energies:
-        """Energies of all ranks' shares: ``sums`` (sample, part, 2) of ``measure``, ``work`` (sample, drive) in J.
+        """Energies over all ranks: ``sums`` (sample, energy, 2) of ``measure``, ``work`` (sample, drive) in J.
 
         All ranks must call it.
         """
-        whole, fine = sums.T  # (part, sample) each
+        whole, fine = sums.T  # (energy, sample) each
         # Carrying leaves every number below 2^53: their sums over ranks, as floats, are exact.
         carried = fine >> 40
         total = np.vstack([whole + carried, fine - (carried << 40), work.T])
         self.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
-        *stored, lost, damping = total[:PARTS] * self.unit + total[PARTS : 2 * PARTS] * (self.unit / _FINE)
-        kinetic, spring, contact, work = *stored, total[2 * PARTS :].sum(axis=0)
+
+        whole, fine, works = np.split(total, [ENERGY_SUMS, 2 * ENERGY_SUMS])
+        kinetic, spring, contact, dissipated, damping = whole * self.unit + fine * (self.unit / _FINE)
+        work = works.sum(axis=0)
         if self._balanced:
-            damping = work - lost - (kinetic + spring + contact)
-        return Energies(kinetic, spring, contact, work, lost, damping, self._balanced)
+            damping = work - dissipated - (kinetic + spring + contact)
+        return Energies(kinetic, spring, contact, work, dissipated, damping, self._balanced)

@@ -10,7 +10,7 @@ from vipetsc.case.initial import file_hash
 from vipetsc.dynamics.energies import measure
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Setup
-from vipetsc.dynamics.ts.right_hand_side import relative_motion
+from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain
 from vipetsc.lattice.modes import mode_shape
@@ -29,7 +29,7 @@ def set_in_motion(setup: Setup) -> None:
     with state.localForm() as local:
         y, lattice = local.array, meter.lattice
         sums = measure(y, lattice, meter.unit)
-        rows = [relative_motion(y, lattice, i) for i in range(len(layout.contacts))]
+        rows = [relative_motion(y, lattice.site_dofs, i) for i in range(len(layout.contacts))]
     motion = np.zeros((len(setup.model.chain.sites), 2))
     for numbers, theirs in layout.comm.allgather((layout.contacts, rows)):
         motion[list(numbers)] = np.reshape(theirs, (-1, 2))

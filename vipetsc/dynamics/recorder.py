@@ -10,7 +10,7 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.case.schema import OutputTable
-from vipetsc.dynamics.energies import PARTS, Energies
+from vipetsc.dynamics.energies import ENERGY_SUMS, Energies
 from vipetsc.dynamics.observers import Observer, Setup
 from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.io.chunks import DAMPED, LOSSES, Recording, ranges
@@ -83,7 +83,7 @@ class Recorder(Observer):
 
     def _begin_chunk(self) -> None:
         n, self._held, self._rows, self._number = self._length, 0, 0, 0
-        self._sums, self._work = np.zeros((n, PARTS, 2), np.int64), np.zeros((n, len(self.setup.model.drives)))
+        self._sums, self._work = np.zeros((n, ENERGY_SUMS, 2), np.int64), np.zeros((n, len(self.setup.model.drives)))
         self._losses = np.zeros((n, len(self.setup.layout.sites)))
         self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[part] for part in self._energies))}
         self._fields = self.setup.output.room(self._shape)

@@ -36,10 +36,6 @@ ENGINES = (Propagator, Integrator)
 BLOCK_CELLS = 1_000_000
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
 
-# In a script under mpirun, a rank that raises would leave the others waiting; who has a hook already is not disturbed.
-if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
-    install_abort_hook()
-
 
 @dataclass(frozen=True)
 class Result:
@@ -98,6 +94,9 @@ def simulate(
     OSError
         If a file cannot be written, on all ranks.
     """
+    # In a script under mpirun, a rank that raises would leave the others waiting; whose hook is there already stays.
+    if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
+        install_abort_hook()
     if isinstance(folder, RunMemory) and resume:
         raise ValueError("a run in memory cannot be resumed")
     case = with_database(case)

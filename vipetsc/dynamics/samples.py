@@ -10,7 +10,7 @@ import numpy as np
 from vipetsc.compiled import njit
 from vipetsc.dynamics.drives import wall_energy
 from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, measure
-from vipetsc.dynamics.layout import LatticeRecord
+from vipetsc.dynamics.lattice_record import LatticeRecord
 
 
 class Samples(NamedTuple):

@@ -22,7 +22,6 @@ from vipetsc.contact.law import FREE, impact_time
 from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, switch_sites, update_episode, with_room
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout, join
-from vipetsc.dynamics.places import site_records
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
 from vipetsc.dynamics.propagator.clusters import (
     DofTables,
@@ -45,6 +44,7 @@ from vipetsc.dynamics.propagator.substeps import (
     create_trial,
     select_cluster,
 )
+from vipetsc.dynamics.site_dofs import site_records
 
 # A contact's first substep as a fraction of its duration at a tolerance of 1e-6; it goes with the error as others do.
 FIRST_SUBSTEP = 0.1

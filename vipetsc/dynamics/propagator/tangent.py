@@ -7,8 +7,8 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.contact.law import CLOSED, PERMANENT
 from vipetsc.dynamics.engine import StalledError
-from vipetsc.dynamics.layout import Layout, create_record
-from vipetsc.dynamics.places import site_records
+from vipetsc.dynamics.lattice_record import create_record
+from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.nodes import NODES
@@ -16,6 +16,7 @@ from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.substeps import create_tape
 from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
 from vipetsc.dynamics.samples import Samples
+from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.parallel import on_every_rank
 
 # Rows of the tape of a cluster.

@@ -16,7 +16,8 @@ from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
 from vipetsc.dynamics.drives import select_piece
 from vipetsc.dynamics.engine import Engine, FillResult, StalledError
-from vipetsc.dynamics.layout import Layout, create_record, join
+from vipetsc.dynamics.lattice_record import create_record
+from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
 from vipetsc.dynamics.ts.sums import register_sums

@@ -16,13 +16,13 @@ from vipetsc.compiled import cfunc, kernel
 from vipetsc.contact.law import FREE, SITE, contact_force
 from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
-from vipetsc.dynamics.layout import COEFFICIENTS, COUPLING, MASS, SMOOTH, SPRING, LatticeRecord, Shape
+from vipetsc.dynamics.lattice_record import COEFFICIENTS, COUPLING, MASS, NONLINEAR, SPRING, LatticeRecord, Shape
 from vipetsc.dynamics.native import pointer
-from vipetsc.dynamics.places import PLACE
-from vipetsc.dynamics.ts.springs import (
+from vipetsc.dynamics.site_dofs import SITE_DOFS, relative_motion
+from vipetsc.dynamics.springs import (
     damping_powers,
     inverse_mass,
-    smooth_force,
+    nonlinear_force_on,
     spring_acceleration,
     spring_accelerations,
 )
@@ -30,21 +30,12 @@ from vipetsc.lattice.drive import PIECE
 
 
 @kernel
-def relative_motion(y: np.ndarray, lattice: LatticeRecord, i: int) -> tuple[float, float]:
-    """w = u_resonator - u_host of site ``i`` and w'."""
-    host, resonator = lattice.places[i].host, lattice.places[i].resonator
-    if host.u < 0:
-        return y[resonator.u], y[resonator.v]
-    return y[resonator.u] - y[host.u], y[resonator.v] - y[host.v]
-
-
-@kernel
 def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int, force: float) -> float:
     """Acceleration of one mass by its springs, a contact ``force`` and the drives."""
     per_mass = inverse_mass(lattice, cell, mass)
     acceleration = spring_acceleration(y, lattice, cell, mass) + force * per_mass
-    if lattice.smooth.size > 0:
-        acceleration += smooth_force(y, lattice, cell, mass) * per_mass
+    if lattice.nonlinear.size > 0:
+        acceleration += nonlinear_force_on(y, lattice, cell, mass) * per_mass
     for i in range(lattice.drives.rows.size):
         if lattice.drives.rows[i].target == (lattice.shape.dofs + mass) * lattice.shape.cells + cell:
             acceleration += drive_force(lattice.drives, i, t) * per_mass
@@ -53,22 +44,50 @@ def _acceleration(t: float, y: np.ndarray, lattice: LatticeRecord, cell: int, ma
 
 @kernel
 def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
-    """Fill ``motion`` (sites, 3) with w, w', w'' of every owned site."""
+    """Fill ``motion`` (sites, 3) with w, w', w'' of every site, all of which join masses of one owned cell."""
     for i in range(motion.shape[0]):
-        w, rate = relative_motion(y, lattice, i)
+        w, rate = relative_motion(y, lattice.site_dofs, i)
         force, _ = contact_force(lattice.contacts, i, w, rate)
-        host, resonator = lattice.places[i].host, lattice.places[i].resonator
+        host, resonator = lattice.site_dofs[i].host, lattice.site_dofs[i].resonator
         at_host = _acceleration(t, y, lattice, host.cell, host.mass, force)
         at_resonator = _acceleration(t, y, lattice, resonator.cell, resonator.mass, -force)
-        motion[i, 0], motion[i, 1], motion[i, 2] = w, rate, at_resonator - at_host
+        motion[i, 0] = w
+        motion[i, 1] = rate
+        motion[i, 2] = at_resonator - at_host
 
 
 @kernel
 def observe_pairs(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord, motion: np.ndarray) -> None:
-    """The same of every site, given the state ``y`` and its derivative ``f``, both with their ghosts."""
+    """Fill ``motion`` (sites, 3) with w, w', w'' of every site, whatever masses it joins.
+
+    The state ``y`` and its derivative ``f`` come with their ghosts.
+    """
     for i in range(motion.shape[0]):
-        motion[i, 0], motion[i, 1] = relative_motion(y, lattice, i)
-        motion[i, 2] = relative_motion(f, lattice, i)[1]
+        w, rate = relative_motion(y, lattice.site_dofs, i)
+        _, acceleration = relative_motion(f, lattice.site_dofs, i)
+        motion[i, 0] = w
+        motion[i, 1] = rate
+        motion[i, 2] = acceleration
+
+
+@kernel
+def _add_contacts(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
+    """Add the accelerations by contacts to ``f``, and put in what they dissipate."""
+    n, d = lattice.shape.cells, lattice.shape.dofs
+    for i in range(lattice.site_dofs.size):
+        power = 0.0
+        if lattice.contacts[i].mode != FREE:
+            host, resonator = lattice.site_dofs[i].host, lattice.site_dofs[i].resonator
+            w, rate = relative_motion(y, lattice.site_dofs, i)
+            force, power = contact_force(lattice.contacts, i, w, rate)
+            force -= lattice.contacts[i].preload
+            if host.cell >= 0:
+                f[(d + host.mass) * n + host.cell] += force * inverse_mass(lattice, host.cell, host.mass)
+            if resonator.cell >= 0:
+                per_mass = inverse_mass(lattice, resonator.cell, resonator.mass)
+                f[(d + resonator.mass) * n + resonator.cell] -= force * per_mass
+        if lattice.site_dofs[i].ledger >= 0:
+            f[lattice.site_dofs[i].ledger] = power
 
 
 @kernel
@@ -78,35 +97,27 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
     n, d = shape.cells, shape.dofs
     for k in range(d * n):
         f[k] = y[d * n + k]
+
     for mass in range(d):
         spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
-        if lattice.smooth.size > 0:
+        if lattice.nonlinear.size > 0:
             for cell in range(n):
-                force = smooth_force(y, lattice, cell, mass)
+                force = nonlinear_force_on(y, lattice, cell, mass)
                 f[(d + mass) * n + cell] += force * inverse_mass(lattice, cell, mass)
-    for i in range(lattice.places.size):
-        power, place = 0.0, lattice.places[i]
-        if lattice.contacts[i].mode != FREE:
-            host, resonator = place.host, place.resonator
-            w, rate = relative_motion(y, lattice, i)
-            force, power = contact_force(lattice.contacts, i, w, rate)
-            force -= lattice.contacts[i].preload
-            if host.cell >= 0:
-                f[(d + host.mass) * n + host.cell] += force * inverse_mass(lattice, host.cell, host.mass)
-            if resonator.cell >= 0:
-                per_mass = inverse_mass(lattice, resonator.cell, resonator.mass)
-                f[(d + resonator.mass) * n + resonator.cell] -= force * per_mass
-        if place.ledger >= 0:
-            f[place.ledger] = power
+
+    _add_contacts(y, f, lattice)
+
     for i in range(lattice.drives.rows.size):
-        drive, force = lattice.drives.rows[i], drive_force(lattice.drives, i, t)
+        drive = lattice.drives.rows[i]
+        force = drive_force(lattice.drives, i, t)
         f[drive.target] += force * drive.inverse
         f[shape.work + i] = force * y[drive.target]
+
     if shape.damping >= 0:
         damping_powers(y, lattice, f[shape.damping : shape.damping + n])
 
 
-_TABLES = ("masses", "couplings", "springs", "places", "contacts", "rows", "pieces", "smooth", *COEFFICIENTS)
+_TABLES = ("masses", "couplings", "springs", "site_dofs", "contacts", "rows", "pieces", "nonlinear", *COEFFICIENTS)
 
 
 def _c_struct(record: type) -> np.dtype:
@@ -143,10 +154,10 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.masses), (size.masses,), MASS),
         carray(pointer(at.couplings), (size.couplings,), COUPLING),
         carray(pointer(at.springs), (size.springs,), SPRING),
-        carray(pointer(at.places), (size.places,), PLACE),
+        carray(pointer(at.site_dofs), (size.site_dofs,), SITE_DOFS),
         carray(pointer(at.contacts), (size.contacts,), SITE),
         Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
-        carray(pointer(at.smooth), (size.smooth,), SMOOTH),
+        carray(pointer(at.nonlinear), (size.nonlinear,), NONLINEAR),
         carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
         carray(pointer(at.grounding), (size.grounding,), np.float64),
         carray(pointer(at.stiffness), (size.stiffness,), np.float64),

@@ -8,7 +8,8 @@ have one number each; else (``is_varied``) each cell has its own, and the same s
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.dynamics.layout import LatticeRecord
+from vipetsc.dynamics.lattice_record import LatticeRecord
+from vipetsc.dynamics.spring_law import nonlinear_energy, nonlinear_force
 
 # Cells in one pass: what a pass touches stays in the first-level cache.
 CHUNK = 512
@@ -43,19 +44,30 @@ def inverse_mass(lattice: LatticeRecord, cell: int, mass: int) -> float:
 
 
 @kernel
-def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """As ``spring_acceleration``, with the cell's own numbers and dashpots."""
+def _is_beyond_free_end(lattice: LatticeRecord, cell: int) -> bool:
+    """Whether a ``cell`` next to the owned ones does not exist, so that no spring goes there."""
     shape = lattice.shape
-    n, d, total = shape.cells, shape.dofs, 0.0
+    return (cell < 0 and shape.left_free) or (cell >= shape.cells and shape.right_free)
+
+
+@kernel
+def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
+    """Acceleration of one mass as by ``spring_acceleration``, with the cell's own numbers and dashpots."""
+    shape = lattice.shape
+    n, d = shape.cells, shape.dofs
+    total = 0.0
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
-        c, of_spring = cell + coupling.offset, coupling.spring * (n + 1) + 1 + cell + min(coupling.offset, 0)
-        if (c < 0 and shape.left_free) or (c >= n and shape.right_free):
+        c = cell + coupling.offset
+        if _is_beyond_free_end(lattice, c):
             continue
-        total += lattice.stiffness[of_spring] * (displacement(y, lattice, c, coupling.other) - y[mass * n + cell])
+        # A row of the tables begins with the cell before the first one; a spring is its left cell's.
+        entry = coupling.spring * (n + 1) + 1 + cell + min(coupling.offset, 0)
+        total += lattice.stiffness[entry] * (displacement(y, lattice, c, coupling.other) - y[mass * n + cell])
         if shape.damping >= 0:
             rate = displacement(y, lattice, c, d + coupling.other) - y[(d + mass) * n + cell]
-            total += lattice.damping[of_spring] * rate
+            total += lattice.damping[entry] * rate
+
     if shape.damping >= 0:
         total -= lattice.grounding[mass * n + cell] * y[(d + mass) * n + cell]
     return total * lattice.inverse_masses[mass * n + cell]
@@ -66,13 +78,13 @@ def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: 
     """Acceleration in m/s^2 of one mass by its springs and dashpots; the sums of the chunked loops, bit for bit."""
     if is_varied(lattice):
         return _varied_acceleration(y, lattice, cell, mass)
-    shape = lattice.shape
-    here = y[mass * shape.cells + cell]
+
+    here = y[mass * lattice.shape.cells + cell]
     total = 0.0
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
         c = cell + coupling.offset
-        if (c < 0 and shape.left_free) or (c >= shape.cells and shape.right_free):
+        if _is_beyond_free_end(lattice, c):
             continue
         total += coupling.stiffness * (displacement(y, lattice, c, coupling.other) - here)
     return total * lattice.masses[mass].inverse_mass
@@ -93,16 +105,20 @@ def _add_springs(out: np.ndarray, other: np.ndarray, here: np.ndarray, factors: 
 @kernel
 def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, a: int, out: np.ndarray) -> None:
     """Accelerations of a mass in the cells from ``a`` on, whose neighbours are all owned."""
-    n, m, velocities, row = lattice.shape.cells, out.size, lattice.shape.dofs * lattice.shape.cells, mass
+    n, m = lattice.shape.cells, out.size
+    velocities = lattice.shape.dofs * n
+    here = y[mass * n + a :][:m]
+    rate = y[velocities + mass * n + a :][:m]
+
     out[:] = 0.0
-    here, rate = y[row * n + a :][:m], y[velocities + row * n + a :][:m]
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
-        first, of_spring = coupling.other * n + coupling.offset + a, coupling.spring * (n + 1) + 1 + a
-        of_spring += min(coupling.offset, 0)
-        _add_springs(out, y[first:][:m], here, lattice.stiffness[of_spring:])
+        first = coupling.other * n + coupling.offset + a
+        entry = coupling.spring * (n + 1) + 1 + a + min(coupling.offset, 0)
+        _add_springs(out, y[first:][:m], here, lattice.stiffness[entry:])
         if lattice.shape.damping >= 0:
-            _add_springs(out, y[velocities + first :][:m], rate, lattice.damping[of_spring:])
+            _add_springs(out, y[velocities + first :][:m], rate, lattice.damping[entry:])
+
     if lattice.shape.damping >= 0:
         for i in range(m):
             out[i] -= lattice.grounding[mass * n + a + i] * rate[i]
@@ -122,6 +138,7 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
         if is_varied(lattice):
             _varied_accelerations(y, lattice, mass, a, out)
             continue
+
         out[:] = 0.0
         for s in range(row.first, row.last):
             coupling = lattice.couplings[s]
@@ -129,6 +146,8 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
             _add_spring(out, y[first + a : first + b], here[a:b], coupling.stiffness)
         for i in range(out.size):
             out[i] *= inverse
+
+    # The first and the last cell have neighbours among the ghosts, or walls, or none.
     if n > 0:
         acceleration[0] = spring_acceleration(y, lattice, 0, mass)
     if n > 1:
@@ -137,34 +156,36 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
 
 @kernel
 def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> float:
-    """What the other mass of the ``smooth`` coupling ``s`` of a ``cell`` is ahead, in m; 0 beyond a free end."""
-    coupling, c, shape = lattice.smooth[s], cell + lattice.smooth[s].offset, lattice.shape
-    if (c < 0 and shape.left_free) or (c >= shape.cells and shape.right_free):
+    """Elongation in m of the ``nonlinear`` spring ``s`` of a ``cell``; 0 of one beyond a free end."""
+    coupling = lattice.nonlinear[s]
+    c = cell + coupling.offset
+    if _is_beyond_free_end(lattice, c):
         return 0.0
-    return displacement(y, lattice, c, coupling.other) - y[coupling.mass * shape.cells + cell]
+    here = y[coupling.mass * lattice.shape.cells + cell]
+    return coupling.sign * (displacement(y, lattice, c, coupling.other) - here)
 
 
 @kernel
-def smooth_force(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
+def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Force in N on one mass by the parts of its springs that are not linear."""
     total = 0.0
-    for s in range(lattice.smooth.size):
-        if lattice.smooth[s].mass == mass:
-            z = _elongation(y, lattice, s, cell)
-            total += z * z * (lattice.smooth[s].quadratic + lattice.smooth[s].cubic * z)
+    for s in range(lattice.nonlinear.size):
+        coupling = lattice.nonlinear[s]
+        if coupling.mass == mass:
+            total += coupling.sign * nonlinear_force(coupling.law, _elongation(y, lattice, s, cell))
     return total
 
 
 @kernel
-def add_smooth_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
+def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
     """Add the energies of those parts in the cells from ``first`` on, and in a spring to a wall on the left."""
-    for s in range(lattice.smooth.size):
-        coupling, starts = lattice.smooth[s], s % 2 == 0
+    for s in range(lattice.nonlinear.size):
+        coupling = lattice.nonlinear[s]
         for i in range(energies.size):
+            # A spring counts where it starts; one that starts in the wall on the left, where it ends.
             at_wall = first + i + coupling.offset < 0 and lattice.shape.left_ghost < 0
-            if starts or at_wall:
-                z = _elongation(y, lattice, s, first + i)
-                energies[i] += z * z * z * (coupling.quadratic / 3.0 + 0.25 * coupling.cubic * z)
+            if coupling.sign > 0.0 or at_wall:
+                energies[i] += nonlinear_energy(coupling.law, _elongation(y, lattice, s, first + i))
 
 
 @kernel
@@ -178,10 +199,15 @@ def add_squares(
     """
     shape, n = lattice.shape, lattice.shape.cells
     for s in range(lattice.springs.size):
-        spring, factors = lattice.springs[s], values[s * (n + 1) + 1 + first :]
+        spring = lattice.springs[s]
+        start, end = half + spring.start, half + spring.end
+        factors = values[s * (n + 1) + 1 + first :]
+        # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
         leaves = spring.next_cell == 1 and first + sums.size == n
-        inside, start, end = sums.size - leaves, half + spring.start, half + spring.end
-        here, other = y[start * n + first :][:inside], y[end * n + first + spring.next_cell :][:inside]
+        inside = sums.size - leaves
+        here = y[start * n + first :][:inside]
+        other = y[end * n + first + spring.next_cell :][:inside]
+
         for i in range(inside):
             stretch = other[i] - here[i]
             sums[i] += factors[i] * stretch * stretch
@@ -199,6 +225,7 @@ def damping_powers(y: np.ndarray, lattice: LatticeRecord, powers: np.ndarray) ->
     powers[:] = 0.0
     add_squares(y, lattice, 0, d, lattice.damping, powers)
     for mass in range(d):
-        rate, ground = y[(d + mass) * n :][:n], lattice.grounding[mass * n :][:n]
+        rate = y[(d + mass) * n :][:n]
+        ground = lattice.grounding[mass * n :][:n]
         for i in range(n):
             powers[i] += ground[i] * rate[i] * rate[i]

@@ -1,0 +1,157 @@
+"""A rank's part of the lattice as compiled kernels see it: sizes, and tables of masses, springs, sites and drives."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.case import Model
+from vipetsc.dynamics.drives import Drives, create_drives
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.site_dofs import create_site_dofs, site_records
+from vipetsc.dynamics.spring_law import SPRING_LAW, spring_laws
+from vipetsc.lattice import Chain, Spring
+
+MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
+"""A mass of the cell: 1/kg; its rows of the couplings, half open."""
+COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64), ("spring", np.int64)])
+"""A spring as one of its masses sees it: cells to the other mass, that mass, N/m, the spring's number."""
+NONLINEAR = np.dtype(
+    [("mass", np.int64), ("offset", np.int64), ("other", np.int64), ("sign", np.float64), ("law", SPRING_LAW)]
+)
+"""A spring that is not linear as one of its masses sees it: that mass, cells to the other one, that one; 1 at the end
+``start`` of the spring, which comes first, -1 at the other: the sign by which the other mass is ahead where the spring
+is longer; its law.
+"""
+SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int64), ("stiffness", np.float64)])
+"""A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
+
+
+class Shape(NamedTuple):
+    """Sizes and indices of a rank's part of the lattice; an index is -1 where the rank has no such thing.
+
+    ``owned`` and ``ghosted`` count the state's components without and with ghosts, ``exchange`` tells whether ghosts
+    must be fetched, ``paired`` whether contacts join other masses than the cell's pair. ``left_ghost`` and
+    ``right_ghost`` are the first components of the neighbouring cells,
+    ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``work``, ``dissipated`` and
+    ``damping`` are the components of the first drive's work, of the energies that the first site and the first cell's
+    dashpots have dissipated.
+    """
+
+    cells: int
+    dofs: int
+    paired: bool
+    owned: int
+    ghosted: int
+    exchange: bool
+    left_ghost: int
+    right_ghost: int
+    left_free: bool
+    right_free: bool
+    work: int
+    dissipated: int
+    damping: int
+
+
+class LatticeRecord(NamedTuple):
+    """A rank's part of a lattice: sizes, tables of the dtypes above, its sites and its drives.
+
+    ``site_dofs`` (site,) of dtype ``SITE_DOFS`` and ``contacts`` (site,) of dtype ``SITE`` are those of the same sites.
+    Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
+    ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where dashpots are integrated
+    ``grounding`` (dof, cell) and ``damping`` (spring, 1 + cell) in N s/m; else these are empty.
+    """
+
+    shape: Shape
+    masses: np.ndarray
+    couplings: np.ndarray
+    springs: np.ndarray
+    site_dofs: np.ndarray
+    contacts: np.ndarray
+    drives: Drives
+    nonlinear: np.ndarray
+    inverse_masses: np.ndarray
+    grounding: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+
+COEFFICIENTS = LatticeRecord._fields[-4:]
+
+
+def create_record(model: Model, layout: Layout) -> LatticeRecord:
+    """The record of the part of ``model`` that ``layout`` gives to this rank; all sites are free."""
+    chain = model.chain
+    cell = chain.cell
+    shape = _create_shape(chain, layout)
+    drives = create_drives(model.drives, layout.drives)
+    for row, number in zip(drives.rows, layout.drives, strict=True):
+        drive = model.drives[number]
+        row["target"] = (layout.dofs + drive.mass) * layout.owned + drive.cell - layout.start
+        row["inverse"] = 1 / chain.coefficients(drive.cell, drive.cell + 1).masses[0, drive.mass]
+
+    couplings = cell.couplings()
+    rows = np.searchsorted([coupling.mass for coupling in couplings], np.arange(layout.dofs + 1)).tolist()
+    masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
+    inverse_masses, grounding, stiffness, damping = _coefficients(chain, layout)
+    return LatticeRecord(
+        shape=shape,
+        masses=np.array(masses, MASS),
+        couplings=np.array([(c.offset, c.other, c.stiffness, c.spring) for c in couplings], COUPLING),
+        springs=np.array([(s.start, s.end, s.next_cell, s.stiffness) for s in cell.springs], SPRING),
+        site_dofs=create_site_dofs(model, layout, (shape.left_ghost, shape.right_ghost)),
+        contacts=site_records(model, layout.contacts),
+        drives=drives,
+        nonlinear=_nonlinear_couplings(cell.springs),
+        inverse_masses=inverse_masses,
+        grounding=grounding,
+        stiffness=stiffness,
+        damping=damping,
+    )
+
+
+def _create_shape(chain: Chain, layout: Layout) -> Shape:
+    """Sizes and indices of the part of ``chain`` that ``layout`` gives to this rank."""
+    left, right = layout.neighbours()
+    behind_left = layout.size + layout.ghost_rows * (left is not None)
+    return Shape(
+        cells=layout.owned,
+        dofs=layout.dofs,
+        paired=bool(chain.pairs),
+        owned=layout.size,
+        ghosted=behind_left + layout.ghost_rows * (right is not None),
+        exchange=layout.comm.size > 1 or layout.periodic,
+        left_ghost=-1 if left is None else layout.size,
+        right_ghost=-1 if right is None else behind_left,
+        left_free=chain.ends == "free" and left is None,
+        right_free=chain.ends == "free" and right is None,
+        work=layout.rows * layout.owned,
+        dissipated=layout.dissipated,
+        damping=2 * layout.dofs * layout.owned if layout.damped else -1,
+    )
+
+
+def _nonlinear_couplings(springs: tuple[Spring, ...]) -> np.ndarray:
+    """Records of dtype ``NONLINEAR`` of both ends of every spring that is not linear."""
+    springs = tuple(spring for spring in springs if not spring.is_linear)
+    couplings = np.zeros(2 * len(springs), NONLINEAR)
+    couplings["mass"] = np.ravel([(s.start, s.end) for s in springs])
+    couplings["other"] = np.ravel([(s.end, s.start) for s in springs])
+    couplings["offset"] = np.ravel([(s.next_cell, -s.next_cell) for s in springs])
+    couplings["sign"] = [1.0, -1.0] * len(springs)
+    couplings["law"] = np.repeat(spring_laws(springs), 2)
+    return couplings
+
+
+def _coefficients(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The arrays ``COEFFICIENTS`` of a rank's cells."""
+    if chain.is_uniform() and not layout.damped:
+        none = np.zeros(0)
+        return none, none, none, none
+
+    masses, grounding, stiffness, damping = chain.coefficients(layout.start - 1, layout.stop)
+    inverse_masses = (1 / masses[1:]).T.flatten()
+    if not layout.damped:
+        none = np.zeros(0)
+        return inverse_masses, none, stiffness.T.flatten(), none
+    return inverse_masses, grounding[1:].T.flatten(), stiffness.T.flatten(), damping.T.flatten()

@@ -1,0 +1,78 @@
+"""Contact sites as compiled code sees them: where each acts on a rank's part of the state, its law and its stops.
+
+A site whose masses are in cells of two ranks is followed by both, from the same numbers to the same bits; the one that
+owns the site's cell logs it and has what it dissipates in its ledger.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vipetsc.case import Model
+from vipetsc.compiled import kernel
+from vipetsc.contact.law import create_contacts, hold
+from vipetsc.dynamics.layout import Layout
+
+END = np.dtype([(name, np.int64) for name in ("u", "v", "cell", "mass")])
+"""An end of a site: components of its displacement and velocity, -1 on ground; its owned cell, else -1; its mass."""
+SITE_DOFS = np.dtype([("host", END), ("resonator", END), ("ledger", np.int64)])
+"""A site: its ends, the component of the energy that it dissipates, -1 on a rank that does not own the site."""
+
+
+def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
+    """Sites of dtype ``SITE``, free or held together; a number below 0 is a site without stops."""
+    numbers = np.maximum(np.asarray(numbers, np.int64), -1)
+    chain = model.chain
+
+    # A row after the last site is that of number -1: no stops, the cell's own pair.
+    gaps = np.array(model.gaps or [(gap, gap) for gap in chain.clearances]).reshape(-1, 2)
+    gaps = np.vstack([gaps, [[np.inf] * 2]])[numbers]
+    masses = np.array([*chain.reduced_masses(), chain.cell.reduced_mass])[numbers]
+    joins_next_cell = np.array([*(pair.next_cell for pair in chain.contact_pairs), False])[numbers]
+    laws = [model.laws[i] if model.laws and i >= 0 else model.contact for i in numbers]
+    sites = create_contacts(laws, gaps, masses, model.scale)
+
+    least = gaps.min(axis=1)
+    permanent = (least < 0) | ((least == 0) & joins_next_cell & (sites["damping"] == 0))
+    hold(sites, laws, permanent, speed=model.scale * model.drive.frequency)
+    return sites
+
+
+def create_site_dofs(model: Model, layout: Layout, ghosts: tuple[int, int]) -> np.ndarray:
+    """Records (site,) of dtype ``SITE_DOFS`` of the sites ``layout.contacts``.
+
+    ``ghosts`` are the first components of the neighbouring cells on the left and on the right.
+    """
+    chain = model.chain
+    n, d = layout.owned, layout.dofs
+
+    def end(cell: int, mass: int) -> tuple[int, int, int, int]:
+        if mass < 0:
+            return -1, -1, -1, -1
+        here = cell % chain.cells - layout.start
+        if 0 <= here < n:
+            return mass * n + here, (d + mass) * n + here, here, mass
+        first = ghosts[cell >= layout.stop]
+        return first + mass, first + d + mass, -1, mass
+
+    site_dofs = np.zeros(len(layout.contacts), SITE_DOFS)
+    pairs = chain.contact_pairs
+    for row, i in zip(site_dofs, layout.contacts, strict=True):
+        pair = pairs[i]
+        cell = chain.sites[i]
+        if cell == chain.cells - 1 and layout.start == 0 and n < chain.cells:
+            cell = -1  # of a ring, as its first cells see it
+        row["host"] = end(cell, pair.host)
+        row["resonator"] = end(cell + pair.next_cell, pair.resonator)
+
+    owned = np.isin(layout.contacts, layout.sites)
+    site_dofs["ledger"] = np.where(owned, layout.dissipated + np.cumsum(owned) - 1, -1)
+    return site_dofs
+
+
+@kernel
+def relative_motion(y: np.ndarray, site_dofs: np.ndarray, i: int) -> tuple[float, float]:
+    """w = u_resonator - u_host in m of site ``i`` in the state ``y``, and w' in m/s."""
+    host, resonator = site_dofs[i].host, site_dofs[i].resonator
+    if host.u < 0:
+        return y[resonator.u], y[resonator.v]
+    return y[resonator.u] - y[host.u], y[resonator.v] - y[host.v]
