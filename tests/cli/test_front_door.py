@@ -14,7 +14,7 @@ import h5py
 import pytest
 
 from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
-from vipetsc.cli.doctor import doctor_table
+from vipetsc.cli.verbs.doctor_verb import doctor_table
 from vipetsc.figures.registry import FIGURES
 
 SMALL = """

@@ -9,6 +9,7 @@ import re
 import shlex
 import sys
 import termios
+from dataclasses import replace
 from pathlib import Path
 
 from mpi4py import MPI
@@ -17,7 +18,8 @@ import pytest
 
 import vipetsc as package
 from vipetsc import parallel
-from vipetsc.cli.main import EXAMPLES, VERBS, _parser
+from vipetsc.cli.main import _parser
+from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.parallel import BAR, Progress
 
 ROOT = Path(package.__file__).parents[1]
@@ -28,13 +30,12 @@ STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3}"
 
 
 def test_every_verb_has_an_example_that_it_takes(in_process):
-    assert EXAMPLES.keys() == VERBS.keys()
-    for name, example in EXAMPLES.items():
-        words = shlex.split(example.partition(" > ")[0])
+    for verb in VERBS.values():
+        words = shlex.split(verb.example.partition(" > ")[0])
         options = _parser().parse_args(words)
-        assert options.verb == name
+        assert options.verb == verb.name
         if getattr(options, "case", None):
-            assert (ROOT / options.case).exists(), example
+            assert (ROOT / options.case).exists(), verb.example
     shown = in_process("law", "--help")
     assert shown.returncode == 0 and "example: vipetsc law runs/law.toml" in shown.stdout
 
@@ -73,7 +74,7 @@ def test_what_ends_a_verb_stands_in_its_log(in_process, tmp_path, monkeypatch):
     def fail(*arguments: object) -> int:
         raise RuntimeError("the disk is on fire")
 
-    monkeypatch.setitem(VERBS, "doctor", (fail, *VERBS["doctor"][1:]))
+    monkeypatch.setitem(VERBS, "doctor", replace(VERBS["doctor"], function=fail))
     with pytest.raises(RuntimeError):
         in_process("doctor", "--log", tmp_path / "log")
     assert re.search(rf"^{STAMP} CRITICAL vipetsc: the disk is on fire", (tmp_path / "log").read_text(), flags=re.M)

@@ -17,7 +17,7 @@ from vipetsc.case import keys
 from vipetsc.case.case_file import CaseError, read_section, sections_in
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.verb_cases import SECTIONS
-from vipetsc.cli.main import VERBS
+from vipetsc.cli.verbs.verb_list import VERBS
 
 ROOT = Path(package.__file__).parents[1]
 CASES = sorted([*(ROOT / "runs").glob("*.toml"), *(ROOT / "vipetsc/paper/cases").glob("*.toml")])

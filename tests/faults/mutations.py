@@ -22,7 +22,7 @@ from pydantic import BaseModel
 from vipetsc.case import Case, CaseError, CaseFile, DesignCase, NnmCase
 from vipetsc.case.sweep import SweepTable
 from vipetsc.case.verb_cases import load_every
-from vipetsc.cli.tables import case_rows
+from vipetsc.cli.verbs.verb_list import verb_of
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.options import check_options
 from vipetsc.io.store import RunMemory
@@ -278,7 +278,7 @@ def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
             cases = load_every(path)
             check_options(cases[0])
             for case in cases:
-                case_rows(case, 1)
+                verb_of(case).table(case, 1)
                 if isinstance(case, Case):
                     case.warnings()
                 assert type(case).from_toml(case.to_toml()).to_toml() == case.to_toml()  # a NaN differs from itself

@@ -7,7 +7,7 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.case import CaseError
-from vipetsc.cli.tables import run_case_rows
+from vipetsc.cli.verbs.run_verb import run_rows
 from vipetsc.dynamics import memory, simulate
 from vipetsc.dynamics.memory import memory_available, memory_needed
 
@@ -58,7 +58,7 @@ def test_a_state_beyond_petscs_indices_is_refused_with_the_build_that_counts_it(
     case = small_case(lattice={"cells": 300_000_000}, contacts={"sites": [6], "clearance": 1e-4})
     said = r"lattice.cells = 300000000: makes a state of 2400000002 numbers, more than the 2147483647 .*64-bit-indices"
     monkeypatch.setattr(memory.PETSc, "IntType", np.int32)
-    for refused in (lambda: simulate(case, folder / "run"), lambda: run_case_rows(case, 1)):
+    for refused in (lambda: simulate(case, folder / "run"), lambda: run_rows(case, 1)):
         with pytest.raises(CaseError, match=said):
             refused()
     monkeypatch.setattr(memory.PETSc, "IntType", np.int64)

@@ -9,7 +9,7 @@ from tests.conftest import DIFFERING, small_case
 from vipetsc import spectra
 from vipetsc.case import Case, CaseError
 from vipetsc.case.schema import AnalysisTable
-from vipetsc.cli.lattice import ends_text
+from vipetsc.cli.case_rows import describe_ends
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice.chain import Pair
@@ -107,9 +107,9 @@ def test_an_absorbing_end_is_that_of_all_drives():
     ends = {"cells": 90, "absorbing": {"cells": 10, "strength": 400.0}}
     with pytest.raises(CaseError, match=r"lattice\.absorbing\.end.*driven cell 85"):
         small_case(lattice=ends, drive={"more": [{"frequency": 1500.0, "cell": 85}]})
-    told = ends_text(small_case(lattice=ends, drive=TWO_DRIVES))
+    told = describe_ends(small_case(lattice=ends, drive=TWO_DRIVES))
     assert "at 1500 rad/s" in told and told.count("comes back") == 2
-    in_a_gap = ends_text(small_case(lattice=ends, drive={"frequency": 650.0, "cycles": 200}))
+    in_a_gap = describe_ends(small_case(lattice=ends, drive={"frequency": 650.0, "cycles": 200}))
     assert "no wave comes to it at 650 rad/s" in in_a_gap
     one, both = (small_case(lattice={"cells": 90, "absorbing": {}}, drive=drive) for drive in ({}, TWO_DRIVES))
     assert one.lattice.absorbing != both.lattice.absorbing

@@ -203,6 +203,15 @@ class Case(CaseFile):
         """Radius in m of the spheres in contact, the preset's where another one is not given; None if it is unknown."""
         return self.contacts.radius or (CONTACTS["radius"] if self.lattice.preset else None)
 
+    def runs(self) -> list[CaseFile]:
+        """The case itself: verbs that simulate others vary it."""
+        return [self]
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether the results are drawn, ``output.figures``."""
+        return self.output.figures
+
     def warnings(self) -> list[str]:
         """What is allowed but likely not meant, one sentence each."""
         options = self.petsc.model_extra or {} if self.petsc else {}

@@ -154,6 +154,15 @@ class CaseFile(Section):
         """What is allowed but likely not meant, one sentence each."""
         return []
 
+    def runs(self) -> list["CaseFile"]:
+        """The cases of runs that the verb simulates, as far as they are fixed before it begins."""
+        return []
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether the results are drawn."""
+        return True
+
     def __copy__(self) -> Self:
         # A copy may get other fields (``model_copy``), and what cached properties hold follows from the old ones.
         copied = super().__copy__()

@@ -135,6 +135,15 @@ class OptimiseCase(CaseFile):
         section = self.options.model_dump(exclude_none=True)
         return tomli_w.dumps({"name": self.name} | self.table | {"optimise": section})
 
+    def runs(self) -> list[CaseFile]:
+        """The case to begin with, of which designs are variations."""
+        return [self.base]
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether the results are drawn, ``output.figures`` of the case to begin with."""
+        return self.base.output.figures
+
     @property
     def sites(self) -> list[int]:
         """Cells (1-based) of the sites of the case to begin with."""

@@ -167,6 +167,15 @@ class Sweep(CaseFile):
             raise CaseError(members[0].problems, self.name)
         return members
 
+    def runs(self) -> list[CaseFile]:
+        """The valid cases among the members that are tried."""
+        return [member.case for member in self.members(MOST_TRIED) if member.case]
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether the results are drawn, ``output.figures`` of the members."""
+        return bool(self.table.get("output", {}).get("figures", True))
+
     def names(self) -> dict[str, str]:
         """A short name for every key that varies: its last part, or all of it where that is not unique."""
         keys = [key for axis in self.axes for key in axis]

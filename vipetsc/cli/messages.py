@@ -1,9 +1,9 @@
-"""What is told: answers on stdout, progress and warnings on stderr, all of it in a file if ``--log`` names one."""
+"""Messages: answers on stdout, progress and warnings on stderr, all of them in a file if ``--log`` names one."""
 
 import argparse
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -13,45 +13,62 @@ from mpi4py import MPI
 from vipetsc.io.lock import FolderError
 from vipetsc.parallel import BAR, on_root
 
-logger, answers = logging.getLogger("vipetsc"), logging.getLogger("vipetsc.answers")
+logger = logging.getLogger("vipetsc")
+answers = logging.getLogger("vipetsc.answers")
 OFTEN = {"vipetsc.step", "vipetsc.landing", "vipetsc.read"}  # phases that --verbose leaves out
 
 
 def echo(comm: MPI.Comm, text: str, stream: TextIO | None = None) -> None:
-    """Tell ``text`` on rank 0, as an answer; with stderr as the ``stream`` as a warning."""
-    if comm.rank == 0:
-        (answers.info if stream is None else logger.warning)("%s", text)
+    """Print ``text`` on rank 0, as an answer; with stderr as the ``stream`` as a warning."""
+    if comm.rank != 0:
+        return
+    if stream is None:
+        answers.info("%s", text)
+    else:
+        logger.warning("%s", text)
+
+
+def echo_paths(comm: MPI.Comm, paths: Iterable[Path]) -> None:
+    """Print on rank 0 which files were written."""
+    for path in paths:
+        echo(comm, f"  {path}")
+
+
+def echo_warnings(comm: MPI.Comm, warnings: Iterable[str]) -> None:
+    """Print on rank 0 what a user should know about a case or a result."""
+    for warning in warnings:
+        echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
 
 
 @contextmanager
-def told(comm: MPI.Comm, options: argparse.Namespace, asked: bool) -> Iterator[None]:
-    """Tell within the block what ``options`` (quiet, verbose, log) want; what was ``asked`` for also when quiet.
+def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[None]:
+    """Print within the block what ``options`` (quiet, verbose, log) want; an answer that was asked for even when quiet.
 
-    All ranks must call it. Raises FolderError if the file cannot be written.
+    All ranks must call it. Raises FolderError if the file of ``--log`` cannot be written.
     """
-    out, err = logging.StreamHandler(sys.stdout), logging.StreamHandler(sys.stderr)
-    handlers: list[logging.Handler] = [out, err]
-    out.addFilter(lambda record: record.name == answers.name and (asked or not options.quiet))
-    err.addFilter(lambda record: record.name != answers.name)
-    err.setLevel(logging.WARNING if options.quiet else logging.DEBUG)
+    handlers = _stream_handlers(quiet=options.quiet, is_answer=is_answer)
     if options.log:
-        on_root(comm, lambda: _writable(options.log))
+        on_root(comm, lambda: _check_writable(options.log))
         if comm.rank == 0:
-            file = logging.FileHandler(options.log, encoding="utf-8")
-            file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-            handlers.append(file)
-    level, logger.propagate = logger.level, False
-    logger.setLevel(logging.DEBUG if options.verbose and comm.rank == 0 else logging.INFO)
+            handlers.append(_file_handler(options.log))
+
+    is_verbose = options.verbose and comm.rank == 0
+    level = logger.level
+    logger.propagate = False
+    logger.setLevel(logging.DEBUG if is_verbose else logging.INFO)
     logging.getLogger(BAR).setLevel(logging.CRITICAL if options.quiet else logging.NOTSET)
     for handler in handlers:
         logger.addHandler(handler)
-    if options.verbose and comm.rank == 0:
-        sys.addaudithook(_tell_phase)
+    if is_verbose:
+        sys.addaudithook(_report_phase)
+
     try:
         yield
     except Exception as error:
-        for handler in handlers[2:]:  # on stderr the process's own hook tells it
-            handler.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))
+        # In the file alone: on stderr the process's own hook reports it.
+        for handler in handlers:
+            if isinstance(handler, logging.FileHandler):
+                handler.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))
         raise
     finally:
         for handler in handlers:
@@ -61,14 +78,30 @@ def told(comm: MPI.Comm, options: argparse.Namespace, asked: bool) -> Iterator[N
         logger.setLevel(level)
 
 
-def _writable(path: Path) -> None:
+def _stream_handlers(quiet: bool, is_answer: bool) -> list[logging.Handler]:
+    """The handlers of stdout, for answers, and of stderr, for all else."""
+    out = logging.StreamHandler(sys.stdout)
+    out.addFilter(lambda record: record.name == answers.name and (is_answer or not quiet))
+    err = logging.StreamHandler(sys.stderr)
+    err.addFilter(lambda record: record.name != answers.name)
+    err.setLevel(logging.WARNING if quiet else logging.DEBUG)
+    return [out, err]
+
+
+def _file_handler(path: Path) -> logging.Handler:
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    return handler
+
+
+def _check_writable(path: Path) -> None:
     try:
         path.open("a").close()
     except OSError as error:
         raise FolderError(f"--log {path}: {error.strerror}; name a file that can be written") from error
 
 
-def _tell_phase(event: str, arguments: tuple[Any, ...]) -> None:
-    """A hook for Python's audit events, which stays for good: what a verb begins, while somebody wants to know."""
+def _report_phase(event: str, arguments: tuple[Any, ...]) -> None:
+    """Log the phase that a verb begins (a hook for audit events, which stays installed until the process ends)."""
     if event.startswith("vipetsc.") and event not in OFTEN and logger.isEnabledFor(logging.DEBUG):
         logger.debug("%s %s", event.removeprefix("vipetsc."), " ".join(map(str, arguments)))

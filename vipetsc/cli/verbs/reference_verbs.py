@@ -1,4 +1,4 @@
-"""Verbs that tell about the program itself: chapters of the manual, the schema of case files, shell completion."""
+"""Verbs on the program itself: chapters of the manual, the schema of case files, completion in a shell."""
 
 import argparse
 import json
@@ -8,7 +8,9 @@ from importlib.resources import files
 from mpi4py import MPI
 
 from vipetsc.case import CaseError, Problem
-from vipetsc.cli.verbs import DONE, echo
+from vipetsc.cli.arguments import argument
+from vipetsc.cli.messages import echo
+from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.parallel import StopRequest, on_root
 
 KEYS = "case-keys"  # the chapter that is made from the schema
@@ -16,12 +18,14 @@ KEYS = "case-keys"  # the chapter that is made from the schema
 
 def chapters(index: str = "index") -> dict[str, str]:
     """Names and titles of the manual's chapters, or of the pages that another ``index`` than its own leads to."""
-    names = [*([KEYS] if index == "index" else ()), *re.findall(r"\]\((\S+)\.md\)", chapter(index))]
+    names = re.findall(r"\]\((\S+)\.md\)", chapter(index))
+    if index == "index":
+        names.append(KEYS)
     return {name: chapter(name).partition("\n")[0].removeprefix("# ") for name in sorted(names)}
 
 
 def chapter(name: str) -> str:
-    """The text of a chapter; that of all keys is made of their schema."""
+    """The text of a chapter; the one of all keys is made of their schema."""
     if name == KEYS:
         from vipetsc.case.keys import chapter as all_keys
 
@@ -30,7 +34,7 @@ def chapter(name: str) -> str:
 
 
 def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """A chapter of the manual as plain text, or which there are."""
+    """Print a chapter of the manual as plain text, or a list of them."""
     titles, studies = on_root(comm, lambda: (chapters(), chapters("gallery")))
     if options.topic is None:
         width = max(map(len, titles))
@@ -39,8 +43,8 @@ def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
     elif options.topic in titles | studies:
         echo(comm, on_root(comm, lambda: plain(chapter(options.topic))))
     else:
-        known = ", ".join(titles | studies)
-        raise CaseError([Problem("TOPIC", options.topic, f"no chapter; there are {known}")], "manual")
+        names = ", ".join(titles | studies)
+        raise CaseError([Problem("TOPIC", options.topic, f"no chapter; there are {names}")], "manual")
     return DONE
 
 
@@ -56,12 +60,16 @@ def _columns(rows: str) -> str:
     cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows.splitlines()]
     cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]) - 1)]
-    lines = ["  ".join([*(f"{cell:<{n}}" for cell, n in zip(row, widths, strict=False)), row[-1]]) for row in cells]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+    lines = []
+    for row in cells:
+        padded = [f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)]
+        lines.append("  ".join([*padded, row[-1]]).rstrip())
+    return "\n".join(lines) + "\n"
 
 
 def schema(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """The JSON schema of case files."""
+    """Print the JSON schema of case files."""
     from vipetsc.case.keys import json_schema
 
     echo(comm, on_root(comm, lambda: json.dumps(json_schema(), indent=2)))
@@ -69,9 +77,36 @@ def schema(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 
 def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """A script by which the shell completes verbs, options and files."""
+    """Print a script by which the shell completes verbs, options and files."""
     import shtab
 
     kinds = {"case": shtab.FILE, "path": shtab.FILE, "--out": shtab.DIRECTORY}
     echo(comm, on_root(comm, lambda: shtab.complete(options.parser(kinds), options.shell)))
     return DONE
+
+
+MANUAL = PlainVerb(
+    name="manual",
+    text="a chapter of the manual, as plain text",
+    example="manual case-file",
+    arguments=(argument("topic", nargs="?", metavar="TOPIC", help="a chapter; a list of them if left out"),),
+    function=manual,
+    is_answer=True,
+)
+
+SCHEMA = PlainVerb(
+    name="schema",
+    text="the JSON schema of case files, for editors",
+    example="schema > vipetsc.schema.json",
+    function=schema,
+    is_answer=True,
+)
+
+COMPLETION = PlainVerb(
+    name="completion",
+    text="what a shell needs to complete verbs, options and files",
+    example="completion bash > ~/.local/share/bash-completion/completions/vipetsc",
+    arguments=(argument("shell", choices=("bash", "zsh"), help="the shell whose completions are printed"),),
+    function=completion,
+    is_answer=True,
+)

@@ -1,0 +1,92 @@
+"""What follows from a case, in words: the lattice with its ends, losses, contacts and sites, and how a run begins."""
+
+import numpy as np
+
+from vipetsc.case import Case
+from vipetsc.case.contacts import describe_stops
+from vipetsc.case.inhomogeneity import lobe_reflection
+from vipetsc.case.initial import InitialTable
+from vipetsc.case.warnings import losses
+from vipetsc.cli.tables import first_few
+from vipetsc.lattice import gaps, pass_bands
+from vipetsc.lattice.damped import absorber, reflection
+
+
+def lattice_rows(case: Case) -> list[tuple[str, str]]:
+    """Name, lattice, bands and contacts of a case, as rows of a table."""
+    model = case.model()
+    chain = model.chain
+    cell = chain.cell
+
+    lattice = f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {describe_ends(case)}"
+    if case.lattice.preset:
+        lattice += f", reading {case.lattice.reading}"
+    bands = pass_bands(cell)
+    gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in gaps(bands))
+    laws = model.laws[:8] or (model.contact,)
+    clearances = first_few(describe_stops(model.gaps, chain.clearances))
+
+    return [
+        ("case", case.name),
+        ("lattice", lattice),
+        ("pass bands", ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands) + " rad/s"),
+        ("gaps", f"{gap_list} rad/s" if gap_list else "none"),
+        ("loss", describe_losses(case)),
+        ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
+        ("sites", first_few([cell + 1 for cell in chain.sites])),
+        ("clearance", f"{clearances} mm" if chain.sites else "none"),
+    ]
+
+
+def describe_ends(case: Case) -> str:
+    """The ends; of one that absorbs, what comes back of the energy of a wave at each drive's frequency."""
+    lattice = case.lattice
+    absorbing = lattice.absorbing
+    if absorbing is None or not (absorbing.cells and absorbing.strength):
+        return f"{lattice.ends} ends"
+
+    end = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength)
+    reflections = []
+    for omega, cycles in dict.fromkeys((drive.frequency or 0.0, drive.cycles) for _, drive in case.drive.every):
+        back = reflection(end, omega, absorbing.cells)
+        lobe = lobe_reflection(end, omega, cycles)
+        if np.isfinite(lobe):
+            reflections.append(f"{back:.1e} of the energy comes back at {omega:.6g} rad/s, {lobe:.1e} of the burst's")
+        else:
+            reflections.append(f"no wave comes to it at {omega:.6g} rad/s")
+
+    which = "both ends absorb"
+    if absorbing.end != "both":
+        which = f"{lattice.ends} ends, the {absorbing.end} one absorbs"
+    return f"{which} over {absorbing.cells} cells: {'; '.join(reflections)}"
+
+
+def describe_losses(case: Case) -> str:
+    """The loss ratio of each band: least, largest and mean over its wavenumbers; empty where none is asked for."""
+    sentences = []
+    for band, (asked, least, mean, most) in enumerate(losses(case.lattice), 1):
+        sentence = f"band {band} {least:.3g}-{most:.3g}, mean {mean:.3g}"
+        if np.isfinite(asked):
+            sentence += f" (asked {asked:.3g})"
+        sentences.append(sentence)
+    return "; ".join(sentences)
+
+
+def describe_initial(initial: InitialTable | None) -> str:
+    """What a run begins with; empty for a lattice at rest."""
+    if initial is None:
+        return ""
+    if initial.kind == "file":
+        if initial.time is not None:
+            return f"{initial.path} at {initial.time:g} s"
+        if initial.orbit is not None:
+            return f"{initial.path}, orbit {initial.orbit}"
+        return str(initial.path)
+
+    size = f"{initial.amplitude:.4g} m" if initial.amplitude else f"{initial.energy:.4g} J"
+    if initial.kind == "mode":
+        return f"mode {initial.number or f'near {initial.near:g} rad/s'}, {size}"
+    return (
+        f"a packet of band {initial.band} about kappa = {(initial.wavenumber or 0) / np.pi:.4f} pi,"
+        f" {initial.width:g} cells wide in cell {initial.cell}, {size}"
+    )

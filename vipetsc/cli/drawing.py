@@ -1,0 +1,82 @@
+"""Pictures of what a folder holds, drawn from its files over all ranks."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mpi4py import MPI
+
+from vipetsc.io.folder import FolderError
+from vipetsc.parallel import on_every_rank, on_root
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What is drawn of the results of a verb.
+
+    ``source`` is the name of these pictures in the registry of figures, ``file`` the one that shows that a folder holds
+    results to draw (a pattern as of ``Path.glob``), ``noun`` what that file is. ``prepare`` checks folders, and
+    measures what is missing in them or older than its run; without it, a file that cannot be read is found out by
+    drawing it. ``recognise`` says whether folders hold such results where one ``file`` in one folder does not tell.
+    """
+
+    source: str
+    file: str
+    noun: str
+    prepare: Callable[[Sequence[Path]], None] | None = None
+    recognise: Callable[[Sequence[Path]], bool] | None = None
+
+    def are_of(self, folders: Sequence[Path]) -> bool:
+        """Whether these pictures show what ``folders`` hold."""
+        if self.recognise:
+            return self.recognise(folders)
+        return len(folders) == 1 and any(folders[0].glob(self.file))
+
+
+def draw_pictures(
+    pictures: Pictures,
+    folders: Sequence[Path],
+    comm: MPI.Comm,
+    names: list[str] | None = None,
+    formats: tuple[str, ...] = ("png",),
+    afresh: bool = True,
+) -> list[Path]:
+    """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older.
+
+    ``names`` are figures among ``pictures``, all by default; unless ``afresh``, those that are newer than the files
+    they show stay. Returns the files written, on rank 0, an empty list on the others. Raises FolderError for folders
+    that hold nothing to draw, and for a figure that does not exist.
+    """
+    from vipetsc.figures.registry import draw
+
+    def draw_part() -> list[Path]:
+        try:
+            return draw(pictures.source, folders, names, formats, rank=comm.rank, ranks=comm.size, newest=newest)
+        except (OSError, KeyError, ValueError) as error:
+            if pictures.prepare:  # which has checked the files, so that this is no matter of the folder
+                raise
+            article = "an" if pictures.noun[0] in "aeiou" else "a"
+            path = folders[0] / pictures.file
+            raise FolderError(f"{path}: is not {article} {pictures.noun} of vipetsc ({error})") from None
+
+    on_root(comm, lambda: prepare(pictures, folders, names))
+    newest = None if afresh else on_root(comm, lambda: newest_result(folders))
+    drawn = on_every_rank(comm, draw_part)
+    return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
+
+
+def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None = None) -> None:
+    """Check what is to be drawn, and measure what is missing or older than its run; on one rank."""
+    from vipetsc.figures.registry import figure_names
+
+    try:
+        figure_names(pictures.source, names)
+    except KeyError as error:
+        raise FolderError(f"--fig: {error.args[0]}") from None
+    if pictures.prepare:
+        pictures.prepare(folders)
+
+
+def newest_result(folders: Sequence[Path]) -> float:
+    """When the newest file of results in ``folders`` was written."""
+    return max(path.stat().st_mtime for folder in folders for path in folder.glob("*.h5"))

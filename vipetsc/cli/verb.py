@@ -1,0 +1,153 @@
+"""What the command line knows of a verb: one record, from which parser, completion, checks and tests take their lists.
+
+A ``PlainVerb`` is a function. A ``StudyVerb`` computes results of a case into a folder, and all of these run in one
+frame: the case is read, its PETSc options are checked, its warnings are printed, the folder is locked, the study
+computes, the pictures are drawn, and the exit code says how that went.
+"""
+
+import argparse
+import os
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from vipetsc.case import CaseFile
+from vipetsc.cli.arguments import Argument
+from vipetsc.cli.drawing import Pictures, draw_pictures
+from vipetsc.cli.messages import echo, echo_paths, echo_warnings
+from vipetsc.io.folder import FolderKind
+from vipetsc.io.lock import locked
+from vipetsc.parallel import StopRequest, on_root
+
+DONE, FAILED, BAD_INPUT, STOPPED = 0, 1, 2, os.EX_TEMPFAIL
+
+Rows = list[tuple[str, str]]
+Function = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verb(ABC):
+    """One verb of the command line.
+
+    ``text`` is its line in the help, ``example`` a call that the help shows, without the program's name. ``results``
+    is what its folder holds, for verbs that leave results of their own and go on with them. One that ``is_stoppable``
+    looks at requests to stop, and saves first; others end where they are. What one that ``is_answer`` prints was asked
+    for, and is printed with ``--quiet`` too. One that ``takes_petsc_options`` makes those of time stepping part of its
+    case.
+    """
+
+    name: str
+    text: str
+    example: str
+    arguments: tuple[Argument, ...] = ()
+    results: FolderKind | None = None
+    is_stoppable: bool = False
+    is_answer: bool = False
+    takes_petsc_options: bool = False
+
+    @abstractmethod
+    def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+        """Do what ``options`` ask for; returns the exit code. All ranks must call it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlainVerb(Verb):
+    """A verb that is a ``function`` of the parsed options, the ranks and a request to stop."""
+
+    function: Function
+
+    def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+        """Call the function; returns its exit code."""
+        return self.function(options, comm, stop)
+
+
+@dataclass
+class Work:
+    """What a study is given besides its case: where it leaves its results, on which ranks, and how it was asked to."""
+
+    options: argparse.Namespace
+    folder: Path
+    comm: MPI.Comm
+    stop: StopRequest
+    warned: list[str] = field(default_factory=list)
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """The keywords that every study takes: ``force``, ``resume``, ``stop``, ``progress``."""
+        asked = {"force": self.options.force, "resume": self.options.resume}
+        return asked | {"stop": self.stop, "progress": True}
+
+    def report(self, text: str) -> None:
+        """Print ``text`` on rank 0, as an answer."""
+        echo(self.comm, text)
+
+    def warn(self, sentences: Iterable[str]) -> None:
+        """Print on rank 0 those ``sentences`` that were not printed before."""
+        new = [sentence for sentence in dict.fromkeys(sentences) if sentence not in self.warned]
+        echo_warnings(self.comm, new)
+        self.warned += new
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a study ended, the same on all ranks.
+
+    ``complete``: all that was asked for is there; ``failures`` say what is not, and why, and are printed last;
+    ``drawable``: the folder holds what pictures show.
+    """
+
+    complete: bool = True
+    drawable: bool = True
+    failures: Sequence[str] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyVerb(Verb):
+    """A verb that computes results of a ``case`` into a folder.
+
+    ``study`` computes, prints what came out, and says how it ended; all ranks call it. ``table`` are the rows that
+    ``validate`` prints of a case on so many ranks, ``pictures`` what is drawn of the results. The folder is named
+    after the case, with the ``suffix``. ``load`` reads the case from the parsed options, where ``CASE`` and ``--set``
+    do not say all.
+    """
+
+    case: type[CaseFile]
+    study: Callable[[Any, Work], Outcome]
+    table: Callable[[Any, int], Rows]
+    pictures: Pictures
+    results: FolderKind
+    suffix: str = ""
+    load: Callable[[argparse.Namespace], CaseFile] | None = None
+    is_stoppable: bool = True
+
+    def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+        """Compute, draw and report; returns the exit code."""
+        case = on_root(comm, lambda: self.checked_case(options))
+        folder = options.out or Path("runs") / f"{case.name}{self.suffix}"
+        work = Work(options, folder, comm, stop)
+        work.warn(on_root(comm, case.warnings))
+
+        with locked(comm, folder):
+            outcome = self.study(case, work)
+            # What was computed is saved; pictures are drawn by the command that goes on.
+            stop.check(comm)
+            if outcome.drawable and case.wants_pictures:
+                echo_paths(comm, draw_pictures(self.pictures, [folder], comm, afresh=False))
+
+        for failure in outcome.failures:
+            echo(comm, f"vipetsc: {failure}", sys.stderr)
+        return DONE if outcome.complete and not outcome.failures else FAILED
+
+    def checked_case(self, options: argparse.Namespace) -> CaseFile:
+        """The case, with PETSc options that time stepping knows; raises CaseError. Called on one rank."""
+        from vipetsc.dynamics.options import check_options
+
+        case = self.load(options) if self.load else self.case.load(options.case, options.set)
+        for run in case.runs():
+            check_options(run)
+        return case

@@ -1,0 +1,149 @@
+"""The verb ``bands``: pass bands, gaps and group velocities of a cell, and linear modes of the finite lattice."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from vipetsc.case import Case, CaseError, Problem
+from vipetsc.cli.arguments import CASE, OUT, SET, argument
+from vipetsc.cli.messages import echo
+from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.io.atomic import write_text
+from vipetsc.io.folder import origin
+from vipetsc.io.lock import locked
+from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands
+from vipetsc.lattice.damped import damped_bloch, decay_length
+from vipetsc.parallel import StopRequest, on_root
+
+MODES = argument(
+    "--modes",
+    type=int,
+    metavar="N",
+    help="also the N linear modes of the finite lattice that are nearest to a frequency, and their shapes",
+)
+NEAR = argument("--near", type=float, metavar="OMEGA", help="that frequency in rad/s; 0 if left out")
+JSON = argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Print pass bands, gaps and group velocities of a case's cell, and leave them as a table and a picture."""
+    case = on_root(comm, lambda: Case.load(options.case, options.set))
+    folder = options.out or Path("runs") / f"{case.name}-bands"
+
+    # All ranks find modes together; the rest is a second's work of one.
+    modes = modes_report(case, options, folder, comm)
+    text = on_root(comm, lambda: write_bands(case, folder, options.json))
+    echo(comm, text if options.json else text + modes)
+    return DONE
+
+
+def write_bands(case: Case, folder: Path, as_json: bool) -> str:
+    """Leave ``bands.json`` and ``bands.png`` in ``folder``; returns what is printed. Called on one rank."""
+    from vipetsc.figures.registry import draw_bands
+
+    cell = case.lattice.unit_cell()
+    numbers = bands_table(cell) | damping_table(cell, case.drive.frequency or 0.0)
+    with locked(MPI.COMM_SELF, folder):
+        for leftover in folder.glob(".*.part"):  # of a command that was killed
+            leftover.unlink()
+        picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
+        text = json.dumps(numbers | {"picture": str(picture)} | origin(), indent=2)
+        write_text(folder / "bands.json", text + "\n")
+
+    if as_json:
+        return text
+    return f"{bands_report(numbers)}{damping_report(numbers)}\n  {picture}"
+
+
+def bands_table(cell: UnitCell) -> dict[str, Any]:
+    """Bands of a cell with edges and largest group velocity, and gaps."""
+    rows = []
+    for band in pass_bands(cell):
+        kappa, frequency, speed = max_group_velocity(cell, band.number)
+        fastest = {"wavenumber": kappa, "frequency": frequency, "group_velocity": speed}
+        rows.append({"band": band.number, "low": band.low, "high": band.high, "max_group_velocity": fastest})
+    return {
+        "units": {"frequency": "rad/s", "group_velocity": "cells/s", "wavenumber": "rad/cell"},
+        "bands": rows,
+        "gaps": [{"low": low, "high": high} for low, high in gaps(pass_bands(cell))],
+    }
+
+
+def bands_report(numbers: dict[str, Any]) -> str:
+    """``bands_table`` as text."""
+    lines = ["band       low      high  rad/s    fastest: kappa/pi   rad/s   cells/s"]
+    for row in numbers["bands"]:
+        fastest = row["max_group_velocity"]
+        lines.append(
+            f"{row['band']:4d} {row['low']:9.2f} {row['high']:9.2f}           "
+            f"{fastest['wavenumber'] / np.pi:16.4f} {fastest['frequency']:8.2f} {fastest['group_velocity']:8.2f}"
+        )
+    lines += [f" gap {gap['low']:9.2f} {gap['high']:9.2f}" for gap in numbers["gaps"]]
+    return "\n".join(lines)
+
+
+def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
+    """Damping ratio and decay time in s of each band's fastest wave; the decay length in cells at ``frequency``."""
+    if not cell.is_damped:
+        return {}
+
+    rows = []
+    for band in pass_bands(cell):
+        kappa = max_group_velocity(cell, band.number)[0]
+        point = damped_bloch(cell, kappa)
+        rate = point.rate[band.number - 1]
+        rows.append({
+            "band": band.number,
+            "wavenumber": kappa,
+            "damping_ratio": float(point.ratio[band.number - 1]),
+            "frequency": float(rate.imag),
+            "decay_time": float(-1 / rate.real),
+        })  # fmt: skip
+    return {"damping": rows, "decay_length": {"frequency": frequency, "cells": decay_length(cell, frequency)}}
+
+
+def damping_report(numbers: dict[str, Any]) -> str:
+    """``damping_table`` as text; empty for a cell without dashpots."""
+    if "damping" not in numbers:
+        return ""
+
+    lines = ["\nband  damping ratio  decays by 1/e in (s)   at: kappa/pi   rad/s"]
+    for row in numbers["damping"]:
+        lines.append(
+            f"{row['band']:4d} {row['damping_ratio']:14.4g} {row['decay_time']:21.4g} "
+            f"{row['wavenumber'] / np.pi:14.4f} {row['frequency']:8.2f}"
+        )
+    length = numbers["decay_length"]
+    lines.append(f"at {length['frequency']:.6g} rad/s waves decay by 1/e in {length['cells']:.4g} cells")
+    return "\n".join(lines)
+
+
+def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MPI.Comm) -> str:
+    """The linear modes of ``--modes`` as text on rank 0, which writes them; empty if none are asked for."""
+    if options.modes is None:
+        if options.near is not None:
+            raise CaseError([Problem("--near", options.near, "says near which frequency --modes are; give both")])
+        return ""
+
+    from vipetsc.studies import linear_modes
+
+    with locked(comm, folder):
+        data = linear_modes.find_modes(case, options.modes, options.near or 0.0, folder, comm)
+    if data is None:
+        return ""
+    return f"\n{linear_modes.modes_report(data)}\n  {folder / 'modes.h5'}"
+
+
+VERB = PlainVerb(
+    name="bands",
+    text="pass bands, gaps and group velocities of a cell",
+    example="bands runs/three-mass.toml --json",
+    arguments=(CASE, MODES, NEAR, SET, OUT, JSON),
+    function=bands,
+    is_answer=True,
+)

@@ -1,0 +1,191 @@
+"""The verbs ``nnm`` and ``nfrc``: branches of free and of driven periodic motions, which are drawn alike."""
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vipetsc.case import NnmCase
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.cli.arguments import CASE, OF_STUDIES, case_with
+from vipetsc.cli.case_rows import lattice_rows
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.messages import echo_warnings
+from vipetsc.cli.tables import first_few, table
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import BRANCHES
+from vipetsc.parallel import on_root
+
+if TYPE_CHECKING:
+    from vipetsc.modes.branches.branch import Branch
+    from vipetsc.modes.point import Point
+
+logger = logging.getLogger(__name__)
+
+MOST_SPECIAL = 4  # points of a kind that are printed
+SHOW_EVERY = 0.5  # s between two lines of the live table
+
+
+def follow_modes(case: NnmCase, work: Work) -> Outcome:
+    """Follow the branches of the case; one that fails is written as far as it came."""
+    from vipetsc.modes.branches.follow import claim_branches, follow_all
+    from vipetsc.modes.branches.lattice_follow import follower_of
+
+    comm = work.comm
+    with claim_branches(case, work.folder, comm, work.options.force, work.options.resume) as claim:
+        branches = follow_all(case, claim.folder, comm, claim.going_on, branch_log(), work.stop, follower_of(case))
+        for branch in branches:
+            work.report(branch_table(branch))
+            echo_warnings(comm, [f"{branch.name}: {finding}" for finding in branch.findings])
+
+        # Branches that were stopped do not take the place of earlier ones.
+        work.stop.check(comm)
+        claim.publish()
+
+    failures = [f"{branch.name}: {branch.ending}" for branch in branches if branch.ending.startswith("failed")]
+    return Outcome(failures=comm.bcast(failures))
+
+
+def follow_responses(case: NfrcCase, work: Work) -> Outcome:
+    """Follow the curves of steady states of the case; one that fails is written as far as it came."""
+    from vipetsc.modes.response.nfrc import claim_curves, follow_curves
+
+    comm = work.comm
+    with claim_curves(case, work.folder, comm, work.options.force, work.options.resume) as claim:
+        curves = follow_curves(case, claim.folder, comm, claim.going_on, work.stop)
+        for curve in curves:
+            work.report(table(curve.summary()))
+
+        work.stop.check(comm)
+        # Curves that fail before their first point leave no file, and nothing to replace earlier ones by.
+        has_curves = on_root(comm, lambda: any(claim.folder.glob("branch-*.h5")))
+        if has_curves:
+            claim.publish()
+
+    failures = [f"{curve.name}: {curve.ending}" for curve in curves if curve.ending.startswith("failed")]
+    return Outcome(drawable=has_curves, failures=comm.bcast(failures))
+
+
+def nnm_rows(case: NnmCase, ranks: int) -> Rows:
+    """System, modes, range of energy and contact law of the branches."""
+    contact = case.contact()
+    low, high = case.nnm.energy
+    return [
+        ("nnm", f"{case.nnm.system} system, modes {first_few(case.nnm.modes)}, {low:g} to {high:g} J"),
+        ("nnm contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.onset_exponent:g}"),
+    ]
+
+
+def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
+    """Lattice and contacts; how many curves there are, over what, at which values, and how they are computed."""
+    options = case.nfrc
+    if options.source == "wave":
+        excitation = f"a wave of band {options.band} that comes in, {options.direction}"
+        amplitude_unit = "of the clearance"
+    else:
+        excitation = f"a force on mass {case.drive.mass} of cell {case.drive.cell}"
+        amplitude_unit = "N"
+
+    if options.over == "amplitude":
+        over_unit, fixed, fixed_unit = amplitude_unit, "frequency", "rad/s"
+    else:
+        over_unit, fixed, fixed_unit = "rad/s", "amplitude", amplitude_unit
+
+    low, high = options.range
+    count = len(case.curves())
+    parity = "odd ones alone" if options.symmetric else "even ones too"
+
+    lattice = dict(lattice_rows(case))
+    if options.infinite:
+        lattice["lattice"] = f"infinite, sites by their cells of {case.lattice.cells}"
+    return [
+        *lattice.items(),
+        ("nfrc", f"{count} curve{'s' if count > 1 else ''} over the {options.over}, {low:g} to {high:g} {over_unit}"),
+        ("driven by", excitation),
+        (f"at {fixed}", f"{first_few([f'{value:.6g}' for value in options.fixed])} {fixed_unit}"),
+        ("restitution", first_few([f"{restitution:g}" for restitution in options.restitutions])),
+        ("harmonics", f"up to {options.harmonics}, {parity}; {options.points} points a curve at most"),
+    ]
+
+
+def branch_log() -> Callable[["Branch", "Point"], None]:
+    """A live table of growing branches: a line a point, no more than two a second."""
+    title = "branch           point      T (s)        E (J)  Newton  contacts  max multiplier\n"
+    last = -math.inf
+
+    def show(branch: "Branch", point: "Point") -> None:
+        nonlocal title, last
+        now = time.monotonic()
+        if now - last < SHOW_EVERY:
+            return
+        logger.info(
+            f"{title}{branch.name:<14} {point.index:7d} {point.period:10.4e} {point.energy:12.6e} {point.newton:7d}"
+            f" {point.episodes:9d} {point.multiplier:15.6g}"
+        )
+        title = ""
+        last = now
+
+    return show
+
+
+def branch_table(branch: "Branch") -> str:
+    """How a branch went: length, range, special points, power laws."""
+    regular = branch.regular()
+    lines = [f"{branch.name}: {len(regular)} points; {branch.ending}"]
+    if regular:
+        energy = branch.column("energy")
+        frequency = branch.column("frequency")
+        residual = max(point.residual for point in regular)
+        lines.append(
+            f"  E {energy.min():.6g} to {energy.max():.6g} J, f {frequency.min():.9g} to {frequency.max():.9g} Hz,"
+            f" largest residual {residual:.1e}"
+        )
+
+    special = [point for point in branch.points if point.kind != "regular"]
+    for kind in sorted({point.kind for point in special}):
+        of_kind = [point for point in special if point.kind == kind]
+        lines.append(f"  {kind}: {len(of_kind)}")
+        lines += [f"    E = {point.energy:.12g} J, f = {point.frequency:.11g} Hz" for point in of_kind[:MOST_SPECIAL]]
+
+    if tongues := branch.tongues():
+        lines.append(f"  {len(tongues)} tongues of internal resonances: {', '.join(f'{k}:1' for k in tongues)}")
+    for region, law in branch.fits().items():
+        lines.append(
+            f"  region {region}: df/dE ~ E^{law['exponent']:.4f}, adjusted R^2 {law['adjusted_r2']:.5f}"
+            f" ({law['points']} points)"
+        )
+    return "\n".join(lines)
+
+
+def hold_branches(folders: Sequence[Path]) -> bool:
+    """Whether all folders hold branches; those of one name share a page."""
+    return all(any(folder.glob("branch-*.h5")) and not (folder / "run.h5").exists() for folder in folders)
+
+
+PICTURES = Pictures(source="branches", file="branch-*.h5", noun=BRANCHES.noun, recognise=hold_branches)
+
+NNM = StudyVerb(
+    name="nnm",
+    text="nonlinear normal modes: frequency-energy branches",
+    example="nnm runs/nnm-hertz.toml --quiet --log nnm.log",
+    arguments=(case_with("nnm"), *OF_STUDIES),
+    case=NnmCase,
+    study=follow_modes,
+    table=nnm_rows,
+    results=BRANCHES,
+    pictures=PICTURES,
+)
+
+NFRC = StudyVerb(
+    name="nfrc",
+    text="steady states under a wave or a force, with stability",
+    example="nfrc runs/nfrc.toml",
+    arguments=(CASE, *OF_STUDIES),
+    case=NfrcCase,
+    study=follow_responses,
+    table=nfrc_rows,
+    results=BRANCHES,
+    pictures=PICTURES,
+)

@@ -1,0 +1,36 @@
+"""The verb ``design``: the (lambda, eta) search of the four-band cell."""
+
+from vipetsc.case import DesignCase
+from vipetsc.cli.arguments import CASE, OF_STUDIES
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import SEARCH
+
+
+def search_cells(case: DesignCase, work: Work) -> Outcome:
+    """Search the grid of (lambda, eta) in each of its readings."""
+    from vipetsc.paper.cell_search import search_design
+
+    work.report(search_design(case, work.folder, work.comm, **work.keywords))
+    return Outcome()
+
+
+def design_rows(case: DesignCase, ranks: int) -> Rows:
+    """The size of the grid, and the readings in which it is searched."""
+    search = case.design
+    cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
+    return [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]
+
+
+VERB = StudyVerb(
+    name="design",
+    text="the (lambda, eta) search of the four-band cell",
+    example="design runs/design.toml --set design.lambda.count=10",
+    arguments=(CASE, *OF_STUDIES),
+    case=DesignCase,
+    study=search_cells,
+    table=design_rows,
+    results=SEARCH,
+    pictures=Pictures(source="design", file="design.h5", noun=SEARCH.noun),
+    is_stoppable=False,  # it takes seconds, and has nothing to save on the way
+)

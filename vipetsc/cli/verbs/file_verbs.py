@@ -1,0 +1,74 @@
+"""The verbs ``analyse`` and ``export``: measures of runs that are there, and results in the forms of other programs."""
+
+import argparse
+from pathlib import Path
+
+from mpi4py import MPI
+
+from vipetsc.cli.arguments import SET, argument
+from vipetsc.cli.messages import echo_paths
+from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.io.folder import FolderError
+from vipetsc.io.lock import locked
+from vipetsc.parallel import StopRequest, on_root
+
+
+def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Measure runs that are there; of a sweep, those whose fields were kept, and its ensemble."""
+    from vipetsc.studies.reanalysis import reanalyse_folders
+
+    with locked(comm, *existing_folders(options.path, comm)):
+        echo_paths(comm, reanalyse_folders(options.path, comm, options.set))
+    return DONE
+
+
+def export(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Write ``run.xdmf`` beside a run, and the curves of runs, sweeps, branches and searches as CSV files."""
+    with locked(comm, *existing_folders(options.path, comm)):
+        for path in options.path:
+            echo_paths(comm, on_root(comm, lambda path=path: write_exports(path)))  # type: ignore[misc]
+    return DONE
+
+
+def existing_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
+    """The folders that those of ``paths`` that exist are or lie in."""
+    return on_root(comm, lambda: [path if path.is_dir() else path.parent for path in paths if path.exists()])
+
+
+def write_exports(path: Path) -> list[Path]:
+    """Export what ``path`` is or holds; returns the files. Raises FolderError for one that cannot be read."""
+    from vipetsc.io.export import write_curves, write_xdmf
+
+    folder = path if path.is_dir() else path.parent
+    branches = sorted(path.glob("branch-*.h5")) if path.is_dir() else []
+    written = []
+    try:
+        if (folder / "run.h5").exists():
+            mesh = write_xdmf(folder)
+            if mesh:
+                written.append(mesh)
+        for source in branches or [path]:
+            written += write_curves(source)
+    except (OSError, ValueError) as error:
+        raise FolderError(str(error)) from error
+    return written
+
+
+ANALYSE = PlainVerb(
+    name="analyse",
+    text="measures of runs already made, from their files",
+    example="analyse runs/four-band --set analysis.band_stride=1",
+    arguments=(
+        argument("path", type=Path, nargs="+", metavar="PATH", help="folder of a run or of a sweep, or a run.h5"),
+        SET,
+    ),
+    function=analyse,
+)
+
+EXPORT = PlainVerb(
+    name="export",
+    text="XDMF (ParaView) beside a run, and curves of any results as CSV",
+    example="export runs/four-band",
+    arguments=(argument("path", type=Path, nargs="+", metavar="PATH", help="folder or file of results"),),
+    function=export,
+)

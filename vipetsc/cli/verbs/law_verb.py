@@ -1,0 +1,38 @@
+"""The verb ``law``: the scattering law of one site."""
+
+from vipetsc.case import LawCase
+from vipetsc.cli.arguments import CASE, OF_STUDIES
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.tables import table
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import LAW
+
+
+def take_law(case: LawCase, work: Work) -> Outcome:
+    """Take the scattering law, refined until it is as fine as asked for."""
+    from vipetsc.studies.one_site import make_law
+
+    law = make_law(case, work.folder, work.comm, **work.keywords)
+    work.report(table(law.summary()))
+    return Outcome()
+
+
+def law_rows(case: LawCase, ranks: int) -> Rows:
+    """How far the law reaches, and the site, the ring and the samples of its runs."""
+    site = case.one_site()
+    where = f"a clearance of {site.clearance:.5g} m {site.distance} cells from the drive"
+    return [("law", f"z to {case.law.largest:g}, {where}; ring of {site.cells} cells, {site.samples} samples")]
+
+
+VERB = StudyVerb(
+    name="law",
+    text="the scattering law of one site, refined; goes on where it was",
+    example="law runs/law.toml --set law.tolerance=0.02",
+    arguments=(CASE, *OF_STUDIES),
+    case=LawCase,
+    study=take_law,
+    table=law_rows,
+    results=LAW,
+    pictures=Pictures(source="law", file="law.h5", noun=LAW.noun),
+    suffix="-law",
+)

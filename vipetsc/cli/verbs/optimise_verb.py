@@ -1,0 +1,38 @@
+"""The verb ``optimise``: the best clearances, sites, restitution or cell for an objective."""
+
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.cli.arguments import OF_STUDIES, case_with
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.tables import first_few
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import OPTIMUM
+
+
+def search_designs(plan: OptimiseCase, work: Work) -> Outcome:
+    """Search for the best design, or for the front of two objectives."""
+    from vipetsc.studies.optimum_search import run_search
+
+    work.report(run_search(plan, work.folder, work.comm, **work.keywords))
+    return Outcome()
+
+
+def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
+    """How many designs of what are searched, and for which objectives."""
+    variables = first_few([variable.name for variable in plan.variables()])
+    return [
+        ("optimise", f"{plan.options.budget} designs of {variables}"),
+        *(("objective", objective.describe()) for objective in plan.options.objective),
+    ]
+
+
+VERB = StudyVerb(
+    name="optimise",
+    text="the best design for an objective; goes on where it was",
+    example="optimise runs/optimise-clearances.toml --set optimise.budget=40",
+    arguments=(case_with("optimise"), *OF_STUDIES),
+    case=OptimiseCase,
+    study=search_designs,
+    table=optimise_rows,
+    results=OPTIMUM,
+    pictures=Pictures(source="optimum", file="optimum.h5", noun=OPTIMUM.noun),
+)

@@ -1,0 +1,51 @@
+"""The verb ``paper``: every figure and claim of the paper."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+from vipetsc.cli.arguments import OUT, argument
+from vipetsc.cli.messages import echo
+from vipetsc.cli.verb import DONE, FAILED, PlainVerb
+from vipetsc.io.folder import PAPER
+from vipetsc.parallel import StopRequest, on_root
+
+
+def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Compute what is missing of the paper, draw it, measure its claims, and put all into a report."""
+    from vipetsc.paper.make import make_paper, plan_table
+    from vipetsc.paper.plan import FULL, QUICK, paper_plan
+    from vipetsc.paper.report import claims_table
+
+    plan = paper_plan(QUICK if options.quick else FULL)
+    folder = options.out or Path("runs") / ("paper-quick" if options.quick else "paper")
+    if options.list:
+        echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
+        return DONE
+
+    result = make_paper(plan, folder, comm, only=options.only, stop=stop, tell=lambda text: echo(comm, f"  {text}"))
+    for note in result.notes:
+        echo(comm, f"vipetsc: {note}", sys.stderr)
+    echo(comm, claims_table(result.claims))
+    echo(comm, f"  {len(result.made)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
+    return DONE if result.complete else FAILED
+
+
+VERB = PlainVerb(
+    name="paper",
+    text="every figure and claim of the paper, and a report",
+    example="paper --quick --only fig09 C7",
+    arguments=(
+        argument(
+            "--only", nargs="+", default=[], metavar="ID", help="only what these figures (fig05) and claims (C7) need"
+        ),
+        argument("--quick", action="store_true", help="coarse grids: minutes, marked on every picture"),
+        argument("--list", action="store_true", help="what is done, what is left and how long it takes"),
+        OUT,
+    ),
+    function=paper,
+    results=PAPER,
+    is_stoppable=True,
+)

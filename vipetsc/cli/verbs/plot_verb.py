@@ -1,0 +1,175 @@
+"""The verb ``plot``: pictures of what folders hold again, from their files, and movies of runs."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from vipetsc.cli.arguments import Argument, argument
+from vipetsc.cli.drawing import Pictures, draw_pictures, prepare
+from vipetsc.cli.messages import echo, echo_paths
+from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.io.folder import FolderError
+from vipetsc.parallel import StopRequest, on_root
+
+NARROWEST = 320  # pixels
+WIDEST = 3840
+FASTEST = 50.0  # frames a second that a GIF can have
+MOVIE_FORMATS = "gif", "mp4"
+
+
+def positive(text: str) -> float:
+    """A positive, finite number."""
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not positive and finite")
+    return value
+
+
+def window(text: str) -> tuple[int, int]:
+    """First and last of ``A:B``."""
+    first, separator, last = text.partition(":")
+    if not (separator and first.isdigit() and last.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text} is not A:B, the first and the last cell, from 1")
+    return int(first), int(last)
+
+
+# By the field of a movie's `Shot` that each of them sets.
+OF_MOVIES: dict[str, Argument] = {
+    "speed": argument(
+        "--speed",
+        type=positive,
+        metavar="X",
+        help="of a movie: seconds of the run in a second; 10 s for all if left out",
+    ),
+    "start": argument("--from", type=float, metavar="T", dest="start", help="of a movie: its first instant in s"),
+    "stop": argument("--to", type=float, metavar="T", dest="stop", help="of a movie: its last instant in s"),
+    "cells": argument("--cells", type=window, metavar="A:B", help="of a movie: the first and the last cell"),
+    "rate": argument("--rate", type=positive, metavar="N", help="of a movie: frames a second, 15 if left out"),
+    "width": argument("--width", type=int, metavar="PIXELS", help="of a movie: 960 if left out"),
+}
+
+
+def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Draw what folders hold again, from their files, or make a movie of a run."""
+    pictures, folders = on_root(comm, lambda: pictures_of(options.path))
+    formats = set(options.format or ())
+    of_movie = {name: getattr(options, name) for name in OF_MOVIES if getattr(options, name) is not None}
+
+    if options.movie:
+        wrong = formats - {*MOVIE_FORMATS} or (options.fig and {"--fig"})
+        if wrong:
+            raise FolderError(f"--movie: is a gif or an mp4 of its own, without {min(wrong)}")
+        paths, missing = on_root(comm, lambda: film(pictures, folders[0], options.movie, of_movie, formats))
+        echo_paths(comm, paths)
+        if missing:
+            echo(comm, f"vipetsc: {missing}", sys.stderr)
+        return DONE
+
+    misplaced = [OF_MOVIES[name].flag for name in of_movie]
+    misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
+    if misplaced:
+        raise FolderError(f"{misplaced[0]}: is of a movie; add --movie")
+    echo_paths(comm, draw_pictures(pictures, folders, comm, options.fig, tuple(options.format or ("png",))))
+    return DONE
+
+
+def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
+    """The pictures of what ``paths`` hold, and their folders, where files were named; on one rank.
+
+    Folders in which nothing is recognised are those of a run, whose pictures say what is missing. Raises FolderError
+    for folders that cannot share a page.
+    """
+    from vipetsc.cli.verbs.verb_list import study_verbs
+
+    known = {verb.pictures.source: verb.pictures for verb in study_verbs()}
+    files = {pictures.file for pictures in known.values()}
+    folders = [path.parent if path.name in files else path for path in paths]
+    for pictures in known.values():
+        if pictures.are_of(folders):
+            return pictures, folders
+
+    if len(folders) > 1:
+        raise FolderError(f"{' '.join(map(str, paths))}: only sweeps and folders of branches can share a page")
+    return known["run"], folders
+
+
+def film(
+    pictures: Pictures, folder: Path, quantity: str, options: dict[str, Any], formats: set[str]
+) -> tuple[list[Path], str]:
+    """Make a movie of the run in ``folder``, in ``formats``; ``options`` by their names in `Shot`; on one rank.
+
+    Returns the files, and which format could not be made and why. Nothing is written on bad input.
+    """
+    from vipetsc.figures import movie, movie_frames
+    from vipetsc.figures.style import rc_style
+    from vipetsc.io.netcdf import open_netcdf
+    from vipetsc.io.read import open_run
+
+    if pictures.source != "run":
+        raise FolderError(f"--movie: {folder} holds no run; of a sweep: run CASE --member ID, then plot that")
+    if not (folder / "run.h5").exists():
+        raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
+    shot = movie_frames.Shot(quantity, **options)
+    if shot.rate > FASTEST or not NARROWEST <= shot.width <= WIDEST:
+        raise FolderError(
+            f"--rate {shot.rate:g} --width {shot.width}: at most {FASTEST:g} a second, {NARROWEST} to {WIDEST} pixels"
+        )
+
+    has_ffmpeg = movie.ffmpeg() is not None
+    missing = ""
+    if "mp4" in formats and not has_ffmpeg:
+        raise FolderError(f"--format mp4: {movie.REMEDY}")
+    if not formats:
+        formats = {*MOVIE_FORMATS} if has_ffmpeg else {"gif"}
+        missing = "" if has_ffmpeg else f"no MP4: {movie.REMEDY}"
+
+    with rc_style(), ExitStack() as stack:
+        run = stack.enter_context(open_run(folder / "run.h5"))
+        try:
+            movie_frames.check(run, shot)
+        except ValueError as error:
+            raise FolderError(f"{folder}: {error}") from None
+
+        prepare(pictures, [folder])
+        analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
+        stage = movie.Stage(run, movie_frames.scenes(run, analysis, shot), shot.width)
+        paths = [folder / "figures" / f"movie-{quantity}.{name}" for name in MOVIE_FORMATS if name in formats]
+        return movie.write_movie(stage, shot.rate, paths), missing
+
+
+VERB = PlainVerb(
+    name="plot",
+    text="pictures of a finished run again, from its files; movies",
+    example="plot runs/four-band --fig dispersion --format pdf",
+    arguments=(
+        argument(
+            "path",
+            type=Path,
+            nargs="+",
+            metavar="PATH",
+            help="folder of a run, a search or a law, or its run.h5, design.h5, law.h5; or folders of branches, whose"
+            " branches of one name share a page",
+        ),
+        argument("--fig", action="append", metavar="NAME", help="only this figure; may be repeated"),
+        argument(
+            "--format",
+            action="append",
+            choices=("png", "pdf", "gif", "mp4"),
+            help="png if left out, of movies gif, and mp4 with ffmpeg; may be repeated",
+        ),
+        argument(
+            "--movie",
+            nargs="?",
+            choices=("energy", "velocity"),
+            const="energy",
+            help="a movie of a run: energy of the bands by cell, or velocity of the hosts",
+        ),
+        *OF_MOVIES.values(),
+    ),
+    function=plot,
+)

@@ -1,0 +1,79 @@
+"""The verb ``predict``: several sites composed from the answer of one, beside simulations."""
+
+import xarray as xr
+
+from vipetsc.case.predict import PredictCase
+from vipetsc.cli.arguments import CASE, OF_STUDIES
+from vipetsc.cli.case_rows import lattice_rows
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import PREDICTION
+
+SUMMARY = {
+    "onset_amplitude": "first contact (N)",
+    "rms_upper": "rms of the upper bands (decades)",
+    "rms_other": "rms of all bands but the driven one (decades)",
+    "worst_dissipated": "largest difference of what is dissipated",
+    "cpu_seconds": "CPU time without the simulations (s)",
+}
+
+
+def compose_sites(case: PredictCase, work: Work) -> Outcome:
+    """Predict the case's transfer at every amplitude, and simulate it where that is asked for."""
+    from vipetsc.studies.prediction import predict
+
+    prediction = predict(case, work.folder, work.comm, **work.keywords)
+    work.report(prediction_table(prediction))
+    return Outcome()
+
+
+def predict_rows(case: PredictCase, ranks: int) -> Rows:
+    """Lattice and contacts; the amplitudes, the runs that predictions are composed of, what they are compared with."""
+    options = case.predict
+    if options.amplitudes:
+        low = min(options.amplitudes)
+        high = max(options.amplitudes)
+        amplitudes = f"{len(options.amplitudes)} amplitudes, {low:g} to {high:g} N"
+    else:
+        amplitudes = f"{options.count} amplitudes, from that of the first contact to {options.span:g} times it"
+
+    site = case.one_site()
+    where = f"a clearance of {site.clearance:.5g} m {site.distance} cells from the drive"
+    ring = f"ring of {site.cells} cells, {site.samples} samples"
+
+    return [
+        *lattice_rows(case),
+        ("predict", amplitudes),
+        ("composed of", f"{options.points} runs of one site with {where}; {ring}"),
+        ("compared with", "a simulation at every amplitude" if options.simulate else "no simulation"),
+    ]
+
+
+def prediction_table(data: xr.Dataset) -> str:
+    """Predicted and simulated fractions of the energy at every amplitude, and how far apart they are."""
+    kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
+    columns = [(kind, quantity) for quantity in ("upper", "other", "dissipated") for kind in kinds]
+
+    lines = ["   amplitude (N)  " + "  ".join(f"{kind} {quantity}" for kind, quantity in columns)]
+    for row, amplitude in enumerate(data["amplitude"].values):
+        values = []
+        for kind, quantity in columns:
+            width = len(f"{kind} {quantity}")
+            values.append(f"{float(data[f'{kind}/{quantity}'][row]):{width}.4f}")
+        lines.append(f"{amplitude:16.5g}  " + "  ".join(values))
+
+    lines += [f"{text}: {data.attrs[key]:.4g}" for key, text in SUMMARY.items() if key in data.attrs]
+    return "\n".join(lines)
+
+
+VERB = StudyVerb(
+    name="predict",
+    text="several sites from the answer of one, beside simulations",
+    example="predict runs/predict.toml",
+    arguments=(CASE, *OF_STUDIES),
+    case=PredictCase,
+    study=compose_sites,
+    table=predict_rows,
+    results=PREDICTION,
+    pictures=Pictures(source="prediction", file="prediction.h5", noun=PREDICTION.noun),
+)

@@ -1,0 +1,184 @@
+"""The verb ``run``: one simulation, its analysis and its pictures; or a member of a sweep again, whole."""
+
+import argparse
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vipetsc.case import Case, Sweep
+from vipetsc.cli.arguments import CASE, OF_STUDIES, argument
+from vipetsc.cli.case_rows import describe_initial, lattice_rows
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.messages import logger
+from vipetsc.cli.tables import duration, first_few, table
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import RUN, FolderError
+from vipetsc.lattice import waves_at
+from vipetsc.parallel import on_root
+
+if TYPE_CHECKING:
+    from vipetsc.dynamics import Result
+
+MEMBER = argument(
+    "--member",
+    metavar="ID",
+    help="make a member of a sweep (CASE is its file or folder) again, whole: its name, or its number from 0",
+)
+
+
+def load(options: argparse.Namespace) -> Case:
+    """The case of the file, or that of a member of the sweep whose file or folder is given; raises CaseError."""
+    if options.member is None:
+        return Case.load(options.case, options.set)
+
+    path = Path(options.case or "a sweep's case")
+    plan = Sweep.load(path / "case.toml" if path.is_dir() else path)
+    number = plan.number(options.member)
+    return plan.case(number).varied(name=f"{plan.name}-{plan.ids()[number]}", overrides=options.set)
+
+
+def simulate_and_measure(case: Case, work: Work) -> Outcome:
+    """Simulate the case, and measure its fields where they are kept."""
+    from vipetsc.dynamics import simulate
+    from vipetsc.dynamics.cost import estimate
+    from vipetsc.io.export import has_xdmf, write_xdmf
+    from vipetsc.studies.reanalysis import is_measured, measure_run
+
+    result = simulate(case, work.folder, work.comm, **work.keywords)
+    work.warn(result.warnings)
+    faster = on_root(work.comm, lambda: estimate(case, work.comm.size).faster)
+    work.report(run_table(result, faster))
+    if work.comm.rank == 0:
+        logger.debug("statistics %s", json.dumps(result.statistics))
+    work.stop.check(work.comm)
+
+    has_fields = bool(case.output.fields) and result.statistics["samples"] > 1
+    if has_fields:
+        # The linear run of its sweep tells when the wave arrives at the sites of a member.
+        sweep = Path(work.options.case) if work.options.member else None
+        on_root(work.comm, lambda: is_measured(work.folder) or measure_run(work.folder, sweep))
+        on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
+    return Outcome(complete=result.complete, drawable=has_fields)
+
+
+def run_rows(case: Case, ranks: int) -> Rows:
+    """What follows from a case of a run: bands, drive, times, samples, file size, cost on so many ``ranks``."""
+    from vipetsc.dynamics.cost import estimate
+    from vipetsc.dynamics.memory import check_indices, memory_available, memory_needed
+    from vipetsc.dynamics.recorder import recorded_cells, written_together
+
+    model = case.model()
+    check_indices(model)
+    chain = model.chain
+    cost = estimate(case, ranks)
+
+    waves = [
+        f"band {band}, kappa = {kappa / np.pi:.4f} pi, v_g = {speed:.2f} cells/s"
+        for band, kappa, speed in waves_at(chain.cell, model.drive.frequency)
+    ]
+    burst = max(drive.waveform.duration for drive in model.drives)
+
+    columns = len(recorded_cells(case.output, chain.cells)) * chain.cell.dofs * len(case.output.fields)
+    size = 8 * (columns * -(-model.samples // case.output.stride) + len(chain.sites) * model.samples)
+    writer = "parallel" if written_together(model, case.output, ranks) else "gather"
+    free = shutil.disk_usage(".").free
+
+    needed = sum(memory_needed(model, case.output, cost.engine, ranks).values())
+    available = memory_available() / ranks
+    memory = f"{needed / 1e9:.3g} GB on a rank"
+    if needed > available:
+        memory += f", and here are {available / 1e9:.3g} GB"
+
+    time = f"about {duration(cost.seconds)} on {ranks} rank{'s' if ranks > 1 else ''}"
+    if cost.episodes:
+        time += f", {duration(cost.contacts)} of it for about {float(f'{cost.episodes:.1g}'):g} contacts"
+
+    return [
+        *lattice_rows(case),
+        ("begins with", describe_initial(case.initial)),
+        *(("drive", drive.describe()) for _, drive in case.drive.every),
+        ("waves at Om", "; ".join(waves) or "none: in a gap"),
+        ("burst, end", f"{burst:.6g} s, {model.end:.6g} s"),
+        ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
+        ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
+        ("engine", f"{cost.engine}: {cost.note}" if cost.note else cost.engine),
+        (
+            "disk",
+            f"{size / 2**20:.4g} MiB ({writer}), twice that until the run has ended;"
+            f" {free / 2**30:.4g} GiB are free here",
+        ),
+        ("memory", memory),
+        ("time", time),
+        ("faster", cost.faster),
+    ]
+
+
+def run_table(result: "Result", faster: str = "") -> str:
+    """How a run ended and its numbers; ``faster``: what would have been."""
+    numbers = result.statistics
+    if numbers["engine"] == "propagator":
+        method = f"{numbers['method']}, {numbers['bandwidth']} cells each way, exact to {numbers['truncation']:.1g}"
+        steps = f"{numbers['steps']} linear ({method}), {numbers['substeps']} with forces"
+    else:
+        steps = f"{numbers['steps']} accepted, {numbers['rejected']} rejected ({numbers['method']})"
+
+    energy = ""
+    if work := numbers.get("work"):
+        energy = f"work {work:.6g} J, dissipated {100 * numbers['dissipated'] / work:.4g} %"
+        if damped := numbers.get("dissipated_by_damping", 0.0):
+            energy += f" in contacts and {100 * damped / work:.4g} % in dashpots"
+        if numbers["ledger_error"] is not None:
+            energy += f", ledger closes to {numbers['ledger_error']:.2g} of the work"
+
+    rebounds = [*dict.fromkeys(np.ravel(numbers.get("effective_restitution", [])).tolist())]
+    restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)" if rebounds else ""
+    limits = [f"{name} {numbers[name]}" for name in ("grazes", "floored", "clipped", "pulled") if numbers[name]]
+    note = numbers.get("engine_note")
+
+    rows = [
+        ("energy", energy),
+        ("impacts", f"{numbers['episodes']} episodes, {numbers['landings']} landings"),
+        ("restitution", restitution),
+        ("limits", ", ".join(limits)),
+        ("steps", steps),
+        ("time", f"{numbers['wall_seconds']:.2f} s wall, {numbers['cpu_seconds']:.2f} s CPU of all ranks"),
+        ("folder", str(result.folder)),
+        ("engine", f"{numbers['engine']}: {note}" if note else ""),
+        ("faster", faster),
+    ]
+    return f"{result.sentence}\n{table(rows)}"
+
+
+def measure_where_missing(folders: Sequence[Path]) -> None:
+    """Check that a folder holds a finished run, and measure it if its measures are missing or older than the run."""
+    from vipetsc.studies.reanalysis import is_measured, measure_run
+
+    (folder,) = folders
+    run = folder / "run.h5"
+    if not run.exists():
+        raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
+    try:
+        measured = is_measured(folder)
+    except (OSError, ValueError, KeyError) as error:
+        raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
+    if not measured:
+        measure_run(folder)
+
+
+VERB = StudyVerb(
+    name="run",
+    text="one simulation, its analysis and pictures",
+    example="run runs/diatomic.toml --set drive.amplitude=0.8 --out runs/soft",
+    arguments=(CASE, MEMBER, *OF_STUDIES),
+    case=Case,
+    load=load,
+    study=simulate_and_measure,
+    table=run_rows,
+    results=RUN,
+    pictures=Pictures(source="run", file="run.h5", noun="run", prepare=measure_where_missing),
+    takes_petsc_options=True,
+)

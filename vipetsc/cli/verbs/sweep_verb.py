@@ -1,0 +1,93 @@
+"""The verb ``sweep``: every combination in the section [sweep] of a case."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vipetsc.case import Sweep
+from vipetsc.case.sweep import MOST_TRIED
+from vipetsc.cli.arguments import OF_STUDIES, case_with
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.tables import table
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import SWEEP, FolderError
+from vipetsc.io.read import outdated
+
+if TYPE_CHECKING:
+    from vipetsc.studies.sweep import SweepResult
+
+MOST_FAILURES = 10  # that are printed
+
+
+def simulate_members(plan: Sweep, work: Work) -> Outcome:
+    """Simulate the members that are missing, and collect what was measured of all."""
+    from vipetsc.studies.sweep import run_sweep
+
+    result = run_sweep(plan, work.folder, work.comm, **work.keywords)
+    work.warn(result.warnings)
+    work.report(sweep_table(result))
+    return Outcome(complete=result.complete)
+
+
+def sweep_rows(plan: Sweep, ranks: int) -> Rows:
+    """How many members a sweep has, and how many of those tried are no valid cases."""
+    tried = plan.members(MOST_TRIED)
+    impossible = sum(member.case is None for member in tried)
+    counts = " x ".join(map(str, plan.shape))
+    of = "them" if len(tried) == plan.count else len(tried)
+    return [("sweep", f"{plan.count} members ({counts}), {impossible} of {of} impossible")]
+
+
+def sweep_table(result: "SweepResult") -> str:
+    """How a sweep ended: counts, time, what failed."""
+    complete, scaled, failed, missing = (result.count(status) for status in range(4))
+    counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
+    rows = [
+        ("members", f"{result.status.size}: {counts}"),
+        ("made now", f"{result.made} in {result.seconds:.1f} s"),
+        ("ranks busy", ", ".join(f"{100 * busy:.0f} %" for busy in result.busy)),
+    ]
+    if missing:
+        rows.append(("missing", f"{missing}; stopped on request, the same command goes on"))
+    else:
+        rows.append(("leaves", str(result.folder / "ensemble.h5")))
+
+    failures = json.loads((result.folder / "index.json").read_text(encoding="utf-8"))["failed"]
+    rows += [("failed", f"member {row['place']}: {row['reason']}") for row in failures[:MOST_FAILURES]]
+    return table(rows)
+
+
+def relate_to_branches(folders: Sequence[Path]) -> None:
+    """Check that folders hold finished sweeps or branches, and lay sweeps over the branches beside them."""
+    from vipetsc.studies.backbone import relate_folders
+
+    for folder in folders:
+        if reason := outdated(folder):
+            raise FolderError(reason)
+        if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
+            raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
+    relate_folders(folders)
+
+
+def begin_with_a_sweep(folders: Sequence[Path]) -> bool:
+    """Whether the first of the folders holds a sweep; the others are sweeps or branches that share its pages."""
+    return (folders[0] / "ensemble.h5").exists()
+
+
+PICTURES = Pictures(
+    source="sweep", file="ensemble.h5", noun="sweep", prepare=relate_to_branches, recognise=begin_with_a_sweep
+)
+
+VERB = StudyVerb(
+    name="sweep",
+    text="every combination in [sweep]; goes on where it was",
+    example="sweep runs/interband-amplitudes.toml --set sweep.ranks=1",
+    arguments=(case_with("sweep"), *OF_STUDIES),
+    case=Sweep,
+    study=simulate_members,
+    table=sweep_rows,
+    results=SWEEP,
+    pictures=PICTURES,
+    takes_petsc_options=True,
+)

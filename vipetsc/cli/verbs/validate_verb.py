@@ -1,0 +1,69 @@
+"""The verb ``validate``: what follows from a case, read as every verb whose section it has reads it."""
+
+import argparse
+
+from mpi4py import MPI
+
+import numpy as np
+
+from vipetsc.case import Case
+from vipetsc.case.disorder import DisorderTable, values_of
+from vipetsc.case.verb_cases import disorder_of, load_every
+from vipetsc.cli.arguments import CASE, SET
+from vipetsc.cli.messages import echo
+from vipetsc.cli.tables import first_few, table
+from vipetsc.cli.verb import DONE, PlainVerb, Rows
+from vipetsc.parallel import StopRequest, on_root
+
+
+def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Check a case as every verb whose section it has, and print what follows from it."""
+    echo(comm, on_root(comm, lambda: report_of(options, comm.size)))
+    return DONE
+
+
+def report_of(options: argparse.Namespace, ranks: int) -> str:
+    """The rows of all verbs that read the case, and its warnings; raises CaseError. Called on one rank."""
+    from vipetsc.cli.verbs.verb_list import verb_of
+    from vipetsc.dynamics.options import check_options
+
+    cases = load_every(options.case, options.set)
+    rows: Rows = []
+    warnings: list[str] = []
+    for case in cases:
+        check_options(case)
+        rows += verb_of(case).table(case, ranks)
+        warnings += case.warnings()
+    disorder = disorder_of(options.case, options.set)
+    if disorder:
+        rows += disorder_rows(*disorder)
+
+    # Verbs share rows and warnings of the lattice that they have in common.
+    lines = [table([*dict.fromkeys(rows)])]
+    lines += [f"warning: {warning}" for warning in dict.fromkeys(warnings)]
+    return "\n".join(lines)
+
+
+def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
+    """What scatters, how, and the first values drawn, over those of the ``nominal`` case, which has no scatter."""
+    before = values_of(nominal.lattice, nominal.contacts)
+    after = values_of(drawn.lattice, drawn.contacts)
+    rows = []
+    for name, deviation in disorder.quantities().items():
+        if name == "sites":
+            values = f"cells {first_few([f'{cell:.5g}' for cell in after[name]])}"
+        else:
+            values = f"times {first_few([f'{ratio:.5g}' for ratio in np.divide(after[name], before[name])])}"
+        rows.append((f"disorder of {name}", f"{deviation}; seed {disorder.seed}: {values}"))
+    return rows
+
+
+VERB = PlainVerb(
+    name="validate",
+    text="check a case; print band edges, frequency, end time, size and cost",
+    example="validate runs/three-mass.toml",
+    arguments=(CASE, SET),
+    function=validate,
+    is_answer=True,
+    takes_petsc_options=True,
+)

@@ -1,0 +1,31 @@
+"""All verbs by their names: the records that the other modules of this folder declare."""
+
+import pkgutil
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+from vipetsc.case import CaseFile
+from vipetsc.cli.verb import StudyVerb, Verb
+
+
+def _declared() -> Iterator[Verb]:
+    # Modules are found rather than listed: a verb that is there cannot be left out of help, completion or tests.
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
+        name = f"{__package__}.{module.name}"
+        if name != __name__:
+            values = vars(import_module(name)).values()
+            yield from (value for value in values if isinstance(value, Verb))
+
+
+VERBS: dict[str, Verb] = {verb.name: verb for verb in sorted(_declared(), key=lambda verb: verb.name)}
+
+
+def study_verbs() -> list[StudyVerb]:
+    """The verbs that compute results of a case."""
+    return [verb for verb in VERBS.values() if isinstance(verb, StudyVerb)]
+
+
+def verb_of(case: CaseFile) -> StudyVerb:
+    """The verb that reads ``case``."""
+    return next(verb for verb in study_verbs() if verb.case is type(case))
