@@ -15,7 +15,7 @@ from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.scattering import KC, LEAST_WEIGHT, bin_colours, shown_bins
 from vipetsc.figures.style import GREY, rc_style
-from vipetsc.figures.sweep_members import Files, Sweeps, Wave, in_pi, series_of
+from vipetsc.figures.sweep_members import DrivenWave, Files, Sweeps, in_pi, series_of
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
 from vipetsc.spectra import filter_bank, normalised, transform
@@ -157,7 +157,7 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
     assert np.all(np.diff(series) > 0)
     with open_run(members(whole)[2] / "run.h5") as run:
         site = np.min(run["sites/cell"].values)
-        wave = Wave.of(Case.of(run))
+        wave = DrivenWave.of(Case.of(run))
         assert series[1] - series[0] == pytest.approx(0.5 * (site - 1) / wave.speed)
         at = int(np.argmin(np.abs(field_time(run) - series[1])))
         host = run["velocity"][at, :, 0].values
@@ -337,6 +337,6 @@ def test_wavenumbers_in_pi():
 
 def test_a_drive_in_a_gap_has_no_wave():
     case = {"lattice": {"preset": "diatomic", "cells": 20}, "drive": {"frequency": 600.0}, "time": {"end": 0.1}}
-    assert Wave.of(Case.from_table(case)).band == 0
-    driven = Wave.of(Case.from_table({"lattice": {"preset": "diatomic"}, "drive": BASE["drive"]}))
+    assert DrivenWave.of(Case.from_table(case)).band == 0
+    driven = DrivenWave.of(Case.from_table({"lattice": {"preset": "diatomic"}, "drive": BASE["drive"]}))
     assert (driven.band, driven.wavenumber) == (2, pytest.approx(5 * np.pi / 9))

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import ROMAN
-from vipetsc.figures.sweep_members import AmplitudeSeries, MeasuredRun, from_series
+from vipetsc.figures.sweep_members import AmplitudeSeries, SweepMember, from_series
 from vipetsc.io.read import field_time
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.spectra import Nodes, inverse, transform
@@ -177,7 +177,7 @@ def partition(series: AmplitudeSeries) -> Figure:
     return figure
 
 
-def _contours(axes: Axes, member: MeasuredRun, colours: np.ndarray) -> None:
+def _contours(axes: Axes, member: SweepMember, colours: np.ndarray) -> None:
     """Every bin where its energy exceeds ``LEVEL`` of the largest of any, filled and outlined in its colour."""
     field, cells, time = (member.analysis[name].values for name in (FIELD, "cell", "partition/snapshot"))
     step = max(1, len(cells) // 300)

@@ -23,6 +23,7 @@ from vipetsc.lattice.chain import cells_between
 
 AMPLITUDE = "amplitude"
 LEVELS = ("Low", "Medium", "High")
+FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction
 T = TypeVar("T")
 
 
@@ -34,7 +35,7 @@ class Files(ExitStack):
         self._opened: dict[Path, Any] = {}
 
     def get(self, path: Path, opener: Callable[[Path], AbstractContextManager[T]]) -> T:
-        """What ``opener`` makes of ``path``; raises as it does."""
+        """Return what ``opener`` gives for ``path``, from an earlier call if there was one; raise as it does."""
         if path not in self._opened:
             self._opened[path] = self.enter_context(opener(path))
         return cast(T, self._opened[path])
@@ -51,7 +52,7 @@ class Sweeps(list[xr.Dataset]):
         self.files = files
 
 
-class MeasuredRun(NamedTuple):
+class SweepMember(NamedTuple):
     """A member of a sweep with its fields: its case, in the lattice's own terms (0-based) too, and its files."""
 
     folder: Path
@@ -63,24 +64,27 @@ class MeasuredRun(NamedTuple):
     @classmethod
     @contextmanager
     def open(cls, folder: Path) -> Iterator[Self]:
-        """The member in ``folder``, its files open for the time of the block; raises OSError or ValueError."""
+        """Yield the member in ``folder``, its files open for the time of the block; raise OSError or ValueError."""
         with open_run(folder / "run.h5") as run, open_netcdf(folder / "analysis.h5", "analysis") as analysis:
             case = Case.of(run)
-            yield cls(folder, case, case.model(), run, analysis)
+            yield cls(folder=folder, case=case, model=case.model(), run=run, analysis=analysis)
 
 
-def transfer_members(sweeps: Sweeps) -> Iterator[MeasuredRun]:
-    """The whole members with sites and a band above the driven one."""
+def transfer_members(sweeps: Sweeps) -> Iterator[SweepMember]:
+    """Yield the whole members with sites and a band above the driven one."""
     for ensemble in sweeps:
         for _, folder in whole_members(ensemble):
-            member = sweeps.files.get(folder, MeasuredRun.open)
+            member = sweeps.files.get(folder, SweepMember.open)
             # The transfer of a lattice without a higher band is not a number.
             if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
                 yield member
 
 
-class Wave(NamedTuple):
-    """The linear wave at the drive's frequency: its ``band`` (1-based), wavenumber (rad/cell) and speed (cells/s)."""
+class DrivenWave(NamedTuple):
+    """The linear wave at the drive's frequency: its ``band`` (1-based), wavenumber (rad/cell) and speed (cells/s).
+
+    In a gap, which has no wave, the band is 0 and the others are NaN.
+    """
 
     band: int
     wavenumber: float
@@ -88,10 +92,13 @@ class Wave(NamedTuple):
 
     @classmethod
     def of(cls, case: Case) -> Self:
-        """The wave that ``case`` drives, its wavenumber NaN in a gap."""
+        """Return the wave that ``case`` drives."""
         model = case.model()
         waves = waves_at(model.chain.cell, model.drive.frequency)
-        return cls(waves[0][0], float(waves[0][1]), abs(float(waves[0][2]))) if waves else cls(0, np.nan, np.nan)
+        if not waves:
+            return cls(band=0, wavenumber=np.nan, speed=np.nan)
+        band, wavenumber, speed = waves[0]
+        return cls(band=band, wavenumber=wavenumber, speed=speed)
 
 
 class AmplitudeSeries(NamedTuple):
@@ -102,42 +109,47 @@ class AmplitudeSeries(NamedTuple):
 
     suffix: str
     title: str
-    runs: tuple[MeasuredRun, ...]
-    wave: Wave
+    runs: tuple[SweepMember, ...]
+    wave: DrivenWave
 
     @property
     def headings(self) -> list[str]:
         """What stands above each amplitude's panels."""
-        return [
-            f"{level} amplitude, {run.case.drive.amplitude:g} N" for level, run in zip(LEVELS, self.runs, strict=True)
-        ]
+        levels = zip(LEVELS, self.runs, strict=True)
+        return [f"{level} amplitude, {run.case.drive.amplitude:g} N" for level, run in levels]
 
     def page(self, rows: int, height: float, **shared: Any) -> tuple[Figure, np.ndarray]:
-        """A figure with a column of panels (row, column) for each amplitude, lettered and headed."""
+        """Return a figure with a column of panels (row, column) for each amplitude, lettered and headed."""
         figure = style.new_figure(style.PAGE, height, self.title)
         grid = figure.subplots(rows, len(self.runs), squeeze=False, **shared)
         for (row, column), panel in np.ndenumerate(grid):
-            tag = "abc"[column] + f".{ROMAN[row]}" * (rows > 1)
+            tag = "abc"[column]
+            if rows > 1:
+                tag += f".{ROMAN[row]}"
             panel.set_title(f"({tag})" if row else f"({tag}) {self.headings[column]}")
         return figure, grid
 
     def snapshot_times(self) -> np.ndarray:
-        """Four times in s, from the linear wave: half way to the first site, at it, past the last, near the end.
+        """Return four times in s, from the linear wave: half way to the first site, at it, past the last, near the end.
 
         The packet's middle leaves the driven cell when half the burst is over.
         """
         member = self.runs[0]
-        sites, chain = recorded_sites(member.run), member.model.chain
+        chain = member.model.chain
+        sites = recorded_sites(member.run)
         delay = cells_between(sites - 1, member.model.drive_cell, chain.cells, chain.ends) / self.wave.speed
-        burst, end = member.model.drive.duration, field_time(member.run)[-1]
-        near, far = delay.min(), delay.max()
-        return np.minimum(np.array([0.5 * burst + 0.5 * near, 0.5 * burst + near, burst + far, 0.95 * end]), end)
+        first, last = delay.min(), delay.max()
+        burst = member.model.drive.duration
+        end = field_time(member.run)[-1]
+        times = np.array([0.5 * burst + 0.5 * first, 0.5 * burst + first, burst + last, 0.95 * end])
+        return np.minimum(times, end)
 
 
 def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callable[..., Any]:
-    """Decorator of a figure of an `AmplitudeSeries`: offers one picture a series whose analyses hold ``needs``.
+    """Decorate a figure of an `AmplitudeSeries`: it offers one picture a series whose analyses hold ``needs``.
 
-    Of those only series that drive a ``wave`` of a pass band, or that recorded contact ``sites`` and cells beside them.
+    With ``wave`` only of series that drive a pass band, with ``sites`` only of those that recorded contact sites and
+    other cells.
     """
 
     def decorate(page: Callable[[AmplitudeSeries], Figure]) -> Callable[[Sweeps], Iterator[Drawing]]:
@@ -145,8 +157,9 @@ def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callabl
         def offer(sweeps: Sweeps) -> Iterator[Drawing]:
             for series in series_of(sweeps, *needs):
                 run = series.runs[0].run
+                has_wave = series.wave.band > 0
                 has_sites = len(recorded_sites(run)) > 0 and run.sizes["cell"] > 1
-                if (series.wave.band or not wave) and (has_sites or not sites):
+                if (has_wave or not wave) and (has_sites or not sites):
                     yield Drawing(series.suffix, partial(page, series))
 
         return offer
@@ -154,47 +167,75 @@ def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callabl
     return decorate
 
 
+class _MemberFolder(NamedTuple):
+    """A member of an ensemble as its row, and the folder of its files."""
+
+    row: xr.Dataset
+    folder: Path
+
+
 def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
-    """Every configuration of the sweeps with full fields at its lowest, middle and highest amplitude.
+    """Yield every configuration of the sweeps with full fields at its lowest, middle and highest amplitude.
 
     ``needs`` names what their analyses must hold.
     """
-    measured = [(ensemble, triples) for ensemble in sweeps if (triples := _triples(ensemble))]
+    measured = [(ensemble, _triples(ensemble)) for ensemble in sweeps]
+    several_sweeps = sum(bool(triples) for _, triples in measured) > 1
     for ensemble, triple in ((ensemble, triple) for ensemble, triples in measured for triple in triples):
-        runs = tuple(sweeps.files.get(folder, MeasuredRun.open) for _, folder in triple)
-        if all("velocity" in r.run and all(name in r.analysis for name in needs) for r in runs):
-            first, case = triple[0][0], runs[0].case
-            wave = Wave.of(case)
-            others = [name for name in axes(ensemble) if name not in (AMPLITUDE, "reading", "wavenumber", "sites")]
-            title = [f"{case.lattice.reading.capitalize()} reading", *(_in_words(first, n, " ") for n in others)]
-            title += [counted(len(sites_of(case)), "site")]
-            title += [f"κ* = {in_pi(wave.wavenumber)}"] if wave.band else []
-            yield AmplitudeSeries(suffix(first, ensemble, len(measured) > 1), ", ".join(title), runs, wave)
+        runs = tuple(sweeps.files.get(member.folder, SweepMember.open) for member in triple)
+        if all("velocity" in run.run and all(name in run.analysis for name in needs) for run in runs):
+            wave = DrivenWave.of(runs[0].case)
+            yield AmplitudeSeries(
+                suffix=suffix(triple[0].row, ensemble, named=several_sweeps),
+                title=_series_title(triple[0].row, ensemble, runs[0].case, wave),
+                runs=runs,
+                wave=wave,
+            )
 
 
-def _triples(ensemble: xr.Dataset) -> list[list[tuple[xr.Dataset, Path]]]:
-    """Members and folders at the lowest, middle and highest amplitude of every configuration that has three."""
+def _series_title(member: xr.Dataset, ensemble: xr.Dataset, case: Case, wave: DrivenWave) -> str:
+    """Return the reading, whatever else varies, the number of sites and the driven wavenumber of a series."""
+    parts = [f"{case.lattice.reading.capitalize()} reading"]
+    for name in axes(ensemble):
+        if name not in (AMPLITUDE, "reading", "wavenumber", "sites"):
+            parts.append(_in_words(member, name, " "))
+    parts.append(counted(len(sites_of(case)), "site"))
+    if wave.band:
+        parts.append(f"κ* = {in_pi(wave.wavenumber)}")
+    return ", ".join(parts)
+
+
+def _triples(ensemble: xr.Dataset) -> list[list[_MemberFolder]]:
+    """Return the members at the lowest, middle and highest amplitude of every configuration that has three."""
     if AMPLITUDE not in axes(ensemble):
         return []
     others = [name for name in axes(ensemble) if name != AMPLITUDE]
-    rows = grouped(whole_members(ensemble), lambda pair: repr([pair[0][name].item() for name in others]))
-    ordered = [sorted(row, key=lambda pair: pair[0][AMPLITUDE].item()) for row in rows.values()]
-    return [[row[0], row[len(row) // 2], row[-1]] for row in ordered if len(row) >= len(LEVELS)]
+
+    def configuration(member: _MemberFolder) -> str:
+        return repr([member.row[name].item() for name in others])
+
+    members = [_MemberFolder(row, folder) for row, folder in whole_members(ensemble)]
+    triples = []
+    for group in grouped(members, configuration).values():
+        if len(group) >= len(LEVELS):
+            group.sort(key=lambda member: member.row[AMPLITUDE].item())
+            triples.append([group[0], group[len(group) // 2], group[-1]])
+    return triples
 
 
 def _in_words(member: xr.Dataset, name: str, joint: str) -> str:
-    """The value of a swept key; a number after the key's name."""
+    """Return the value of a swept key; a number after the key's name."""
     value = member[name].item()
     return value if isinstance(value, str) else f"{name}{joint}{value:g}"
 
 
 def table(ensemble: xr.Dataset) -> dict[str, Any]:
-    """The sweep's case file."""
+    """Return the sweep's case file as a table."""
     return tomllib.loads(ensemble.attrs["case"])
 
 
 def grouped(items: Iterable[T], key: Callable[[T], str]) -> dict[str, list[T]]:
-    """The ``items`` by their ``key``, in the order in which they come."""
+    """Return the ``items`` by their ``key``, in the order in which they come."""
     groups: dict[str, list[T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)
@@ -202,44 +243,58 @@ def grouped(items: Iterable[T], key: Callable[[T], str]) -> dict[str, list[T]]:
 
 
 def reading_of(ensemble: xr.Dataset) -> str:
-    """The reading that all members of a sweep share which does not vary it."""
-    return next((Sweep.of(ensemble).case(number).lattice.reading for _, number in curves(ensemble)), "")
+    """Return the reading of all members of a sweep that does not vary it."""
+    for _, number in curves(ensemble):
+        return Sweep.of(ensemble).case(number).lattice.reading
+    return ""
 
 
 def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collection[str] | None = None) -> str:
-    """What tells ``member`` (or a row of them) from others of the ensemble in a file's name; the amplitude aside.
+    """Return what tells ``member`` (or a row of them) from others of the ensemble in a file's name; no amplitude.
 
     The sweep's name if it is to be ``named``, the reading, and whatever else has several values; of the axes only
     ``dims``, by default all.
     """
-    parts = [table(ensemble)["name"]] if named else []
-    parts += [] if "reading" in axes(ensemble) else [reading_of(ensemble)]
+    parts = []
+    if named:
+        parts.append(table(ensemble)["name"])
+    if "reading" not in axes(ensemble):
+        parts.append(reading_of(ensemble))
+
     for name in axes(ensemble):
+        # Sweeps of one reading or wavenumber are drawn beside others, so these are always named.
         tells = name in ("reading", "wavenumber") or ensemble.sizes[name] > 1
-        if name != AMPLITUDE and tells and (dims is None or name in dims):
-            wave = name == "wavenumber"
-            text = in_pi(member[name].item()).replace("π", "pi") if wave else _in_words(member, name, "-")
-            parts.append("".join(c if c.isalnum() or c in "-." else "-" for c in text))
+        if name == AMPLITUDE or not tells or (dims is not None and name not in dims):
+            continue
+        parts.append(_in_file_name(member, name))
     return "-".join(parts)
 
 
+def _in_file_name(member: xr.Dataset, name: str) -> str:
+    """Return the value of a swept key in characters that every file system takes."""
+    if name == "wavenumber":
+        return in_pi(member[name].item()).replace("π", "pi").replace("/", "-")
+    return "".join(c if c.isalnum() or c in "-." else "-" for c in _in_words(member, name, "-"))
+
+
 def in_pi(wavenumber: float) -> str:
-    """A wavenumber in rad/cell as 5π/9, or as a decimal where no such fraction is near."""
-    share = float(wavenumber) / np.pi
-    near = Fraction(share).limit_denominator(36)
-    if abs(float(near) - share) > 1e-6:
-        return f"{share:.3f}π"
-    over = f"/{near.denominator}" if near.denominator > 1 else ""
-    return f"{'' if near.numerator == 1 else near.numerator}π{over}"
+    """Return a wavenumber in rad/cell as 5π/9, or as a decimal where no such fraction is near."""
+    multiple = float(wavenumber) / np.pi
+    near = Fraction(multiple).limit_denominator(FRACTION_LIMIT)
+    if abs(float(near) - multiple) > 1e-6:
+        return f"{multiple:.3f}π"
+    numerator = "" if near.numerator == 1 else near.numerator
+    denominator = f"/{near.denominator}" if near.denominator > 1 else ""
+    return f"{numerator}π{denominator}"
 
 
 def counted(number: int, noun: str) -> str:
-    """``1 site``, ``5 sites``."""
+    """Return a number with its noun: ``1 site``, ``5 sites``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def sites_of(case: Case) -> list[int]:
-    """Cells of the contact sites, from 1."""
+    """Return the cells of the contact sites, from 1."""
     sites = case.contacts.sites
     assert isinstance(sites, list)  # those of a resolved case are
     return sites
@@ -257,10 +312,17 @@ class Labels(NamedTuple):
 
     @classmethod
     def of(cls, case: Case) -> Self:
-        """The names of ``case``."""
-        law, reading, amplitude = case.contacts.law, case.lattice.reading, f"{case.drive.amplitude:.4g}"
+        """Return the names of ``case``."""
+        law = case.contacts.law
+        reading = case.lattice.reading
+        amplitude = f"{case.drive.amplitude:.4g}"
         configuration = f"{counted(len(sites_of(case)), 'site')}, {case.drive.cycles:g} cycles"
-        stem = f"{reading}-{configuration}".replace(",", "").replace(" ", "-")
-        member = f"{law.capitalize()}, {reading}, {configuration}, {amplitude} N"
-        page = f"{reading.capitalize()}, {configuration}"
-        return cls(law.capitalize(), configuration, page, stem, member, f"{law}-{stem}-{amplitude}N")
+        page_stem = f"{reading}-{configuration}".replace(",", "").replace(" ", "-")
+        return cls(
+            law=law.capitalize(),
+            configuration=configuration,
+            page=f"{reading.capitalize()}, {configuration}",
+            page_stem=page_stem,
+            member=f"{law.capitalize()}, {reading}, {configuration}, {amplitude} N",
+            member_stem=f"{law}-{page_stem}-{amplitude}N",
+        )
