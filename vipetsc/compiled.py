@@ -42,7 +42,8 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
 
     def decorate(function: Callable[..., Any]) -> Any:
         config: Any = numba.config
-        chosen, file = config.CACHE_DIR, Path(function.__code__.co_filename)
+        chosen = config.CACHE_DIR
+        file = Path(function.__code__.co_filename)
         config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, file, chosen))
         try:
             return compiler(*signature, cache=True, **options)(function)
@@ -61,41 +62,54 @@ def kernel_cache(package: Path, file: Path, chosen: str = "") -> Path:
     digest = hashlib.sha256()
     for path in sorted(kernel_sources(package, file)):
         digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
-    parent = package / "__pycache__" if os.access(package, os.W_OK) else Path.home() / ".cache" / package.name
-    return Path(chosen or parent) / f"kernels-{digest.hexdigest()[:16]}"
+
+    if chosen:
+        parent = Path(chosen)
+    elif os.access(package, os.W_OK):
+        parent = package / "__pycache__"
+    else:
+        parent = Path.home() / ".cache" / package.name
+    return parent / f"kernels-{digest.hexdigest()[:16]}"
 
 
 def kernel_sources(package: Path, file: Path) -> set[Path]:
-    """What the kernels of ``file`` are made of: itself, the files that it imports, and the tables of ``package``.
+    """Files that the kernels of ``file`` depend on: itself, the files that it imports, and the tables of ``package``.
 
-    Of files with kernels among those, what they import, and so on.
+    Where one of those has kernels too, the files that it imports are among them, and so on.
     """
-    sources, waiting = _tables(package), [file]
+    sources = set(_tables(package))
+    waiting = [file]
     while waiting:
         path = waiting.pop()
         if path not in sources:
-            sources |= {path}
+            sources.add(path)
             waiting += _imports(package, path)
-    return set(sources)
+    return sources
 
 
 @cache
 def _tables(package: Path) -> frozenset[Path]:
+    """The tables of numbers in ``package``."""
     return frozenset(package.rglob("*.csv"))
 
 
 @cache
 def _imports(package: Path, path: Path) -> list[Path]:
-    """The files of ``package`` that a file with kernels imports; of another one, none."""
-    text, files = path.read_bytes(), []
-    for node in ast.walk(ast.parse(text)) if HAS_KERNELS.search(text) else ():
+    """The files of ``package`` that the file ``path`` imports; none if it has no kernels."""
+    text = path.read_bytes()
+    if not HAS_KERNELS.search(text):
+        return []
+
+    names = []
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            files += [package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names]
+            # What is imported may be a module, or a name in one.
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    files = [package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names]
     return [file for file in files if file.exists()]
 
 
-# Of functions that make no arrays but views: numba counts no references to theirs, which costs more than short sums do
+# For functions that make no arrays but views: numba counts no references to theirs, which costs more than short sums do
 # (each array of a tuple, at each access). ``inlined`` ones are put in place of their calls, with the constants there.
 kernel = njit(error_model="numpy", _nrt=False)
 inlined = njit(error_model="numpy", _nrt=False, inline="always")

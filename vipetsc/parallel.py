@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, Self, TypeVar, cast
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -19,20 +19,27 @@ from tqdm import tqdm
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
 BAR = "vipetsc.bar"  # the logger whose level switches bars off
+LINE_EVERY = 5.0  # s between lines of the log where there is no terminal
 STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 
 
 def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
-    """Let a rank that raises end all ranks, with one message; otherwise the others wait for it for ever."""
+    """Let a rank that raises end all ranks, with one message; otherwise the others wait for it for ever.
+
+    The front door calls it; a script that starts ranks of its own may.
+    """
 
     def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
         if comm.rank and getattr(error, "from_root", False):
             time.sleep(2)  # rank 0 raised the same: its message is enough, and it ends this rank
         where = f"rank {comm.rank}: " if comm.size > 1 else ""
-        # A full disk or too little memory is the machine's matter: the trace would hide the message.
-        machine = isinstance(error, OSError | MemoryError)
-        lines = [str(error) or "out of memory"] if machine else traceback.format_exception(kind, error, trace)
-        logger.critical("vipetsc: %s%s", where, "".join(lines).rstrip())
+        if isinstance(error, OSError | MemoryError):
+            # A full disk or too little memory is the machine's matter: the trace would hide the message.
+            text = str(error) or "out of memory"
+        else:
+            text = "".join(traceback.format_exception(kind, error, trace))
+        logger.critical("vipetsc: %s%s", where, text.rstrip())
+
         sys.stdout.flush()
         if comm.size > 1:
             comm.Abort(1)
@@ -44,8 +51,9 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
 
 def wait_for_all(comm: MPI.Comm) -> None:
     """Wait for all ranks of ``comm``, asleep after a moment: those that still work need the cores."""
-    met, begin = comm.Ibarrier(), time.monotonic()
-    while not met.Test():
+    barrier = comm.Ibarrier()
+    begin = time.monotonic()
+    while not barrier.Test():
         if time.monotonic() - begin > 1e-3:
             time.sleep(1e-3)
 
@@ -53,45 +61,72 @@ def wait_for_all(comm: MPI.Comm) -> None:
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
     attempt = _attempt(function) if comm.rank == 0 else None
-    wait_for_all(comm)
-    return _agreed(*comm.bcast(attempt))
+    wait_for_all(comm)  # before the broadcast, in which ranks would wait at full speed
+    return _value_or_raise(comm.bcast(attempt))
 
 
 def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on each rank; what it raises on one, the lowest, is raised on all ranks."""
-    value, error = _attempt(function)
+    attempt = _attempt(function)
     wait_for_all(comm)
-    return _agreed(value, next((e for e in comm.allgather(error) if e is not None), None))
+    errors = [error for error in comm.allgather(attempt.error) if error is not None]
+    if errors:
+        attempt = _Attempt(value=None, error=errors[0])
+    return _value_or_raise(attempt)
 
 
-def _attempt(function: Callable[[], T]) -> tuple[T | None, Exception | None]:
+class _Attempt(NamedTuple):
+    """The ``value`` of a call, or the ``error`` that it raised."""
+
+    value: Any
+    error: Exception | None
+
+
+def _attempt(function: Callable[[], T]) -> _Attempt:
+    """What a call of ``function`` gives, without raising."""
     try:
-        return function(), None
+        return _Attempt(value=function(), error=None)
     except Exception as error:
-        return None, error
+        return _Attempt(value=None, error=error)
 
 
-def _agreed(value: T | None, error: Exception | None) -> T:
-    if error is not None:
-        error.from_root = True  # type: ignore[attr-defined]  # rank 0 raises it as well, and reports it for all
-        raise error
-    return cast(T, value)
+def _value_or_raise(attempt: _Attempt) -> Any:
+    """The value of an ``attempt`` that all ranks know of; raises its error on all of them."""
+    if attempt.error is not None:
+        attempt.error.from_root = True  # type: ignore[attr-defined]  # rank 0 raises it too, and reports it for all
+        raise attempt.error
+    return attempt.value
 
 
-def sort_over_ranks(comm: MPI.Comm, rows: np.ndarray, keys: Sequence[str]) -> tuple[np.ndarray, int, int]:
-    """Sort the ``rows`` of all ranks by their ``keys``: this rank's part of them, how many come before it, all.
+class SortedRows(NamedTuple):
+    """Part of a table sorted over ranks: this rank's ``rows`` in order, behind the ``first`` of all ``total``."""
 
-    The parts are about as large; rows that agree in the first key stay together. All ranks must call it.
+    rows: np.ndarray
+    first: int
+    total: int
+
+
+def sort_over_ranks(comm: MPI.Comm, rows: np.ndarray, keys: Sequence[str]) -> SortedRows:
+    """Sort the ``rows`` of all ranks by their ``keys`` and divide them anew; all ranks must call it.
+
+    Parts are about equally large; rows that agree in the first key stay together.
     """
-    total, backwards = comm.allreduce(len(rows)), keys[::-1]
-    rows = rows[np.lexsort([rows[key] for key in backwards])]
+
+    def in_order(table: np.ndarray) -> np.ndarray:
+        return table[np.lexsort([table[key] for key in reversed(keys)])]
+
+    total = comm.allreduce(len(rows))
+    rows = in_order(rows)
     if comm.size > 1 and total:
-        first = rows[keys[0]]
-        some = np.sort(np.concatenate(comm.allgather(first[:: total // (64 * comm.size) + 1])))
-        cuts = np.searchsorted(first, some[np.arange(1, comm.size) * len(some) // comm.size])
-        rows = np.concatenate(comm.alltoall(np.split(rows, cuts)))
-        rows = rows[np.lexsort([rows[key] for key in backwards])]
-    return rows, sum(comm.allgather(len(rows))[: comm.rank]), total
+        # Quantiles of a sample, 64 values a rank, cut the first key into about equal parts.
+        first_key = rows[keys[0]]
+        sample = np.sort(np.concatenate(comm.allgather(first_key[:: total // (64 * comm.size) + 1])))
+        quantiles = sample[np.arange(1, comm.size) * len(sample) // comm.size]
+        parts = np.split(rows, np.searchsorted(first_key, quantiles))
+        rows = in_order(np.concatenate(comm.alltoall(parts)))
+
+    first = sum(comm.allgather(len(rows))[: comm.rank])
+    return SortedRows(rows=rows, first=first, total=total)
 
 
 class SharedCounter:
@@ -105,7 +140,8 @@ class SharedCounter:
 
     def draw(self, step: int = 1) -> int:
         """The count before ``step`` is added to it."""
-        value, added = np.empty(1, np.int64), np.array([step], np.int64)
+        value = np.empty(1, np.int64)
+        added = np.array([step], np.int64)
         self._window.Lock(0, MPI.LOCK_SHARED)
         self._window.Fetch_and_op(added, value, 0, 0, MPI.SUM)
         self._window.Unlock(0)
@@ -117,14 +153,14 @@ class SharedCounter:
 
 
 class StoppedError(Exception):
-    """Work was left on request, to be gone on with; says how."""
+    """Work was left on request; the message says how to go on with it."""
 
 
 class StopRequest:
-    """A request to stop: ``requested`` once this rank has got one, which is not yet a reason to leave the others.
+    """A request to stop, by a signal: ``requested`` once this rank has got one.
 
-    A loop that all ranks go through asks whether it is ``agreed``, or calls ``check``; work that one rank does alone
-    looks at ``requested``, and the ranks agree when they meet again.
+    One rank must not leave the others: a loop that all ranks go through asks whether it is ``agreed``, or calls
+    ``check``; work that one rank does alone looks at ``requested``, and the ranks agree when they meet again.
     """
 
     requested = False
@@ -147,11 +183,13 @@ class StopRequest:
 
         def receive(number: int, frame: FrameType | None) -> None:
             self.requested = True
+            # ``timeout`` sends its signal twice: the second, if it comes at once, is no wish to end the process.
             signal.pthread_sigmask(signal.SIG_BLOCK, earlier)
-            signal.sigtimedwait(earlier, 0.1)  # ``timeout`` sends its signal twice
+            signal.sigtimedwait(earlier, 0.1)
             for number in earlier:
                 signal.signal(number, signal.SIG_DFL)
             signal.pthread_sigmask(signal.SIG_UNBLOCK, earlier)
+
             if at_once and MPI.COMM_WORLD.size > 1:
                 MPI.COMM_WORLD.Abort(os.EX_TEMPFAIL)  # the others may wait for this rank
             if at_once:
@@ -171,13 +209,17 @@ class Progress:
     """How far a run is, on rank 0: a bar on a terminal, otherwise a line of the log every five seconds."""
 
     def __init__(self, comm: MPI.Comm, total: float, unit: str, show: bool = True) -> None:
-        self._total, self._unit = total, unit
-        self._begin = self._last = time.monotonic()
+        self._total = total
+        self._unit = unit
+        self._begin = time.monotonic()
+        self._last = self._begin
         self._first = 0.0
         self._show = show and comm.rank == 0
-        terminal = self._show and sys.stderr.isatty() and logging.getLogger(BAR).level < logging.CRITICAL
-        layout = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
-        self._bar = tqdm(total=total, unit=unit, bar_format=layout, file=sys.stderr) if terminal else None
+
+        self._bar = None
+        if self._show and sys.stderr.isatty() and logging.getLogger(BAR).level < logging.CRITICAL:
+            layout = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
+            self._bar = tqdm(total=total, unit=unit, bar_format=layout, file=sys.stderr)
 
     def start_at(self, done: float) -> None:
         """Count from ``done``, where a resumed run begins."""
@@ -190,11 +232,11 @@ class Progress:
         now = time.monotonic()
         if self._bar is not None:
             self._bar.update(done - self._bar.n)
-        elif self._show and now - self._last >= 5.0:
+        elif self._show and now - self._last >= LINE_EVERY:
             rate = (done - self._first) / (now - self._begin)
             left = (self._total - done) / rate if rate > 0 else float("inf")
-            share = f"{100 * done / self._total:3.0f} %  {done:.4g} of {self._total:.4g} {self._unit}"
-            logger.info("%s, %.0f s left", share, left)
+            position = f"{100 * done / self._total:3.0f} %  {done:.4g} of {self._total:.4g} {self._unit}"
+            logger.info("%s, %.0f s left", position, left)
             self._last = now
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from vipetsc.lattice import Band, bloch, diatomic, four_band, pass_bands
 from vipetsc.spectra import (
     Dispersion,
     Parts,
-    bands,
+    band_energies,
     dispersion,
     front_arrival,
     ibtet,
@@ -112,10 +112,10 @@ def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, see
 
 
 def test_a_narrow_part_takes_few_times_and_a_wide_one_every_stride():
-    narrow = bands._fewest_steps(895 - 640, 2 * 640, 2 * 895, 4420, 1)
+    narrow = band_energies._fewest_steps(band_energies._Cosines(640, 895), 4420, 1)
     assert 3 * 255 <= narrow < 1100
-    assert bands._fewest_steps(3300, 2 * 1100, 2 * 4400, 4420, 1) == 4420
-    assert bands._fewest_steps(3300, 2 * 1100, 2 * 4400, 4420, 10) < 460
+    assert band_energies._fewest_steps(band_energies._Cosines(1100, 4400), 4420, 1) == 4420
+    assert band_energies._fewest_steps(band_energies._Cosines(1100, 4400), 4420, 10) < 460
     velocity, edges = noise((100, 3, 2)), [0.0, 20.0, np.inf]
     every, some = (part_energies(velocity, MASSES, 0.1, edges, stride) for stride in (1, 10))
     assert np.allclose(every[0], some[0], rtol=1e-12) and not np.allclose(every[1], some[1], rtol=0.1)

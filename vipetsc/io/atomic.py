@@ -37,8 +37,10 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 def unwritten(path: Path, error: Exception) -> OSError:
     """``error``, from Python or from HDF5, that names the file which could not be written, and keeps its number."""
-    told = re.search(r"errno = (\d+)", str(error))
-    number = getattr(error, "errno", None) or (int(told[1]) if told else 0)
+    number = getattr(error, "errno", None)
+    in_text = re.search(r"errno = (\d+)", str(error))  # HDF5 says it in its message alone
+    if not number:
+        number = int(in_text[1]) if in_text else 0
     reason = os.strerror(number) if number else str(error)
     return OSError(number, f"{path} could not be written: {reason}; the same command goes on when that is mended")
 
@@ -46,7 +48,7 @@ def unwritten(path: Path, error: Exception) -> OSError:
 def discard(folder: Path) -> None:
     """Remove ``folder``, if it is there; a kill leaves it whole, or under a name that begins with a dot."""
     aside = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(aside, ignore_errors=True)  # of a call that was killed
     if folder.is_dir():
         os.replace(folder, aside)
         shutil.rmtree(aside, ignore_errors=True)
@@ -62,6 +64,7 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
     """Write ``arrays`` as the fields of one record, in numpy's format; a zip file costs three times that."""
     record = np.dtype([(name, values.dtype, values.shape) for name, values in arrays.items()])
     with atomic_write(path) as aside, aside.open("wb") as file:
+        # One record of all arrays: numpy has the header, and the values follow without being copied together.
         header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
         npy.write_array_header_2_0(file, header)
         file.seek(6)
@@ -73,12 +76,13 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
-    """What ``save_arrays`` wrote, or the ``wanted`` arrays of it; without a ``copy``, read where it is used.
+    """Arrays that ``save_arrays`` wrote, or those ``wanted``; without a ``copy``, values are read where they are used.
 
     Raises OSError that names the file.
     """
     try:
         record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
-        return {name: np.array(record[name], copy=copy) for name in (record.dtype.names if wanted is None else wanted)}
+        names = record.dtype.names if wanted is None else wanted
+        return {name: np.array(record[name], copy=copy) for name in names}
     except (OSError, ValueError) as error:
         raise OSError(f"{path} cannot be read: {error}") from error

@@ -1,12 +1,13 @@
-"""What ``run.h5`` holds; the chunks of a run put together as one dataset in the layout of ``io.netcdf``, or in a file.
+"""The variables of ``run.h5``, and how the chunks of a run are put together in it.
 
-Every share of a chunk says what it is of: fields (sample, dof, cell) are of the ranges ``columns`` of the recorded
-cells, losses (sample, site) of the ranges ``sites``; ``impacts`` are episodes. Rank 0's has ``SAMPLED`` besides.
+A chunk is what a run leaves between two checkpoints; each rank keeps a part of it, which names its own place: fields
+(sample, dof, cell) are of the ranges ``columns`` of the recorded cells, losses (sample, site) of the ranges ``sites``;
+``impacts`` are episodes. Rank 0's part has ``SAMPLED`` besides.
 """
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from mpi4py import MPI
 
@@ -17,7 +18,9 @@ import xarray as xr
 from vipetsc.io.atomic import Arrays
 from vipetsc.io.netcdf import tabulated
 
-# Name in the file: dimensions, units, text. What a chunk holds besides fields, and what is known from the beginning.
+# Variables of the file by name: dimensions, units, text.
+# ``SAMPLED`` and ``DAMPING`` rank 0 has of every sample; ``GIVEN`` is known from the beginning. ``LARGE`` are the
+# fields, the losses and the log of contacts, of which ranks that write together hold their own alone.
 SAMPLED = {
     "time": ("time", "s", "time"),
     "field_time": ("field_time", "s", "time of the recorded fields"),
@@ -28,8 +31,7 @@ SAMPLED = {
     "energy/dissipated": ("time", "J", "energy dissipated in contacts"),
 }
 DAMPED = "energy/dissipated_by_damping"
-OF_DAMPED = {DAMPED: ("time", "J", "energy dissipated in dashpots")}
-# Fields, losses and the log of contacts, of which ranks that write together hold their own alone.
+DAMPING = {DAMPED: ("time", "J", "energy dissipated in dashpots")}
 LOSSES = "energy/dissipated_by_site"
 LARGE = {
     "displacement": ("field_time cell dof", "m", "displacement of each mass"),
@@ -64,11 +66,11 @@ GIVEN = {
 
 @dataclass(frozen=True)
 class Recording:
-    """What the chunks of a run hold.
+    """Description of what the chunks of a run hold.
 
     ``given``: the arrays of ``GIVEN``; ``fields``: names of those that are recorded; ``together``: whether all ranks
     write into one file that they share, instead of rank 0 alone; ``rows``: samples in a field of the whole run.
-    ``sampled``: what rank 0 has of every sample, of ``SAMPLED`` and ``OF_DAMPED``.
+    ``sampled``: names of what rank 0 has of every sample, from ``SAMPLED`` and ``DAMPING``.
     """
 
     given: Arrays
@@ -79,7 +81,7 @@ class Recording:
 
 
 class Chunks(Protocol):
-    """The ``count`` chunks of a run; chunk k has a share of each of ``ranks(k)``, from which ``read`` reads arrays."""
+    """The ``count`` chunks of a run; ``ranks(k)`` kept parts of chunk k, from which ``read`` reads arrays."""
 
     comm: MPI.Comm
     case: str
@@ -103,23 +105,34 @@ def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
 
 
 def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """What is known of a run from the beginning, and what rank 0 keeps of every sample."""
+    """The dataset of ``GIVEN`` and of what rank 0 has of every sample, with the root ``attributes`` of the run."""
     arrays = {**joined(output, output.recording.sampled), **output.recording.given}
     if len(arrays["field_time"]) == len(arrays["time"]):
-        del arrays["field_time"]
-    return xr.Dataset(tabulated(SAMPLED | OF_DAMPED | GIVEN, arrays), attrs={"case": output.case, **attributes})
+        del arrays["field_time"]  # fields are of every sample
+    variables = tabulated(SAMPLED | DAMPING | GIVEN, arrays)
+    return xr.Dataset(variables, attrs={"case": output.case, **attributes})
 
 
-def described(name: str, data: xr.Dataset) -> tuple[list[str], dict[str, str]]:
-    """Dimensions and attributes of a variable of ``LARGE`` beside ``data``, whose time may be that of the fields."""
+class Description(NamedTuple):
+    """Dimensions and attributes of a variable."""
+
+    dims: list[str]
+    attributes: dict[str, str]
+
+
+def described(name: str, data: xr.Dataset) -> Description:
+    """The description of a variable of ``LARGE`` in a file with ``data``, whose time may be that of the fields."""
     dims, units, text = LARGE[name]
-    dims = dims if "field_time" in data else dims.replace("field_time", "time")
-    return dims.split(), {"units": units, "long_name": text}
+    if "field_time" not in data:
+        dims = dims.replace("field_time", "time")
+    return Description(dims=dims.split(), attributes={"units": units, "long_name": text})
 
 
 def coordinates(name: str) -> dict[str, str]:
-    """What a file says besides, by the CF conventions: an episode's time is a coordinate of what is told of it."""
-    return {"coordinates": "onset"} if name.startswith("impacts/") and name != "impacts/onset" else {}
+    """The attribute that makes the onset, by the CF conventions, a coordinate of an episode's other variables."""
+    if name.startswith("impacts/") and name != "impacts/onset":
+        return {"coordinates": "onset"}
+    return {}
 
 
 def writers(output: Chunks) -> MPI.Comm:
@@ -127,33 +140,46 @@ def writers(output: Chunks) -> MPI.Comm:
     return output.comm if output.recording.together else MPI.COMM_SELF
 
 
-def shares(output: Chunks, number: int, wanted: Collection[str]) -> Iterator[Arrays]:
-    """Those of chunk ``number`` that this rank reads; ranks that write together share them out."""
+def parts_to_copy(output: Chunks, number: int, wanted: Collection[str]) -> Iterator[Arrays]:
+    """Arrays ``wanted`` of the parts of chunk ``number`` that fall to this rank: the writers take them in turn."""
     comm = writers(output)
-    return (output.read(number, rank, wanted) for rank in output.ranks(number) if rank % comm.size == comm.rank)
+    for rank in output.ranks(number):
+        if rank % comm.size == comm.rank:
+            yield output.read(number, rank, wanted)
 
 
 def read_log(output: Chunks) -> np.ndarray:
-    """The episodes that this rank reads, in no order."""
-    return np.concatenate([share["impacts"] for k in range(output.count) for share in shares(output, k, ["impacts"])])
+    """The episodes in the parts that fall to this rank, in no order."""
+    parts = [part for number in range(output.count) for part in parts_to_copy(output, number, ["impacts"])]
+    return np.concatenate([part["impacts"] for part in parts])
 
 
 def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
-    """The variables of the episodes ``log``, in order, of which so many come before the ``first``."""
+    """The variables of the episodes ``log``, which are in order and come after ``first`` others."""
     names = log.dtype.names or ()
-    return {"episode": np.arange(first, first + len(log)) + 1} | {f"impacts/{name}": log[name] for name in names}
+    columns: dict[str, np.ndarray] = {"episode": np.arange(first, first + len(log)) + 1}
+    for name in names:
+        columns[f"impacts/{name}"] = log[name]
+    return columns
 
 
 def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
-    """Copy the losses or a field, ``name``, of all chunks to ``dataset``; ranks that write together share them."""
-    first, (time, of) = 0, ("time", "sites") if name == LOSSES else ("field_time", "columns")
+    """Copy the losses or a field, ``name``, of all chunks to ``dataset``; each writer copies its parts."""
+    time = "field_time"
+    places = "columns"
+    if name == LOSSES:
+        time = "time"
+        places = "sites"
+
+    first = 0
     for number in range(output.count):
         rows = output.read(number, 0, [time])[time].size
-        for share in shares(output, number, [name, of]):
-            values, at = np.moveaxis(share[name], -1, 1), 0
-            for start, stop in share[of].tolist():
+        for part in parts_to_copy(output, number, [name, places]):
+            values = np.moveaxis(part[name], -1, 1)
+            column = 0
+            for start, stop in part[places].tolist():
                 # h5py leaves out empty selections, on which writing together would hang.
                 if rows and start < stop:
-                    dataset[first : first + rows, start:stop] = values[:, at : at + stop - start]
-                at += stop - start
+                    dataset[first : first + rows, start:stop] = values[:, column : column + stop - start]
+                column += stop - start
         first += rows

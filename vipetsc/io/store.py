@@ -1,10 +1,11 @@
 """Where a run goes: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
 
 While a run goes on, its samples are kept as chunks: chunk k holds those between the checkpoints k - 1 and k. A chunk
-and a checkpoint are named arrays; a rank writes its share of each into a file of its own, so nothing is sent while a
-run goes on. Every share says what it is of, so that another number of ranks can go on with it. When the run has
-ended, ``io.chunks`` puts them together. Fields (t, cell, dof) and losses (t, site) are too large to be held whole: they
-are copied chunk by chunk, to a file of one rank or to one that all ranks share; these hold a part of the log each.
+and a checkpoint are named arrays; a rank writes its part of each into a file of its own, so nothing is sent while a
+run goes on. Every part names the cells and sites it is of, so that another number of ranks can go on with it. When the
+run has ended, ``io.chunks`` puts them together. Fields (t, cell, dof) and losses (t, site) are too large to be held
+whole: they are copied chunk by chunk, to a file of one rank or to one that all ranks share; these hold a part of the
+log each.
 """
 
 import json
@@ -15,7 +16,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -29,22 +30,34 @@ from vipetsc.io.chunks import LOSSES, Recording
 from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run
-from vipetsc.parallel import on_every_rank, on_root, sort_over_ranks
+from vipetsc.parallel import SortedRows, on_every_rank, on_root, sort_over_ranks
 
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
+
+
+class _Contents(NamedTuple):
+    """Contents of ``run.h5`` that this rank writes, but for the fields and losses, which are copied.
+
+    ``small`` is rank 0's dataset, ``log`` this rank's part of all episodes in order.
+    """
+
+    small: xr.Dataset
+    log: SortedRows
 
 
 class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
     It takes the run's chunks, ``count`` of them, on all ranks of ``comm`` together, and puts them together at the end;
-    ``recording`` tells it what they hold.
+    ``recording`` describes what they hold.
     """
 
     recording: Recording
 
     def __init__(self, folder: Path, comm: MPI.Comm) -> None:
-        self.folder, self.comm, self.count = Path(folder), comm, 0
+        self.folder = Path(folder)
+        self.comm = comm
+        self.count = 0
         self._parts = self.folder / "parts"
 
     def begin(self, case: str) -> None:
@@ -57,32 +70,37 @@ class RunFolder:
 
         ``summary.json`` is written again where it is lost. Raises FolderError if ``run.h5`` cannot be read.
         """
+        return on_root(self.comm, self._read_ending)
 
-        def read() -> dict[str, Any] | None:
-            path = self.folder / "run.h5"
-            if not path.exists() or any(self._parts.glob("*")):
-                return None
-            try:
-                with open_run(path) as run:
-                    told = {key: np.asarray(value).item() for key, value in run.attrs.items()}
-            except (OSError, ValueError) as error:
-                raise FolderError(f"{error}; --force makes the run again") from error
-            told |= {key: json.loads(told[key]) for key in ("statistics", "warnings") if key in told}
-            if not (self.folder / "summary.json").exists():
-                self._summarise(told | {"case": tomllib.loads(told["case"])})
-            return told
+    def _read_ending(self) -> dict[str, Any] | None:
+        """The attributes on one rank, as ``ending``."""
+        path = self.folder / "run.h5"
+        # Parts beside a run.h5 are those of a run that was begun anew.
+        if not path.exists() or any(self._parts.glob("*")):
+            return None
+        try:
+            with open_run(path) as run:
+                attributes = {key: np.asarray(value).item() for key, value in run.attrs.items()}
+        except (OSError, ValueError) as error:
+            raise FolderError(f"{error}; --force makes the run again") from error
 
-        return on_root(self.comm, read)
+        for key in ("statistics", "warnings"):
+            if key in attributes:
+                attributes[key] = json.loads(attributes[key])
+        if not (self.folder / "summary.json").exists():
+            self._summarise(attributes | {"case": tomllib.loads(attributes["case"])})
+        return attributes
 
-    def _summarise(self, told: Mapping[str, Any]) -> None:
-        write_text(self.folder / "summary.json", json.dumps(told, indent=2, allow_nan=False) + "\n")
+    def _summarise(self, summary: Mapping[str, Any]) -> None:
+        """Write ``summary.json``."""
+        write_text(self.folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def room(self, shape: tuple[int, ...]) -> np.ndarray:
         """Room (field, sample, dof, cell) for this rank's fields of the next chunk."""
         return np.empty(shape)
 
     def append(self, chunk: Arrays | None) -> None:
-        """Keep this rank's share of the next chunk, None for no share; all ranks must call it.
+        """Keep this rank's part of the next chunk, None for no part; all ranks must call it.
 
         Raises OSError on all ranks if one cannot write.
         """
@@ -95,11 +113,16 @@ class RunFolder:
         return load_arrays(self._chunk(number, rank), wanted)
 
     def save_state(self, state: Arrays) -> None:
-        """Keep this rank's checkpoint after the last chunk, and the one before; as ``append``."""
-        number, path = self.count - 1, self._state(self.count - 1, self.comm.rank, self.comm.size)
+        """Keep this rank's checkpoint after the last chunk, and the one before; all ranks must call it.
+
+        Raises OSError on all ranks if one cannot write.
+        """
+        number = self.count - 1
+        path = self._state(number, self.comm.rank, self.comm.size)
 
         def replace_oldest() -> None:
             save_arrays(path, state)
+            # The one before stays: until all ranks have written this one, it is the last that is complete.
             if self.comm.rank == 0:
                 for old in self._parts.glob(f"state-{number - 2:06d}-*"):
                     old.unlink()
@@ -107,65 +130,60 @@ class RunFolder:
         on_every_rank(self.comm, replace_oldest)
 
     def last_state(self) -> Sequence[Arrays] | None:
-        """Go back to the last checkpoint that is complete, if there is one: ``count``, and the shares of all its ranks.
+        """Go back to the last checkpoint that is complete: ``count`` becomes its, and all its parts are returned.
 
-        However many there were; all ranks must call it.
+        It may be of another number of ranks; None if there is no checkpoint. All ranks must call it.
         """
-
-        def last_complete() -> tuple[int, int]:
-            names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
-            counts = Counter((int(number), int(size)) for _, number, _, size in names)
-            last = max((key for key, count in counts.items() if count == key[1]), default=(-1, 0))
-            for path in self._parts.glob("*-*-*.npy"):
-                if int(path.stem.split("-")[1]) > last[0]:
-                    path.unlink()  # another number of ranks would not replace it
-            return last
-
-        number, size = on_root(self.comm, last_complete)
+        number, size = on_root(self.comm, self._last_complete_state)
         self.count = number + 1
+        if not size:
+            return None
         paths = [self._state(number, rank, size) for rank in range(size)]
-        return on_every_rank(self.comm, lambda: [load_arrays(path, copy=False) for path in paths]) if paths else None
+        return on_every_rank(self.comm, lambda: [load_arrays(path, copy=False) for path in paths])
+
+    def _last_complete_state(self) -> tuple[int, int]:
+        """Number and ranks of the last complete checkpoint, (-1, 0) if there is none; later files are removed."""
+        names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
+        counts = Counter((int(number), int(size)) for _, number, _, size in names)
+        complete = [key for key, count in counts.items() if count == key[1]]
+        number, size = max(complete, default=(-1, 0))
+
+        for path in self._parts.glob("*-*-*.npy"):
+            if int(path.stem.split("-")[1]) > number:
+                path.unlink()  # another number of ranks would not replace it
+        return number, size
 
     def _chunk(self, number: int, rank: int) -> Path:
+        """The file of a rank's part of chunk ``number``."""
         return self._parts / f"part-{number:06d}-{rank}.npy"
 
     def _state(self, number: int, rank: int, size: int) -> Path:
+        """The file of a rank's part of the checkpoint after chunk ``number``, which ``size`` ranks have written."""
         return self._parts / f"state-{number:06d}-{rank}-{size}.npy"
 
     def ranks(self, number: int) -> list[int]:
-        """Those that kept a share of chunk ``number``."""
+        """The ranks that kept a part of chunk ``number``."""
         return [int(path.stem.split("-")[2]) for path in self._parts.glob(f"part-{number:06d}-*.npy")]
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Put the chunks together; all ranks must call it. Raises OSError on all ranks if one cannot write.
 
-        ``attributes`` besides the case are the root's, the same on all ranks; ``summary.json`` tells them and
+        ``attributes``, the same on all ranks, become those of the root, with the case; ``summary.json`` holds them and
         ``summary``. ``run.h5`` takes its name when it is complete, then the chunks go.
         """
-        target, aside, together = self.folder / "run.h5", self.folder / ".run.h5.part", self.recording.together
+        target = self.folder / "run.h5"
+        aside = self.folder / ".run.h5.part"
+        writes = self.recording.together or self.comm.rank == 0
 
         def read_chunks() -> tuple[xr.Dataset, np.ndarray] | None:
             sys.audit("vipetsc.assemble", str(target))
-            writes = together or self.comm.rank == 0
-            return (chunks.small_dataset(self, attributes), chunks.read_log(self)) if writes else None
+            if not writes:
+                return None
+            return chunks.small_dataset(self, attributes), chunks.read_log(self)
 
         def write() -> None:
             try:
-                with h5py.File(aside, "w", **({"driver": "mpio", "comm": self.comm} if together else {})) as file:
-                    put_dataset(file, data, write=self.comm.rank == 0)
-                    columns, sizes = chunks.log_columns(log, first), {**data.sizes, "episode": total}
-                    # All of them first: ranks create together, but each copies and may fail alone.
-                    large = {}
-                    for name in (*columns, LOSSES, *self.recording.fields):
-                        dims, about = chunks.described(name, data)
-                        dtype = columns[name].dtype if name in columns else float
-                        about |= chunks.coordinates(name)
-                        large[name] = add_variable(file, name, dims, [sizes[dim] for dim in dims], dtype, about)
-                    for name, dataset in large.items():
-                        if name not in columns:
-                            chunks.put_chunks(dataset, self, name)
-                        elif log.size:
-                            dataset[first : first + log.size] = columns[name]
+                self._write(aside, contents)
             except (OSError, RuntimeError) as error:  # h5py raises either when HDF5 cannot write
                 raise unwritten(target, error) from error
 
@@ -177,15 +195,40 @@ class RunFolder:
             discard(self._parts)
 
         try:
-            # A rank that cannot must not leave the others creating a file.
-            parts = on_every_rank(self.comm, read_chunks)
-            if parts:
-                data, (log, first, total) = parts[0], sort_over_ranks(chunks.writers(self), parts[1], ("onset", "site"))
-            on_every_rank(self.comm, write if parts else lambda: None)
+            # A rank that cannot read must not leave the others creating a file.
+            read = on_every_rank(self.comm, read_chunks)
+            if read:
+                small, log = read
+                in_order = sort_over_ranks(chunks.writers(self), log, ("onset", "site"))
+                contents = _Contents(small=small, log=in_order)
+            on_every_rank(self.comm, write if writes else lambda: None)
             on_root(self.comm, conclude)
         finally:
             if self.comm.rank == 0:
                 aside.unlink(missing_ok=True)
+
+    def _write(self, path: Path, contents: _Contents) -> None:
+        """Write a file of the run to ``path``, together with the other writers."""
+        together = {"driver": "mpio", "comm": self.comm} if self.recording.together else {}
+        log = contents.log
+        columns = chunks.log_columns(log.rows, log.first)
+        sizes = {**contents.small.sizes, "episode": log.total}
+        with h5py.File(path, "w", **together) as file:
+            put_dataset(file, contents.small, write=self.comm.rank == 0)
+            # All of them first: ranks create together, but each copies and may fail alone.
+            large = {}
+            for name in (*columns, LOSSES, *self.recording.fields):
+                description = chunks.described(name, contents.small)
+                dtype = columns[name].dtype if name in columns else float
+                about = description.attributes | chunks.coordinates(name)
+                shape = [sizes[dim] for dim in description.dims]
+                large[name] = add_variable(file, name, description.dims, shape, dtype, about)
+
+            for name, dataset in large.items():
+                if name not in columns:
+                    chunks.put_chunks(dataset, self, name)
+                elif log.rows.size:
+                    dataset[log.first : log.first + log.rows.size] = columns[name]
 
 
 class RunMemory:
@@ -193,38 +236,46 @@ class RunMemory:
 
     It is used as a ``RunFolder``. Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
     They lie in memory as (t, dof, cell): on one rank the engine writes them where they stay. ``end`` are the
-    displacements and velocities (cell, 2 dof) at the last sample of a run that is complete; see ``end/displacement``.
+    displacements and velocities (cell, 2 dof) at the last sample of a run that is complete; the dataset has them as
+    ``end/displacement`` and ``end/velocity``.
     """
 
     folder = None
     recording: Recording
 
     def __init__(self, comm: MPI.Comm = MPI.COMM_SELF) -> None:
-        self.comm, self.count = comm, 0
+        self.comm = comm
+        self.count = 0
         self.dataset: xr.Dataset | None = None
         self.end: np.ndarray | None = None
 
     def begin(self, case: str) -> None:
-        """Make ready."""
-        self.case, self.count, self._rows = case, 0, 0
+        """Make ready for a run of ``case`` (TOML)."""
+        self.case = case
+        self.count = 0
+        self._rows = 0
         self._chunks: list[Arrays] = []
-        vars(self).pop("_fields", None)
+        vars(self).pop("_fields", None)  # of the run before
 
     @cached_property
     def _fields(self) -> np.ndarray:
-        sizes = (len(self.recording.given[name]) for name in ("dof", "cell"))
-        return np.empty((len(self.recording.fields), self.recording.rows, *sizes))
+        """All fields (field, sample, dof, cell); made when the recording is known."""
+        dofs = len(self.recording.given["dof"])
+        cells = len(self.recording.given["cell"])
+        return np.empty((len(self.recording.fields), self.recording.rows, dofs, cells))
 
     def room(self, shape: tuple[int, ...]) -> np.ndarray:
         """Room (field, sample, dof, cell) for this rank's fields of the next chunk."""
-        return self._fields[:, self._rows :][:, : shape[1]] if self.comm.size == 1 else np.empty(shape)
+        if self.comm.size > 1:
+            return np.empty(shape)
+        return self._fields[:, self._rows : self._rows + shape[1]]
 
     def append(self, chunk: Arrays | None) -> None:
         """Keep the next chunk."""
         arrays = dict(chunk or {})
         fields = [arrays.pop(name) for name in self.recording.fields if name in arrays]
         rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
-        if self.comm.size > 1 and fields:
+        if self.comm.size > 1 and fields:  # on one rank they stand there already
             self._fields[:, rows] = fields
         self._rows = rows.stop
         self._chunks.append(arrays)
@@ -235,7 +286,7 @@ class RunMemory:
         return [0]
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """Chunk ``number`` of this rank, which has what is ``wanted``."""
+        """Chunk ``number`` of this rank, whole: it is in memory anyhow."""
         return self._chunks[number]
 
     def save_state(self, state: Arrays) -> None:
@@ -248,14 +299,16 @@ class RunMemory:
         """Make the dataset; all ranks must call it."""
         if self.comm.rank == 0:
             self.dataset = chunks.small_dataset(self, attributes)
-            log, *_ = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
-            fields = dict(zip(self.recording.fields, self._fields[:, : self._rows].swapaxes(2, 3), strict=True))
+            log = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
+            large = {**chunks.joined(self, [LOSSES]), **chunks.log_columns(log.rows)}
+            recorded = self._fields[:, : self._rows].swapaxes(2, 3)
+            large |= dict(zip(self.recording.fields, recorded, strict=True))
             if self.end is not None:
-                last = np.split(self.end[self.recording.given["cell"] - 1], 2, axis=1)
-                fields |= dict(zip(("end/displacement", "end/velocity"), last, strict=True))
-            for name, values in {**chunks.joined(self, [LOSSES]), **chunks.log_columns(log), **fields}.items():
-                dims, about = chunks.described(name, self.dataset)
-                self.dataset[name] = dims, values, about
+                displacement, velocity = np.split(self.end[self.recording.given["cell"] - 1], 2, axis=1)
+                large |= {"end/displacement": displacement, "end/velocity": velocity}
+            for name, values in large.items():
+                description = chunks.described(name, self.dataset)
+                self.dataset[name] = (description.dims, values, description.attributes)
         self._chunks = []
 
 
