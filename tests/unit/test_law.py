@@ -21,8 +21,9 @@ from vipetsc.lattice import Chain, ToneBurst, bloch, four_band, waves_at
 from vipetsc.lattice.packet import packet_speeds
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra import by_direction, upper_share, wave_energies
-from vipetsc.studies.one_site import ScatteringRuns, largest_between, make_law
-from vipetsc.studies.scattering_law import OF_POINT, Outcome, ScatteringLaw, matched_clearances
+from vipetsc.studies.one_site import ScatteringRuns, make_law
+from vipetsc.studies.pair_motion import largest_between
+from vipetsc.studies.scattering_law import POINT_LAYOUT, Outcome, ScatteringLaw, matched_clearances
 
 THREE = {
     "masses": [0.010, 0.004, 0.002],
@@ -197,7 +198,7 @@ def by_hand() -> ScatteringLaw:
 
 def test_between_points_the_law_is_linear_in_log_z():
     law = by_hand()
-    assert [*Outcome._fields] == [*Outcome(*(law.mean))._asdict()] and set(Outcome._fields) == set(OF_POINT)
+    assert [*Outcome._fields] == [*Outcome(*(law.mean))._asdict()] and set(Outcome._fields) == set(POINT_LAYOUT)
     middle = law.at([[np.sqrt(1.2 * 1.5), 1.02], [0.1, 9.0]])
     np.testing.assert_allclose(middle.upper, [[0.12, 0.08], [0, 0.01]], atol=1e-15)
     assert middle.share.shape == (2, 2, 3, 2) and middle.onset[0, 1] == 0.1 and np.isnan(middle.onset[1, 0])

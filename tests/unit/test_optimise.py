@@ -336,9 +336,9 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
         raise {"stalls": RuntimeError("stalled"), "short": error}[key]
 
     for _ in range(2):
-        runs = RecordedRuns("small", tmp_path, MPI.COMM_SELF, StopRequest())
+        runs = RecordedRuns("small-runs", tmp_path, MPI.COMM_SELF, StopRequest()).read()
         with pytest.raises(OSError, match=r"Unable|full|0 problem"):
             runs.make(["stalls", "short"], work, failures=True)
-        known = RecordedRuns("small", tmp_path, MPI.COMM_SELF, StopRequest()).known
+        known = RecordedRuns("small-runs", tmp_path, MPI.COMM_SELF, StopRequest()).read().known
         assert [*known] == ["stalls"] and known["stalls"]["reason"] == "stalled"
     assert asked == ["stalls", "short", "short"]

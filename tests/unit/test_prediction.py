@@ -13,7 +13,8 @@ from vipetsc.dynamics import simulate
 from vipetsc.io.records import read_records
 from vipetsc.io.store import RunMemory
 from vipetsc.studies.composition import Network
-from vipetsc.studies.prediction import LINEAR, SITE, PredictionRuns, amplitudes_of, composed, predict, site_points
+from vipetsc.studies.prediction import LINEAR, SITE, Records, amplitudes_of, composed, predict, site_points
+from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, SiteResponse, in_contact
 
 SMALL = {
@@ -45,6 +46,11 @@ def response(made, **sections):
     linear = next(record for record in records if record["kind"] == LINEAR)
     answers = [record for record in records if record["kind"] == SITE]
     return linear, answers, small(**sections)
+
+
+def compose_case(case, linear, answers):
+    """The prediction of a case from these records, without simulations beside it."""
+    return composed(case, Records(linear, answers, [], answers[0]["largest"]))
 
 
 def answer(made):
@@ -103,7 +109,7 @@ def test_without_loss_nothing_is_lost(made):
     linear, answers, case = response(made)
     for record in answers:
         record["sums"][6], record["totals"][0] = [0.0] * BINS, 0.0
-    data = composed(case, linear, answers, [], answers[0]["largest"])
+    data = compose_case(case, linear, answers)
     assert float(np.abs(data["predicted/dissipated"]).max()) == 0
     assert float(data["predicted/upper"].max()) > 0.05
 
@@ -113,14 +119,14 @@ def test_the_order_of_the_sites_in_the_file_does_not_matter(made):
     swapped = small(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
     ways = []
     for case, reached in ((small(), linear["reached"]), (swapped, linear["reached"][::-1])):
-        ways.append(composed(case, linear | {"reached": reached}, answers, [], answers[0]["largest"]))
+        ways.append(compose_case(case, linear | {"reached": reached}, answers))
     np.testing.assert_allclose(ways[0]["predicted/bands"], ways[1]["predicted/bands"], atol=2e-4)
 
 
 def test_a_site_that_nothing_reaches_changes_nothing(made):
     linear, answers, _ = response(made)
     more = small(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})
-    data = composed(more, linear | {"reached": [*linear["reached"], 1e-4]}, answers, [], answers[0]["largest"])
+    data = compose_case(more, linear | {"reached": [*linear["reached"], 1e-4]}, answers)
     np.testing.assert_allclose(data["predicted/bands"], made[2]["predicted/bands"], atol=2e-3)
 
 
@@ -136,14 +142,14 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(made):
     site = answer(made)
     assert all(0 < record["release"] < 1 for record in answers[4:])
     z = [record["z"] for record in answers]
-    np.testing.assert_allclose(site.of_bursts(np.array(z))[-1], [record["release"] for record in answers])
+    np.testing.assert_allclose(site.of_bursts(np.array(z)).release, [record["release"] for record in answers])
 
 
 def test_runs_that_are_there_are_not_made_again(made, tmp_path, monkeypatch):
     folder, case, data = made
     (tmp_path / "prediction-runs.jsonl").write_bytes((folder / "prediction-runs.jsonl").read_bytes())
     (tmp_path / "case.toml").write_text(case.to_toml())
-    monkeypatch.setattr(PredictionRuns, "_run", lambda *_: pytest.fail("a run was made"))
+    monkeypatch.setattr(RecordedRuns, "run_in_memory", lambda *_: pytest.fail("a run was made"))
     again = predict(case, tmp_path)
     for name in ("predicted/bands", "simulated/bands"):
         np.testing.assert_array_equal(again[name], data[name])

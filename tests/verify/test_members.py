@@ -17,7 +17,7 @@ from vipetsc.studies.ensemble import COMPLETE, SCALED
 from vipetsc.studies.linear_run import linear_case, linear_name
 from vipetsc.studies.reanalysis import reanalyse_folders
 from vipetsc.studies.sweep import run_sweep
-from vipetsc.studies.sweep_runs import MemberStore
+from vipetsc.studies.sweep_runs import SweepRuns
 
 TABLE = {
     "name": "margin",
@@ -34,9 +34,9 @@ def sweep(tmp_path_factory):
     folder = tmp_path_factory.mktemp("members")
     case = Case.from_table(TABLE | {"drive": TABLE["drive"] | {"amplitude": 1.0}})
     plan = Sweep.from_table(TABLE | {"sweep": {"drive": {"amplitude": [1.0]}}})
-    store = MemberStore(plan, folder, MPI.COMM_SELF, StopRequest())
-    store.make_linear(linear_case(case), ())
-    one = store.linear[linear_name(case)].reached(case).max()
+    runs = SweepRuns(plan, folder, MPI.COMM_SELF, StopRequest())
+    runs.make_linear(linear_case(case), ())
+    one = runs.linear[linear_name(case)].reached(case).max()
     shares = np.array([0.6, 0.85, 1.02, 1.1, 1.25, 3.0])
     table = TABLE | {"sweep": {"drive": {"amplitude": (shares / one).tolist()}}}
     result = run_sweep(Sweep.from_table(table), folder / "sweep")

@@ -94,7 +94,7 @@ class LawCase(Case):
         return max(max_group_velocity(cell, number + 1)[2] for number in range(cell.dofs))
 
     def one_site(self) -> OneSite:
-        """The lattice and the times of the law's runs (see ``studies.law``)."""
+        """The lattice and the times of the law's runs (see ``studies.ring``)."""
         distance, clearance, model = self.law.distance, self.law.clearance, self.model()
         assert distance is not None and clearance is not None
         cell, interval = model.chain.cell, model.sample_interval

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from vipetsc.paper.build_record import read_record, write_record
 from vipetsc.paper.plan import STALE, PaperStep, Plan
 from vipetsc.parallel import StoppedError, StopRequest, on_root
-from vipetsc.studies.pool import FULL, TaskPool
+from vipetsc.studies.pool import DISK_FULL, TaskPool
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
         raise
     except Exception as error:
         alone = comm.size > 1 and not getattr(error, "from_root", False)
-        if alone or getattr(error, "errno", None) in FULL:
+        if alone or getattr(error, "errno", None) in DISK_FULL:
             raise
         notes.append(f"failed: {name}: {error or type(error).__name__}")
 

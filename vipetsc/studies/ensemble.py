@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -17,7 +17,8 @@ from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
 from vipetsc.io.records import Line, Record, merge_records, read_records
 from vipetsc.spectra import FEWEST, doubt, normalised, power_law
-from vipetsc.studies.linear_run import FITTED, MEASURES, RECORDS, LinearRun, record_files
+from vipetsc.studies.linear_run import FITTED, MEASURES, MEMBERS, LinearRun
+from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sample_statistics import over_samples
 
 FORMAT_VERSION = 2
@@ -25,7 +26,7 @@ STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached bef
 COMPLETE, SCALED, FAILED, MISSING = range(4)
 AMPLITUDE = "drive.amplitude"
 
-# What is known of a member's run, as ``MEASURES`` are of its analysis.
+# What the ensemble takes of a member's statistics: as ``MEASURES`` of its analysis.
 STATISTICS = {
     "contact_episodes": ("", "1", "contact episodes"),
     "dissipated_fraction": ("", "1", "dissipated energy over the drive's work"),
@@ -61,18 +62,29 @@ FIT = {
 }
 
 
+class LinearSource(NamedTuple):
+    """What a scaled member was scaled from: the ``name`` of a linear run, measured for the first ``site`` (cell)."""
+
+    name: str
+    site: int
+
+
 class Results:
-    """What the records of the sweep ``plan`` in ``folder`` tell, those of other versions and sweeps left out.
+    """What the records of the sweep ``plan`` in ``folder`` hold, those of other versions and sweeps left out.
 
     ``status`` (member): how each ended, an index of ``STATUS``; ``reasons`` of those that failed by number; ``tables``
     (member, or member and a list, padded with NaN) of what was measured by name, for the first of equal members;
     ``errors`` the largest that is said of each; ``used`` tolerances, engines and options of the analysis; ``linear``
     runs by name; ``lines`` where the records stand. ``first`` (member) is the number of the first member that is equal.
-    ``warnings`` by number are about the members, ``damaged`` tells of lines that could not be used.
+    ``warnings`` by number are about the members, ``damaged`` names lines that could not be used.
     """
 
     def __init__(self, plan: Sweep, folder: Path) -> None:
-        self.plan, self.folder, self.ids = plan, folder, plan.ids()
+        self.plan = plan
+        self.folder = folder
+        self.ids = plan.ids()
+        self.paths = RecordPaths(folder, MEMBERS)
+        self.files = self.paths.existing()
         self.status = np.full(plan.count, MISSING, np.int8)
         self.reasons: dict[int, str] = {}
         self.tables: dict[str, np.ndarray] = {}
@@ -84,81 +96,107 @@ class Results:
         self.cpu_seconds: dict[int, float] = {}
         self.used: dict[str, set[Any]] = {"rtol": set(), "engine": set(), "analysis": set()}
         self.errors: dict[str, float] = {}
+
         number_of: dict[str, int] = {}
         self.first = np.array([number_of.setdefault(name, number) for number, name in enumerate(self.ids)])
-        scaled: dict[int, tuple[str, int]] = {}
-        self.files = record_files(folder)
-        for record, line in (pair for path in self.files for pair in read_records(path, self.damaged.append)):
-            if record["vipetsc_version"] != vipetsc.__version__:
-                continue
-            if "envelope" in record:
-                run, name = LinearRun.of_record(record), record["linear"]
-                self.linear[name], self.lines[f"{name} {[*run.measures]}"] = run.joined(self.linear.get(name)), line
-            elif (number := number_of.get(record["id"])) is not None:
-                self._enter(number, record, line)
-                if record["status"] == STATUS[SCALED]:
-                    scaled[number] = record["linear"], record["site"]
-        self._scale(scaled)
+        sources = self._read(number_of)
+        self._scale(sources)
         self.status = self.status[self.first]
 
+    def _read(self, number_of: Mapping[str, int]) -> dict[int, LinearSource]:
+        """Take all records; returns what scaled members were scaled from, by the members' numbers."""
+        sources: dict[int, LinearSource] = {}
+        for path in self.files:
+            for record, line in read_records(path, self.damaged.append):
+                if record["vipetsc_version"] != vipetsc.__version__:
+                    continue
+                if "envelope" in record:
+                    self._enter_linear(record, line)
+                    continue
+
+                number = number_of.get(record["id"])
+                if number is not None:
+                    self._enter(number, record, line)
+                    if record["status"] == STATUS[SCALED]:
+                        sources[number] = LinearSource(record["linear"], record["site"])
+        return sources
+
+    def _enter_linear(self, record: Record, line: Line) -> None:
+        """Take the ``record`` of a linear run, which may be measured for other sites than an earlier one."""
+        run = LinearRun.of_record(record)
+        name = record["linear"]
+        self.linear[name] = run.joined(self.linear.get(name))
+        self.lines[f"{name} {[*run.measures]}"] = line
+
     def _enter(self, number: int, record: Record, line: Line) -> None:
-        """Take what a ``record`` tells of a member; the latest counts, a failure only where nothing else is there."""
-        if record["status"] == STATUS[FAILED] and self.status[number] in (COMPLETE, SCALED):
+        """Take the ``record`` of a member; the latest counts, a failure only where nothing else is there."""
+        failed = record["status"] == STATUS[FAILED]
+        if failed and self.status[number] in (COMPLETE, SCALED):
             return
-        self.status[number], self.lines[record["id"]] = STATUS.index(record["status"]), line
+        self.status[number] = STATUS.index(record["status"])
+        self.lines[record["id"]] = line
         self.reasons.pop(number, None)
-        if record["status"] == STATUS[FAILED]:
+        if failed:
             self.reasons[number] = record["reason"]
             return
-        known = record["statistics"]
-        row = {"contact_episodes": known["episodes"], "ledger_error": known["ledger_error"], "work": known["work"]}
-        row["dissipated_fraction"] = known["dissipated"] / known["work"] if known["work"] else np.nan
+
+        statistics = record["statistics"]
+        work = statistics["work"]
+        row = {
+            "contact_episodes": statistics["episodes"],
+            "ledger_error": statistics["ledger_error"],
+            "work": work,
+            "dissipated_fraction": statistics["dissipated"] / work if work else np.nan,
+        }
         self._put(number, row | record.get("measures", {}))
         # An amplitude sweep goes below the onset on purpose.
         self.warnings[number] = [text for text in record["warnings"] if not text.startswith("no contact")]
         self.cpu_seconds[number] = record["cpu_seconds"]
-        for name, value in (("rtol", record["rtol"]), ("engine", known["engine"])):
-            self.used[name].add(value)
+        self.used["rtol"].add(record["rtol"])
+        self.used["engine"].add(statistics["engine"])
 
     def _put(self, number: int | list[int], row: Record) -> None:
         """Enter what was measured of a member, or the same of several, into the tables."""
-        if parts := row.get("parts"):
-            self.parts.add(tuple(parts))
-        if options := row.get("analysis"):
-            self.used["analysis"].add(options)
+        if row.get("parts"):
+            self.parts.add(tuple(row["parts"]))
+        if row.get("analysis"):
+            self.used["analysis"].add(row["analysis"])
         for name, error in row.get("errors", {}).items():
             self.errors[name] = max(error, self.errors.get(name, 0.0))
+
         for name in row.keys() - {"parts", "analysis", "errors"}:
             value = np.asarray(row[name], float)
             if name not in self.tables:
                 self.tables[name] = np.full((len(self.ids), *value.shape), np.nan)
             table = self.tables[name]
             if value.ndim and len(value) > table.shape[1]:
-                wider = (0, 0), (0, len(value) - table.shape[1])
-                self.tables[name] = table = np.pad(table, wider, constant_values=np.nan)
+                missing_columns = len(value) - table.shape[1]
+                table = np.pad(table, ((0, 0), (0, missing_columns)), constant_values=np.nan)
+                self.tables[name] = table
             table[(number, *map(slice, value.shape))] = value
 
-    def _scale(self, scaled: Mapping[int, tuple[str, int]]) -> None:
+    def _scale(self, sources: Mapping[int, LinearSource]) -> None:
         """Give scaled members the measures of their linear runs; those whose record is lost are missing."""
-        members: dict[tuple[str, int], list[int]] = {}
-        for number, source in scaled.items():
+        # All members of one source at once: a large sweep has thousands of each.
+        members: dict[LinearSource, list[int]] = {}
+        for number, source in sources.items():
             if self.status[number] == SCALED:
                 members.setdefault(source, []).append(number)
-        for (name, site), numbers in members.items():
-            if name in self.linear and site in self.linear[name].measures:
-                run = self.linear[name]
-                self._put(numbers, run.measures[site])
-                if "bands/modal_energy" in run.measures[site]:
-                    table = self.tables["bands/modal_energy"]
-                    table[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
-            else:
+
+        for source, numbers in members.items():
+            run = self.linear.get(source.name)
+            if run is None or source.site not in run.measures:
                 self.status[numbers] = MISSING
+                continue
+            self._put(numbers, run.measures[source.site])
+            if "bands/modal_energy" in run.measures[source.site]:
+                energy = self.tables["bands/modal_energy"]
+                energy[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
 
     def merge_files(self) -> None:
         """Put the records of all ranks together in one file, without those that count no more."""
-        if self.damaged or self.files != [self.folder / RECORDS]:
-            parts = [path for path in self.files if path.name != RECORDS]
-            merge_records(self.folder / RECORDS, self.lines.values(), parts)
+        if self.damaged or self.files != [self.paths.merged]:
+            merge_records(self.paths.merged, self.lines.values(), self.paths.by_rank())
 
 
 def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
@@ -168,47 +206,92 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     failed. The file depends on the members alone, not on when or on how many ranks they were made.
     """
     sys.audit("vipetsc.merge", str(results.folder))
-    plan, names = results.plan, results.plan.names()
-    data: Variables = {}
-    for axis in plan.axes:
-        for key, values in axis.items():
-            data[names[key]] = variable(names[next(iter(axis))], coordinate(values), UNITS.get(key, "1"), key)
-    dims = tuple(names[next(iter(axis))] for axis in plan.axes)
+    plan = results.plan
+    data = _coordinates(plan) | _member_variables(results) | _measured_variables(results)
+    data |= _fit_variables(plan, data)
 
+    positions = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
+    numbers = results.first[results.status == FAILED]
+    about = origin() | {"format_version": FORMAT_VERSION}
+    about |= {name: sorted(values) for name, values in results.used.items()}
+    about |= {
+        "case": plan.to_toml(),
+        "failed": [f"{tuple(at)}: {results.reasons[n]}" for at, n in zip(positions, numbers, strict=True)],
+        "warnings": json.dumps(warnings),
+    }
+    write_netcdf(results.folder / "ensemble.h5", xr.Dataset(data, attrs=about))
+
+
+def _dimensions(plan: Sweep) -> tuple[str, ...]:
+    """The name of each axis of the sweep: that of its first key."""
+    names = plan.names()
+    return tuple(names[next(iter(axis))] for axis in plan.axes)
+
+
+def _coordinates(plan: Sweep) -> Variables:
+    """The swept values of every key."""
+    names = plan.names()
+    data: Variables = {}
+    for axis, dimension in zip(plan.axes, _dimensions(plan), strict=True):
+        for key, values in axis.items():
+            data[names[key]] = variable(dimension, coordinate(values), UNITS.get(key, "1"), key)
+    return data
+
+
+def _member_variables(results: Results) -> Variables:
+    """How every member ended, and its name."""
+    plan = results.plan
+    dims = _dimensions(plan)
     flags = {"flag_values": np.arange(MISSING, dtype=np.int8), "flag_meanings": " ".join(STATUS[:MISSING])}
-    data["status"] = variable(dims, results.status.reshape(plan.shape), "1", "how the member ended", **flags)
     ids = np.array(results.ids, dtype=object).reshape(plan.shape)
-    data["member"] = variable(dims, ids, "1", "name of the member, and of its folder if it has one")
+    return {
+        "status": variable(dims, results.status.reshape(plan.shape), "1", "how the member ended", **flags),
+        "member": variable(dims, ids, "1", "name of the member, and of its folder if it has one"),
+    }
+
+
+def _measured_variables(results: Results) -> Variables:
+    """``STATISTICS`` and those of ``MEASURES`` that some member has, with the coordinates that they need."""
+    plan = results.plan
+    dims = _dimensions(plan)
+    data: Variables = {}
     for name, (further, *texts) in (STATISTICS | MEASURES).items():
         table = results.tables.get(name, np.full(plan.count, np.nan))[results.first]
         if further == "part" and len(results.parts) != 1:  # cells whose bands overlap differently have no common parts
             continue
         if name in STATISTICS or table.ndim > 1 or not np.isnan(table).all():
-            said: dict[str, Any] = {"sampling_error": results.errors[name]} if name in results.errors else {}
+            error: dict[str, Any] = {}
+            if name in results.errors:
+                error["sampling_error"] = results.errors[name]
             table = table.reshape(*plan.shape, *table.shape[1:])
-            data[name] = variable((*dims, *further.split()), table, *texts, **said)
+            data[name] = variable((*dims, *further.split()), table, *texts, **error)
+
     if "entropy/history" in data:
         number = np.arange(data["entropy/history"].shape[-1])
         data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
         data["entropy/time"] = data.pop("entropy/snapshot")
-    for name in data.keys() & {"bands/share", "bands/modal_energy"}:
-        data[name].attrs["parts"] = list(*results.parts)
-        number = np.arange(1, data[name].shape[-1] + 1)
-        data["part"] = variable("part", number, "1", "part of the frequency axis")
-    places = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
-    numbers = results.first[results.status == FAILED]
-    failed = [f"{tuple(place)}: {results.reasons[n]}" for place, n in zip(places, numbers, strict=True)]
-    about = (
-        origin() | {"format_version": FORMAT_VERSION} | {name: sorted(values) for name, values in results.used.items()}
-    )
-    about |= {"case": plan.to_toml(), "failed": failed, "warnings": json.dumps(warnings)}
-    data |= _fits(data, names[AMPLITUDE]) if AMPLITUDE in names else {}
+    for name in ("bands/share", "bands/modal_energy"):
+        if name in data:
+            data[name].attrs["parts"] = list(*results.parts)
+            number = np.arange(1, data[name].shape[-1] + 1)
+            data["part"] = variable("part", number, "1", "part of the frequency axis")
+    return data
+
+
+def _fit_variables(plan: Sweep, data: Variables) -> Variables:
+    """Power laws over the amplitude; statistics over samples of disorder, and power laws of their means."""
+    names = plan.names()
+    fits: Variables = {}
+    if AMPLITUDE in names:
+        fits |= _fits(data, names[AMPLITUDE])
     if any(axis.keys() == {SEED} for axis in plan.axes):
-        data |= over_samples(data, names[SEED], [name for name in STATISTICS | MEASURES if name in data])
-        means = {name: data[f"statistics/{name}/mean"] for name in FITTED if name in data}
-        along = {name: data[name] for key, name in names.items() if key == AMPLITUDE}
-        data |= {f"statistics/{name}": fit for key in along for name, fit in _fits(means | along, key).items()}
-    write_netcdf(results.folder / "ensemble.h5", xr.Dataset(data, attrs=about))
+        fits |= over_samples(data, names[SEED], [name for name in STATISTICS | MEASURES if name in data])
+        if AMPLITUDE in names:
+            amplitude = names[AMPLITUDE]
+            means = {name: fits[f"statistics/{name}/mean"] for name in FITTED if name in data}
+            fits_of_means = _fits(means | {amplitude: data[amplitude]}, amplitude)
+            fits |= {f"statistics/{name}": fit for name, fit in fits_of_means.items()}
+    return fits
 
 
 def _fits(data: Variables, along: str) -> Variables:
@@ -219,12 +302,13 @@ def _fits(data: Variables, along: str) -> Variables:
     fits: Variables = {}
     amplitude = data[along].values.astype(float)
     for name in FITTED:
-        if name in data:
-            curves = data[name].transpose(..., *data[along].dims)
-            rows = [fit_curve(amplitude, y, name != "ibtet") for y in curves.values.reshape(-1, len(amplitude))]
-            for key, about in FIT.items():
-                table = np.array([row[key] for row in rows]).reshape(curves.shape[:-1])
-                fits[f"fits/{name}/{key}"] = variable([*map(str, curves.dims[:-1])], table, *about)
+        if name not in data:
+            continue
+        curves = data[name].transpose(..., *data[along].dims)
+        rows = [fit_curve(amplitude, y, name != "ibtet") for y in curves.values.reshape(-1, len(amplitude))]
+        for key, about in FIT.items():
+            table = np.array([row[key] for row in rows]).reshape(curves.shape[:-1])
+            fits[f"fits/{name}/{key}"] = variable([*map(str, curves.dims[:-1])], table, *about)
     return fits
 
 
@@ -233,17 +317,32 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     row = dict.fromkeys(FIT, np.nan)
     valid = np.isfinite(curve)
     order = np.argsort(np.abs(amplitude[valid]), kind="stable")
-    x, y = np.abs(amplitude[valid])[order], curve[valid][order]
+    x = np.abs(amplitude[valid])[order]
+    y = curve[valid][order]
     if len(y) < 3 or np.ptp(y) == 0:
         return row
+
     peak = int(np.argmax(y))
-    row |= {"peak_amplitude": x[peak], "peak": y[peak], "points": len(y) - peak, "is_power_law": 0.0}
+    row["peak_amplitude"] = x[peak]
+    row["peak"] = y[peak]
+    row["points"] = len(y) - peak
+    row["is_power_law"] = 0.0
     if row["points"] < 3:
         return row
-    y = normalised(y) if normalise else y
-    line, curved = power_law(x[peak:], y[peak:]), power_law(x[peak:], y[peak:], "nonlinear")
+
+    if normalise:
+        y = normalised(y)
+    line = power_law(x[peak:], y[peak:])
+    curved = power_law(x[peak:], y[peak:], "nonlinear")
     low, high = line.exponent_interval
-    row |= {"exponent": line.exponent, "exponent_low": low, "exponent_high": high, "factor": line.factor}
-    row["is_power_law"] = float(not doubt(row["points"], line.r2_adjusted))
-    row |= {"r2_log_log": line.r2_adjusted, "r2_nonlinear": curved.r2_adjusted}
-    return row | {"exponent_nonlinear": curved.exponent, "factor_nonlinear": curved.factor}
+    return row | {
+        "exponent": line.exponent,
+        "exponent_low": low,
+        "exponent_high": high,
+        "factor": line.factor,
+        "is_power_law": float(not doubt(row["points"], line.r2_adjusted)),
+        "r2_log_log": line.r2_adjusted,
+        "r2_nonlinear": curved.r2_adjusted,
+        "exponent_nonlinear": curved.exponent,
+        "factor_nonlinear": curved.factor,
+    }

@@ -1,7 +1,7 @@
-"""Linear runs: what the members of a sweep share that differ in contacts and amplitude alone.
+"""Linear runs: what those members of a sweep have in common that differ in contacts and amplitude alone.
 
 Until the first contact a lattice is linear, so displacements go with the drive's amplitude and energies with its
-square. The linear run, under 1 N and without contacts, tells which members nothing touches; those are that run, scaled.
+square. The linear run, under 1 N and without contacts, shows which members nothing touches; those are that run, scaled.
 """
 
 from collections.abc import Collection
@@ -18,12 +18,13 @@ from vipetsc.io.read import field_time
 from vipetsc.io.records import Record, read_records
 from vipetsc.lattice.chain import Pair, cells_between
 from vipetsc.studies.analysis import LAYOUT, analyse
+from vipetsc.studies.pair_motion import PairMotion
+from vipetsc.studies.recorded_runs import RecordPaths
 
-# A member is scaled where its linear wave stays below this share of every clearance: the largest w between samples
-# exceeds the sampled envelope by less than the rest for any burst of a few cycles.
+# A member is scaled where its linear wave stays below this fraction of every clearance: the largest w between samples
+# exceeds the sampled envelope by less than what is left, for any burst of a few cycles.
 MARGIN = 0.9
-PARTS = "members-*.jsonl"  # records of the ranks, until all are put together in
-RECORDS = "members.jsonl"
+MEMBERS = "members"  # what the records of a sweep are called
 
 # What the ensemble takes of a member's analysis: further dimension, units and description.
 FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
@@ -38,7 +39,7 @@ MEASURES = {name: LAYOUT[name] for name in (*FITTED, "ibtet_whole", "entropy/err
 
 
 class LinearRun(NamedTuple):
-    """A linear wave, what is known of its run, and the measures of the members in which nothing touches.
+    """A linear wave, the statistics of its run, and the measures of the members in which nothing touches.
 
     ``envelope`` (cell): largest sqrt(w^2 + (w'/Om)^2) in m of the contact pair's relative displacement w, Om the
     drive's angular frequency. ``arrival`` (cell): time in s of the largest host velocity, the paper's t_hat when taken
@@ -52,13 +53,20 @@ class LinearRun(NamedTuple):
 
     @classmethod
     def of(cls, run: xr.Dataset, statistics: dict[str, Any], sites: Collection[int], names: Collection[str]) -> Self:
-        """Of a ``run`` with both fields of all cells, measured for each of the first ``sites`` (cells; 0 for none)."""
+        """Take the wave of a ``run`` with both fields of all cells, and the measures ``names`` of it.
+
+        They are measured for each of the first ``sites`` (cells; 0 for none).
+        """
         model = Case.of(run).model()
-        cell, fields = model.chain.cell, (run["displacement"].values, run["velocity"].values)
-        w, rate = (field[..., cell.resonator] - field[..., cell.host] for field in fields)
-        envelope = np.sqrt(np.max(w**2 + (rate / model.drive.frequency) ** 2, axis=0))
-        arrival = field_time(run)[np.argmax(np.abs(fields[1][..., cell.host]), axis=0)]
-        wave = cls(envelope, arrival, statistics | {"work": float(run["energy/work"][-1])}, {})
+        motion = PairMotion.of(run, model.chain.cell)
+        squares = motion.displacement**2 + (motion.velocity / model.drive.frequency) ** 2
+        host_velocity = run["velocity"].values[..., model.chain.cell.host]
+        wave = cls(
+            envelope=np.sqrt(np.max(squares, axis=0)),
+            arrival=field_time(run)[np.argmax(np.abs(host_velocity), axis=0)],
+            statistics=statistics | {"work": float(run["energy/work"][-1])},
+            measures={},
+        )
         for site in sites:
             wave.measures[site] = measured(analyse(with_site(run, site), names, wave.arrival_at(site)))
         return wave
@@ -70,29 +78,45 @@ class LinearRun(NamedTuple):
     def reached(self, case: Case) -> np.ndarray:
         """Linear relative displacement over the lesser clearance (site) at the amplitude of ``case``.
 
-        It is inf where contacts join other masses than the cell's pair, of which the envelope tells nothing.
+        It is inf where contacts join other masses than the cell's pair, of which the envelope says nothing.
         """
-        sites, clearance = np.asarray(case.contacts.sites, int) - 1, np.asarray(case.contacts.clearance or [], float)
+        contacts = case.contacts
+        sites = np.asarray(contacts.sites, int) - 1
         if _pairs(case):
             return np.full(len(sites), np.inf)
-        gaps = gaps_of_sites(case.contacts, clearance.tolist())
-        return factor(case) * self.envelope[sites] / (np.min(gaps, axis=1) if gaps else clearance)
+
+        clearance = np.asarray(contacts.clearance or [], float)
+        gaps = gaps_of_sites(contacts, clearance.tolist())
+        if gaps:
+            clearance = np.min(gaps, axis=1)
+        return factor(case) * self.envelope[sites] / clearance
 
     def joined(self, other: "LinearRun | str | None") -> "LinearRun":
-        """The run with the measures that another record of it tells as well."""
-        return self._replace(measures=other.measures | self.measures) if isinstance(other, LinearRun) else self
+        """The run with the measures that another record of it holds as well."""
+        if isinstance(other, LinearRun):
+            return self._replace(measures=other.measures | self.measures)
+        return self
 
     def record(self, name: str) -> Record:
         """The run as the record ``name``."""
-        told = self._asdict() | {"envelope": self.envelope.tolist(), "arrival": self.arrival.tolist()}
-        return {"linear": name, "vipetsc_version": vipetsc.__version__} | told
+        return {
+            "linear": name,
+            "vipetsc_version": vipetsc.__version__,
+            "envelope": self.envelope.tolist(),
+            "arrival": self.arrival.tolist(),
+            "statistics": self.statistics,
+            "measures": self.measures,
+        }
 
     @classmethod
     def of_record(cls, record: Record) -> Self:
-        """The run that a ``record`` tells of."""
-        envelope, arrival = (np.array(record[name], float) for name in ("envelope", "arrival"))
-        measures = {int(site): row for site, row in record["measures"].items()}
-        return cls(envelope, arrival, record["statistics"], measures)
+        """The run that a ``record`` holds."""
+        return cls(
+            envelope=np.array(record["envelope"], float),
+            arrival=np.array(record["arrival"], float),
+            statistics=record["statistics"],
+            measures={int(site): row for site, row in record["measures"].items()},  # JSON has no numbers as keys
+        )
 
 
 def measured(analysis: xr.Dataset) -> Record:
@@ -100,15 +124,26 @@ def measured(analysis: xr.Dataset) -> Record:
 
     ``parts`` of the frequency axis by name, ``errors`` by the samples left out, the options of the ``analysis``.
     """
-    row: Record = {name: analysis[name].values.tolist() for name in MEASURES if name in analysis}
-    errors = {name: analysis[name].attrs.get("sampling_error") for name in row}
-    row |= {"errors": {name: float(error) for name, error in errors.items() if error is not None}}
-    row |= {"analysis": analysis.attrs["analysis"]} if "analysis" in analysis.attrs else {}
-    for name in row.keys() & {"bands/share", "bands/modal_energy"}:
-        row["parts"] = list(analysis[name].attrs["parts"])
+    row: Record = {}
+    errors: dict[str, float] = {}
+    for name in MEASURES:
+        if name in analysis:
+            row[name] = analysis[name].values.tolist()
+            error = analysis[name].attrs.get("sampling_error")
+            if error is not None:
+                errors[name] = float(error)
+    row["errors"] = errors
+    if "analysis" in analysis.attrs:
+        row["analysis"] = analysis.attrs["analysis"]
+
+    for name in ("bands/share", "bands/modal_energy"):
+        if name in row:
+            row["parts"] = list(analysis[name].attrs["parts"])
     if "bands/modal_energy" in row:
         row["bands/modal_energy"] = analysis["bands/modal_energy"].values[:, -1].tolist()
-    return row | ({"entropy/start": float(analysis.attrs["entropy/start"])} if "entropy/history" in row else {})
+    if "entropy/history" in row:
+        row["entropy/start"] = float(analysis.attrs["entropy/start"])
+    return row
 
 
 def _pairs(case: Case) -> tuple[Pair, ...]:
@@ -119,7 +154,9 @@ def _pairs(case: Case) -> tuple[Pair, ...]:
 
 def is_proportional(case: Case) -> bool:
     """Whether the lattice moves in proportion to the one amplitude of its drive until something touches."""
-    return not (case.initial or case.drive.more or _pairs(case)) and case.lattice.unit_cell().is_linear
+    if case.initial or case.drive.more or _pairs(case):
+        return False
+    return case.lattice.unit_cell().is_linear
 
 
 def factor(case: Case) -> float:
@@ -128,18 +165,16 @@ def factor(case: Case) -> float:
 
 
 def linear_case(case: Case) -> Case:
-    """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone share it.
+    """The lattice of ``case`` without contacts under 1 N; cases that differ in those alone have it in common.
 
     Unless it ``is_proportional``, the drives are those of the case. Contacts that join other masses than the cell's
     pair may be all that joins the cells: they stay.
     """
     amplitude = 1.0 if is_proportional(case) else case.drive.amplitude
-    changes: dict[str, dict[str, Any]] = {"drive": {"amplitude": amplitude}}
-    without = ["output"]
-    if not _pairs(case):
-        changes["contacts"] = {"sites": 0}
-        without.append("contacts")
-    return case.varied(name="linear", without=without, **changes)
+    if _pairs(case):
+        return case.varied(name="linear", without=("output",), drive={"amplitude": amplitude})
+    without = ("output", "contacts")
+    return case.varied(name="linear", without=without, drive={"amplitude": amplitude}, contacts={"sites": 0})
 
 
 def linear_name(case: Case) -> str:
@@ -150,8 +185,10 @@ def linear_name(case: Case) -> str:
 def leading_cell(case: Case) -> int:
     """Cell (1-based) of the site nearest to the drive; 0 without sites."""
     cells = np.asarray(case.contacts.sites, np.int64)
+    if not cells.size:
+        return 0
     distance = cells_between(cells, case.drive.cell, case.lattice.cells, case.lattice.ends)
-    return int(cells[np.argmin(distance)]) if cells.size else 0
+    return int(cells[np.argmin(distance)])
 
 
 def with_site(linear: xr.Dataset, site: int) -> xr.Dataset:
@@ -161,15 +198,11 @@ def with_site(linear: xr.Dataset, site: int) -> xr.Dataset:
 
 
 def read_linear(sweep: Path, case: Case) -> LinearRun | None:
-    """The linear run of ``case`` in the folder of a ``sweep``; None if its records tell of none."""
-    run, name = None, linear_name(case)
-    for path in record_files(sweep):
-        for record, _ in read_records(path, lambda text: None):
+    """The linear run of ``case`` in the folder of a ``sweep``; None if there is no record of one."""
+    run = None
+    name = linear_name(case)
+    for path in RecordPaths(sweep, MEMBERS).existing():
+        for record, _ in read_records(path, damaged=lambda text: None):
             if record.get("linear") == name and "envelope" in record:
                 run = LinearRun.of_record(record)
     return run
-
-
-def record_files(sweep: Path) -> list[Path]:
-    """The files with records in the folder of a ``sweep``, the latest last."""
-    return [path for path in (sweep / RECORDS, *sorted(sweep.glob(PARTS))) if path.exists()]

@@ -1,11 +1,11 @@
 """The best design for an objective, or the front of two: a case with ``[optimise]`` in, ``optimum.h5`` out.
 
 Rank 0 asks the sampler for designs and tells it their losses in that order; all ranks make the runs. What a run came
-to is recorded at once, so a search that was stopped or killed asks and tells the same again, and goes on.
+to is recorded at once, so a search that was stopped or killed asks and tells as before, and goes on.
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,10 @@ from vipetsc.studies.scattering_law import matched_clearances
 from vipetsc.studies.sweep import is_whole
 
 POPULATION = 24  # of NSGA-II
-CURVE = 4.0, 11  # compared at amplitudes from the least over this to the largest times this, so many
-SHOWN = "upper_share_at_end", "dissipated"  # of every design, whatever its objective: a transfer can be lost energy's
+# Designs are compared at so many amplitudes, from the least over this to the largest times this.
+CURVE_POINTS, CURVE_SPREAD = 11, 4.0
+# Shown of every design, whatever its objective: a large transfer may go with a large loss.
+SHOWN = ("upper_share_at_end", "dissipated")
 
 # Dimensions, units and description of every variable.
 LAYOUT = {
@@ -66,7 +68,11 @@ LAYOUT = {
 
 @dataclass
 class Design:
-    """One that was tried: its ``values`` (variable), its case and runs, None if it is impossible, what came of it."""
+    """A design that was tried: its ``values`` (variable) and what became of it.
+
+    ``case`` and ``runs`` are None and empty for an impossible one; ``losses`` (objective) are small for a good one, NaN
+    if it failed for a ``reason``.
+    """
 
     values: np.ndarray
     generation: int
@@ -77,48 +83,60 @@ class Design:
 
 
 class OptimumSearch:
-    """The ``designs`` tried so far, on one rank; 0 is the case to begin with, 1 the start if that differs."""
+    """The ``designs`` tried so far, on one rank; 0 is the case to begin with, 1 the start if that differs.
 
-    def __init__(self, plan: OptimiseCase, judge: ObjectiveRuns, sampler: Sampler, start: np.ndarray) -> None:
-        self.plan, self.judge, self.sampler = plan, judge, sampler
-        self.designs = [Design(plan.begin(), 0, plan.base, [*judge.runs(plan.base).values()])]
-        other = self._design(start, 0)
-        self.designs += [other] if other.case is None or case_id(other.case) != case_id(plan.base) else []
+    ``asked`` are those that are not judged yet, by ``objective``, the runs of all designs.
+    """
+
+    def __init__(self, plan: OptimiseCase, objective: ObjectiveRuns, sampler: Sampler, start: np.ndarray) -> None:
+        self.plan = plan
+        self.objective = objective
+        self.sampler = sampler
+        self.designs = [Design(plan.begin(), 0, plan.base, [*objective.runs(plan.base).values()])]
+        first = self._design(start, 0)
+        if first.case is None or case_id(first.case) != case_id(plan.base):
+            self.designs.append(first)
         self.asked = self.designs
 
     def _design(self, values: np.ndarray, generation: int) -> Design:
         try:
             case = self.plan.design(values)
-            return Design(values, generation, case, [*self.judge.runs(case).values()])
+            return Design(values, generation, case, [*self.objective.runs(case).values()])
         except CaseError as error:
             return Design(values, generation, reason="; ".join(map(str, error.problems)))
 
     def runs(self) -> list[Case]:
-        """Those of the designs that are not judged yet."""
+        """The runs of the designs that are not judged yet."""
         return [run for design in self.asked for run in design.runs]
 
     def tell_and_ask(self) -> bool:
-        """ObjectiveRuns the designs whose runs were made, tell the sampler, and ask for more; whether there are any."""
+        """Judge the designs whose runs were made, tell the sampler, and ask for more; whether there are any."""
         for design in self.asked:
             design.losses = [np.nan] * len(self.plan.options.objective)
             if design.case:
-                design.losses, design.reason = self.judge.losses(design.case)
-        generation, left = self.asked[0].generation, self.plan.options.budget - len(self.designs)
+                design.losses, design.reason = self.objective.losses(design.case)
+
+        left = self.plan.options.budget - len(self.designs)
         if left <= 0:
             return False
-        if generation:
-            # One that failed is told to be worse than all others.
-            known = self.losses()
-            worst = np.max(known, axis=0, initial=0.0, where=np.isfinite(known)) + 1
-            told = np.array([design.losses for design in self.asked])
-            self.sampler.tell(np.where(np.isfinite(told), told, worst))
+
+        generation = self.asked[0].generation
+        if generation:  # generation 0 is the case and the start, which the sampler did not ask for
+            self._tell()
         points = self.sampler.ask()[:left]
         self.asked = [self._design(self.plan.from_unit(point), generation + 1) for point in points]
         self.designs += self.asked
         return True
 
+    def _tell(self) -> None:
+        """Give the sampler the losses of the designs that it asked for; one that failed is worse than all others."""
+        judged = self.losses()
+        worst = np.max(judged, axis=0, initial=0.0, where=np.isfinite(judged)) + 1
+        losses = np.array([design.losses for design in self.asked])
+        self.sampler.tell(np.where(np.isfinite(losses), losses, worst))
+
     def losses(self) -> np.ndarray:
-        """Of all designs (design, objective)."""
+        """Losses of all designs (design, objective)."""
         return np.array([design.losses for design in self.designs])
 
     def compared(self) -> dict[str, int]:
@@ -164,21 +182,21 @@ def run_search(
 
 def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> None:
     """Try designs until the budget is spent, compare the best with the case, and write what was found."""
-    judge = ObjectiveRuns(plan, folder, comm, stop)
+    objective = ObjectiveRuns(plan, folder, comm, stop)
     bar = Progress(comm, plan.options.budget, "designs", show=progress)
-
-    searches: list[OptimumSearch] = []  # on rank 0
+    searches: list[OptimumSearch] = []  # one on rank 0, none on the others
 
     try:
         start = _start(plan, folder, comm, stop)
-        on_root(comm, lambda: searches.append(OptimumSearch(plan, judge, _sampler(plan, start), start)))
+        on_root(comm, lambda: searches.append(OptimumSearch(plan, objective, _sampler(plan, start), start)))
         more = True
         while more:
-            judge.make(on_root(comm, lambda: searches[0].runs()))
+            objective.make(on_root(comm, lambda: searches[0].runs()))
             more = on_root(comm, lambda: searches[0].tell_and_ask())
             bar.update(sum(len(search.designs) for search in searches))
-        judge.make(on_root(comm, lambda: [run for row in _curves(searches[0]).values() for run in row]))
-        judge.recorded.finish()
+
+        objective.make(on_root(comm, lambda: [run for row in _curves(searches[0]).values() for run in row]))
+        objective.recorded.finish()
         on_root(comm, lambda: _write(searches[0], folder))
     finally:
         bar.close()
@@ -188,14 +206,17 @@ def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) 
     """The values (variable) at which the search begins; all ranks must call it. Raises StoppedError."""
     if plan.options.start == "case":
         return plan.begin()
+
     table = {key: value for key, value in plan.table.items() if key != "disorder"}
     law = make_law(LawCase.from_table(table | {"name": "law"}), folder / "law", comm, stop=stop)
-    lattice, drive = plan.base.lattice, plan.base.drive
+    lattice = plan.base.lattice
+    drive = plan.base.drive
 
     def matched() -> np.ndarray:
         data, result = run_in_memory(linear_case(plan.base), MPI.COMM_SELF, stop)
-        linear = LinearRun.of(data, result.statistics, (), ())
-        sites = np.array(plan.sites)  # the law's are in the order in which the wave meets them
+        linear = LinearRun.of(data, result.statistics, sites=(), names=())
+        # The law's sites are in the order in which the wave meets them, the plan's are not.
+        sites = np.array(plan.sites)
         order = np.argsort(cells_between(sites, drive.cell, lattice.cells, lattice.ends), kind="stable")
         clearance = np.empty(len(sites))
         clearance[order] = matched_clearances(law, linear, sites[order].tolist(), drive.amplitude)
@@ -206,75 +227,130 @@ def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) 
 
 def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
     """The sampler of ``plan`` from the values ``start`` (variable) on."""
-    options, point = plan.options, plan.to_unit(start)
+    options = plan.options
+    point = plan.to_unit(start)
     if len(options.objective) == 2:
         return Nsga2(point, options.step, options.seed, options.population or POPULATION)
-    steps = np.array([1 / (v.high - v.low) if v.kind == "whole" else 0.0 for v in plan.variables()])
-    directions, gaps = np.eye(len(point)), np.array([v.name.startswith("clearance") for v in plan.variables()])
-    directions[np.ix_(gaps, gaps)] = smooth(int(gaps.sum()))
+
+    variables = plan.variables()
+    steps = np.array([1 / (v.high - v.low) if v.kind == "whole" else 0.0 for v in variables])
+    # Of clearances, what the row of sites has in common is searched first.
+    clearances = np.array([v.name.startswith("clearance") for v in variables])
+    directions = np.eye(len(point))
+    directions[np.ix_(clearances, clearances)] = smooth(int(clearances.sum()))
     return CmaEs(point, steps, directions, options.step, options.seed, options.population)
 
 
 def _curves(search: OptimumSearch) -> dict[str, list[Case]]:
     """The runs of the compared designs over the amplitude."""
     options = search.plan.options
-    asked = [a for o in options.objective for a in o.amplitudes or [search.judge.amplitude]]
-    spread, count = CURVE
-    amplitudes = options.curve or np.geomspace(min(asked) / spread, max(asked) * spread, count).tolist()
-    amplitudes = sorted({*amplitudes, search.judge.amplitude})
-    cases = {name: search.designs[number].case for name, number in search.compared().items()}
-    return {
-        name: [search.plan.run(case, amplitude) for amplitude in amplitudes] for name, case in cases.items() if case
-    }
+    case_amplitude = search.objective.amplitude
+    amplitudes = options.curve
+    if not amplitudes:
+        asked = [a for objective in options.objective for a in objective.amplitudes or [case_amplitude]]
+        amplitudes = np.geomspace(min(asked) / CURVE_SPREAD, max(asked) * CURVE_SPREAD, CURVE_POINTS).tolist()
+    amplitudes = sorted({*amplitudes, case_amplitude})
+
+    curves: dict[str, list[Case]] = {}
+    for name, number in search.compared().items():
+        case = search.designs[number].case
+        if case:
+            curves[name] = [search.plan.run(case, amplitude) for amplitude in amplitudes]
+    return curves
 
 
 def _write(search: OptimumSearch, folder: Path) -> None:
-    """The best cases, then ``optimum.h5``."""
+    """Write the best cases, then ``optimum.h5``, whose presence says that the search is complete."""
     sys.audit("vipetsc.conclude", str(folder))
-    plan, designs, judge = search.plan, search.designs, search.judge
-    objectives, variables, compared = plan.options.objective, plan.variables(), search.compared()
-    signs = np.array([-1.0 if objective.goal == "maximise" else 1.0 for objective in objectives])
-    value = signs * search.losses()
-    values: dict[str, Any] = {"design": np.arange(len(designs)), "variable": [v.name for v in variables]}
-    values |= {"objective": [f"{number}: {o.name}" for number, o in enumerate(objectives, 1)]}
-    values |= {"low": [float(v.low) for v in variables], "high": [float(v.high) for v in variables]}
-    values |= {"unit": [v.unit for v in variables], "generation": [d.generation for d in designs]}
-    values |= {"parameter": [d.values for d in designs], "value": value, "reason": [d.reason for d in designs]}
-    of_design = [[judge.values(run) for run in design.runs] for design in designs]
-    for name in SHOWN:
-        values[name] = [np.mean([row.get(name, np.nan) for row in rows]) if rows else np.nan for rows in of_design]
-    values["front"] = front(search.losses())
-    cases = [case for number in compared.values() if (case := designs[number].case)]
-    chains = [case.model().chain for case in cases]
-    values |= {"compared": [*compared], "comparison/number": [*compared.values()]}
-    values |= {"site": np.arange(1, len(plan.sites) + 1), "comparison/cell": [np.add(c.sites, 1) for c in chains]}
-    values |= {"comparison/clearance": [c.clearances for c in chains]}
-    curves = _curves(search)
-    told = {name: [judge.values(run) for run in runs] for name, runs in curves.items()}
-    values["amplitude"] = [run.drive.amplitude for run in curves["case"]]
-    bands = len(plan.base.lattice.unit_cell().masses)
-    values["band"] = np.arange(1, bands + 1)
-    for name, none in {"bands": [np.nan] * bands, **dict.fromkeys((*SHOWN, "transmitted"), np.nan)}.items():
-        values[f"curve/{name}"] = [[row.get(name, none) for row in rows] for rows in told.values()]
-    asked = [objective.name for objective in objectives]
-    values["curve/value"] = [[[row.get(name, np.nan) for name in asked] for row in rows] for rows in told.values()]
-    for name, case in zip(compared, cases, strict=True):
+    plan = search.plan
+    cases: dict[str, Case] = {}
+    for name, number in search.compared().items():
+        case = search.designs[number].case
+        if case:
+            cases[name] = case
+    for name, case in cases.items():
         if name != "case":
             best = case.model_copy(update={"name": f"{plan.name}-{name}"})
             write_text(folder / f"{name}.toml", best.to_toml())
-    runs = len({case_id(run) for design in designs for run in design.runs})
-    data = xr.Dataset(
-        tabulated(LAYOUT, values), attrs=provenance(judge.recorded.comm) | {"case": plan.to_toml(), "runs": runs}
-    )
+
+    values = _design_values(search) | _comparison_values(search, [*cases.values()]) | _curve_values(search)
+    runs = {case_id(run) for design in search.designs for run in design.runs}
+    about = provenance(search.objective.recorded.comm) | {"case": plan.to_toml(), "runs": len(runs)}
+    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
     write_netcdf(folder / "optimum.h5", data.assign_attrs(summary=_summary(data, plan)))
 
 
+def _design_values(search: OptimumSearch) -> dict[str, Any]:
+    """What varies, and all designs with what came of them, by name in ``LAYOUT``."""
+    designs = search.designs
+    variables = search.plan.variables()
+    objectives = search.plan.options.objective
+    signs = np.array([-1.0 if objective.goal == "maximise" else 1.0 for objective in objectives])
+    values: dict[str, Any] = {
+        "design": np.arange(len(designs)),
+        "variable": [v.name for v in variables],
+        "objective": [f"{number}: {objective.name}" for number, objective in enumerate(objectives, 1)],
+        "low": [float(v.low) for v in variables],
+        "high": [float(v.high) for v in variables],
+        "unit": [v.unit for v in variables],
+        "generation": [design.generation for design in designs],
+        "parameter": [design.values for design in designs],
+        "value": signs * search.losses(),
+        "reason": [design.reason for design in designs],
+        "front": front(search.losses()),
+    }
+
+    measured = [[search.objective.values(run) for run in design.runs] for design in designs]
+    for name in SHOWN:
+        values[name] = [_mean_of(name, rows) for rows in measured]
+    return values
+
+
+def _mean_of(name: str, rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Mean of what is called ``name`` over the runs of a design; NaN if one failed, or there are none."""
+    if not rows:
+        return np.nan
+    return np.mean([row.get(name, np.nan) for row in rows])
+
+
+def _comparison_values(search: OptimumSearch, cases: Sequence[Case]) -> dict[str, Any]:
+    """Sites and clearances of the compared designs, whose ``cases`` are given, by name in ``LAYOUT``."""
+    compared = search.compared()
+    chains = [case.model().chain for case in cases]
+    return {
+        "compared": [*compared],
+        "comparison/number": [*compared.values()],
+        "site": np.arange(1, len(search.plan.sites) + 1),
+        "comparison/cell": [np.add(chain.sites, 1) for chain in chains],
+        "comparison/clearance": [chain.clearances for chain in chains],
+    }
+
+
+def _curve_values(search: OptimumSearch) -> dict[str, Any]:
+    """What was measured of the compared designs over the amplitude, by name in ``LAYOUT``."""
+    curves = _curves(search)
+    measured = [[search.objective.values(run) for run in runs] for runs in curves.values()]
+    bands = len(search.plan.base.lattice.unit_cell().masses)
+    names = [objective.name for objective in search.plan.options.objective]
+    values: dict[str, Any] = {
+        "amplitude": [run.drive.amplitude for run in curves["case"]],
+        "band": np.arange(1, bands + 1),
+        "curve/bands": [[row.get("bands", [np.nan] * bands) for row in rows] for rows in measured],
+        "curve/value": [[[row.get(name, np.nan) for name in names] for row in rows] for rows in measured],
+    }
+    for name in (*SHOWN, "transmitted"):
+        values[f"curve/{name}"] = [[row.get(name, np.nan) for row in rows] for rows in measured]
+    return values
+
+
 def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
-    """What was found, in a table: a line for every compared design."""
+    """A table of what was found, with a line for every compared design."""
     reasons = [reason for reason in data["reason"].values if reason]
     lines = [f"{data.sizes['design']} designs, {data.attrs['runs']} runs; {len(reasons)} designs failed"]
-    lines += [f"  such as: {reasons[0]}"] if reasons else []
+    if reasons:
+        lines.append(f"  such as: {reasons[0]}")
     lines += [f"  {number}: {objective.describe()}" for number, objective in enumerate(plan.options.objective, 1)]
+
     columns = [*data["objective"].values, "upper share", "dissipated"]
     lines.append(f"  {'design':<8}{'number':>7}" + "".join(f"{name:>24}" for name in columns))
     for name, number in zip(data["compared"].values, data["comparison/number"].values, strict=True):

@@ -1,21 +1,44 @@
-"""Jobs shared over teams of ranks: a job may fail, a request to stop and a full disk end them all."""
+"""Jobs done by teams of ranks: one job may fail, a request to stop and a full disk end them all."""
 
 import errno
 import sys
 import time
 from collections.abc import Callable, Hashable, Sequence
-from typing import TypeVar
+from enum import IntEnum
+from typing import NamedTuple, TypeVar
 
 from mpi4py import MPI
 
 from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
 
-FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # no other member could be written either
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # no other job's result could be written either
 BLOCKS = 100  # that each team draws, at least, so that none waits long for the last
-PATIENCE = 5.0  # s that a rank whose member failed waits for the rest of its team to have failed as well
-MADE, UNMADE, LEFT, ENDED = range(4)  # how a job ended; the later counts if ranks differ
+PATIENCE = 5.0  # s that a rank whose job failed waits for the rest of its team to have failed as well
 
 Job = TypeVar("Job", bound=Hashable)
+
+
+class Ending(IntEnum):
+    """How a job ended; where the ranks of a team differ, the largest counts."""
+
+    DONE = 0
+    FAILED = 1
+    STOPPED = 2
+    FATAL = 3  # ends all jobs
+
+
+class JobEnd(NamedTuple):
+    """How a job ended, and why it did so if it was not done."""
+
+    ending: Ending
+    reason: str = ""
+
+
+class TeamReport(NamedTuple):
+    """What one rank tells the others when it draws no more jobs: how its last job ended, and how many it counts."""
+
+    last: JobEnd
+    done: int
 
 
 class TaskPool:
@@ -28,8 +51,12 @@ class TaskPool:
     def __init__(
         self, comm: MPI.Comm, team: MPI.Comm, stop: StopRequest, failures: tuple[type[Exception], ...] = (Exception,)
     ) -> None:
-        self.comm, self.team, self.stop, self.failures = comm, team, stop, failures
-        self.stopped, self.busy = False, 0.0
+        self.comm = comm
+        self.team = team
+        self.stop = stop
+        self.failures = failures
+        self.stopped = False
+        self.busy = 0.0
 
     def run(
         self,
@@ -38,73 +65,109 @@ class TaskPool:
         progress: Progress | None = None,
         fail: Callable[[Job, str], None] = lambda job, reason: None,
     ) -> int:
-        """Do all ``jobs``, those that come first first; returns how many came out. Collective.
+        """Do all ``jobs``, those that come first first; returns how many were done. Collective.
 
         ``fail`` is called on the first rank of a team with a job that failed, and why. Raises OSError on all ranks when
         the disk is full, or after an exception that is no failure.
         """
-        drawn, ended = SharedCounter(self.comm), SharedCounter(self.comm)
-        block = max(len(jobs) * self.team.size // (BLOCKS * self.comm.size), 1)  # many small jobs are drawn together
-        leader, ending, reason, made, end, number = self.team.rank == 0, MADE, "", 0, 0, 0
-        while not (self.stopped or self.stop.agreed(self.team)):
-            if number == end:
-                number = self.team.bcast(drawn.draw(block) if leader else None)
-                end = min(number + block, len(jobs))
-            if number >= len(jobs):
-                break
-            begin = time.perf_counter()
-            ending, reason = self._end(jobs[number], work, fail)
-            self.busy += time.perf_counter() - begin
-            if ending in (LEFT, ENDED):
-                break
-            made, number = made + (ending == MADE), number + 1
-            done = ended.draw(1 if leader else 0)
-            if progress:
-                progress.update(done + 1)
-        else:
-            ending = LEFT
-        if ending in (LEFT, ENDED):
-            drawn.draw(len(jobs))  # so that no team begins another block
-        wait_for_all(self.comm)
-        shares = self.comm.allgather((ending, reason, made if leader else 0))
-        self.stopped = any(ending == LEFT for ending, *_ in shares)
+        reports = self.comm.allgather(self._draw_jobs(jobs, work, progress, fail))
+        self.stopped = any(report.last.ending == Ending.STOPPED for report in reports)
         if progress:
             progress.close()
-        drawn.free()
-        ended.free()
 
         def check() -> None:
-            if full := next((reason for ending, reason, _ in shares if ending == ENDED), ""):
-                raise OSError(full)
+            for report in reports:
+                if report.last.ending == Ending.FATAL and report.last.reason:
+                    raise OSError(report.last.reason)
 
         on_root(self.comm, check)
-        return sum(made for *_, made in shares)
+        return sum(report.done for report in reports)
 
-    def _end(self, job: Job, work: Callable[[Job], None], fail: Callable[[Job, str], None]) -> tuple[int, str]:
-        """Do a ``job`` with the whole team: how it ended, and why.
+    def _draw_jobs(
+        self,
+        jobs: Sequence[Job],
+        work: Callable[[Job], None],
+        progress: Progress | None,
+        fail: Callable[[Job, str], None],
+    ) -> TeamReport:
+        """Draw ``jobs`` with this team and do them, until none are left or one ends all. Collective."""
+        drawn = SharedCounter(self.comm)
+        ended = SharedCounter(self.comm)
+        # Many small jobs are drawn together: a draw and its broadcast may take longer than one of them.
+        block = max(len(jobs) * self.team.size // (BLOCKS * self.comm.size), 1)
+        leads = self.team.rank == 0
+        last = JobEnd(Ending.DONE)
+        done = 0
+        number = 0
+        block_end = 0
+
+        while True:
+            if self.stopped or self.stop.agreed(self.team):
+                last = JobEnd(Ending.STOPPED)
+                break
+            if number == block_end:
+                number = self.team.bcast(drawn.draw(block) if leads else None)
+                block_end = min(number + block, len(jobs))
+            if number >= len(jobs):
+                break
+
+            begin = time.perf_counter()
+            last = self._do(jobs[number], work, fail)
+            self.busy += time.perf_counter() - begin
+            if last.ending > Ending.FAILED:
+                break
+
+            number += 1
+            if leads and last.ending == Ending.DONE:
+                done += 1
+            # Every rank asks for the count, which moves the bar of rank 0 also when another team has ended a job.
+            count = ended.draw(1 if leads else 0)
+            if progress:
+                progress.update(count + 1)
+
+        if last.ending > Ending.FAILED:
+            drawn.draw(len(jobs))  # so that no team begins another block
+        # No team may draw any more when the counters go. Ranks that wait here sleep: the others need the cores.
+        wait_for_all(self.comm)
+        drawn.free()
+        ended.free()
+        return TeamReport(last, done)
+
+    def _do(self, job: Job, work: Callable[[Job], None], fail: Callable[[Job, str], None]) -> JobEnd:
+        """Do a ``job`` with the whole team.
 
         A rank that fails alone leaves the others in the midst of it, where they wait for ever: its exception is raised.
         """
-        ending, failure = (MADE, ""), None
+        end = JobEnd(Ending.DONE)
+        failure = None
         try:
             sys.audit("vipetsc.member", str(job))
             work(job)
         except StoppedError:
-            ending = LEFT, ""
+            end = JobEnd(Ending.STOPPED)
         except Exception as error:
-            failure, text = error, str(error)
-            named = text if isinstance(error, RuntimeError) else f"{type(error).__name__}: {text}"
-            over = not isinstance(error, self.failures) or getattr(error, "errno", None) in FULL
-            ending = (ENDED, text if isinstance(error, OSError) else named) if over else (UNMADE, named)
-        met, since = self.team.Ibarrier(), time.monotonic()
+            failure = error
+            end = self._judge(error)
+
+        met = self.team.Ibarrier()
+        since = time.monotonic()
         while not met.Test():
             if failure and time.monotonic() - since > PATIENCE:
                 raise failure
             time.sleep(1e-3)
-        ending = max(self.team.allgather(ending))
-        if ending[0] == UNMADE:
+
+        end = max(self.team.allgather(end))
+        if end.ending == Ending.FAILED:
             try:
-                on_root(self.team, lambda: fail(job, ending[1]))
-            except OSError as error:
-                return ENDED, str(error)
-        return ending
+                on_root(self.team, lambda: fail(job, end.reason))
+            except OSError as error:  # the failure could not be recorded
+                return JobEnd(Ending.FATAL, str(error))
+        return end
+
+    def _judge(self, error: Exception) -> JobEnd:
+        """Whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
+        text = str(error)
+        named = text if isinstance(error, RuntimeError) else f"{type(error).__name__}: {text}"
+        if isinstance(error, self.failures) and getattr(error, "errno", None) not in DISK_FULL:
+            return JobEnd(Ending.FAILED, named)
+        return JobEnd(Ending.FATAL, text if isinstance(error, OSError) else named)

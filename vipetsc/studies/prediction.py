@@ -1,22 +1,23 @@
-"""A run with any number of sites predicted from the answer of one: a case in, ``prediction.h5`` out.
+"""A run with any number of sites predicted from the response of one: a case in, ``prediction.h5`` out.
 
-Runs: the linear lattice under 1 N (onset, work, energies by band); one site in an infinite lattice (the geometry of
-``studies.one_site``) at ``predict.points`` amplitudes, dense near the onset (``studies.response``); then, to compare,
-the case itself at every amplitude. What a run came to is recorded at once. ``studies.composition`` composes the sites.
-Energies of bands are those of linear modes at the last sample, over the drive's work.
+Runs: the linear lattice under 1 N (onset, work, energies by band); one site in an infinite lattice (``studies.ring``)
+at ``predict.points`` amplitudes, dense near the onset (``studies.response``); then, to compare, the case itself at
+every amplitude. What a run came to is recorded at once. ``studies.composition`` composes the sites. Energies of bands
+are those of linear modes at the last sample, over the drive's work.
 """
 
 import time
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
 import xarray as xr
 
+from vipetsc.case import Case
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.folder import PREDICTION, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
@@ -25,15 +26,16 @@ from vipetsc.lattice import pass_bands
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra import ModalParts
 from vipetsc.studies.composition import Network
-from vipetsc.studies.one_site import largest_between
-from vipetsc.studies.recorded_runs import RecordedRuns, run_in_memory
-from vipetsc.studies.response import Burst, SiteResponse
+from vipetsc.studies.pair_motion import PairMotion
+from vipetsc.studies.recorded_runs import RecordedRuns
+from vipetsc.studies.response import Burst, SiteResponse, SiteRun
+from vipetsc.studies.ring import Ring
 
-RECORDS, PARTS = "prediction.jsonl", "prediction-*.jsonl"
 LINEAR, SITE, MEMBER = "linear", "site", "member"
 # Largest linear relative displacement over clearance, less 1, of the runs near the onset; others are log-spaced above.
-NEAR = 5e-4, 2e-3, 7e-3, 0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2
+NEAR_ONSET = (5e-4, 2e-3, 7e-3, 0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2)
 HIGH = 2.8
+BEYOND = 1.01  # the one site's runs reach this many times the largest z of any amplitude
 LAYOUT = {
     "amplitude": ("amplitude", "N", "amplitude of the drive"),
     "band": ("band", "1", "pass band, from 1"),
@@ -49,7 +51,25 @@ LAYOUT = {
 MEASURED = ("bands", "upper", "other", "dissipated")
 LAYOUT |= {f"simulated/{name}": LAYOUT[f"predicted/{name}"] for name in MEASURED}
 LAYOUT["simulated/contact_episodes"] = ("amplitude", "1", "contact episodes; NaN where a run failed")
-Job = tuple[str, float]  # what is run, and its amplitude in N or, of the one site, its z
+
+
+class Job(NamedTuple):
+    """A run to be made: its ``kind``, and its amplitude in N or, of the one site, its z."""
+
+    kind: str
+    at: float
+
+
+class Records(NamedTuple):
+    """What the runs of a prediction came to: the ``linear`` one, those of one ``site`` by z, those to compare with.
+
+    ``largest`` is the largest z for which the site's were made.
+    """
+
+    linear: Record
+    site: list[Record]
+    members: list[Record]
+    largest: float
 
 
 def predict(
@@ -71,21 +91,12 @@ def predict(
     with claimed(comm, folder, PREDICTION, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "prediction.h5"
         if not on_root(comm, path.exists):
-            study = PredictionRuns(case, claim.folder, comm, stop or StopRequest(), progress)
-            linear = study.make([(LINEAR, 1.0)])[0]
-            amplitudes = amplitudes_of(case, linear)
-            largest = max(float(amplitudes[-1] * max(linear["reached"])), HIGH) * 1.01
-            study.largest = largest
-            answers = study.make([(SITE, z) for z in site_points(case, largest)])
-            members = study.make([(MEMBER, a) for a in amplitudes.tolist()]) if case.predict.simulate else []
-
+            runs = PredictionRuns(case, claim.folder, comm, stop or StopRequest(), progress)
+            records = runs.make_all()
             about = provenance(comm)
+            runs.recorded.finish()
+            on_root(comm, lambda: write_netcdf(path, composed(case, records).assign_attrs(about)))
 
-            def write() -> None:
-                write_netcdf(path, composed(case, linear, answers, members, largest).assign_attrs(about))
-
-            study.recorded.finish()
-            on_root(comm, write)
         claim.publish()
         return on_root(comm, lambda: read_prediction(claim.path))
 
@@ -106,147 +117,204 @@ def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
 
 def site_points(case: PredictCase, largest: float) -> list[float]:
     """z of the runs of one site, up to ``largest``."""
-    high = np.geomspace(HIGH, largest / 1.01, case.predict.points - len(NEAR))
-    return [1 + z for z in NEAR] + np.unique(high).tolist()
+    high = np.geomspace(HIGH, largest / BEYOND, case.predict.points - len(NEAR_ONSET))
+    return [1 + z for z in NEAR_ONSET] + np.unique(high).tolist()
 
 
 class PredictionRuns:
-    """The runs of a prediction over the ranks of ``comm``, one rank a run, and their records in ``folder``.
-
-    The one site's have ``largest`` as the largest z.
-    """
+    """The runs of a prediction over the ranks of ``comm``, one rank a run, and their records in ``folder``."""
 
     def __init__(self, case: PredictCase, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> None:
-        self.case, self.recorded, self.progress = case, RecordedRuns("prediction", folder, comm, stop), progress
-        self.setting, self.model, self.largest = case.one_site(), case.model(), 0.0
+        self.case = case
+        self.model = case.model()
+        self.recorded = RecordedRuns("prediction-runs", folder, comm, stop).read()
+        self.ring = Ring(case, self.recorded)
+        self.progress = progress
 
-    def make(self, jobs: Sequence[Job]) -> list[Record]:
-        """The records of ``jobs``, the missing ones made now. Collective; raises RuntimeError if one fails."""
-        kinds = {LINEAR: self._linear, SITE: self._site, MEMBER: self._member}
+    def make_all(self) -> Records:
+        """The records of all runs, those that are missing made now. Collective; raises RuntimeError if one fails."""
+        linear = self.make([Job(LINEAR, 1.0)])[0]
+        amplitudes = amplitudes_of(self.case, linear)
+        largest = max(float(amplitudes[-1] * max(linear["reached"])), HIGH) * BEYOND
+        site = self.make([Job(SITE, z) for z in site_points(self.case, largest)], largest)
+        members: list[Record] = []
+        if self.case.predict.simulate:
+            members = self.make([Job(MEMBER, amplitude) for amplitude in amplitudes.tolist()])
+        return Records(linear, site, members, largest)
 
-        def work(job: Any) -> Record:
-            return {"kind": job[0], "at": job[1]} | kinds[job[0]](job[1])
+    def make(self, jobs: Sequence[Job], largest: float = 0.0) -> list[Record]:
+        """The records of ``jobs``, those that are missing made now. Collective; raises RuntimeError if one fails.
 
-        self.recorded.make(jobs, work, what=f"{jobs[0][0]} runs", progress=self.progress)
+        ``largest`` is the largest z of the one site's runs, whose sums are over bins up to it.
+        """
+
+        def work(key: Any) -> Record:
+            job = Job(*key)
+            if job.kind == LINEAR:
+                record = self._linear(job.at)
+            elif job.kind == SITE:
+                record = self._site(job.at, largest)
+            else:
+                record = self._member(job.at)
+            return {"kind": job.kind, "at": job.at} | record
+
+        self.recorded.make(jobs, work, what=f"{jobs[0].kind} runs", progress=self.progress)
         return [self.recorded.known[job] for job in jobs]
-
-    def _run(self, changes: dict[str, dict[str, Any]]) -> tuple[xr.Dataset, dict[str, Any]]:
-        """A run in memory of the case with ``changes`` to its sections, and its statistics."""
-        varied = self.case.varied(name=self.case.name, without=("output",), **changes)
-        data, result = run_in_memory(varied, self.recorded.team, self.recorded.stop)
-        return data, result.statistics
-
-    def _moved(self, run: xr.Dataset, places: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """w (time, place) and its rate at ``places`` of a run's cells."""
-        cell = self.model.chain.cell
-        fields = (run[name].values[:, places] for name in ("displacement", "velocity"))
-        w, rate = (field[..., cell.resonator] - field[..., cell.host] for field in fields)
-        return w, rate
-
-    def _bands(self, run: xr.Dataset) -> list[float]:
-        """Energy in J of the pass bands at the last sample; modes in gaps count to the band below."""
-        modes = ModalParts.of(self.model.chain).modes
-        u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
-        energy = np.abs(modes.amplitudes(u, v)[0]) ** 2 / 2
-        lows = [band.low for band in pass_bands(self.model.chain.cell)[1:]]
-        places = np.searchsorted(lows, modes.frequency * (1 + 1e-9))
-        return [float(e) for e in np.bincount(places, energy, len(lows) + 1)]
 
     def _linear(self, amplitude: float) -> Record:
         """The lattice without contacts: the largest w at the sites over the clearances, work, energies."""
-        run, statistics = self._run({"drive": {"amplitude": amplitude}, "contacts": {"sites": [], "clearance": []}})
-        w, rate = self._moved(run, self.model.chain.sites)
-        largest = [largest_between(run["time"].values, *pair) for pair in zip(w.T, rate.T, strict=True)]
-        reached = [w / gap for w, gap in zip(largest, self.model.chain.clearances, strict=True)]
-        return {"reached": reached, "work": statistics["work"], "bands": self._bands(run)}
+        chain = self.model.chain
+        linear = self.case.varied(
+            without=("output",), drive={"amplitude": amplitude}, contacts={"sites": [], "clearance": []}
+        )
+        run, statistics = self._run(linear)
+        largest = PairMotion.of(run, chain.cell, chain.sites).largest()
+        reached = [w / clearance for w, clearance in zip(largest, chain.clearances, strict=True)]
+        return {"reached": reached, "work": statistics["work"], "bands": self._band_energies(run)}
 
-    def _one(self, amplitude: float, clearance: Sequence[float]) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
-        """A run of one site, or none, in a lattice that is infinite while it lasts, with w there and its rate."""
-        setting = self.setting
-        place = [setting.site + 1]
-        changes: dict[str, dict[str, Any]] = {
-            "lattice": {"cells": setting.cells, "ends": "periodic"},
-            "contacts": {"sites": place if clearance else [], "clearance": list(clearance)},
-            "drive": {"cell": 1, "amplitude": amplitude},
-            "time": {"end": setting.end},
-            "output": {"window": place * 2},
-        }
-        run, _ = self._run(changes)
-        w, rate = self._moved(run, [0])
-        return run, w[:, 0], rate[:, 0]
+    def _site(self, z: float, largest: float) -> Record:
+        """One site under a burst that reaches ``z`` clearances: sums over its time in contact."""
+        burst, peak = self._burst
+        clearance = self.ring.setting.clearance
+        amplitude = self.ring.amplitude(z, peak)
+        run = self.ring.run_at_site(amplitude, with_site=True)
+        w = PairMotion.of(run, self.model.chain.cell).displacement[:, 0]
+        separation = run["impacts/separation"].values
+        touched = SiteRun(
+            amplitude=amplitude,
+            clearance=clearance,
+            displacement=w,
+            dissipated=run["energy/dissipated"].values,
+            last_contact=float(np.nanmax(separation)) if len(separation) else np.nan,
+        )
+        return {"z": z, "amplitude": amplitude, "largest": largest} | burst.sums(touched, largest)
 
     @cached_property
     def _burst(self) -> tuple[Burst, float]:
         """The linear wave at the one site under 1 N, and its largest |w| in m."""
-        run, w, rate = self._one(1.0, ())
-        times = run["time"].values
-        cell, drive = self.model.chain.cell, self.model.drive.frequency
-        return Burst(cell, drive, times, w), largest_between(times, w, rate)
-
-    def _site(self, z: float) -> Record:
-        """One site under a burst that reaches ``z`` clearances: sums over its time in contact."""
-        (burst, peak), clearance = self._burst, self.setting.clearance
-        amplitude = z * clearance / peak
-        run, w, _ = self._one(amplitude, [clearance])
-        ends = run["impacts/separation"].values
-        end = float(np.nanmax(ends)) if len(ends) else np.nan
-        sums = burst.sums(amplitude, clearance, self.largest, w, run["energy/dissipated"].values, end)
-        return {"z": z, "amplitude": amplitude, "largest": self.largest} | sums
+        cell = self.model.chain.cell
+        motion = PairMotion.of(self.ring.run_at_site(1.0, with_site=False), cell)
+        burst = Burst(cell, self.model.drive.frequency, motion.time, motion.displacement[:, 0])
+        return burst, motion.largest()[0]
 
     def _member(self, amplitude: float) -> Record:
         """The case under ``amplitude``: what is compared."""
-        stride = self.model.samples - 1
-        run, told = self._run({"drive": {"amplitude": amplitude}, "output": {"stride": stride}})
-        row = {name: told[name] for name in ("work", "dissipated", "episodes")}
-        return row | {"bands": self._bands(run)}
+        first_and_last = {"stride": self.model.samples - 1}
+        run, statistics = self._run(
+            self.case.varied(without=("output",), drive={"amplitude": amplitude}, output=first_and_last)
+        )
+        return {
+            "work": statistics["work"],
+            "dissipated": statistics["dissipated"],
+            "episodes": statistics["episodes"],
+            "bands": self._band_energies(run),
+        }
+
+    def _run(self, case: Case) -> tuple[xr.Dataset, dict[str, Any]]:
+        """A run of ``case`` in memory, and its statistics."""
+        data, result = self.recorded.run_in_memory(case)
+        return data, result.statistics
+
+    def _band_energies(self, run: xr.Dataset) -> list[float]:
+        """Energy in J of the pass bands at the last sample; modes in gaps count to the band below."""
+        modes = ModalParts.of(self.model.chain).modes
+        u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
+        energy = np.abs(modes.amplitudes(u, v)[0]) ** 2 / 2
+        lower_edges = [band.low for band in pass_bands(self.model.chain.cell)[1:]]
+        band = np.searchsorted(lower_edges, modes.frequency * (1 + 1e-9))
+        return [float(e) for e in np.bincount(band, energy, len(lower_edges) + 1)]
 
 
-def composed(
-    case: PredictCase, linear: Record, answers: list[Record], members: list[Record], largest: float
-) -> xr.Dataset:
+def composed(case: PredictCase, records: Records) -> xr.Dataset:
     """The content of ``prediction.h5``, without its provenance."""
-    begin, model = time.process_time(), case.model()
-    amplitudes, cell = amplitudes_of(case, linear), model.chain.cell
-    drive = next(i for i, band in enumerate(pass_bands(cell)) if model.drive.frequency <= band.high)
-    network, onset = Network(model), 1 / max(linear["reached"])
-    response = SiteResponse.of(answers, cell, model.drive.frequency, largest)
-    rest, rows = np.array(linear["bands"]) / linear["work"], []
-    for amplitude in amplitudes:
-        made = network.compose(float(amplitude), response) if amplitude > onset else None
-        work = linear["work"] * amplitude**2
-        lost, z = (made.dissipated / work, made.z) if made else (0.0, amplitude * np.array(linear["reached"]))
-        bands = rest + (made.into / work if made else 0)
-        bands[drive] = 1 - lost - np.delete(bands, drive).sum()
-        rows.append((bands, lost, z, made.change if made else 0.0))
-    predicted = dict(zip(("bands", "dissipated", "z", "change"), map(np.array, zip(*rows, strict=True)), strict=True))
-    values = {f"predicted/{name}": value for name, value in (predicted | _sums(predicted["bands"], drive)).items()}
-    values |= {"amplitude": amplitudes, "band": np.arange(1, cell.dofs + 1)}
-    values |= {"site": np.arange(1, len(model.chain.sites) + 1), "sites/cell": np.array(model.chain.sites) + 1}
-    about: dict[str, Any] = {"case": case.to_toml(), "onset_amplitude": onset, "drive_band": drive + 1}
-    about["cpu_seconds"] = sum(r["cpu_seconds"] for r in [linear, *answers]) + time.process_time() - begin
-    if members:
-        work = np.array([m["work"] for m in members])
-        simulated = np.array([m["bands"] for m in members]) / work[:, None]
-        lost = np.array([m["dissipated"] for m in members]) / work
-        measured = {"bands": simulated, "dissipated": lost} | _sums(simulated, drive)
-        values |= {f"simulated/{name}": value for name, value in measured.items()}
-        values["simulated/contact_episodes"] = np.array([float(m["episodes"]) for m in members])
+    begin = time.process_time()
+    model = case.model()
+    cell = model.chain.cell
+    linear = records.linear
+    amplitudes = amplitudes_of(case, linear)
+    driven = next(i for i, band in enumerate(pass_bands(cell)) if model.drive.frequency <= band.high)
+    onset = 1 / max(linear["reached"])
+
+    response = SiteResponse.of(records.site, cell, model.drive.frequency, records.largest)
+    predicted = _predicted(Network(model), response, amplitudes, linear, driven)
+    values = {f"predicted/{name}": value for name, value in predicted.items()}
+    values |= {
+        "amplitude": amplitudes,
+        "band": np.arange(1, cell.dofs + 1),
+        "site": np.arange(1, len(model.chain.sites) + 1),
+        "sites/cell": np.array(model.chain.sites) + 1,
+    }
+    about: dict[str, Any] = {"case": case.to_toml(), "onset_amplitude": onset, "drive_band": driven + 1}
+    in_runs = sum(record["cpu_seconds"] for record in [linear, *records.site])
+    about["cpu_seconds"] = in_runs + time.process_time() - begin
+
+    if records.members:
+        simulated = _simulated(records.members, driven)
+        values |= {f"simulated/{name}": value for name, value in simulated.items()}
         about |= errors(values)
     return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
 
 
-def _sums(bands: np.ndarray, drive: int) -> dict[str, np.ndarray]:
-    return {"upper": bands[:, drive + 1 :].sum(axis=1), "other": np.delete(bands, drive, axis=1).sum(axis=1)}
+def _predicted(
+    network: Network, response: SiteResponse, amplitudes: np.ndarray, linear: Record, driven: int
+) -> dict[str, np.ndarray]:
+    """What is predicted at every amplitude, by its name in ``LAYOUT``; ``driven`` is the drive's band from 0."""
+    onset = 1 / max(linear["reached"])
+    untouched = np.array(linear["bands"]) / linear["work"]
+    rows: dict[str, list[Any]] = {"bands": [], "dissipated": [], "z": [], "change": []}
+    for amplitude in amplitudes:
+        work = linear["work"] * amplitude**2
+        bands = untouched.copy()
+        dissipated = 0.0
+        z = amplitude * np.array(linear["reached"])
+        change = 0.0
+        if amplitude > onset:
+            composition = network.compose(float(amplitude), response)
+            bands += composition.into / work
+            dissipated = composition.dissipated / work
+            z = composition.z
+            change = composition.change
+        # Energies add up to the work, so the driven band has what other bands and the loss leave.
+        bands[driven] = 1 - dissipated - np.delete(bands, driven).sum()
+
+        rows["bands"].append(bands)
+        rows["dissipated"].append(dissipated)
+        rows["z"].append(z)
+        rows["change"].append(change)
+    predicted = {name: np.array(column) for name, column in rows.items()}
+    return predicted | _sums(predicted["bands"], driven)
+
+
+def _simulated(members: Sequence[Record], driven: int) -> dict[str, np.ndarray]:
+    """What was simulated at every amplitude, by its name in ``LAYOUT``."""
+    work = np.array([member["work"] for member in members])
+    bands = np.array([member["bands"] for member in members]) / work[:, None]
+    measured = {
+        "bands": bands,
+        "dissipated": np.array([member["dissipated"] for member in members]) / work,
+        "contact_episodes": np.array([float(member["episodes"]) for member in members]),
+    }
+    return measured | _sums(bands, driven)
+
+
+def _sums(bands: np.ndarray, driven: int) -> dict[str, np.ndarray]:
+    """Energy (amplitude) of the bands above the ``driven`` one, and of all others but it."""
+    return {"upper": bands[:, driven + 1 :].sum(axis=1), "other": np.delete(bands, driven, axis=1).sum(axis=1)}
 
 
 def errors(values: dict[str, np.ndarray]) -> dict[str, float]:
-    """Of a prediction beside simulations with contacts: rms and worst in decades of upper and other bands, loss."""
-    some = values["simulated/contact_episodes"] > 0
-    told: dict[str, float] = {}
+    """Errors of a prediction, judged by simulations with contacts.
+
+    Root mean square and worst, in decades, of the energies of upper and other bands; worst of the dissipated fraction.
+    """
+    touched = values["simulated/contact_episodes"] > 0
+    summary: dict[str, float] = {}
     for name in ("upper", "other"):
         pair = np.array([values[f"{kind}/{name}"] for kind in ("predicted", "simulated")])
-        use = some & (pair > 0).all(axis=0)
-        off = np.abs(np.diff(np.log10(pair[:, use]), axis=0))
-        told |= {f"rms_{name}": float(np.sqrt(np.mean(off**2))), f"worst_{name}": float(off.max())} if use.any() else {}
-    off = np.abs(values["predicted/dissipated"] - values["simulated/dissipated"])
-    return told | {"worst_dissipated": float(off.max())}
+        comparable = touched & (pair > 0).all(axis=0)
+        if comparable.any():
+            decades = np.abs(np.diff(np.log10(pair[:, comparable]), axis=0))
+            summary[f"rms_{name}"] = float(np.sqrt(np.mean(decades**2)))
+            summary[f"worst_{name}"] = float(decades.max())
+    lost = np.abs(values["predicted/dissipated"] - values["simulated/dissipated"])
+    return summary | {"worst_dissipated": float(lost.max())}

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from mpi4py import MPI
 
@@ -15,10 +16,18 @@ from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
 from vipetsc.studies.analysis import FULL, analyse, describe_options
 from vipetsc.studies.ensemble import MISSING, Results
-from vipetsc.studies.linear_run import PARTS, leading_cell, measured, read_linear
+from vipetsc.studies.linear_run import leading_cell, measured, read_linear
 from vipetsc.studies.sweep import conclude
 from vipetsc.studies.sweep_runs import keeps_all, measures_of
 from vipetsc.studies.velocity_record import options_of
+
+
+class MeasurableRun(NamedTuple):
+    """A run in ``folder``, the ``sweep`` (folder) that it may be a member of, and the ``measures`` to take."""
+
+    folder: Path
+    sweep: Path
+    measures: Collection[str]
 
 
 def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str] = ()) -> list[Path]:
@@ -26,52 +35,68 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str
 
     ``overrides`` are of ``[analysis]``, and of runs alone: members that kept no fields could not follow.
 
-    The runs are shared over the ranks of ``comm``. Members of a sweep that kept no fields stay as they are; the
-    sweep's ensemble is put together anew.
+    The ranks of ``comm`` measure different runs. Members of a sweep that kept no fields stay as they are; the sweep's
+    ensemble is put together anew.
 
     Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
     """
 
-    def look() -> tuple[list[tuple[Path, Path, Collection[str]]], list[Path]]:
+    def look() -> tuple[list[MeasurableRun], list[Path]]:
         sweeps = [path for path in paths if (path / "index.json").exists()]
-        if refused := [text for text in overrides if sweeps or not text.startswith("analysis.")]:
-            raise FolderError(f"{refused[0]}: of a run that is there only [analysis] can change, of a sweep nothing")
+        for override in overrides:
+            if sweeps or not override.startswith("analysis."):
+                raise FolderError(f"{override}: of a run that is there only [analysis] can change, of a sweep nothing")
         return [run for path in paths for run in _measurable(path)], sweeps
 
     runs, sweeps = on_root(comm, look)
 
-    def reassemble(folder: Path) -> Path:
-        results = Results(Sweep.load(folder / "case.toml"), folder)
-        if (results.status == MISSING).any():
-            raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
-        file = RecordFile(folder / PARTS.replace("*", "0"))
-        for name in results.ids:
-            if (folder / name / "analysis.h5").exists():
-                with open_netcdf(folder / name / "analysis.h5", "analysis") as analysis:
-                    file.append(results.lines[name].record() | {"measures": measured(analysis)})
-        file.close()
-        conclude(Results(results.plan, folder), afresh=True)
-        return folder / "ensemble.h5"
+    def measure_own() -> list[Path]:
+        of_this_rank = runs[comm.rank :: comm.size]
+        return [measure_run(run.folder, run.sweep, run.measures, overrides) for run in of_this_rank]
 
-    mine = on_every_rank(comm, lambda: [measure_run(*run, overrides) for run in runs[comm.rank :: comm.size]])
-    written = sorted(path for paths in comm.allgather(mine) for path in paths)
-    return written + on_root(comm, lambda: list(map(reassemble, sweeps)))
+    measured_here = on_every_rank(comm, measure_own)
+    written = sorted(path for of_rank in comm.allgather(measured_here) for path in of_rank)
+    return written + on_root(comm, lambda: [_reassemble(folder) for folder in sweeps])
 
 
-def _measurable(path: Path) -> Iterator[tuple[Path, Path, Collection[str]]]:
-    """Folder, sweep and measures of the runs in ``path`` that can be measured, all checked; raises FolderError."""
+def _reassemble(folder: Path) -> Path:
+    """Put the ensemble of the sweep in ``folder`` together anew; returns its path."""
+    results = Results(Sweep.load(folder / "case.toml"), folder)
+    if (results.status == MISSING).any():
+        raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
+
+    # New records behind the old ones: the latest of a member counts.
+    file = RecordFile(results.paths.of_rank(0))
+    for name in results.ids:
+        path = folder / name / "analysis.h5"
+        if path.exists():
+            with open_netcdf(path, "analysis") as analysis:
+                file.append(results.lines[name].record() | {"measures": measured(analysis)})
+    file.close()
+    conclude(Results(results.plan, folder), afresh=True)
+    return folder / "ensemble.h5"
+
+
+def _measurable(path: Path) -> Iterator[MeasurableRun]:
+    """The runs in ``path`` that can be measured, all checked; raises FolderError."""
     folder = path.parent if path.name == "run.h5" else path
     sweep = (folder / "index.json").exists()
-    if reason := outdated(folder):
+    reason = outdated(folder)
+    if reason:
         raise FolderError(reason)
     if not sweep and not (folder / "run.h5").exists():
         raise FolderError(f"{path}: holds no run.h5; the folder of a finished run or sweep is needed")
-    measures = measures_of(Sweep.load(folder / "case.toml")) if sweep else FULL
-    for file in sorted(folder.glob("*/run.h5")) if sweep else [folder / "run.h5"]:
+
+    files = [folder / "run.h5"]
+    measures: Collection[str] = FULL
+    if sweep:
+        files = sorted(folder.glob("*/run.h5"))
+        measures = measures_of(Sweep.load(folder / "case.toml"))
+    for file in files:
         try:
             with open_run(file) as run:
                 if not sweep or keeps_all(Case.of(run)):
-                    yield file.parent, file.parents[1], measures
+                    yield MeasurableRun(file.parent, file.parents[1], measures)
         except (OSError, ValueError, KeyError) as error:
             raise FolderError(f"{file}: is not a run of vipetsc ({error})") from None
 
@@ -81,15 +106,14 @@ def measure_run(
 ) -> Path:
     """Write ``folder/analysis.h5`` and return its path; raises as ``open_run``.
 
-    When the wave arrives, the ``sweep`` knows of which the run is a member, by default that around its folder.
-    ``overrides`` are of ``[analysis]``.
+    The time at which the wave arrives is taken from the ``sweep`` of which the run is a member, by default the folder
+    that its own is in. ``overrides`` are of ``[analysis]``.
     """
     with open_run(folder / "run.h5") as run:
         case = Case.of(run)
         linear = read_linear(sweep or folder.parent, case)
         arrival = linear.arrival_at(leading_cell(case)) if linear else None
-        options = options_of(run, folder, overrides)
-        analysis = analyse(run, measures, arrival, options)
+        analysis = analyse(run, measures, arrival, options_of(run, folder, overrides))
         write_netcdf(folder / "analysis.h5", analysis.assign_attrs(origin() | analysis.attrs))
     return folder / "analysis.h5"
 
@@ -97,8 +121,13 @@ def measure_run(
 def is_measured(folder: Path) -> bool:
     """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
     with open_run(folder / "run.h5") as run:
-        expected = {key: run.attrs.get(key) for key in ("case", "status")} | {"vipetsc_version": vipetsc.__version__}
-        expected["analysis"] = describe_options(options_of(run, folder))
-        with suppress(OSError), open_netcdf(folder / "analysis.h5", "analysis") as analysis:  # it is there, and whole
+        expected = {
+            "case": run.attrs.get("case"),
+            "status": run.attrs.get("status"),
+            "vipetsc_version": vipetsc.__version__,
+            "analysis": describe_options(options_of(run, folder)),
+        }
+        # One that is not there or was cut off raises OSError.
+        with suppress(OSError), open_netcdf(folder / "analysis.h5", "analysis") as analysis:
             return all(analysis.attrs.get(key) == value for key, value in expected.items())
     return False

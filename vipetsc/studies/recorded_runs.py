@@ -1,4 +1,8 @@
-"""Runs of a study, made over ranks and recorded as they come: a study that was stopped or killed goes on with them."""
+"""Runs of a study, made by teams of ranks and recorded as they come: a study that was stopped or killed goes on.
+
+Every study that makes many runs has one ``RecordedRuns``: the scattering law, a prediction, a search for an optimum,
+and a sweep, whose records stand in ``members.jsonl`` and are read by ``studies.ensemble``.
+"""
 
 import time
 from collections.abc import Callable, Iterable
@@ -13,26 +17,71 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.run import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
-from vipetsc.io.store import RunMemory
+from vipetsc.io.store import RunMemory, RunOutput
 from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float]
-FAILURES = RuntimeError, ArithmeticError  # of the run itself; too little memory (also as CaseError) or disk is none
+# What may be wrong with one run alone. Too little memory (also as CaseError) or disk is none of it: another try,
+# with more of it, may succeed.
+FAILURES = (RuntimeError, ArithmeticError)
+
+
+class RecordPaths:
+    """Where the records called ``name`` stand in ``folder``: a file for each rank, until all are merged into one."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder = folder
+        self.name = name
+
+    @property
+    def merged(self) -> Path:
+        """The file of all records."""
+        return self.folder / f"{self.name}.jsonl"
+
+    def of_rank(self, rank: int) -> Path:
+        """The file that ``rank`` appends to."""
+        return self.folder / f"{self.name}-{rank}.jsonl"
+
+    def by_rank(self) -> list[Path]:
+        """The files of ranks that are there."""
+        return sorted(self.folder.glob(f"{self.name}-*.jsonl"))
+
+    def existing(self) -> list[Path]:
+        """All files that are there; of two records of one run the later in this order counts."""
+        merged = [self.merged] if self.merged.exists() else []
+        return merged + self.by_rank()
 
 
 class RecordedRuns:
-    """The records of runs by key in ``folder``: those ``known`` to begin with, and more as they are made.
+    """Runs made by teams of ``ranks`` of ``comm``, and their records called ``name`` in ``folder``.
 
-    They stand in ``<study>-runs-<rank>.jsonl``, and in ``<study>-runs.jsonl`` when all are put together. ``ranks`` of
-    ``comm``, a ``team``, share each run. All ranks hold all records.
+    ``team`` are the ranks that work on a run together with this one; the first of them appends its record. ``known``
+    are the records by key, on all ranks: those that are there, once they are ``read``, and those that are made after
+    that. ``failures`` are the exceptions that a single run may end in.
     """
 
-    def __init__(self, study: str, folder: Path, comm: MPI.Comm, stop: StopRequest, ranks: int = 1) -> None:
-        self.path, self.comm, self.stop = folder / f"{study}-runs.jsonl", comm, stop
+    def __init__(
+        self,
+        name: str,
+        folder: Path,
+        comm: MPI.Comm,
+        stop: StopRequest,
+        ranks: int = 1,
+        failures: tuple[type[Exception], ...] = FAILURES,
+    ) -> None:
+        self.comm = comm
+        self.stop = stop
         self.team = comm.Split(comm.rank // ranks, comm.rank)
-        self.file = RecordFile(self.path.with_stem(f"{self.path.stem}-{comm.rank}"))
-        self.known = on_root(comm, lambda: {key: record for key, (record, _) in self._read().items()})
+        self.pool = TaskPool(comm, self.team, stop, failures)
+        self.paths = RecordPaths(folder, name)
+        self.file = RecordFile(self.paths.of_rank(comm.rank))
+        self.known: dict[Key, Record] = {}
+
+    def read(self) -> "RecordedRuns":
+        """Take the records that are there as ``known``, on all ranks; returns itself. Collective."""
+        self.known = on_root(self.comm, lambda: {key: record for key, (record, _) in self._read().items()})
+        return self
 
     def make(
         self,
@@ -47,19 +96,21 @@ class RecordedRuns:
 
         The record of a run that fails is its ``reason`` if ``failures`` may be; else RuntimeError is raised on all
         ranks. Raises OSError on all, and there is no record, if memory or disk is short or if it was no failure
-        of the run itself: it may come out the next time. Raises StoppedError on all if some rank got a request to stop.
+        of the run itself: it may succeed the next time. Raises StoppedError on all if some rank got a request to stop.
         """
         missing = [key for key in dict.fromkeys(keys) if key not in self.known]
-        made, failed = dict[Key, Record](), list[str]()
+        recorded: dict[Key, Record] = {}
+        failed: list[str] = []
 
-        def one(key: Key) -> None:
-            begin, record = time.process_time(), work(key)
-            record = {"cpu_seconds": round(time.process_time() - begin, 4)} | record
-            on_root(self.team, lambda: keep(key, record))
+        def make_one(key: Key) -> None:
+            begin = time.process_time()
+            record = work(key)
+            timed = {"cpu_seconds": round(time.process_time() - begin, 4)} | record
+            on_root(self.team, lambda: keep(key, timed))
 
         def keep(key: Key, record: Record) -> None:
-            made[key] = {"key": key, "vipetsc_version": vipetsc.__version__} | record
-            self.file.append(made[key])
+            recorded[key] = {"key": key, "vipetsc_version": vipetsc.__version__} | record
+            self.file.append(recorded[key])
 
         def fail(key: Key, reason: str) -> None:
             if failures:
@@ -67,20 +118,34 @@ class RecordedRuns:
             else:
                 failed.append(f"{key}: {reason}")
 
-        pool = TaskPool(self.comm, self.team, self.stop, FAILURES)
-        pool.run(missing, one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
+        self.pool.run(missing, make_one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
         self.file.close()
-        for more in self.comm.allgather(made):
-            self.known |= more
-        if pool.stopped:
+        for records in self.comm.allgather(recorded):
+            self.known |= records
+        if self.pool.stopped:
             raise StoppedError(f"stopped on request with {len(self.known)} runs; the same command goes on")
-        reasons = [reason for some in self.comm.allgather(failed) for reason in some]
+
+        reasons = [reason for of_rank in self.comm.allgather(failed) for reason in of_rank]
 
         def check() -> None:
             if reasons:
                 raise RuntimeError(f"one of the {what} did not come out, {reasons[0]}")
 
         on_root(self.comm, check)
+
+    def simulate(self, case: Case, output: RunOutput) -> Result:
+        """Run ``case`` on all ranks of the team into ``output``.
+
+        Raises StoppedError if the run was stopped, RuntimeError if it failed.
+        """
+        return completed(simulate(case, output, self.team, stop=self.stop))
+
+    def run_in_memory(self, case: Case) -> tuple[xr.Dataset, Result]:
+        """What a run of ``case`` by the team holds, empty on all ranks but its first, and how it ended.
+
+        Raises as ``simulate``.
+        """
+        return run_in_memory(case, self.team, self.stop)
 
     def finish(self) -> None:
         """Put the records of all ranks into one file and let go of the team. Collective.
@@ -89,30 +154,29 @@ class RecordedRuns:
         """
 
         def merge() -> None:
-            if parts := self._parts():
-                merge_records(self.path, [line for _, line in self._read().values()], parts)
+            by_rank = self.paths.by_rank()
+            if by_rank:
+                merge_records(self.paths.merged, [line for _, line in self._read().values()], by_rank)
 
         on_root(self.comm, merge)
         self.team.Free()
 
     def _read(self) -> dict[Key, tuple[Record, Line]]:
         """Records of this version and their lines by key; a damaged line is as if it had never been."""
-        read: dict[Key, tuple[Record, Line]] = {}
-        for path in (self.path, *self._parts()):
-            for record, line in read_records(path, lambda text: None) if path.exists() else ():
-                key = tuple(record["key"]) if isinstance(record["key"], list) else record["key"]
-                if record["vipetsc_version"] == vipetsc.__version__:
-                    read[key] = record, line
-        return read
-
-    def _parts(self) -> list[Path]:
-        return sorted(self.path.parent.glob(f"{self.path.stem}-*.jsonl"))
+        records: dict[Key, tuple[Record, Line]] = {}
+        for path in self.paths.existing():
+            for record, line in read_records(path, damaged=lambda text: None):
+                if record["vipetsc_version"] != vipetsc.__version__:
+                    continue
+                key = record["key"]
+                records[tuple(key) if isinstance(key, list) else key] = record, line  # JSON has no tuples
+        return records
 
 
 def run_in_memory(case: Case, team: MPI.Comm, stop: StopRequest) -> tuple[xr.Dataset, Result]:
-    """A run of ``case`` on all ranks of ``team``: its content, empty on all but the first, and how it ended.
+    """What a run of ``case`` by all ranks of ``team`` holds, empty on all but the first, and how it ended.
 
-    Raises as ``completed``.
+    Raises StoppedError if the run was stopped, RuntimeError if it failed.
     """
     memory = RunMemory(team)
     result = completed(simulate(case, memory, team, stop=stop))

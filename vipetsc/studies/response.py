@@ -1,15 +1,16 @@
-"""How one site answers a wave: contact force and energies, by the driven wave's amplitude at the moment.
+"""How one site responds to a wave: contact force and energies, by the driven wave's amplitude at the moment.
 
-A burst meets a site in a lattice so long that nothing comes back. With w the relative displacement of the contact pair,
+A burst meets a site in a lattice so long that nothing returns. With w the relative displacement of the contact pair,
 w_0 that of the lattice without contacts and g(omega) the response of w to a pair of opposite forces at the infinite
 lattice, the contact's force is f = (w - w_0)/g at every frequency. Around the drive's frequency Om,
 w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), around 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds the clearance D,
-contact goes on until the last one ends, at the z = |c|/D that the run tells (``release``). Meanwhile all of it is taken
+contact goes on until the last one ends, at the z = |c|/D that the run shows (``release``). Meanwhile all of it is taken
 for a function of z, averaged over bins of log z, over the burst's rise and fall and over runs of several amplitudes.
 What a whole burst loses and gives to other bands then comes out right by a factor. Both the factor and the release are
 those of bursts with the same largest z.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -20,6 +21,12 @@ from vipetsc.lattice import Band, Chain, UnitCell, WaveCompliance, bloch, pass_b
 LOWEST = 0.15  # z of the first of the bins
 BINS = 40
 DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that nothing comes round
+TINY = 1e-300  # in place of zero in a divisor
+# Half-widths of the lines around Om and 3 Om, over Om: what is not the signal's own line is cut off.
+FIRST_LINE = 0.3
+THIRD_LINE = 0.4
+# Forces are followed up to this many times the top band's edge: above, g falls as 1/omega^2 and (w - w_0)/g is noise.
+TOP = 1.02
 
 
 def self_response(cell: UnitCell, omega: np.ndarray) -> np.ndarray:
@@ -27,85 +34,174 @@ def self_response(cell: UnitCell, omega: np.ndarray) -> np.ndarray:
     return WaveCompliance(Chain(cell, 1, sites=(0,)), infinite=True).at(omega)[:, 0, 0]
 
 
-def power_per_area(cell: UnitCell, omega: float) -> tuple[int, float, float] | None:
-    """Of the fastest wave at ``omega``: band (from 0), |v_g| (cells/s), power over |w|^2 (W/m^2); None in a gap."""
-    if not (waves := waves_at(cell, omega)):
+class TravellingWave(NamedTuple):
+    """The fastest wave at a frequency: its ``band`` from 0, |v_g| ``speed`` in cells/s, power over |w|^2 in W/m^2."""
+
+    band: int
+    speed: float
+    power_per_area: float
+
+
+def fastest_wave(cell: UnitCell, omega: float) -> TravellingWave | None:
+    """The fastest wave at ``omega`` in rad/s; None in a gap."""
+    waves = waves_at(cell, omega)
+    if not waves:
         return None
+
     number, kappa, speed = max(waves, key=lambda wave: wave[2])
     vector = bloch(cell, kappa).vectors[:, number - 1]
     relative = abs(vector[cell.resonator] - vector[cell.host])
-    return number - 1, speed, speed * omega**2 / (2 * max(relative, 1e-300) ** 2)
+    return TravellingWave(number - 1, speed, speed * omega**2 / (2 * max(relative, TINY) ** 2))
 
 
 def in_contact(z: np.ndarray, release: np.ndarray) -> np.ndarray:
     """Whether sites (site, time) are in contact: from z > 1 until z < ``release`` (site)."""
-    on, state = np.zeros(z.shape, bool), np.zeros(len(z), bool)
+    on = np.zeros(z.shape, bool)
+    state = np.zeros(len(z), bool)
     for i, now in enumerate(z.T):
-        on[:, i] = state = np.where(state, now >= release, now > 1)
+        state = np.where(state, now >= release, now > 1)
+        on[:, i] = state
     return on
 
 
+def unit_phase(c: np.ndarray) -> np.ndarray:
+    """c/|c|; 0 where c is."""
+    return c / np.maximum(np.abs(c), TINY)
+
+
+@dataclass(frozen=True)
+class SiteRun:
+    """A run with one site in contact, at the samples of its burst.
+
+    ``amplitude`` of the drive in N, ``clearance`` in m, w (time) in m as ``displacement``, ``dissipated`` (time) in J
+    since the begin, ``last_contact``: the time in s at which the last contact ends, NaN without any.
+    """
+
+    amplitude: float
+    clearance: float
+    displacement: np.ndarray
+    dissipated: np.ndarray
+    last_contact: float
+
+
 class Burst:
-    """The linear wave at a site: ``time`` in s (uniform), relative displacement ``w`` in m and what follows from it."""
+    """The linear wave at a site: ``time`` in s (uniform), relative displacement ``w`` in m and what follows from it.
+
+    Over the frequencies ``omega`` in rad/s stand the response ``g`` in m/N and the ``linear`` spectrum; ``c`` (time) is
+    the envelope at the frequency ``drive``.
+    """
 
     def __init__(self, cell: UnitCell, drive: float, time: np.ndarray, w: np.ndarray) -> None:
-        self.cell, self.drive, self.time, self.step = cell, drive, time, float(time[1] - time[0])
-        length = 2 * len(time) * self.step
-        self.decay = DECAY / length
-        self.omega = 2 * np.pi * np.fft.rfftfreq(2 * len(time), self.step)
+        self.cell = cell
+        self.drive = drive
+        self.time = time
+        self.step = float(time[1] - time[0])
+        # Padded to twice the time, so that the transform's period does not fold the response back.
+        self.padded = 2 * len(time)
+        self.decay = DECAY / (self.padded * self.step)
+        self.omega = 2 * np.pi * np.fft.rfftfreq(self.padded, self.step)
         self.g = self_response(cell, self.omega - 1j * self.decay)
         self.bands: tuple[Band, ...] = pass_bands(cell)
         self.linear = self.spectrum(w)
-        self.c = self.envelope(self.linear, drive, 0.3 * drive)
+        self.c = self.envelope(self.linear, drive, FIRST_LINE * drive)
 
     def spectrum(self, w: np.ndarray) -> np.ndarray:
         """Fourier transform of ``w`` at ``omega`` - i decay."""
-        return np.asarray(np.fft.rfft(w * np.exp(-self.decay * self.time), 2 * len(self.time)))
+        return np.asarray(np.fft.rfft(w * np.exp(-self.decay * self.time), self.padded))
 
     def envelope(self, spectrum: np.ndarray, middle: float, half: float) -> np.ndarray:
         """a(t) of the part Re a exp(i middle t) of a signal within ``half`` of ``middle``."""
-        part = np.zeros(2 * len(self.time), complex)
+        part = np.zeros(self.padded, complex)
         part[: len(self.omega)] = np.where(np.abs(self.omega - middle) < half, 2 * spectrum, 0)
         return np.asarray(np.fft.ifft(part)[: len(self.time)] * np.exp((self.decay - 1j * middle) * self.time))
 
-    def sums(self, amplitude: float, gap: float, largest: float, w: np.ndarray, lost: np.ndarray, end: float) -> Record:
-        """Sums (quantity, bin) over a run's samples in contact, totals, and the z of the release.
+    def sums(self, run: SiteRun, largest: float) -> Record:
+        """``sums`` (quantity, bin) over a ``run``'s samples in contact, ``totals``, and the z of the ``release``.
 
-        ``gap`` is the clearance in m, ``lost`` (time) in J is dissipated, contacts ``end`` in s (NaN without any).
-
-        Quantities: |c|^2, Re and Im of f1 c*, Re and Im of f3 (c*/|c|)^3 |c|, power that the driven wave gives, power
-        dissipated, power into each band.
+        The bins of log z go from ``LOWEST`` to ``largest``. Quantities: |c|^2, Re and Im of f1 c*, Re and Im of
+        f3 (c*/|c|)^3 |c|, power that the driven wave gives, power dissipated, power into each band. The totals are
+        those of the last two over all samples.
         """
-        c, drive = amplitude * self.c, self.drive
-        force = np.where(
-            self.omega < 1.02 * self.bands[-1].high, (self.spectrum(w) - amplitude * self.linear) / self.g, 0
-        )
-        rate = 1j * (self.omega - 1j * self.decay)
-        f1, f3 = self.envelope(force, drive, 0.3 * drive), self.envelope(force, 3 * drive, 0.4 * drive)
-        v1 = self.envelope(rate * (self.g * force + amplitude * self.linear), drive, 0.3 * drive)
-        rows = [np.abs(c) ** 2, f1 * c.conj(), f3 * (c.conj() / np.maximum(np.abs(c), 1e-300)) ** 3 * np.abs(c)]
-        rows = [rows[0], rows[1].real, rows[1].imag, rows[2].real, rows[2].imag, -0.5 * (f1 * v1.conj()).real]
-        rows.append(np.gradient(lost, self.step))
-        for band in self.bands:
-            within = (band.low + band.high) / 2, (band.high - band.low) / 2
-            pair = self.envelope(force, *within), self.envelope(rate * self.g * force, *within)
-            rows.append(0.5 * (pair[0] * pair[1].conj()).real)
-        z = np.abs(c) / gap
-        release = min(float(np.interp(end, self.time, z)), 1.0) if np.isfinite(end) else 1.0
-        on = in_contact(z[None], np.array([release]))[0] & np.isfinite(end)
+        c = run.amplitude * self.c
+        incident = run.amplitude * self.linear
+        carried = self.omega < TOP * self.bands[-1].high
+        force = np.where(carried, (self.spectrum(run.displacement) - incident) / self.g, 0)
+        powers = [np.gradient(run.dissipated, self.step), *self._band_powers(force)]
+        rows = [*self._force_rows(c, force, incident), *powers]
+
+        z = np.abs(c) / run.clearance
+        touched = np.isfinite(run.last_contact)
+        release = 1.0
+        if touched:
+            release = min(float(np.interp(run.last_contact, self.time, z)), 1.0)
+        on = in_contact(z[None], np.array([release]))[0] & touched
+
         grid = np.linspace(np.log(LOWEST), np.log(largest), BINS)
-        place = np.clip(np.rint((np.log(np.maximum(z[on], LOWEST)) - grid[0]) / (grid[1] - grid[0])), 0, BINS - 1)
-        bins = [np.bincount(place.astype(int), row[on], BINS).tolist() for row in rows]
-        return {"sums": bins, "totals": [float(row.sum()) for row in rows[6:]], "release": release}
+        position = (np.log(np.maximum(z[on], LOWEST)) - grid[0]) / (grid[1] - grid[0])
+        nearest = np.clip(np.rint(position), 0, BINS - 1).astype(int)
+        return {
+            "sums": [np.bincount(nearest, row[on], BINS).tolist() for row in rows],
+            "totals": [float(row.sum()) for row in powers],
+            "release": release,
+        }
+
+    def _force_rows(self, c: np.ndarray, force: np.ndarray, incident: np.ndarray) -> list[np.ndarray]:
+        """|c|^2, Re and Im of f1 c*, Re and Im of f3 (c*/|c|)^3 |c|, power that the driven wave gives, over time."""
+        drive = self.drive
+        f1 = self.envelope(force, drive, FIRST_LINE * drive)
+        f3 = self.envelope(force, 3 * drive, THIRD_LINE * drive)
+        velocity = self.envelope(self._rate() * (self.g * force + incident), drive, FIRST_LINE * drive)
+        fundamental = f1 * c.conj()
+        third = f3 * unit_phase(c.conj()) ** 3 * np.abs(c)
+        return [
+            np.abs(c) ** 2,
+            fundamental.real,
+            fundamental.imag,
+            third.real,
+            third.imag,
+            -0.5 * (f1 * velocity.conj()).real,
+        ]
+
+    def _band_powers(self, force: np.ndarray) -> list[np.ndarray]:
+        """Power in W that the ``force`` radiates into each band, over time."""
+        powers = []
+        for band in self.bands:
+            middle = (band.low + band.high) / 2
+            half = (band.high - band.low) / 2
+            f = self.envelope(force, middle, half)
+            velocity = self.envelope(self._rate() * self.g * force, middle, half)
+            powers.append(0.5 * (f * velocity.conj()).real)
+        return powers
+
+    def _rate(self) -> np.ndarray:
+        """Factor (omega) of a spectrum that makes it that of the time derivative."""
+        return np.asarray(1j * (self.omega - 1j * self.decay))
+
+
+class ContactState(NamedTuple):
+    """What a site in contact does, over the shape of z; ``into`` has the bands as first axis. See ``SiteResponse``."""
+
+    fundamental: np.ndarray
+    third: np.ndarray
+    lost: np.ndarray
+    into: np.ndarray
+
+
+class BurstState(NamedTuple):
+    """What holds over a whole burst, over its largest z: factors of loss and of bands (band, ...), and release."""
+
+    lost: np.ndarray
+    into: np.ndarray
+    release: np.ndarray
 
 
 class SiteResponse(NamedTuple):
     """What a site in contact does at z = exp(``x``): all arrays over ``x``.
 
-    ``fundamental`` is f1/c and ``third`` f3 (c*/|c|)^3/|c| in N/m (complex). ``given``, ``lost`` and ``into`` (band, x)
-    are powers over that of a travelling wave of the same |c|: what the driven wave loses, what is dissipated, and what
-    goes to every band but its own, scaled to sum to it. Of bursts whose largest z is exp(``peaks``): ``factor`` (loss
-    and bands, run), by which the sum over a burst is that of the run, and ``release`` (run), z at which contact ends.
+    ``fundamental`` is f1/c and ``third`` f3 (c*/|c|)^3/|c| in N/m (complex). ``lost`` and ``into`` (band, x) are powers
+    over that of a travelling wave of the same |c|: what is dissipated, and what goes to every band but its own, scaled
+    to sum to what the driven wave loses. Of bursts whose largest z is exp(``peaks``): ``factor`` (loss and bands, run),
+    by which the sum over a burst is that of the run, and ``release`` (run), z at which contact ends.
     """
 
     x: np.ndarray
@@ -119,35 +215,69 @@ class SiteResponse(NamedTuple):
 
     @classmethod
     def of(cls, records: list[Record], cell: UnitCell, drive: float, largest: float) -> Self:
-        """From the sums of all runs, in any order; without contacts a response that is zero."""
-        x = np.linspace(np.log(LOWEST), np.log(largest), BINS)
+        """The response from the sums of all runs, in any order; zero if there was no contact."""
         records = sorted(records, key=lambda record: record["z"])
-        sums, peaks = np.array([record["sums"] for record in records]), np.log([record["z"] for record in records])
-        release, rows = np.array([record["release"] for record in records]), sums.sum(axis=0)
-        here = power_per_area(cell, drive)
-        seen = rows[0] > 0
-        if here is None or not seen.any():
-            none = np.zeros((cell.dofs, BINS))
-            return cls(x, 0j * x, 0j * x, 0 * x, none, peaks, np.ones((1 + cell.dofs, len(peaks))), release)
-        mean = np.array([np.interp(x, x[seen], row[seen] / rows[0][seen]) for row in rows])
-        given, lost, into = mean[5] / here[2], mean[6], mean[7:].copy()
-        into[here[0]] = 0
-        into, lost = np.maximum(into, 0), np.maximum(lost, 0)
-        scale = np.maximum(given, 0) / np.maximum(into.sum(axis=0) + lost, 1e-300)
+        x = np.linspace(np.log(LOWEST), np.log(largest), BINS)
+        sums = np.array([record["sums"] for record in records])
+        peaks = np.log([record["z"] for record in records])
+        release = np.array([record["release"] for record in records])
+        wave = fastest_wave(cell, drive)
+        squares = sums[:, 0]  # |c|^2, by run
+        total = sums.sum(axis=0)
+        seen = total[0] > 0
+        if wave is None or not seen.any():
+            return cls(
+                x=x,
+                fundamental=0j * x,
+                third=0j * x,
+                lost=0 * x,
+                into=np.zeros((cell.dofs, BINS)),
+                peaks=peaks,
+                factor=np.ones((1 + cell.dofs, len(peaks))),
+                release=release,
+            )
+
+        # Bins that no sample fell into lie between others that have some.
+        mean = np.array([np.interp(x, x[seen], row[seen] / total[0][seen]) for row in total])
+        given = mean[5] / wave.power_per_area
+        lost = np.maximum(mean[6], 0)
+        into = mean[7:].copy()
+        into[wave.band] = 0
+        into = np.maximum(into, 0)
+        scale = np.maximum(given, 0) / np.maximum(into.sum(axis=0) + lost, TINY)
         table = np.array([lost * scale, *(into * scale)])
-        totals = np.array([record["totals"] for record in records]).T / here[2]
-        factor = np.maximum(totals, 0) / np.maximum(table @ sums[:, 0].T, 1e-300)
-        factor = np.where(table @ sums[:, 0].T > 0, factor, 1.0)
-        factor[1 + here[0]] = 1.0
-        return cls(x, mean[1] + 1j * mean[2], mean[3] + 1j * mean[4], table[0], table[1:], peaks, factor, release)
 
-    def at(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """fundamental, third, lost (shape of z) and into (band, shape of z) at ``z``."""
+        totals = np.array([record["totals"] for record in records]).T / wave.power_per_area
+        composed = table @ squares.T
+        factor = np.where(composed > 0, np.maximum(totals, 0) / np.maximum(composed, TINY), 1.0)
+        factor[1 + wave.band] = 1.0
+        return cls(
+            x=x,
+            fundamental=mean[1] + 1j * mean[2],
+            third=mean[3] + 1j * mean[4],
+            lost=table[0],
+            into=table[1:],
+            peaks=peaks,
+            factor=factor,
+            release=release,
+        )
+
+    def at(self, z: np.ndarray) -> ContactState:
+        """What a site in contact does at ``z``."""
         x = np.log(np.maximum(z, LOWEST))
-        f1, f3 = (np.interp(x, self.x, q.real) + 1j * np.interp(x, self.x, q.imag) for q in self[1:3])
-        return f1, f3, np.interp(x, self.x, self.lost), np.array([np.interp(x, self.x, q) for q in self.into])
+        return ContactState(
+            fundamental=self._interpolated(x, self.fundamental),
+            third=self._interpolated(x, self.third),
+            lost=np.interp(x, self.x, self.lost),
+            into=np.array([np.interp(x, self.x, row) for row in self.into]),
+        )
 
-    def of_bursts(self, largest: np.ndarray) -> np.ndarray:
-        """The factor (loss and bands) and last the release of sites (site) under bursts with these ``largest`` z."""
+    def _interpolated(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Complex ``values`` at ``x``."""
+        return np.asarray(np.interp(x, self.x, values.real) + 1j * np.interp(x, self.x, values.imag))
+
+    def of_bursts(self, largest: np.ndarray) -> BurstState:
+        """What holds over bursts with these ``largest`` z (site)."""
         x = np.log(np.maximum(largest, 1e-9))
-        return np.array([np.interp(x, self.peaks, row) for row in (*self.factor, self.release)])
+        factors = np.array([np.interp(x, self.peaks, row) for row in self.factor])
+        return BurstState(lost=factors[0], into=factors[1:], release=np.interp(x, self.peaks, self.release))

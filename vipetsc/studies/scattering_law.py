@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.studies.linear_run import LinearRun
 
-FORWARD, BACKWARD = 0, 1
+FORWARD, BACKWARD = 0, 1  # directions: from the drive to the site and on, and the other
 LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency is judged
 NEAR = 5  # cells from the site within which energy counts as near it
 FLAT = 0.1  # of the efficiency, which its scatter does not tell apart
 BROAD = 0.05  # half the width in log z over which it is averaged: a design has to bear as much
+LISTED = (1.01, 1.1, 1.5, 3.0, 10.0, 30.0, 100.0)  # values of z in the printed table
 
-OF_POINT = {
+POINT_LAYOUT = {
     "transmitted": ("z", "1", "share that goes on in the drive's band"),
     "reflected": ("z", "1", "share that goes back in the drive's band"),
     "upper": ("z", "1", "share that bands above the drive's get"),
@@ -40,8 +41,8 @@ LAYOUT = {
     "near": ("z", "1", f"twice the kinetic energy within {NEAR} cells of the site at the end, contained in the shares"),
     "interpolation_error": ("z", "1", "largest distance of a share from the line between the neighbours before it"),
     "efficiency": ("z", "1", "U/(1-T), both averaged over 5 % of z either way; 0 where little leaves the drive's wave"),
-    **OF_POINT,
-    **{f"{name}_scatter": (dims, unit, f"deviation: {text}") for name, (dims, unit, text) in OF_POINT.items()},
+    **POINT_LAYOUT,
+    **{f"{name}_scatter": (dims, unit, f"deviation: {text}") for name, (dims, unit, text) in POINT_LAYOUT.items()},
 }
 
 
@@ -94,11 +95,17 @@ class ScatteringLaw:
     @classmethod
     def of(cls, data: xr.Dataset) -> Self:
         """The law in the content of ``law.h5``."""
-        mean, scatter = (
-            Outcome(*(data[f"{name}{end}"].values for name in Outcome._fields)) for end in ("", "_scatter")
+        return cls(
+            z=data["z"].values,
+            mean=Outcome(**{name: data[name].values for name in Outcome._fields}),
+            scatter=Outcome(**{name: data[f"{name}_scatter"].values for name in Outcome._fields}),
+            drive_band=int(data.attrs["drive_band"]) - 1,
+            clearance=float(data.attrs["clearance"]),
+            peak=float(data.attrs["peak"]),
+            linear_time=data["time"].values,
+            linear_envelope=data["envelope"].values,
+            about=data.attrs,
         )
-        about = int(data.attrs["drive_band"]) - 1, float(data.attrs["clearance"]), float(data.attrs["peak"])
-        return cls(data["z"].values, mean, scatter, *about, data["time"].values, data["envelope"].values, data.attrs)
 
     def at(self, z: ArrayLike) -> Outcome:
         """What becomes of a wave at ``z`` (any shape): linear in log z between the points, T = 1 below the first.
@@ -108,7 +115,7 @@ class ScatteringLaw:
         return self._interpolated(self.mean, z)
 
     def deviation(self, z: ArrayLike) -> Outcome:
-        """The scatter at ``z``, as ``at``."""
+        """The scatter at ``z`` (any shape), interpolated as ``at`` interpolates the mean."""
         return self._interpolated(self.scatter, z)
 
     def _interpolated(self, values: Outcome, z: ArrayLike) -> Outcome:
@@ -119,18 +126,19 @@ class ScatteringLaw:
 
         def between(array: np.ndarray) -> np.ndarray:
             w = weight.reshape(weight.shape + (1,) * (array.ndim - 1))
-            # Exactly the point's value at a point, and no NaN of a neighbour beside it.
             mixed = (1 - w) * array[right - 1] + w * array[right]
+            # Exactly the point's value at a point, and no NaN of its neighbour.
             return np.where(w == 0, array[right - 1], np.where(w == 1, array[right], mixed))
 
         return Outcome(*map(between, values))
 
     def efficiency(self) -> np.ndarray:
         """U/(1-T) (point), both averaged over 5 % of z either way; 0 where 1-T is below 2 % somewhere there."""
-        around = np.exp(np.linspace(-BROAD, BROAD, 41))[:, None] * self.z
-        outcome = self.at(around)
+        neighbourhood = np.exp(np.linspace(-BROAD, BROAD, 41))[:, None] * self.z
+        outcome = self.at(neighbourhood)
         lost = 1 - outcome.transmitted
-        return np.where(lost.min(axis=0) > LEAST, outcome.upper.mean(axis=0) / lost.mean(axis=0).clip(LEAST), 0.0)
+        mean_efficiency = outcome.upper.mean(axis=0) / lost.mean(axis=0).clip(LEAST)
+        return np.where(lost.min(axis=0) > LEAST, mean_efficiency, 0.0)
 
     def matched(self) -> tuple[float, float]:
         """Where upper bands get the most of what the drive's wave loses: z*, and T there.
@@ -141,31 +149,36 @@ class ScatteringLaw:
         efficiency = self.efficiency()
         if not efficiency.any():
             raise ValueError("no band above the drive's gets energy from it")
-        best = int(np.argmax(np.where(efficiency >= (1 - FLAT) * efficiency.max(), self.mean.transmitted, -np.inf)))
+
+        near_best = efficiency >= (1 - FLAT) * efficiency.max()
+        best = int(np.argmax(np.where(near_best, self.mean.transmitted, -np.inf)))
         return float(self.z[best]), float(self.at(self.z[best]).transmitted)
 
     def summary(self) -> list[tuple[str, str]]:
-        """What there is to tell of the law, as rows of a table."""
-        about, mean = self.about, self.mean
-        sums = mean.share.sum(axis=(1, 2)) + mean.dissipated + mean.contact
+        """Rows of a table that describe the law: its ring, the packet, its points and a few of its values."""
+        about = self.about
+        sums = self.mean.share.sum(axis=(1, 2)) + self.mean.dissipated + self.mean.contact
         arrives = f"at {about['arrival']:.4g} s, {about['spread']:.4g} times as long as the burst"
         rows = [
             ("ring", f"{about['cells']} cells, site at {about['distance']}, clearance {self.clearance:.5g} m"),
             ("packet", f"{arrives}; {about['under_way']:.1e} of its energy had not passed at the end"),
             ("points", f"{len(self.z)} from z = 1 to {self.z[-1]:g}; shares sum to 1 within {abs(sums - 1).max():.0e}"),
         ]
-        for z in (1.01, 1.1, 1.5, 3.0, 10.0, 30.0, 100.0):
-            o, d = self.at(z), self.deviation(z)
-            shares = (
-                (o.transmitted, d.transmitted),
-                (o.reflected, d.reflected),
-                (o.upper, d.upper),
-                (o.dissipated, d.dissipated),
-            )
-            told = (f"{name} {m:.3f}+-{s:.3f}" for name, (m, s) in zip("TRUL", shares, strict=True))
-            rows += [(f"z = {z:g}", ", ".join(told))] if z < self.z[-1] else []
-        best = f"z* = {about['matched_z']:.4g}, T = {about['matched_transmitted']:.3g}"
-        return [*rows, ("matched", best if self.efficiency().any() else "no band above the drive's gets energy")]
+        rows += [(f"z = {z:g}", self._fractions_at(z)) for z in LISTED if z < self.z[-1]]
+
+        best = "no band above the drive's gets energy"
+        if self.efficiency().any():
+            best = f"z* = {about['matched_z']:.4g}, T = {about['matched_transmitted']:.3g}"
+        return [*rows, ("matched", best)]
+
+    def _fractions_at(self, z: float) -> str:
+        """T, R, U and the dissipated fraction L at ``z`` with their scatter."""
+        mean = self.at(z)
+        scatter = self.deviation(z)
+        symbols = {"T": "transmitted", "R": "reflected", "U": "upper", "L": "dissipated"}
+        return ", ".join(
+            f"{symbol} {getattr(mean, name):.3f}+-{getattr(scatter, name):.3f}" for symbol, name in symbols.items()
+        )
 
 
 def matched_clearances(law: ScatteringLaw, linear: LinearRun, sites: Sequence[int], amplitude: float) -> np.ndarray:

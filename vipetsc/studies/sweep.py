@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -23,8 +23,7 @@ from vipetsc.io.read import outdated
 from vipetsc.parallel import Progress, StopRequest, on_root
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name
-from vipetsc.studies.pool import TaskPool
-from vipetsc.studies.sweep_runs import MemberStore
+from vipetsc.studies.sweep_runs import SweepRuns
 
 MOST_SURVEYED = 10_000  # members whose cases are made beforehand, for their linear runs and what they will cost
 
@@ -33,7 +32,7 @@ MOST_SURVEYED = 10_000  # members whose cases are made beforehand, for their lin
 class SweepResult:
     """How a sweep ended: ``status`` (member), an index of ``studies.ensemble.STATUS``.
 
-    ``made`` counts the members simulated or scaled now; ``busy`` (rank) is the share of the time in which each
+    ``made`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
     rank worked on members. ``warnings`` are sentences about records made again and about the members' results.
     """
 
@@ -55,7 +54,7 @@ class SweepResult:
         return self.count(MISSING) > 0
 
     def count(self, status: int) -> int:
-        """Number of members that ended so."""
+        """Number of members with this ``status``."""
         return int((self.status == status).sum())
 
 
@@ -65,8 +64,8 @@ def run_sweep(
     comm: MPI.Comm = MPI.COMM_WORLD,
     *,
     force: bool = False,
-    stop: StopRequest | None = None,
     resume: bool = False,
+    stop: StopRequest | None = None,
     progress: bool = False,
 ) -> SweepResult:
     """Make every member of ``plan`` in ``folder``, then ``ensemble.h5`` and ``index.json``.
@@ -74,15 +73,17 @@ def run_sweep(
     Members that are complete and made by this version are not made again, so a sweep that was killed goes on where
     it was; ``force`` begins anew and replaces the sweep in the folder when the new one has ended, ``resume`` needs one
     to go on with. A member that fails is recorded with its reason and the others go on. All ranks of
-    ``comm`` make members; ``[sweep] ranks`` of them share each.
+    ``comm`` make members, ``[sweep] ranks`` of them together each.
 
     Raises CaseError if no member is a valid case (of those drawn, where they are many), FolderError if the folder holds
     anything but this sweep.
     """
-    on_root(comm, lambda: plan.members(MOST_TRIED)[:0])
+    on_root(comm, lambda: plan.members(MOST_TRIED)[:0])  # raises; the cases are not sent
     with claimed(comm, folder, SWEEP, plan.to_toml(), force=force, resume=resume) as claim:
-        if reason := on_root(comm, lambda: outdated(claim.folder)):
+        reason = on_root(comm, lambda: outdated(claim.folder))
+        if reason:
             raise FolderError(reason)
+
         result = _make_all(plan, claim.folder, comm, stop or StopRequest(), progress)
         if not result.resumable:
             claim.publish()
@@ -93,94 +94,134 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     """Make what is missing of the members in ``folder``, on all ranks, and put together what is there."""
     begin = time.perf_counter()
     sys.audit("vipetsc.plan", plan.name)
-    team = comm.Split(comm.rank // plan.options.ranks, comm.rank)
-    pool = TaskPool(comm, team, stop)
-    store = MemberStore(plan, folder, team, stop, comm.rank)
+    runs = SweepRuns(plan, folder, comm, stop)
+    pool = runs.recorded.pool
 
     # What there is and what comes first is decided on one rank: another may not see the files of the others yet.
-    survey: _Survey
+    surveys: list[_Survey] = []
 
-    def look() -> tuple[dict[str, tuple[Case, list[int]]], dict[str, LinearRun | str]]:
-        nonlocal survey
+    def look() -> tuple[dict[str, NeededRun], dict[str, LinearRun | str]]:
         survey = _survey(plan, folder)
-        return survey.needed, dict(survey.results.linear if len(survey.missing) else {})
+        surveys.append(survey)
+        return survey.needed, dict(survey.results.linear) if len(survey.missing) else {}
 
-    linear, store.linear = on_root(comm, look)
-    pool.run(list(linear), lambda name: store.make_linear(*linear[name]))
-    for name, run in (item for known in comm.allgather(store.linear) for item in known.items()):
-        store.linear[name] = run if isinstance(run, str) else run.joined(store.linear.get(name))
-    order = on_root(comm, lambda: survey.order(store.linear))
+    needed, runs.linear = on_root(comm, look)
+    pool.run(list(needed), lambda name: runs.make_linear(*needed[name]))
+    _join_linear_runs(runs, comm)
+
+    order = on_root(comm, lambda: surveys[0].order(runs.linear))
     bar = Progress(comm, len(order), "runs", show=progress)
-    made = pool.run(order, store.make, bar, store.fail)
-    store.file.close()
+    made = pool.run(order, runs.make, bar, runs.fail)
+    runs.recorded.file.close()
 
     seconds = time.perf_counter() - begin
     busy = tuple(comm.allgather(pool.busy / seconds))
 
     def put_together() -> tuple[np.ndarray, list[str]]:
-        results = Results(plan, folder) if linear or order else survey.results
+        survey = surveys[0]
+        results = Results(plan, folder) if needed or order else survey.results
         status, warnings = conclude(results, afresh=bool(order))
         return status, [*dict.fromkeys([*survey.results.damaged, *survey.lost, *warnings])]
 
     status, warnings = on_root(comm, put_together)
-    team.Free()
+    runs.recorded.team.Free()
     return SweepResult(status, made, seconds, busy, folder, warnings)
+
+
+def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:
+    """Give every rank the linear runs of all, each with all measures that any rank took of it."""
+    for of_rank in comm.allgather(runs.linear):
+        for name, run in of_rank.items():
+            runs.linear[name] = run if isinstance(run, str) else run.joined(runs.linear.get(name))
+
+
+class NeededRun(NamedTuple):
+    """A linear run that is missing: a ``case`` that needs it, and the first ``sites`` to measure it for (cells)."""
+
+    case: Case
+    sites: list[int]
+
+
+class DrawnMember(NamedTuple):
+    """A missing member whose ``case`` was made beforehand; ``linear`` is the name of its linear run."""
+
+    number: int
+    case: Case
+    linear: str
 
 
 class _Survey(NamedTuple):
     """What there is of a sweep, the numbers of the ``missing`` members, and sentences about what is ``lost``.
 
-    Of the missing members, if they are many, some are ``drawn`` that stand for the others: number, case, name of the
-    linear run. They tell what a member costs, and the linear runs that are ``needed``: cases by name, with the first
-    sites to measure them for.
+    Of the missing members, if they are many, as many are ``drawn`` as can stand for the others. They show what a member
+    costs, and the linear runs that are ``needed``, by name.
     """
 
     results: Results
     missing: np.ndarray
-    drawn: list[tuple[int, Case, str]]
-    needed: dict[str, tuple[Case, list[int]]]
+    drawn: list[DrawnMember]
+    needed: dict[str, NeededRun]
     lost: list[str]
 
     def order(self, linear: dict[str, LinearRun | str]) -> list[int]:
         """The missing members, the longest first: contacts at every site that the linear wave would reach cost most."""
-        cost, known = [0.0], [-1]
-        for number, case, name in self.drawn:
-            if isinstance(run := linear.get(name), LinearRun):
-                cost.append(float(np.minimum(run.reached(case), 10.0).sum()) + 1e-3 * float(case.time.end))
-                known.append(number)
-        # One that is not known costs what the last one before it does that is.
-        place = np.searchsorted(known, self.missing, "right") - 1
-        return list(self.missing[np.argsort(-np.array(cost)[place], kind="stable")].tolist())
+        numbers = [-1]
+        costs = [0.0]
+        for member in self.drawn:
+            run = linear.get(member.linear)
+            if isinstance(run, LinearRun):
+                contacts = float(np.minimum(run.reached(member.case), 10.0).sum())
+                numbers.append(member.number)
+                costs.append(contacts + 1e-3 * float(member.case.time.end))
+        # One that was not drawn costs what the last one before it does that was: its neighbour in the sweep.
+        nearest = np.searchsorted(numbers, self.missing, "right") - 1
+        dearest_first = np.argsort(-np.array(costs)[nearest], kind="stable")
+        return list(self.missing[dearest_first].tolist())
 
 
 def _survey(plan: Sweep, folder: Path) -> _Survey:
     """Look through ``folder``: members that have failed are missing, and those whose fields cannot be read."""
-    results, lost = Results(plan, folder), list[str]()
+    results = Results(plan, folder)
+    lost: list[str] = []
     absent = (results.status != COMPLETE) & (results.status != SCALED)
     if plan.options.fields:
-        files = "run.h5", "analysis.h5"
-        absent |= [not all(is_whole(folder / name / file, lost) for file in files) for name in results.ids]
-    some = missing = np.unique(results.first[absent])
+        for number, name in enumerate(results.ids):
+            whole = is_whole(folder / name / "run.h5", lost) and is_whole(folder / name / "analysis.h5", lost)
+            absent[number] |= not whole
+
+    missing = np.unique(results.first[absent])
+    tried = missing
     if len(missing) > MOST_SURVEYED:
-        some = np.sort(np.random.default_rng(0).choice(missing, MOST_SURVEYED, replace=False))
-    cases = [(number, plan.member(number).case) for number in some.tolist()]
-    drawn = [(number, case, linear_name(case)) for number, case in cases if case]
-    needed: dict[str, tuple[Case, list[int]]] = {}
-    for _, case, name in drawn:
-        _, sites = needed.setdefault(name, (case, []))
-        known = results.linear[name].measures if name in results.linear else ()
-        if not plan.options.fields and leading_cell(case) not in (*sites, *known):
-            sites.append(leading_cell(case))
-    needed = {name: run for name, run in needed.items() if run[1] or name not in results.linear}
-    return _Survey(results, missing, drawn, needed, lost)
+        tried = np.sort(np.random.default_rng(0).choice(missing, MOST_SURVEYED, replace=False))
+    drawn = []
+    for number in tried.tolist():
+        case = plan.member(number).case
+        if case:
+            drawn.append(DrawnMember(number, case, linear_name(case)))
+    return _Survey(results, missing, drawn, _needed_runs(plan, results, drawn), lost)
+
+
+def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) -> dict[str, NeededRun]:
+    """The linear runs of the ``drawn`` members, by name, that are not there or not measured for all first sites."""
+    runs: dict[str, NeededRun] = {}
+    for member in drawn:
+        run = runs.setdefault(member.linear, NeededRun(member.case, []))
+        site = leading_cell(member.case)
+        measured_run = results.linear.get(member.linear)
+        measured = measured_run is not None and site in measured_run.measures
+        # Members whose fields are kept are measured themselves.
+        if not plan.options.fields and not measured and site not in run.sites:
+            run.sites.append(site)
+    return {name: run for name, run in runs.items() if run.sites or name not in results.linear}
 
 
 def is_whole(path: Path, lost: list[str]) -> bool:
-    """Whether an HDF5 file is there and was not cut off, which HDF5 sees; if it was, ``lost`` says so."""
+    """Whether an HDF5 file is there and was not cut off, which HDF5 sees; if it was, ``lost`` gets a sentence."""
     try:
         h5py.File(path).close()
     except OSError as error:
-        lost += [f"{path} cannot be read: {error}; made again"] if path.exists() else []
+        if path.exists():
+            lost.append(f"{path} cannot be read: {error}; made again")
         return False
     return True
 
@@ -190,34 +231,58 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
 
     What is there stays as it is unless it is of other results, or ``afresh``.
     """
-    plan, folder, status = results.plan, results.folder, results.status
+    plan = results.plan
+    folder = results.folder
+    status = results.status
     sys.audit("vipetsc.conclude", str(folder))
-    failed = [
-        {"place": np.unravel_index(n, plan.shape), "id": results.ids[n], "reason": results.reasons[results.first[n]]}
-        for n in np.flatnonzero(status == FAILED)
-    ]
+
     count = {name: int((status == code).sum()) for code, name in enumerate(STATUS)}
-    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__, "sweep": plan.name}
-    index = about | {"members": count, "failed": failed}
+    index = {
+        "format_version": FORMAT_VERSION,
+        "vipetsc_version": vipetsc.__version__,
+        "sweep": plan.name,
+        "members": count,
+        "failed": [_failed_member(results, number) for number in np.flatnonzero(status == FAILED)],
+    }
     warnings = summarise([text for first in results.first for text in results.warnings.get(int(first), ())])
-    path, text = folder / "index.json", json.dumps(index, indent=1, default=int) + "\n"
-    told = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
+
+    path = folder / "index.json"
+    text = json.dumps(index, indent=1, default=int) + "\n"
+    current = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
     # The index comes last: with it and nothing made since, the ensemble is that of these members.
     if not count[STATUS[MISSING]]:
         lost: list[str] = []
-        if afresh or not told or not is_whole(folder / "ensemble.h5", lost):
+        if afresh or not current or not is_whole(folder / "ensemble.h5", lost):
             assemble(results, warnings)
         warnings += lost
         results.merge_files()
-    if not told:
+    if not current:
         write_text(path, text)
     return status, warnings
 
 
+def _failed_member(results: Results, number: int) -> dict[str, Any]:
+    """Where in the sweep a member that failed stands, its name and the reason."""
+    return {
+        "place": np.unravel_index(number, results.plan.shape),
+        "id": results.ids[number],
+        "reason": results.reasons[results.first[number]],
+    }
+
+
 def summarise(sentences: Sequence[str]) -> list[str]:
-    """Warnings of members: of those that differ in numbers alone the last in the alphabet, with how many there are."""
+    """Shorten the warnings of members: of those that differ in numbers alone one, with how many there are.
+
+    The one is the last in the alphabet, which does not depend on the order of the members.
+    """
     kinds: dict[str, list[str]] = {}
     for sentence in sentences:
-        kinds.setdefault(re.sub(r"\d[\d.e+-]*", "0", sentence), []).append(sentence)
-    counted = ((len(texts), len(set(texts)) > 1, max(texts)) for texts in kinds.values())
-    return [f"{n} member{'s' * (n > 1)}{', for instance' * differ}: {text}" for n, differ, text in counted]
+        without_numbers = re.sub(r"\d[\d.e+-]*", "0", sentence)
+        kinds.setdefault(without_numbers, []).append(sentence)
+
+    summary = []
+    for texts in kinds.values():
+        members = "1 member" if len(texts) == 1 else f"{len(texts)} members"
+        example = ", for instance" if len(set(texts)) > 1 else ""
+        summary.append(f"{members}{example}: {max(texts)}")
+    return summary
