@@ -15,7 +15,6 @@ from vipetsc.case import Case
 from vipetsc.contact.law import CLOSED, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.engine import FillResult
-from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import (
     Groups,
@@ -45,7 +44,7 @@ from vipetsc.dynamics.propagator.substeps import (
     create_tape,
     create_trial,
 )
-from vipetsc.dynamics.samples import Samples
+from vipetsc.dynamics.propagator.tangent import no_samples
 from vipetsc.dynamics.vectors import LANES
 
 ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
@@ -56,13 +55,6 @@ def parts(ends: str, interval: float, tolerance: float, sites=(5, 6, 12)):
     model = small_case(lattice={"ends": ends}, contacts={"sites": list(sites)}).model()
     layout = Layout(model, MPI.COMM_SELF)
     return model, layout, StepSeries(model.chain, interval, tolerance), HaloRegions(layout)
-
-
-def no_samples(model, layout, number: int) -> Samples:
-    """Room for no sample from the ``number`` on."""
-    none, fields = np.zeros(0), (np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1)
-    sums, work, losses = np.zeros((0, 5, 2), np.int64), none.reshape(0, 1), none.reshape(0, 0)
-    return Samples(number, sums, work, losses, *fields, create_record(model, layout), 1.0, 1.0)
 
 
 def as_lists(groups) -> list[list[int]]:

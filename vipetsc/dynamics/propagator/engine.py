@@ -1,4 +1,11 @@
-"""The engine of exact linear steps; the package's docstring has the method."""
+"""The engine of exact linear steps: from sample to sample, each cluster's contacts within every step.
+
+A step is the product of the state with P(H) (sec. 1 of the derivation in the package's docstring) and, for the clusters
+whose sites may touch or whose drives are on, what their forces leave behind (sec. 2 to 6). ``step_series`` chooses H: a
+sample interval over a whole number, long, because a step costs the same whatever its length, but not so long that many
+sites feel one another within it. ``take_steps`` is the loop over the steps of a block of samples; ``Propagator`` holds
+its records and is the engine that a simulation sees.
+"""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -24,7 +31,7 @@ from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.lattice import ToneBurst
 from vipetsc.parallel import StopRequest, on_every_rank
 
-# Terms grow as (omega H)^k / k! before they fall: beyond this omega H rounding would show.
+# The terms (omega H)^k / k! grow before they fall, to 5.5 at this omega H, and their rounding with them.
 LARGEST_OMEGA_H = 3.2
 # Steps a sample interval may be cut into.
 MOST_PARTS = 16
@@ -32,6 +39,9 @@ MOST_PARTS = 16
 MOST_SITES = 32
 # Rough costs that decide the step's length, in us: a step, a cell in it, a sample's contacts per site of a cluster.
 STEP_COST, CELL_COST, SITE_COST = 20.0, 0.03, 10.0
+# The series is cut off at this fraction of the run's relative tolerance, or where rounding makes it as large.
+SERIES_TOLERANCE = 1e-4
+LEAST_TOLERANCE = 1e-15
 
 
 @lru_cache(maxsize=4)
@@ -40,11 +50,14 @@ def step_series(model: Model) -> StepSeries | None:
 
     Long steps are few, but sites that feel one another within a step must be followed together.
     """
-    tolerance = max(1e-4 * model.rtol, 1e-15)
+    tolerance = max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE)
     bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
     fastest = max(bursts, default=0.0)
-    best, least = None, np.inf
+
+    best = None
+    least = np.inf
     for parts in range(1, MOST_PARTS + 1):
+        # The cost of the steps alone grows from here on.
         cost = parts * (STEP_COST + CELL_COST * model.chain.cells)
         if cost >= least:
             break
@@ -52,16 +65,19 @@ def step_series(model: Model) -> StepSeries | None:
         too_long = max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
         if too_long or model.chain.cells < series.width:
             continue
+
+        # Every DoF of a cluster is moved by every other one: the mean size of a DoF's cluster.
         sizes = np.diff(group_dofs(model, series.reach).first)
         cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
         if cost < least:
-            best, least = series, cost
+            best = series
+            least = cost
     return best
 
 
 PROGRESS = np.dtype([(name, np.int64) for name in ("steps", "last", "failed", "cluster")] + [("time", float)])
-"""Steps done and the last one to do; of a failure the step, beyond the last if there is none, the cluster or -1, the
-time in s."""
+"""Steps done and the last one to do; of a failure its step (beyond the last one if there is none), its cluster (-1 if
+the state is not finite), its time in s."""
 
 
 class States(NamedTuple):
@@ -90,35 +106,50 @@ def take_steps(
     Several ranks go on to the end even if one fails, which then goes on without contacts: they do not ask one another
     at each step.
     """
-    rows, owned, progress, error = halo.columns.shape[0], states.owned, states.progress[0], 0
+    rows = halo.columns.shape[0]
+    owned = states.owned
+    progress = states.progress[0]
+    error = 0
     while error == 0:
         steps = progress.steps
-        state, out = states.components[steps % 2], states.components[1 - steps % 2]
-        cells, next_cells = state[: rows * owned].reshape(rows, owned), out[: rows * owned].reshape(rows, owned)
+        state = states.components[steps % 2]
+        cells = state[: rows * owned].reshape(rows, owned)
+        next_cells = states.components[1 - steps % 2, : rows * owned].reshape(rows, owned)
+        # Counted from the last sample: times of samples are products, with no rounding of the steps between.
         begin = steps // states.parts * states.sample_interval + steps % states.parts * clusters.interval
         error = exchange(halo, steps % 2, cells)
+
+        # The ledger and the ghosts follow the cells in the state only where it is looked at.
         k = steps // states.parts - samples.number if steps % states.parts == 0 else -1
-        if steps == progress.last or 0 <= k < samples.work.size:
+        is_sample = 0 <= k < samples.work.shape[0]
+        if is_sample or steps == progress.last:
             ghosts = halo.columns[: states.ghost_rows, halo.columns.shape[1] - states.ghosts :]
             state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
-            if 0 <= k < samples.work.size and not take_sample(state, k, samples) and progress.failed > progress.last:
-                progress.failed, progress.cluster = steps, -1
+        if is_sample and not take_sample(state, k, samples) and progress.failed > progress.last:
+            progress.failed = steps
+            progress.cluster = -1
         failed = progress.failed <= progress.last
         if steps == progress.last or (failed and halo.scatter == 0):
             break
+
+        # The clusters read the halo, that is the state before the step.
         apply_propagator(stencil, cells, halo.columns, next_cells)
         for c in range(0 if failed else clusters.state.size):
             may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
             for i in range(dofs.first[c] + dofs.sites[c], dofs.first[c + 1]):
                 may_touch |= begin < clusters.drives.rows[i].duration
-            if may_touch:
-                going, tracks = follow_contacts(clusters, dofs, c, tracks, begin)
-                if not going:
-                    progress.failed, progress.cluster = steps, c
-                    progress.time = begin + clusters.state[c].position * clusters.interval
-                    break
-                first, stop = dofs.first[c], dofs.first[c + 1]
-                apply_impulses(dofs, first, clusters.moments[first:stop], next_cells)
+            if not may_touch:
+                continue
+            followed, tracks = follow_contacts(clusters, dofs, c, tracks, begin)
+            if not followed:
+                progress.failed = steps
+                progress.cluster = c
+                progress.time = begin + clusters.state[c].position * clusters.interval
+                break
+            first = dofs.first[c]
+            apply_impulses(dofs, first, clusters.moments[first : dofs.first[c + 1]], next_cells)
+
+        # A rank alone stays at the step that failed, for its state to be shown; among others it must keep their pace.
         if progress.failed > progress.last or halo.scatter != 0:
             progress.steps += 1
     return error, tracks.log
@@ -133,28 +164,40 @@ class Propagator(Engine):
         series = step_series(model)
         assert series is not None, "refused"
         self.series = series
-        self._layout, self._stop = layout, stop or StopRequest()
+        self._layout = layout
+        self._stop = stop or StopRequest()
+
+        # Everything that reads cells of other ranks says which before the halo is bound; the ghosts come last.
         self._regions = HaloRegions(layout)
         self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions))
         self._stencil = create_stencil(series, layout, self._regions)
-        ghosts = [self._regions.add(cell, 1) for cell in layout.neighbours() if cell is not None]
+        ghosts = [cell for cell in layout.neighbours() if cell is not None]
+        for cell in ghosts:
+            self._regions.add(cell, 1)
+
         self._components = np.zeros((2, layout.size + layout.ghost_rows * len(ghosts)))
         self._states = [layout.create_vector(components) for components in self._components]
         self._halo = self._regions.bind_columns(self._states)
-        self._progress = np.zeros(1, PROGRESS)
-        parts = round(model.sample_interval / series.interval)
-        cells = layout.owned, len(ghosts), layout.ghost_rows
-        self._record = States(self._components, *cells, parts, model.sample_interval, self._progress)
-        self.state, self.time = self._states[0], 0.0
+        self._record = States(
+            components=self._components,
+            owned=layout.owned,
+            ghosts=len(ghosts),
+            ghost_rows=layout.ghost_rows,
+            parts=round(model.sample_interval / series.interval),
+            sample_interval=model.sample_interval,
+            progress=np.zeros(1, PROGRESS),
+        )
+        self.state = self._states[0]
+        self.time = 0.0
 
     @property
     def steps(self) -> int:
         """Linear steps done."""
-        return int(self._progress["steps"][0])
+        return int(self._record.progress["steps"][0])
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """Springs that are not linear; too few cells; too many close sites."""
+        """Why it does not suit ``model``: springs that are not linear; too few cells; too many sites close together."""
         if not model.chain.cell.is_linear:
             return "its steps are those of linear springs, and some have a quadratic or cubic part"
         series = step_series(model)
@@ -163,6 +206,7 @@ class Propagator(Engine):
             if model.chain.cells >= shortest.width:
                 return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
             return f"{model.chain.cells} cells are fewer than the propagator's band"
+
         numbers, first = group_dofs(model, series.reach)
         counts = np.add.reduceat(numbers >= 0, first[:-1], dtype=np.int64)
         largest = int(counts.argmax())
@@ -179,32 +223,46 @@ class Propagator(Engine):
         self._forces.begin(motion, energy)
 
     def fill(self, samples: Samples) -> FillResult:
-        """A stop is at the last sample. Without room it goes to the sample before."""
+        """Fill ``samples`` as ``Engine`` says; without room, go to the sample before the first.
+
+        A stop on request is at the last sample.
+        """
         sys.audit("vipetsc.step")
-        forces, comm, progress, parts = self._forces, self._layout.comm, self._progress[0], self._record.parts
+        forces = self._forces
+        progress = self._record.progress[0]
+        parts = self._record.parts
         last = (samples.number + len(samples.work) - 1) * parts
-        progress["last"], progress["failed"], progress["cluster"] = last, last + 1, -1
-        arrays = forces.dofs, forces.clusters, forces.tracker.tracks, samples
+        progress["last"] = last
+        progress["failed"] = last + 1
+        progress["cluster"] = -1
+        tracks = forces.tracker.tracks
         with PROPAGATOR:
-            error, log = take_steps(self._record, self._stencil, self._halo, *arrays)
+            error, log = take_steps(
+                self._record, self._stencil, self._halo, forces.dofs, forces.clusters, tracks, samples
+            )
         if error:
             raise RuntimeError(f"PETSc could not exchange cells: error {error}")
-        forces.tracker.tracks = forces.tracker.tracks._replace(log=log)
-        # Any rank's failure or request counts on all.
+        forces.tracker.tracks = tracks._replace(log=log)
+
+        # The earliest failure of a rank, and any rank's request, count on all.
+        comm = self._layout.comm
         status = np.array([progress["failed"], -int(self._stop.requested)])
         comm.Allreduce(MPI.IN_PLACE, status, MPI.MIN)
         failed, stop = status.tolist()
-        self.state, self.time = self._states[self.steps % 2], self._time(min(failed, self.steps))
+        self.state = self._states[self.steps % 2]
+        self.time = self._time_after(min(failed, self.steps))
         if failed > last:
             return FillResult(len(samples.work), bool(stop))
-        sites, reason = forces.sites(int(progress["cluster"])), "the state is not finite"
+
+        reason = "the state is not finite"
+        sites = forces.sites(int(progress["cluster"]))
         if sites:
             reason = f"the contacts of sites {', '.join(map(str, sites))} at {progress['time']:.9g} s"
         _, reason = min(comm.allgather((int(progress["failed"]), reason)))
         return FillResult(failed // parts - samples.number + 1, bool(stop), reason)
 
-    def _time(self, steps: int) -> float:
-        """Time in s after so many ``steps``."""
+    def _time_after(self, steps: int) -> float:
+        """Time in s after so many ``steps``, summed as in ``take_steps``."""
         record = self._record
         return steps // record.parts * record.sample_interval + steps % record.parts * self.series.interval
 
@@ -213,14 +271,16 @@ class Propagator(Engine):
 
     def statistics(self) -> dict[str, Any]:
         """Linear steps and what the clusters did, the step and its band."""
-        return {"steps": self.steps} | self._forces.statistics() | {
-            "method": f"P({self.series.interval:.6g} s)",
-            "interval": self.series.interval,
-            "bandwidth": self.series.reach,
-            "terms": self.series.terms,
-            "nonzeros": int(np.count_nonzero(self.series.interior())),
-            "truncation": self.series.truncation,
-        }  # fmt: skip
+        series = self.series
+        band = {
+            "method": f"P({series.interval:.6g} s)",
+            "interval": series.interval,
+            "bandwidth": series.reach,
+            "terms": series.terms,
+            "nonzeros": int(np.count_nonzero(series.interior())),
+            "truncation": series.truncation,
+        }
+        return {"steps": self.steps} | self._forces.statistics() | band
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         state = self._layout.checkpoint(self._components[self.steps % 2])
@@ -230,8 +290,9 @@ class Propagator(Engine):
         steps = int(shares[0]["steps"])
         self._layout.restore(shares, self._components[steps % 2])
         self._forces.restore(shares)
-        self._progress["steps"] = steps
-        self.state, self.time = self._states[steps % 2], self._time(steps)
+        self._record.progress["steps"] = steps
+        self.state = self._states[steps % 2]
+        self.time = self._time_after(steps)
 
     def destroy(self) -> None:
         self._regions.destroy()

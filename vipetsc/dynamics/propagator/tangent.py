@@ -1,6 +1,14 @@
-"""An orbit of a lattice that nothing drives, with variations that are moved beside it: see ``tangent_kernels``."""
+"""An orbit of a lattice that nothing drives, and the motion of variations along it.
+
+``TangentPropagator`` runs the orbit as the engine does, but from a state of one's own, and keeps on a tape the substeps
+in which contacts were closed. From them it makes, once, one small matrix for each step and cluster in contact (sec. 9
+of the derivation in the package's docstring, written out in ``tangent_kernels``); after that any number of variations
+of the initial state are moved at the cost of linear steps. That is what shooting for periodic orbits of a whole lattice
+asks for: products of the monodromy matrix with vectors, never the matrix.
+"""
 
 import copy
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,12 +27,45 @@ from vipetsc.dynamics.samples import Samples
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.parallel import on_every_rank
 
-# Rows of the tape of a cluster.
+# Rows of the tape of a cluster, 208 B each with the motion at the nodes.
 MOST_ROWS = 8192
 
 
+class _Linearisation(NamedTuple):
+    """``matrices`` (number, row, column) of an orbit; ``places`` (step, cluster) numbers them, -1 without contact."""
+
+    places: np.ndarray
+    matrices: np.ndarray
+
+
+class _Moving(NamedTuple):
+    """Workspace of so many variations, the halo for their exchanges, and the objects of PETSc behind it."""
+
+    variations: Variations
+    halo: Halo
+    petsc_objects: list
+
+
+def no_samples(model: Model, layout: Layout, number: int) -> Samples:
+    """Room for no sample from the ``number`` on: an engine that fills it goes to the sample before."""
+    return Samples(
+        number=number,
+        sums=np.zeros((0, 5, 2), np.int64),
+        work=np.zeros((0, 0)),
+        losses=np.zeros((0, 0)),
+        fields=np.zeros((0, 0, 0, 0)),
+        moving=np.zeros(0, np.int64),
+        first_cell=0,
+        every=1,
+        stride=1,
+        lattice=create_record(model, layout),
+        unit=1.0,
+        interval=1.0,
+    )
+
+
 class TangentPropagator(Propagator):
-    """The engine for a lattice that nothing drives, from a state of one's own, with the motion beside its orbit.
+    """The engine for a lattice that nothing drives, from a state of one's own, with the motion of variations of it.
 
     ``cells`` are arrays (2 dof, owned cell), displacements before velocities. A contact that dissipates must be open
     at the beginning: its w'_minus is not part of the state.
@@ -32,16 +73,17 @@ class TangentPropagator(Propagator):
 
     def __init__(self, model: Model, layout: Layout) -> None:
         super().__init__(model, layout)
-        self._model, forces, clusters = model, self._forces, self._forces.clusters
-        tape = create_tape(len(clusters.state), MOST_ROWS, NODES)
+        self._model = model
+        clusters = self._forces.clusters
+        # Drives that are over: a cluster is looked at only where a site may touch.
         clusters.drives.rows["duration"] = 0.0
-        forces.clusters = clusters._replace(tape=tape)
-        self._linear: tuple[np.ndarray, np.ndarray] | None = None
-        self._moved: tuple[Variations, Halo, list] | None = None
+        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), MOST_ROWS, NODES))
+        self._linear: _Linearisation | None = None
+        self._moving: _Moving | None = None
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """As of the engine; contacts that touch or are pressed at rest, too."""
+        """Why it does not suit ``model``: what the engine refuses, and contacts that touch or are pressed at rest."""
         sites = site_records(model, np.arange(len(model.chain.sites)))
         if (np.abs(sites["mode"]) == PERMANENT).any():
             return "contacts touch or are pressed at rest, beside which no variations are moved"
@@ -52,25 +94,30 @@ class TangentPropagator(Propagator):
 
         Raises StalledError, on all ranks, for a closed contact that dissipates.
         """
-        here, clusters, dofs = self._components[0], self._forces.clusters, self._forces.dofs
-        here[: cells.size] = cells.ravel()
-        exchange(self._halo, 0, here[: cells.size].reshape(cells.shape))
+        clusters = self._forces.clusters
+        sites = clusters.contacts
+        state = self._components[0]
+        state[: cells.size] = cells.ravel()
+
+        # The zeroth coefficients of free motion are the relative displacements themselves.
+        exchange(self._halo, 0, state[: cells.size].reshape(cells.shape))
         for c in range(len(clusters.state)):
-            expand_free_motion(dofs, c, self._halo.columns, clusters.taylor)
-        w, sites, history = clusters.taylor[:, 0], clusters.contacts, clusters.history
+            expand_free_motion(self._forces.dofs, c, self._halo.columns, clusters.taylor)
+        w = clusters.taylor[:, 0]
         closed = np.where(w < 0, -w - sites["clearance_minus"], w - sites["clearance"]) > 0
         if self._layout.comm.allreduce(bool((closed & (sites["damping"] != 0)).any())):
             raise StalledError("a contact that dissipates is closed at the beginning")
+
         sites["mode"] = np.where(closed, np.sign(w) * CLOSED, 0)
         sites["approach"] = np.where(closed, np.sign(w) * speed, 1.0)
-        history["onset"], history["duration"] = -np.inf, 1.0
+        # As if the contact were old: its force is smooth.
+        clusters.history["onset"] = -np.inf
+        clusters.history["duration"] = 1.0
 
     def run(self, samples: int) -> np.ndarray:
         """Go on to the sample of that number from the start; the cells there. Raises StalledError on all ranks."""
-        model, layout, none = self._model, self._layout, np.zeros(0)
-        fields = np.zeros((0, 0, 0, 0)), np.zeros(0, np.int64), 0, 1, 1
-        sums, losses, record = np.zeros((0, 5, 2), np.int64), none.reshape(0, 0), create_record(model, layout)
-        result = self.fill(Samples(samples + 1, sums, losses, losses, *fields, record, 1.0, 1.0))
+        layout = self._layout
+        result = self.fill(no_samples(self._model, layout, samples + 1))
         needed = layout.comm.allreduce(int(self._forces.clusters.tape.used.max(initial=0)), max)
         if result.stalled or needed > MOST_ROWS:
             raise StalledError(result.stalled or f"an orbit needs {needed} substeps in contact, of {MOST_ROWS}")
@@ -79,54 +126,84 @@ class TangentPropagator(Propagator):
 
     def contacts(self) -> tuple[np.ndarray, int]:
         """Times (interval, 2) in s in which a site that this rank logs was closed, and the number of its contacts."""
-        tape, spans, episodes = self._forces.clusters.tape, [np.zeros((0, 2))], 0
+        tape = self._forces.clusters.tape
+        spans = [np.zeros((0, 2))]
+        episodes = 0
         for c in np.flatnonzero(self._forces.logs):
             rows = tape.rows[c, : tape.used[c]]
             begin = rows["begin"] + rows["position"] * self.series.interval
             spans.append(np.column_stack([begin, begin + rows["length"] * self.series.interval]))
+            # A contact that is closed from the start has no onset on the tape.
             episodes += int(np.sum((rows["onset"] > 0) | (begin == 0.0)))
         return np.concatenate(spans), episodes
 
-    def _linearised(self) -> tuple[np.ndarray, np.ndarray]:
-        """The matrices of the orbit, and where they belong."""
-        clusters, dofs, tape = self._forces.clusters, self._forces.dofs, self._forces.clusters.tape
-        places, energy = np.full((self.steps, len(clusters.state)), -1), clusters.energy.copy()
+    def _linearise(self) -> _Linearisation:
+        """Make the matrices of the orbit from the tape."""
+        clusters = self._forces.clusters
+        dofs = self._forces.dofs
+        tape = clusters.tape
+        places = np.full((self.steps, len(clusters.state)), -1)
         matrices: list[np.ndarray] = []
+        # Coefficients of every DoF, and w'_minus of every site, of the largest cluster.
         largest = int(np.diff(dofs.first).max(initial=0)) * (clusters.taylor.shape[1] + 1)
+
+        energy = clusters.energy.copy()
         for c in range(len(clusters.state)):
-            rows, motion = tape.rows[c, : tape.used[c]], tape.motion[c, : tape.used[c]]
+            rows = tape.rows[c, : tape.used[c]]
+            motion = tape.motion[c, : tape.used[c]]
             steps, first = np.unique(np.rint(rows["begin"] / self.series.interval), return_index=True)
-            for step, a, b in zip(steps.astype(int), first, np.append(first, len(rows))[1:], strict=True):
+            stop = np.append(first, len(rows))[1:]
+            for step, a, b in zip(steps.astype(int), first, stop, strict=True):
                 places[step, c] = len(matrices)
                 matrices.append(np.zeros((largest, largest)))
                 linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[-1])
+        # Energies of variations were added to those of the orbit.
         clusters.energy[:] = energy
-        return places, np.array(matrices).reshape(len(matrices), largest, largest)
+        return _Linearisation(places, np.array(matrices).reshape(len(matrices), largest, largest))
 
     def move(self, cells: np.ndarray) -> np.ndarray:
-        """Where variations (variation, 2 dof, owned cell) of the beginning are at the orbit's end; collective."""
-        count, rows, layout = len(cells), 2 * self._layout.dofs, self._layout
+        """Move variations (variation, 2 dof, owned cell) of the beginning to the orbit's end; collective."""
+        layout = self._layout
+        count = len(cells)
+        rows = 2 * layout.dofs
         if self._linear is None:
-            self._linear = on_every_rank(layout.comm, self._linearised)
-        if self._moved is None or len(self._moved[0].components) != count:
+            self._linear = on_every_rank(layout.comm, self._linearise)
+        if self._moving is None or len(self._moving.variations.components) != count:
             self._release()
-            components = np.zeros((count, 2, self._components.shape[1]))
-            states, regions = [layout.create_vector(a) for pair in components for a in pair], copy.copy(self._regions)
-            taylor = self._forces.clusters.taylor.copy()
-            variations = Variations(components, np.zeros((count, len(taylor))), *self._linear, taylor)
-            self._moved = variations, regions.bind_columns(states), [regions, *states]
-        variations, halo, _ = self._moved
+            self._moving = self._create_moving(count, self._linear)
+
+        variations = self._moving.variations
         variations.components[:, 0, : rows * layout.owned] = cells.reshape(count, -1)
         variations.approach[:] = 0.0
-        if error := move_variations(variations, self._stencil, halo, self._forces.dofs, layout.owned):
+        error = move_variations(variations, self._stencil, self._moving.halo, self._forces.dofs, layout.owned)
+        if error:
             raise RuntimeError(f"PETSc could not exchange cells: error {error}")
         moved = variations.components[:, len(variations.places) % 2, : rows * layout.owned]
         return moved.reshape(count, rows, layout.owned).copy()
 
+    def _create_moving(self, count: int, linear: _Linearisation) -> _Moving:
+        """Create the workspace of ``count`` variations; collective."""
+        components = np.zeros((count, 2, self._components.shape[1]))
+        states = [self._layout.create_vector(array) for pair in components for array in pair]
+        # The same cells as the engine's, in columns of its own.
+        regions = copy.copy(self._regions)
+        halo = regions.bind_columns(states)
+        taylor = self._forces.clusters.taylor.copy()
+        variations = Variations(
+            components=components,
+            approach=np.zeros((count, len(taylor))),
+            places=linear.places,
+            matrices=linear.matrices,
+            taylor=taylor,
+        )
+        return _Moving(variations, halo, [regions, *states])
+
     def _release(self) -> None:
-        for petsc_object in self._moved[2] if self._moved else []:
-            petsc_object.destroy()
-        self._moved = None
+        """Free the workspace of variations, if there is one."""
+        if self._moving is not None:
+            for petsc_object in self._moving.petsc_objects:
+                petsc_object.destroy()
+        self._moving = None
 
     def destroy(self) -> None:
         """Free the variations' objects as well."""

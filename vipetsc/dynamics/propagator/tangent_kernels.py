@@ -1,7 +1,8 @@
-r"""Compiled motion of variations beside an orbit, by the same exact steps: sec. 9 of the derivation.
+r"""Compiled motion of variations along an orbit, by the same exact steps: sec. 9 of the derivation.
 
-**9. Variations.** A step takes the lattice's state y to P y plus what the forces leave, their moments mu (sec. 5), and
-mu depends on y through the few coefficients a of the free motion of a cluster alone. A variation therefore moves by
+**9. Variations.** A variation dy is the difference to a neighbouring orbit, to first order. A step takes the lattice's
+state y to P y plus what the forces leave, their moments mu (sec. 5), and mu depends on y through the few coefficients a
+of the free motion of a cluster alone. A variation therefore moves by
 
     dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2),
 
@@ -26,9 +27,25 @@ from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator,
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_cluster
 
 
+class Variations(NamedTuple):
+    """Variations that are moved together.
+
+    ``components`` (variation, 2, component) are states as ``Layout`` orders them, read and written in turn;
+    ``approach`` (variation, dof) are those of w'_minus. ``places`` (step, cluster) numbers the
+    ``matrices`` (number, row, column), -1 without contact; ``taylor`` (dof, 2 term) is workspace.
+    """
+
+    components: np.ndarray
+    approach: np.ndarray
+    places: np.ndarray
+    matrices: np.ndarray
+    taylor: np.ndarray
+
+
 @kernel
 def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, float]:
     """Derivatives to w, w' and w'_minus of the force on a closed site's relative displacement."""
+    # The site's own mode may have changed since: the tape has that of the substep.
     if abs(row.mode) == CLIPPED:
         return 0.0, 0.0, 0.0
     side = 1.0 if row.mode > 0 else -1.0
@@ -40,11 +57,14 @@ def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, floa
 
 @kernel
 def _begin_contact(cluster: Cluster, row: Any, x: np.ndarray, first: int) -> None:
-    """Set the variations of w'_minus of a site whose contact begins, in the columns ``x`` (column, number)."""
-    at = row.site * cluster.taylor.shape[1]
+    """Set the variations of w'_minus of a site whose contact begins, in the columns ``x`` (column, number).
+
+    The onset comes earlier by dw/w', and w'_minus changes by dw' - w'' dw/w'; at the floor of |w'_minus| it does not.
+    """
+    w = row.site * cluster.taylor.shape[1]
     floored = abs(row.rate) < cluster.contacts[row.site].floor
     for j in range(x.shape[0]):
-        change = x[j, at + 1] / cluster.interval - row.acceleration * x[j, at] / row.rate
+        change = x[j, w + 1] / cluster.interval - row.acceleration * x[j, w] / row.rate
         x[j, first + row.site] = 0.0 if floored else change
 
 
@@ -52,22 +72,35 @@ def _begin_contact(cluster: Cluster, row: Any, x: np.ndarray, first: int) -> Non
 def _force_variations(
     cluster: Cluster, rows: np.ndarray, motion: np.ndarray, substep: Substep, x: np.ndarray
 ) -> np.ndarray:
-    """Variations (site and node, column) of the forces of the closed sites ``rows`` in a substep."""
-    sites, columns, (dofs, terms) = rows.size, x.shape[0], cluster.taylor.shape
-    system, right = np.eye(sites * NODES), np.zeros((sites * NODES, columns))
-    slopes, (to_w, to_v) = np.zeros((NODES, 3)), np.zeros((2, NODES, NODES))
+    """Variations (site and node, column) of the forces of the closed sites ``rows`` in a substep.
+
+    dF = F_w dw + F_v dv + F_q dq at the nodes, where dw and dv are those of the free motion, the columns ``x``, and
+    what dF adds through the responses.
+    """
+    sites = rows.size
+    columns = x.shape[0]
+    dofs, terms = cluster.taylor.shape
+    system = np.eye(sites * NODES)
+    right = np.zeros((sites * NODES, columns))
+    slopes = np.zeros((NODES, 3))
+    to_w = np.zeros((NODES, NODES))
+    to_v = np.zeros((NODES, NODES))
     for a in range(sites):
-        i, row = rows[a].site, rows[a]
+        row = rows[a]
+        i = row.site
         for node in range(NODES):
             slopes[node] = _slopes(cluster.contacts[i], row, motion[a, 0, node], motion[a, 1, node])
-            at = substep.length * cluster.nodes.position[substep.kind, node]
+            s = substep.length * cluster.nodes.position[substep.kind, node]
             for j in range(columns):
-                w = v = 0.0
-                for k in range(terms - 1, -1, -1):  # Horner's scheme
-                    v = v * at + w
-                    w = w * at + x[j, i * terms + k]
+                # Horner's scheme, for the value and the slope of the series.
+                w = 0.0
+                v = 0.0
+                for k in range(terms - 1, -1, -1):
+                    v = v * s + w
+                    w = w * s + x[j, i * terms + k]
                 change = slopes[node, 0] * w + slopes[node, 1] * v / cluster.interval
                 right[a * NODES + node, j] = change + slopes[node, 2] * x[j, dofs * terms + i]
+
         for b in range(sites):
             if node_responses(cluster, substep, i, rows[b].site, to_w, to_v):
                 for node in range(NODES):
@@ -81,28 +114,51 @@ def _force_variations(
 def linearise(
     clusters: Cluster, dofs: DofTables, c: int, rows: np.ndarray, motion: np.ndarray, out: np.ndarray
 ) -> None:
-    """The matrix J of cluster ``c`` in a step whose part of the tape is ``rows`` and ``motion``, into ``out``.
+    """Put the matrix J of cluster ``c`` in a step whose part of the tape is ``rows`` and ``motion`` into ``out``.
 
     It takes the series of the free motion (dof, 2 term), then the variations of w'_minus (site,), to the moments of the
     forces and the latter at the step's end. Taylor coefficients, moments and energies of the cluster are overwritten.
     """
     cluster = select_cluster(clusters, dofs, c)
-    room, (count, terms) = cluster.trial, cluster.taylor.shape
-    size, begin, position = count * terms, 0, 0.0
+    room = cluster.trial
+    count, terms = cluster.taylor.shape
+    size = count * terms
     columns = size + cluster.contacts.size
-    x, moments = np.eye(columns), np.zeros((columns, count, terms))
+
+    # Column j of J is what becomes of a unit of the j-th number: all are carried through the step together.
+    x = np.eye(columns)
+    moments = np.zeros((columns, count, terms))
+    begin = 0
+    position = 0.0
     while begin < rows.size:
-        row, stop = rows[begin], begin
+        # Rows of one substep, of all sites that were closed in it.
+        row = rows[begin]
+        stop = begin
         while stop < rows.size and rows[stop].position == row.position:
             stop += 1
-        active, substep = rows[begin:stop]["site"].copy(), Substep(row.kind, row.length)
-        trial = Trial(active, active, room.force, room.w, room.v, room.taylor, room.site_motion, room.sums)
-        for j in range(columns if row.position > position else 0):
-            series = x[j, :size].reshape(count, terms)
-            shift(series, row.position - position, series)
+        active = rows[begin:stop]["site"].copy()
+        substep = Substep(row.kind, row.length)
+        trial = Trial(
+            active=active,
+            closed=active,
+            force=room.force,
+            w=room.w,
+            v=room.v,
+            taylor=room.taylor,
+            site_motion=room.site_motion,
+            sums=room.sums,
+        )
+
+        # Free motion up to it, where the tape has nothing.
+        if row.position > position:
+            for j in range(columns):
+                series = x[j, :size].reshape(count, terms)
+                shift(series, row.position - position, series)
         for a in range(begin, stop):
             if rows[a].onset:
                 _begin_contact(cluster, rows[a], x, size)
+
+        # Variations of the forces leave motion and moments as the forces themselves do: both are linear in them.
         forces = _force_variations(cluster, rows[begin:stop], motion[begin:stop], substep, x)
         cluster.state[0].position = row.position
         for j in range(columns):
@@ -116,35 +172,29 @@ def linearise(
             accumulate_moments(cluster, trial, substep)
             copy(trial.taylor, series)
             copy(cluster.moments, moments[j])
-        begin, position = stop, row.position + row.length
+        begin = stop
+        position = row.position + row.length
+
     for j in range(columns):
         out[:size, j] = moments[j].reshape(size)
         out[size:columns, j] = x[j, size:]
 
 
-class Variations(NamedTuple):
-    """Variations that are moved together.
-
-    ``components`` (variation, 2, component) are states as ``Layout`` orders them, read and written in turn;
-    ``approach`` (variation, dof) are those of w'_minus. ``places`` (step, cluster) numbers the
-    ``matrices`` (number, row, column), -1 without contact; ``taylor`` (dof, 2 term) is room.
-    """
-
-    components: np.ndarray
-    approach: np.ndarray
-    places: np.ndarray
-    matrices: np.ndarray
-    taylor: np.ndarray
-
-
 @njit(error_model="numpy")
 def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, number: int, cells: np.ndarray) -> None:
-    """Add to ``cells`` (2 dof, cell) what the forces' variation ``j`` of a cluster leaves there; its series is made."""
-    first, stop, terms = dofs.first[c], dofs.first[c + 1], variations.taylor.shape[1]
+    """Add to ``cells`` (2 dof, cell) what the forces of variation ``j`` in cluster ``c`` leave there.
+
+    ``variations.taylor`` has the series of its free motion; ``number`` is that of the matrix.
+    """
+    first = dofs.first[c]
+    stop = dofs.first[c + 1]
     sites = dofs.sites[c]
+    terms = variations.taylor.shape[1]
     size = (stop - first) * terms
     before = np.concatenate((variations.taylor[first:stop].flatten(), variations.approach[j, first : first + sites]))
-    after, matrix = np.zeros(before.size), variations.matrices[number]
+
+    matrix = variations.matrices[number]
+    after = np.zeros(before.size)
     for row in range(before.size):
         for k in range(before.size):
             after[row] += matrix[row, k] * before[k]
@@ -155,11 +205,14 @@ def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, numbe
 @njit(error_model="numpy")
 def move_variations(variations: Variations, stencil: Stencil, halo: Halo, dofs: DofTables, owned: int) -> int:
     """Move all variations through the orbit's steps; returns PETSc's error code. Collective."""
-    rows, error = halo.columns.shape[0], 0
+    rows = halo.columns.shape[0]
+    error = 0
     for step in range(variations.places.shape[0]):
         for j in range(variations.components.shape[0]):
-            state, out = variations.components[j, step % 2], variations.components[j, 1 - step % 2]
-            cells, next_cells = state[: rows * owned].reshape(rows, owned), out[: rows * owned].reshape(rows, owned)
+            state = variations.components[j, step % 2]
+            out = variations.components[j, 1 - step % 2]
+            cells = state[: rows * owned].reshape(rows, owned)
+            next_cells = out[: rows * owned].reshape(rows, owned)
             error = error or exchange(halo, 2 * j + step % 2, cells)
             apply_propagator(stencil, cells, halo.columns, next_cells)
             for c in range(variations.places.shape[1]):
