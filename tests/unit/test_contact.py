@@ -80,7 +80,7 @@ def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
     start, end = motions(w, h)
     contacts = create_contacts(Contact("hertz", KC, R), [D, D])
     change = changes.first_change(contacts, start, end, h, np.empty((2, 6)))
-    assert change.share * h == pytest.approx(middle - width)
+    assert change.position * h == pytest.approx(middle - width)
     assert (change.site, change.function) == (1, 0 if side == 1 else 1)
     assert changes.switching(contacts, 1, change.function, end[1]).mode == side * CLOSED
 
@@ -88,7 +88,7 @@ def test_an_onset_and_a_separation_in_one_step_are_found_in_turn(side):
     start = motions(np.poly1d(w.c)(np.poly1d([1, begin])), h)[0]  # at the onset
     contacts["mode"][1], contacts["approach"][1] = side * CLOSED, side * 8e-3
     change = changes.first_change(contacts, start, end, h - begin, np.empty((2, 6)))
-    assert begin + change.share * (h - begin) == pytest.approx(middle + width)
+    assert begin + change.position * (h - begin) == pytest.approx(middle + width)
     assert (change.site, change.function) == (1, 0)
     separation = changes.switching(contacts, 1, 0, end[1])
     assert (separation.mode, np.sign(separation.value)) == (FREE, 1)
@@ -109,7 +109,7 @@ def test_the_earliest_of_several_sites_changes_first(order):
     contacts = create_contacts(Contact("hertz", KC, R), clearances)
     change = changes.first_change(contacts, start, end, h, np.empty((2, 6)))
     assert change.site == (0 if order == 1 else 2)
-    assert change.share == pytest.approx(1 / 6)
+    assert change.position == pytest.approx(1 / 6)
 
 
 def test_either_side_has_its_own_clearance():
@@ -138,9 +138,9 @@ def test_clipping_begins_where_g_falls_through_zero():
         contacts = create_contacts(Contact("hertz", KC, R, adhesion), [D, D])
         contacts["mode"][1], contacts["approach"][1] = CLOSED, approach
         change = changes.first_change(contacts, start, end, h, np.empty((2, 6)))
-        assert (change.share > 1) == (adhesion == "allow")
+        assert (change.position > 1) == (adhesion == "allow")
     damping = contacts["damping"][1]
-    begin = change.share * h
+    begin = change.position * h
     assert 1 + damping * w.deriv()(begin) / approach == pytest.approx(0, abs=1e-9)
     clipping = changes.switching(contacts, 1, change.function, end[1])
     assert clipping.mode == CLIPPED

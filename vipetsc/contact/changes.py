@@ -8,7 +8,7 @@ of one of two switching functions of the site's mode, each affine in w or in w':
 - clipped: D - side w, and g.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,13 +16,29 @@ from vipetsc.compiled import allocating, kernel
 from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, contact_force, gap_of
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
-# A site has landed on its clearance when |side w - D| is within this share of D (of its ``scale``).
+# A site has landed on its clearance when |side w - D| is within this fraction of D (of its ``scale``).
 LANDED_W = 1e-10
 # ... and on g = 0 when |g| is within this.
 LANDED_G = 1e-9
 
+# The largest force in a step is sampled at the ends of so many intervals, then narrowed by golden sections.
 _INTERVALS = 8
 _GOLDEN = 0.6180339887498949
+_SECTIONS = 24
+
+
+class AffineForm(NamedTuple):
+    """A switching function ``factor`` d^k w/dt^k + ``offset`` with k = ``order``, 0 or 1.
+
+    ``tolerance`` is that of a landing, ``mode`` the one it leads to. The offset is -inf where the site's mode has no
+    such function: it never crosses zero.
+    """
+
+    order: int
+    factor: float
+    offset: float
+    tolerance: float
+    mode: int
 
 
 class Switching(NamedTuple):
@@ -34,10 +50,10 @@ class Switching(NamedTuple):
     mode: int
 
 
-class Change(NamedTuple):
-    """The first change in a step: its ``share`` of the step (2 if there is none), the site, the switching function."""
+class ModeChange(NamedTuple):
+    """The first change in a step: its ``position`` in the step, from 0 to 1 (2 if there is none), site and function."""
 
-    share: float
+    position: float
     site: int
     function: int
 
@@ -51,69 +67,83 @@ class Extremes(NamedTuple):
 
 
 @kernel
-def _affine_form(contacts: np.ndarray, i: int, function: int) -> tuple[int, float, float, float, int]:
-    """Order k, factor, offset of a switching function ``factor`` d^k w/dt^k + ``offset``; its tolerance and mode.
-
-    The offset is -inf where the site's mode has no such function.
-    """
+def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
+    """Switching function 0 or 1 of site ``i`` in its mode."""
     site = contacts[i]
     tolerance = LANDED_W * site.scale
     if site.mode == FREE:
         side = 1 - 2 * function
-        return 0, float(side), -gap_of(site, side), tolerance, side * CLOSED
+        return AffineForm(0, float(side), -gap_of(site, side), tolerance, side * CLOSED)
     if abs(site.mode) == PERMANENT:
-        return 1, 0.0, -np.inf, 0.0, site.mode
+        return AffineForm(1, 0.0, -np.inf, 0.0, site.mode)
+
     side = 1 if site.mode > 0 else -1
     if function == 0:
-        return 0, float(-side), gap_of(site, side), tolerance, FREE
+        return AffineForm(0, float(-side), gap_of(site, side), tolerance, FREE)
     if not site.clip:
-        return 1, 0.0, -np.inf, 0.0, site.mode
+        return AffineForm(1, 0.0, -np.inf, 0.0, site.mode)
     clipped = abs(site.mode) == CLIPPED
     sign = 1.0 if clipped else -1.0
-    factor = sign * (site.damping / site.approach)
-    return 1, factor, sign, LANDED_G, side * (CLOSED if clipped else CLIPPED)
+    mode = side * (CLOSED if clipped else CLIPPED)
+    return AffineForm(1, sign * (site.damping / site.approach), sign, LANDED_G, mode)
 
 
 @kernel
 def switching(contacts: np.ndarray, i: int, function: int, motion: np.ndarray) -> Switching:
     """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
-    order, factor, offset, tolerance, mode = _affine_form(contacts, i, function)
-    return Switching(factor * motion[order] + offset, factor * motion[order + 1], tolerance, mode)
+    form = _affine_form(contacts, i, function)
+    value = form.factor * motion[form.order] + form.offset
+    rate = form.factor * motion[form.order + 1]
+    return Switching(value, rate, form.tolerance, form.mode)
 
 
 @kernel
-def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray) -> Change:
+def _stays_free(site: Any, b: np.ndarray) -> bool:
+    """Whether a free site is within both clearances all through a step with the Bernstein form ``b`` of w."""
+    if site.mode != FREE:
+        return False
+    plus = site.clearance - LANDED_W * site.scale
+    minus = site.clearance_minus - LANDED_W * site.scale
+    within = True
+    for w in b:
+        within &= -minus < w < plus
+    return within
+
+
+@kernel
+def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray) -> ModeChange:
     """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
 
     ``room`` (2, 6) is overwritten.
     """
-    first, b, c = Change(2.0, -1, 0), room[0], room[1]
+    first = ModeChange(2.0, -1, 0)
+    b, c = room[0], room[1]
     for i in range(contacts.size):
-        site = contacts[i]
-        if abs(site.mode) == PERMANENT:
+        if abs(contacts[i].mode) == PERMANENT:
             continue
         bernstein(start[i], end[i], h, b)
-        room_plus, room_minus = site.clearance - LANDED_W * site.scale, site.clearance_minus - LANDED_W * site.scale
-        within = site.mode == FREE
-        for w in b:
-            within &= -room_minus < w < room_plus
-        if within:
+        # The coefficients bound the motion: nearly all free sites are done here, without a search.
+        if _stays_free(contacts[i], b):
             continue
+
         for function in range(2):
-            order, factor, offset, tolerance, _ = _affine_form(contacts, i, function)
-            if offset == -np.inf:
+            form = _affine_form(contacts, i, function)
+            if form.offset == -np.inf:
                 continue
-            for k in range(6 - order):
-                c[k] = factor * b[k] + offset if order == 0 else factor * 5.0 * (b[k + 1] - b[k]) / h + offset
-            share = first_upcrossing_after_start(c[: 6 - order], tolerance)
-            if share < first.share:
-                first = Change(share, i, function)
+            for k in range(6 - form.order):
+                if form.order == 0:
+                    c[k] = form.factor * b[k] + form.offset
+                else:
+                    c[k] = form.factor * 5.0 * (b[k + 1] - b[k]) / h + form.offset
+            position = first_upcrossing_after_start(c[: 6 - form.order], form.tolerance)
+            if position < first.position:
+                first = ModeChange(position, i, function)
     return first
 
 
 @kernel
 def _push(contacts: np.ndarray, i: int, b: np.ndarray, d: np.ndarray, s: float, room: np.ndarray) -> float:
-    """Contact force in N at share ``s`` of a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
+    """Contact force in N at position ``s`` in a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
     force, _ = contact_force(contacts, i, evaluate(b, s, room), evaluate(d, s, room))
     return force if contacts[i].mode > 0 else -force
 
@@ -124,28 +154,34 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
     b, room = np.empty(6), np.empty(6)
     bernstein(start[i], end[i], h, b)
     d = 5.0 * (b[1:] - b[:5]) / h
-    site = contacts[i]
-    side = 1.0 if site.mode > 0 else -1.0
+    side = 1.0 if contacts[i].mode > 0 else -1.0
+
+    # Deepest at an end, or where side w' falls through zero inside.
     deepest = max(side * b[0], side * b[5])
     recoil = side * (b[:5] - b[1:])
     if recoil[0] < 0.0:
         turn = first_upcrossing(recoil)
         if turn <= 1.0:
             deepest = max(deepest, side * evaluate(b, turn, room))
+
     largest = smallest = _push(contacts, i, b, d, 0.0, room)
     best = 0.0
     for k in range(1, _INTERVALS + 1):
         force = _push(contacts, i, b, d, k / _INTERVALS, room)
         smallest = min(smallest, force)
         if force > largest:
-            largest, best = force, k / _INTERVALS
-    # Golden section around the largest of the samples.
-    low, high = max(best - 1.0 / _INTERVALS, 0.0), min(best + 1.0 / _INTERVALS, 1.0)
-    for _ in range(24):
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+            largest = force
+            best = k / _INTERVALS
+
+    # Golden sections around the largest of the samples.
+    low = max(best - 1.0 / _INTERVALS, 0.0)
+    high = min(best + 1.0 / _INTERVALS, 1.0)
+    for _ in range(_SECTIONS):
+        left = high - _GOLDEN * (high - low)
+        right = low + _GOLDEN * (high - low)
         if _push(contacts, i, b, d, left, room) > _push(contacts, i, b, d, right, room):
             high = right
         else:
             low = left
     largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high), room))
-    return Extremes(deepest - gap_of(site, side), largest, smallest)
+    return Extremes(deepest - gap_of(contacts[i], side), largest, smallest)

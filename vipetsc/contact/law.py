@@ -172,10 +172,13 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
     site = contacts[i]
     if site.mode == FREE:
         return 0.0, 0.0
+
     side = 1.0 if site.mode > 0 else -1.0
     x = side * w - gap_of(site, side)
     if abs(site.mode) == PERMANENT:
+        # No change of mode is looked for: the force itself has the kink where the masses part.
         return side * elastic_force(site.elastic, max(x, 0.0)), 0.0
+
     elastic = elastic_force(site.elastic, x)
     g = 0.0
     if abs(site.mode) != CLIPPED:

@@ -12,7 +12,9 @@ import numpy as np
 
 from vipetsc.compiled import allocating, kernel
 
-# Halvings of [0, 1] are at most 2^-44 = 6e-14 wide; each leaves one half to be searched later.
+# Two roots that are nearer to each other, as fractions of the step, count as one. Halvings of [0, 1] end at
+# 2^-44 = 6e-14, each leaves one half to be searched later: the stack is deep enough.
+_NARROWEST = 1e-13
 _DEPTH = 64
 # Newton steps for one landing before the search is repeated on a shorter step, and all attempts.
 NEWTON_STEPS = 8
@@ -50,33 +52,52 @@ def evaluate(b: np.ndarray, s: float, room: np.ndarray) -> float:
 @kernel
 def _bisect(c: np.ndarray, room: np.ndarray) -> float:
     """Root in [0, 1] of a polynomial that turns from negative to positive once."""
-    a, b = 0.0, 1.0
+    low, high = 0.0, 1.0
+    # Halved until the interval is one rounding unit of 1.
     for _ in range(53):
-        s = 0.5 * (a + b)
+        s = 0.5 * (low + high)
         if evaluate(c, s, room) > 0.0:
-            b = s
+            high = s
         else:
-            a = s
-    return b
+            low = s
+    return high
+
+
+@kernel
+def _halve(c: np.ndarray, left: np.ndarray) -> None:
+    """De Casteljau's scheme: the form on the left half goes to ``left`` (n,), that on the right half stays in ``c``."""
+    n = c.size
+    for k in range(1, n):
+        left[k - 1] = c[0]
+        for i in range(n - k):
+            c[i] = 0.5 * (c[i] + c[i + 1])
+    left[n - 1] = c[0]
 
 
 @allocating
 def first_upcrossing(b: np.ndarray) -> float:
     """Smallest s in [0, 1] at which the polynomial ``b`` (n <= 6,) turns positive; 2 if it never does."""
-    if b[0] > 0.0 or b.max() <= 0.0:
-        return 0.0 if b[0] > 0.0 else 2.0
+    # Nearly every call ends here: what follows allocates.
+    if b[0] > 0.0:
+        return 0.0
+    if b.max() <= 0.0:
+        return 2.0
+
     n = b.size
     stack = np.empty((_DEPTH + 2, 6))
     low = np.empty(_DEPTH + 2)
     width = np.empty(_DEPTH + 2)
-    top = 0
-    stack[0, :n] = b
-    low[0], width[0] = 0.0, 1.0
     left, room = np.empty(6), np.empty(6)
+    stack[0, :n] = b
+    low[0] = 0.0
+    width[0] = 1.0
+    top = 0
     while top >= 0:
         c = stack[top, :n].copy()
-        begin, size = low[top], width[top]
+        begin = low[top]
+        size = width[top]
         top -= 1
+
         if c[0] > 0.0:
             return begin
         if c.max() <= 0.0:
@@ -84,20 +105,19 @@ def first_upcrossing(b: np.ndarray) -> float:
         changes = np.sum((c[:-1] <= 0.0) != (c[1:] <= 0.0))
         if changes == 1 and c[n - 1] > 0.0:
             return begin + size * _bisect(c, room)
-        if size < 1e-13:
+        if size < _NARROWEST:
             return begin
-        for k in range(1, n):
-            left[k - 1] = c[0]
-            for i in range(n - k):
-                c[i] = 0.5 * (c[i] + c[i + 1])
-        left[n - 1] = c[0]
+
         # The left half is on top: the right one is searched only if the left one has no crossing.
+        _halve(c, left[:n])
         top += 1
         stack[top, :n] = c
-        low[top], width[top] = begin + 0.5 * size, 0.5 * size
+        low[top] = begin + 0.5 * size
+        width[top] = 0.5 * size
         top += 1
         stack[top, :n] = left[:n]
-        low[top], width[top] = begin, 0.5 * size
+        low[top] = begin
+        width[top] = 0.5 * size
     return 2.0
 
 
@@ -106,8 +126,9 @@ def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
     """``first_upcrossing``, where a start within ``tolerance`` of zero has just landed and is itself no crossing."""
     if abs(b[0]) > tolerance:
         return first_upcrossing(b)
+    # The polynomial without its value at 0, divided by s: the root at the start is gone, all others stay.
     n = b.size - 1
-    return first_upcrossing(b[1:] * n / np.arange(1, b.size))  # divided by s, without the value at 0
+    return first_upcrossing(b[1:] * n / np.arange(1, b.size))
 
 
 class Landing(NamedTuple):
@@ -134,8 +155,11 @@ def correct(landing: Landing, value: float, rate: float, tolerance: float, goal:
     better = distance < 0.5 * landing.residual
     if distance <= goal or (distance <= tolerance and not better):
         return landing, LANDED
-    newton = landing.length - value / rate if rate != 0.0 else np.inf
+
     attempts = landing.attempts + 1
+    newton = np.inf
+    if rate != 0.0:
+        newton = landing.length - value / rate
     if landing.attempts < NEWTON_STEPS and 0.0 < newton <= landing.longest and better:
         return Landing(newton, landing.longest, distance, attempts), RETRY
     if distance <= tolerance:
@@ -146,6 +170,6 @@ def correct(landing: Landing, value: float, rate: float, tolerance: float, goal:
 
 
 @kernel
-def shorten(landing: Landing, share: float) -> Landing:
-    """The attempt at a ``share`` of the last one's length."""
-    return Landing(landing.length * share, landing.longest, landing.residual, landing.attempts)
+def shorten(landing: Landing, position: float) -> Landing:
+    """The attempt at a change at the ``position``, from 0 to 1, in the last one's step."""
+    return Landing(landing.length * position, landing.longest, landing.residual, landing.attempts)

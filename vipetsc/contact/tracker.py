@@ -12,7 +12,6 @@ from vipetsc.contact.law import (
     CLOSED,
     FREE,
     PERMANENT,
-    SITE,
     contact_force,
     elastic_energy,
     elastic_force,
@@ -26,9 +25,18 @@ COUNTS = np.dtype([(name, np.int64) for name in LIMITS])
 _REALS = ("onset", "approach_velocity", "separation", "indentation", "force", "loss")
 EPISODE = np.dtype([("site", np.int64), ("side", np.int64), *((name, np.float64) for name in _REALS)])
 """One contact of one site: 0-based site, side (+1, -1), times in s, velocity in m/s, depth in m, N, J."""
-TRACKED = np.dtype([("number", np.int64), ("site", SITE), ("counts", COUNTS), ("pulls", bool), ("episode", EPISODE)])
-"""A site: its number in the log; in a checkpoint its mode and law; counts of limits; its episode unless it is free, of
-which the separation is NaN, and whether it was seen to pull."""
+TRACKED = np.dtype(
+    [
+        ("number", np.int64),
+        ("mode", np.int64),
+        ("approach", np.float64),
+        ("counts", COUNTS),
+        ("pulls", bool),
+        ("episode", EPISODE),
+    ]
+)
+"""A site: its number in the log; in a checkpoint its mode and w'_minus in m/s; counts of limits; whether it was seen to
+pull in its episode, which it has unless it is free, and of which the separation is NaN."""
 
 
 class Tracks(NamedTuple):
@@ -41,8 +49,9 @@ class Tracks(NamedTuple):
 
 @njit(error_model="numpy")
 def with_room(tracks: Tracks) -> Tracks:
-    """The same with room in the log for an episode of every site."""
-    used, wanted = tracks.closed[0], tracks.closed[0] + tracks.sites.size
+    """``tracks`` with room in the log for an episode of every site."""
+    used = tracks.closed[0]
+    wanted = used + tracks.sites.size
     if wanted <= tracks.log.size:
         return tracks
     log = np.empty(2 * wanted, tracks.log.dtype)
@@ -52,16 +61,19 @@ def with_room(tracks: Tracks) -> Tracks:
 
 @njit(error_model="numpy")
 def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extremes) -> None:
-    """Update the open episode of site ``i`` with the extremes ``reached`` in a stretch of time."""
-    site, law = tracks.sites[i], contacts[i]
-    episode, pull = site.episode, -reached.smallest_force
+    """Update the open episode of site ``i`` with the extremes ``reached`` in an interval of time."""
+    track, site = tracks.sites[i], contacts[i]
+    episode = track.episode
     episode.indentation = max(episode.indentation, reached.indentation)
     episode.force = max(episode.force, reached.force)
+
     # No pull is that of the law continued to a landing short of D, or beyond g = 0.
-    none = (1.0 + law.damping) * elastic_force(law.elastic, LANDED_W * law.scale)
-    if pull > 0.0 and not site.pulls and pull > none + LANDED_G * elastic_force(law.elastic, episode.indentation):
-        site.pulls = True
-        site.counts.pulled += 1
+    pull = -reached.smallest_force
+    before_onset = (1.0 + site.damping) * elastic_force(site.elastic, LANDED_W * site.scale)
+    beyond_clipping = LANDED_G * elastic_force(site.elastic, episode.indentation)
+    if pull > 0.0 and not track.pulls and pull > before_onset + beyond_clipping:
+        track.pulls = True
+        track.counts.pulled += 1
 
 
 @njit(error_model="numpy")
@@ -69,7 +81,9 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     for i in range(contacts.size):
         side = 1 if contacts[i].mode > 0 else -1
-        if abs(contacts[i].mode) == PERMANENT and not side * start[i, 1] > 0.0 > side * end[i, 1]:  # no turn inside
+        turns = side * start[i, 1] > 0.0 > side * end[i, 1]
+        if abs(contacts[i].mode) == PERMANENT and not turns:
+            # Monotonous in the step: its end is enough, which matters where thousands of beads touch all the time.
             episode = tracks.sites[i].episode
             episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
             episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
@@ -102,14 +116,23 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
 
 @njit(error_model="numpy")
 def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: float, energy: float, t: float) -> None:
-    site, track, floor = contacts[i], tracks.sites[i], contacts[i].floor
-    episode, was_free, side = track.episode, site.mode == FREE, (1 if mode > 0 else -1)
+    """Give site ``i`` its new mode at w' = ``rate``; begin or end its episode, ``energy`` in J dissipated so far."""
+    site, track = contacts[i], tracks.sites[i]
+    episode = track.episode
+    was_free = site.mode == FREE
     site.mode = mode
     if was_free:
-        track.counts.floored += abs(rate) < floor
-        site.approach = side * max(abs(rate), floor)
-        episode.site, episode.side, episode.onset, episode.approach_velocity = track.number, side, t, rate
-        episode.separation, episode.indentation, episode.force, episode.loss = np.nan, 0.0, 0.0, -energy
+        side = 1 if mode > 0 else -1
+        track.counts.floored += abs(rate) < site.floor
+        site.approach = side * max(abs(rate), site.floor)
+        episode.site = track.number
+        episode.side = side
+        episode.onset = t
+        episode.approach_velocity = rate
+        episode.separation = np.nan
+        episode.indentation = 0.0
+        episode.force = 0.0
+        episode.loss = -energy
     elif mode == FREE:
         track.pulls = False
         episode.separation = t
@@ -138,13 +161,18 @@ class ImpactTracker:
     """
 
     def __init__(self, contacts: np.ndarray, numbers: Sequence[int]) -> None:
-        self.contacts, sites = contacts, np.zeros(len(numbers), TRACKED)
-        self.start, self.end = np.zeros((2, len(sites), 3))
+        self.contacts = contacts
+        self.start, self.end = np.zeros((2, len(numbers), 3))
+        sites = np.zeros(len(numbers), TRACKED)
         sites["number"] = numbers
+        self.tracks = Tracks(sites, log=np.zeros(2 * len(sites), EPISODE), closed=np.zeros(1, np.int64))
+
+        # Permanent contacts are in an episode from the start.
         held = np.flatnonzero(np.abs(contacts["mode"]) == PERMANENT)
-        sites["episode"]["site"][held], sites["episode"]["separation"][held] = sites["number"][held], np.nan
-        sites["episode"]["side"][held] = np.sign(contacts["mode"][held])
-        self.tracks = Tracks(sites, np.zeros(2 * len(sites), EPISODE), np.zeros(1, np.int64))
+        episodes = sites["episode"]
+        episodes["site"][held] = sites["number"][held]
+        episodes["side"][held] = np.sign(contacts["mode"][held])
+        episodes["separation"][held] = np.nan
 
     def begin(self, motion: np.ndarray) -> np.ndarray:
         """Close the sites that begin beyond their clearance at t = 0; returns their indices.
@@ -152,34 +180,40 @@ class ImpactTracker:
         ``motion`` (site, 2) has w and w' of all numbered sites. When these contacts began is not known: w'_minus is the
         speed with which two masses alone come to w at w' without loss: mu (w'_minus^2 - w'^2)/2 is the elastic energy.
         """
-        sites, mine = self.contacts, np.flatnonzero(self.tracks.sites["number"] >= 0)
-        (w, rate), near = motion[self.tracks.sites["number"][mine]].T, LANDED_W * sites["scale"][mine]
-        depths = w - sites["clearance"][mine], -w - sites["clearance_minus"][mine]
-        side, deep = np.where(depths[0] < depths[1], -1, 1), np.maximum(*depths)
+        sites, tracked = self.contacts, self.tracks.sites
+        numbered = np.flatnonzero(tracked["number"] >= 0)
+        w, rate = motion[tracked["number"][numbered]].T
+        plus = w - sites["clearance"][numbered]
+        minus = -w - sites["clearance_minus"][numbered]
+        side = np.where(plus < minus, -1, 1)
+        deep = np.maximum(plus, minus)
+
+        # On the clearance, to the tolerance of a landing, the rate decides.
+        near = LANDED_W * sites["scale"][numbered]
         touching = (deep > near) | ((deep >= -near) & (side * rate > 0))
-        closed = touching & (sites["mode"][mine] == FREE)
-        some, side, deep, rate = mine[closed], side[closed], np.maximum(deep[closed], 0.0), rate[closed]
-        law = sites[some]
+        closing = touching & (sites["mode"][numbered] == FREE)
+        closed, side = numbered[closing], side[closing]
+        deep, rate = np.maximum(deep[closing], 0.0), rate[closing]
+
+        law = sites[closed]
         stored = np.array([elastic_energy(site["elastic"], x) for site, x in zip(law, deep, strict=True)])
         speed = np.sqrt(rate**2 + 2 * stored / law["reduced_mass"])
-        sites["approach"][some] = side * np.maximum(speed, law["floor"])
-        sites["mode"][some] = side * CLOSED
-        clipped = law["clip"] & (1 + law["damping"] * rate / sites["approach"][some] < 0)
-        sites["mode"][some[clipped]] *= CLIPPED
-        episodes = self.tracks.sites["episode"]
-        episodes["site"][some], episodes["side"][some] = self.tracks.sites["number"][some], side
-        episodes["approach_velocity"][some], episodes["separation"][some] = side * speed, np.nan
-        return some
+        sites["approach"][closed] = side * np.maximum(speed, law["floor"])
+        sites["mode"][closed] = side * CLOSED
+        clipped = law["clip"] & (1 + law["damping"] * rate / sites["approach"][closed] < 0)
+        sites["mode"][closed[clipped]] *= CLIPPED
+
+        episodes = tracked["episode"]
+        episodes["site"][closed] = tracked["number"][closed]
+        episodes["side"][closed] = side
+        episodes["approach_velocity"][closed] = side * speed
+        episodes["separation"][closed] = np.nan
+        return closed
 
     @property
     def counts(self) -> np.ndarray:
         """How often the limits of the contact law acted on each site, of dtype ``COUNTS``."""
         return self.tracks.sites["counts"]
-
-    @property
-    def _lasting(self) -> np.ndarray:
-        """The sites in contact."""
-        return np.flatnonzero(self.contacts["mode"] != FREE)
 
     def contact_time(self) -> float:
         """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
@@ -202,18 +236,24 @@ class ImpactTracker:
         """Episodes closed since the last call, and ``unfinished`` ones as they are; ``energies`` as in ``switch``."""
         closed = self.tracks.log[: self.tracks.closed[0]].copy()
         self.tracks.closed[:] = 0
-        lasting = self._lasting if unfinished else np.zeros(0, int)
-        still_open = self.tracks.sites["episode"][lasting]
-        still_open["loss"] += energies[lasting]
+        if not unfinished:
+            return closed
+        in_contact = np.flatnonzero(self.contacts["mode"] != FREE)
+        still_open = self.tracks.sites["episode"][in_contact]
+        still_open["loss"] += energies[in_contact]
         return np.concatenate([closed, still_open])
 
     def checkpoint(self) -> np.ndarray:
         """Sites with their modes, counts and episodes (sites,) of dtype ``TRACKED``."""
-        self.tracks.sites["site"] = self.contacts
-        return self.tracks.sites.copy()
+        sites = self.tracks.sites.copy()
+        sites["mode"] = self.contacts["mode"]
+        sites["approach"] = self.contacts["approach"]
+        return sites
 
     def restore(self, table: np.ndarray) -> None:
         """Go back to a checkpoint, the ``table`` of all sites by their numbers."""
-        known = self.tracks.sites["number"] >= 0
-        self.tracks.sites[known] = table[self.tracks.sites["number"][known]]
-        self.contacts[known] = self.tracks.sites["site"][known]
+        numbered = self.tracks.sites["number"] >= 0
+        sites = table[self.tracks.sites["number"][numbered]]
+        self.tracks.sites[numbered] = sites
+        self.contacts["mode"][numbered] = sites["mode"]
+        self.contacts["approach"][numbered] = sites["approach"]

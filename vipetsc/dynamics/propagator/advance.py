@@ -15,7 +15,7 @@ the substep the nodes see little of it.
 import numpy as np
 
 from vipetsc.compiled import inlined, kernel
-from vipetsc.contact.changes import LANDED_W, Change, extremes, first_change, switching
+from vipetsc.contact.changes import LANDED_W, ModeChange, extremes, first_change, switching
 from vipetsc.contact.law import CLOSED, FREE, PERMANENT, begins_linearly, contact_force, gap_of
 from vipetsc.contact.search import (
     LANDED,
@@ -179,12 +179,12 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
 
 
 @kernel
-def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> tuple[float, bool]:
+def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) -> tuple[float, bool]:
     """Repeat a substep to end on a ``change``; the length taken, negative if it could not be, whether it was met."""
     contacts = cluster.contacts
     site = change.site
     h = cluster.interval
-    landing = Landing(length=change.share * substep.length, longest=substep.length, residual=np.inf, attempts=0)
+    landing = Landing(length=change.position * substep.length, longest=substep.length, residual=np.inf, attempts=0)
     while True:
         if landing.length <= ROUNDING:
             begin = switching(contacts, site, change.function, cluster.site_motion[site])
@@ -198,9 +198,9 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: Change) -> t
         if outcome == SEARCH:
             seconds = h * landing.length
             earlier = first_change(contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein)
-            if earlier.share > 1.0:
+            if earlier.position > 1.0:
                 return landing.length, False
-            landing = shorten(landing, earlier.share)
+            landing = shorten(landing, earlier.position)
         elif outcome != RETRY:
             return landing.length, outcome == LANDED
 
@@ -214,14 +214,14 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     state = cluster.state[0]
     seconds = cluster.interval * substep.length
     change = first_change(cluster.contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein)
-    if change.share > 1.0:
+    if change.position > 1.0:
         return substep, False
 
     site = cluster.contacts[change.site]
     separates = not begins_linearly(site.elastic) and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
         # The force begins and ends as a power 3/2, and nodes suit one end: a substep for each.
-        state.length = 0.5 * change.share * substep.length
+        state.length = 0.5 * change.position * substep.length
         return Substep(ONSET, -1.0), False
     kind = EXIT if separates else substep.kind
     state.landings += 1

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.changes import Change, first_change, switching
+from vipetsc.contact.changes import ModeChange, first_change, switching
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
@@ -180,7 +180,7 @@ class Integrator(Engine):
         self.observe(self.tracker.end, end)
         with log.SEARCH:
             change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h, np.empty((2, 6)))
-        earliest = np.array([change.share, -float(self._stop.requested)])
+        earliest = np.array([change.position, -float(self._stop.requested)])
         self.comm.Allreduce(MPI.IN_PLACE, earliest, MPI.MIN)
         share, stop = earliest.tolist()
         if share <= 1.0:
@@ -205,13 +205,13 @@ class Integrator(Engine):
         ts.restartStep()
         return None
 
-    def _land(self, h: float, share: float, change: Change) -> None:
+    def _land(self, h: float, share: float, change: ModeChange) -> None:
         """Step from the saved state onto the change at ``share`` of the step just tried, and switch there.
 
         ``change`` is this rank's first one; the rank whose share is the smallest judges the landing for all.
         """
         comm, tracker = self.comm, self.tracker
-        owner = comm.allreduce(comm.rank if change.share == share else comm.size, MPI.MIN)
+        owner = comm.allreduce(comm.rank if change.position == share else comm.size, MPI.MIN)
         attempt, outcome = Landing(share * h, h, np.inf, 0), RETRY
         self.counts["landings"] += 1
         sys.audit("vipetsc.landing")
@@ -231,7 +231,7 @@ class Integrator(Engine):
         if outcome == LANDED:
             self._switch()
 
-    def _judge(self, attempt: Landing, change: Change) -> tuple[Landing, int]:
+    def _judge(self, attempt: Landing, change: ModeChange) -> tuple[Landing, int]:
         """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it."""
         tracker, site = self.tracker, change.site
         value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, tracker.end[site])
@@ -239,7 +239,7 @@ class Integrator(Engine):
         if outcome != SEARCH:
             return attempt, outcome
         # A graze: short of it, go on from here; beyond it, search again on the shorter step.
-        share = first_change(tracker.contacts, tracker.start, tracker.end, attempt.length, np.empty((2, 6))).share
+        share = first_change(tracker.contacts, tracker.start, tracker.end, attempt.length, np.empty((2, 6))).position
         return (shorten(attempt, share), RETRY) if share <= 1.0 else (attempt, MISSED)
 
     def _switch(self) -> None:
