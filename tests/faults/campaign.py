@@ -20,20 +20,8 @@ from tests.faults.scenarios import SCENARIOS
 from tests.faults.trials import Crew, judge, last_words, matrix, references
 from vipetsc.case import Case
 
-KILLED = (
-    "run",
-    "run-ts",
-    "run-resumed",
-    "run-force",
-    "sweep",
-    "sweep-team",
-    "nnm",
-    "design",
-    "paper",
-    "law",
-    "predict",
-    "optimise",
-)
+# Of verbs that leave results of their own, which the same command goes on with.
+KILLED = [scenario.name for scenario in SCENARIOS.values() if scenario.verb.results]
 
 
 def faults(options: argparse.Namespace) -> dict[str, Any]:

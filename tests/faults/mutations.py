@@ -19,9 +19,8 @@ from typing import Any, Literal, get_args, get_origin
 import tomli_w
 from pydantic import BaseModel
 
-from vipetsc.case import Case, CaseError, CaseFile, DesignCase, NnmCase
-from vipetsc.case.sweep import SweepTable
-from vipetsc.case.verb_cases import load_every
+from vipetsc.case import Case, CaseError, CaseFile
+from vipetsc.case.verb_cases import SECTIONS, load_every
 from vipetsc.cli.verbs.verb_list import verb_of
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.options import check_options
@@ -91,11 +90,8 @@ def parents() -> dict[str, dict[str, Any]]:
 def known_keys() -> dict[Path_, list[Any]]:
     """Every key of every section with values of its kind: the choices of a literal, or none."""
     found: dict[Path_, list[Any]] = {}
-    for kind in (Case, NnmCase, DesignCase):
-        for name, field in kind.model_fields.items():
-            if name != "name":
-                _collect(field.annotation, (name,), found)
-    _collect(SweepTable, ("sweep",), found)
+    for section, table in SECTIONS.items():
+        _collect(table, (section,), found)
     return found | {("petsc", name): list(values) for name, values in PETSC.items()}
 
 

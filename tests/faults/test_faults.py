@@ -8,34 +8,47 @@ from __future__ import annotations
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
-from tests.faults.campaign import fault_table
+from tests.faults.campaign import KILLED, fault_table
 from tests.faults.inject import KINDS
 from tests.faults.phases import phases
 from tests.faults.scenarios import SCENARIOS, prepare
 from tests.faults.trials import ROOT, Crew, judge, last_words, matrix, processes_of, references
 from vipetsc.case import Case
+from vipetsc.cli.verbs.verb_list import VERBS, study_verbs
 from vipetsc.dynamics import simulate
 
-# The verbs on each number of ranks, all phases among them.
-VERBS = {2: ("run-ts", "run-force", "nnm", "design", "paper", "law", "predict"), 3: ("run", "sweep-team", "optimise")}
+# Names of scenarios by the number of ranks on which each meets faults here; all phases are among them.
+ON_RANKS: dict[int, list[str]] = {}
+for scenario in SCENARIOS.values():
+    if scenario.ranks:
+        ON_RANKS.setdefault(scenario.ranks, []).append(scenario.name)
 KILLS = 2  # every one ends a worker and costs seconds
+
+
+def test_every_verb_that_leaves_results_meets_faults_and_kills():
+    leaving = {verb.name for verb in VERBS.values() if verb.results}
+    assert {verb.name for verb in study_verbs()} < leaving
+    assert {scenario.verb.name for scenario in SCENARIOS.values() if scenario.ranks} == leaving
+    assert {SCENARIOS[name].verb.name for name in KILLED} == leaving
 
 
 @pytest.mark.mpirun
 def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
-    crews = {ranks: Crew(tmp_path / str(ranks), ranks) for ranks in VERBS}
-    tasks = [
-        task | {"ranks": ranks} for ranks, crew in crews.items() for task in matrix(references(crew, VERBS[ranks]))
-    ]
+    crews = {ranks: Crew(tmp_path / str(ranks), ranks) for ranks in ON_RANKS}
+    tasks = []
+    for ranks, crew in crews.items():
+        tasks += [task | {"ranks": ranks} for task in matrix(references(crew, ON_RANKS[ranks]))]
     assert phases() - {task["phase"] for task in tasks} == set(), "phases that no verb here comes to"
-    chosen, found, rows = one_of_each(tasks), {}, []
+
+    chosen = one_of_each(tasks)
+    found, rows = {}, []
     for ranks, crew in crews.items():
         for task, stages in crew.do([task for task in chosen if task["ranks"] == ranks]):
-            wrong, came = judge(task, stages, allowed=crew.patience), stages["ended"]["fired"]
-            rows.append(task | {"wrong": wrong, "came": came})
+            wrong = judge(task, stages, allowed=crew.patience)
+            rows.append(task | {"wrong": wrong, "came": stages["ended"]["fired"]})
             if wrong:
                 found[task["id"]] = *wrong, last_words(stages)
-    print(fault_table(rows, KINDS, list(VERBS)))
+    print(fault_table(rows, KINDS, list(ON_RANKS)))
     assert found == {}
     assert processes_of(tmp_path) == []
 
