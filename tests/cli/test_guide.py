@@ -22,7 +22,10 @@ from tests.conftest import clean_environment
 from vipetsc.case import Case, Sweep
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.verb_cases import load_every
+from vipetsc.cli.arguments import CASE, SET
 from vipetsc.cli.main import main
+from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.figures import style
 from vipetsc.modes.system import System
 from vipetsc.parallel import StopRequest, on_root
@@ -142,18 +145,35 @@ def test_every_block_of_commands_is_typed_or_listed_with_a_reason():
     assert not {page.stem for page in GUIDE} & NOT_TYPED.keys()
 
 
-def test_what_extend_shows_of_figures_and_verbs_works():
+def test_what_extend_shows_of_figures_and_verbs_works(monkeypatch):
     text = (MANUAL / "extend.md").read_text(encoding="utf-8")
     blocks = [block for language, block in BLOCK.findall(text) if language == "python"]
     figure, verb = (next(block for block in blocks if block.startswith(f"def {name}(")) for name in ("centre", "weigh"))
-    told: list[str] = []
-    known = {"Case": Case, "Figure": Figure, "MPI": MPI, "StopRequest": StopRequest, "argparse": argparse,
-             "echo": lambda comm, text: told.append(text), "on_root": on_root, "style": style, "xr": xr}  # fmt: skip
-    exec(figure + verb, known)
+    printed: list[str] = []
+    names = {"Case": Case, "Figure": Figure, "MPI": MPI, "StopRequest": StopRequest, "argparse": argparse,
+             "echo": lambda comm, text: printed.append(text), "on_root": on_root, "style": style, "xr": xr,
+             "CASE": CASE, "DONE": DONE, "PlainVerb": PlainVerb, "SET": SET}  # fmt: skip
+    exec(figure + verb, names)
+
     analysis = xr.Dataset({"centre": ("time", [1.0, 5.0])}, {"time": [0.0, 1.0]})
-    assert known["centre"](None, analysis).axes[0].lines[0].get_ydata().tolist() == [1, 5]
-    assert known["weigh"](argparse.Namespace(case=None, set=["lattice.cells=100"]), MPI.COMM_SELF, None) == 0
-    assert told == ["1.5 kg"]
+    assert names["centre"](None, analysis).axes[0].lines[0].get_ydata().tolist() == [1, 5]
+
+    monkeypatch.setitem(VERBS, "weigh", names["VERB"])
+    assert main(["weigh", "--set", "lattice.cells=100", "--quiet"]) == DONE
+    assert printed == ["1.5 kg"]
+
+
+def test_the_chapter_on_verbs_lists_those_that_are_there():
+    text = (MANUAL / "verbs.md").read_text(encoding="utf-8")
+
+    def listed(pattern: str) -> set[str]:
+        return set(re.findall(r"`(\w+)`", re.search(pattern, text, flags=re.S)[1]))
+
+    assert set(re.findall(r"^(?:mpirun -n 2 )?python -m vipetsc (\w+)", text, flags=re.M)) == VERBS.keys()
+    taking = {verb.name for verb in VERBS.values() if verb.takes_petsc_options}
+    assert listed(r"become part of the\s+case \((.*?)\)") == taking
+    leaving = {verb.name for verb in VERBS.values() if verb.results}
+    assert listed(r"whatever happened\n\n(.*?) look at the output folder first") == leaving
 
 
 def test_the_names_that_extend_gives_are_where_it_says():
