@@ -46,12 +46,13 @@ KINDS = {
 
 
 def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
-    """CPU seconds of a whole sweep over so many amplitudes, which lie close together."""
+    """CPU seconds of a whole sweep over so many amplitudes, which lie close together: members cost the same."""
     table = tomllib.loads((RUNS / kind.file).read_text(encoding="utf-8")) | {"name": folder.name}
     for section, changes in kind.changes.items():
         table[section] = table.get(section, {}) | changes
     amplitudes = [kind.amplitude * (1 + 1e-4 * k) for k in range(members)]
     table["sweep"] = {"measures": list(kind.measures), "drive": {"amplitude": amplitudes}}
+
     begin = time.process_time()
     result = run_sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
     if not result.complete:
@@ -61,20 +62,21 @@ def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
 
 def member_seconds(folder: Path, rounds: int) -> dict[str, float]:
     """CPU seconds of one more member of a sweep: what ``1 + MEMBERS`` take more than one, median of ``rounds``."""
-    found: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    measured: dict[str, list[float]] = {name: [] for name in KINDS}
     for turn in range(rounds + 1):
-        for kind, seconds in found.items():
-            one, all_in = (_sweep_seconds(KINDS[kind], n, folder / f"{kind}-{turn}-{n}") for n in (1, 1 + MEMBERS))
+        for name, seconds in measured.items():
+            one = _sweep_seconds(KINDS[name], 1, folder / f"{name}-{turn}-one")
+            many = _sweep_seconds(KINDS[name], 1 + MEMBERS, folder / f"{name}-{turn}-many")
             if turn:  # the first one fills caches
-                seconds.append((all_in - one) / MEMBERS)
-    return {kind: statistics.median(seconds) for kind, seconds in found.items()}
+                seconds.append((many - one) / MEMBERS)
+    return {name: statistics.median(seconds) for name, seconds in measured.items()}
 
 
 def paper_budget(folder: Path) -> dict[str, float]:
     """CPU seconds of the paper by stage, from what ``paper`` left in ``folder``; empty if it left nothing."""
-    made = folder / "made.json"
-    if not made.exists():
+    record = folder / "made.json"
+    if not record.exists():
         return {}
-    told = json.loads(made.read_text(encoding="utf-8")).get("cpu", {})
-    stages = {name: float(seconds) for name, seconds in told.get("steps", {}).items()}
-    return stages | {name: float(seconds) for name, seconds in told.items() if name != "steps"}
+    seconds = json.loads(record.read_text(encoding="utf-8")).get("cpu", {})
+    stages = seconds.pop("steps", {}) | seconds
+    return {name: float(value) for name, value in stages.items()}

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 
 RANKS = (1, 64, 1024)
-LATENCY, BANDWIDTH = 2e-6, 10e9  # s a message, bytes/s a rank: a common cluster's network
-WEAK, STRONG = 100_000, 10_000_000  # cells a rank, cells in all
+# A common cluster's network.
+LATENCY = 2e-6  # s a message
+BANDWIDTH = 10e9  # bytes/s a rank
+WEAK = 100_000  # cells a rank
+STRONG = 10_000_000  # cells in all
 
 
 class ScalingModel:
@@ -22,15 +25,19 @@ class ScalingModel:
     """
 
     def __init__(self, rows: list[dict[str, Any]], engine: str) -> None:
-        good = sorted((r for r in rows if r["engine"] == engine and "failure" not in r), key=lambda r: r["cells"])
-        alone, paired = ([r for r in good if r["ranks"] == ranks] for ranks in (1, 2))
+        measured = [row for row in rows if row["engine"] == engine and "failure" not in row]
+        measured.sort(key=lambda row: row["cells"])
+        alone = [row for row in measured if row["ranks"] == 1]
+        paired = [row for row in measured if row["ranks"] == 2]
         if not alone or not paired:
             raise ValueError(f"{engine} was not measured on one rank and on two")
-        self._cells, self._seconds = [r["cells"] for r in alone], [r["wall_ms"] / 1e3 for r in alone]
+
+        self._cells = [row["cells"] for row in alone]
+        self._seconds = [row["wall_ms"] / 1e3 for row in alone]
         self.shared = max(1.0, 2 / paired[-1]["memory_speedup"])
-        self.messages, self.bytes, self.reductions = (
-            max(r[key] for r in paired) for key in ("messages", "message_bytes", "reductions")
-        )
+        self.messages = max(row["messages"] for row in paired)
+        self.bytes = max(row["message_bytes"] for row in paired)
+        self.reductions = max(row["reductions"] for row in paired)
 
     def compute(self, cells: float) -> float:
         """Seconds of one rank for so many cells; beyond the measured ones, in proportion to them."""
@@ -50,6 +57,11 @@ class ScalingModel:
         return self.compute(cells / ranks) + self.communicate(ranks)
 
 
+def _time_and_efficiency(seconds: float, efficiency: float) -> str:
+    """An entry of the tables."""
+    return f"{1e3 * seconds:.3g} ({100 * efficiency:.0f} %)"
+
+
 def model_tables(rows: list[dict[str, Any]]) -> str:
     """Weak and strong scaling by the model, and its assumptions, in Markdown."""
     lines = []
@@ -58,21 +70,22 @@ def model_tables(rows: list[dict[str, Any]]) -> str:
             model = ScalingModel(rows, engine)
         except ValueError:
             continue
-        for name, size, each in (("weak", WEAK, True), ("strong", STRONG, False)):
-            alone = model.total(size, 1)
-            cells = []
-            for ranks in RANKS:
-                seconds = model.total(size * ranks if each else size, ranks)
-                efficiency = alone / seconds / (1 if each else ranks)
-                cells.append(f"{1e3 * seconds:.3g} ({100 * efficiency:.0f} %)")
-            what = f"{size:,} cells " + ("a rank" if each else "in all")
-            lines.append(f"| {engine} | {name}, {what} | " + " | ".join(cells) + " |")
+        weak = []
+        strong = []
+        for ranks in RANKS:
+            seconds = model.total(WEAK * ranks, ranks)
+            weak.append(_time_and_efficiency(seconds, model.total(WEAK, 1) / seconds))
+            seconds = model.total(STRONG, ranks)
+            strong.append(_time_and_efficiency(seconds, model.total(STRONG, 1) / seconds / ranks))
+        lines.append(f"| {engine} | weak, {WEAK:,} cells a rank | " + " | ".join(weak) + " |")
+        lines.append(f"| {engine} | strong, {STRONG:,} cells in all | " + " | ".join(strong) + " |")
         lines.append(
             f"| {engine} | a rank and interval: {model.messages:.3g} messages and {model.bytes:.3g} bytes to each"
             f" neighbour, {model.reductions:.3g} reductions |" + " |" * len(RANKS)
         )
     if not lines:
         return ""
+
     head = "| engine | model: ms per 2e-4 s (efficiency) | " + " | ".join(f"{n} ranks" for n in RANKS) + " |"
     assumed = (
         f"Assumed: {1e6 * LATENCY:g} us a message, {BANDWIDTH / 1e9:g} GB/s a rank, log2(ranks) messages in turn a"

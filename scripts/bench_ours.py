@@ -1,4 +1,4 @@
-"""Ours: every engine the case files know, through the parts that a run is made of, without its files."""
+"""Solvers of this package: every engine of the case files, through the parts of a run, without its files."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ class Flight:
     """
 
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
-        self.case, self.model = case, case.model()
+        self.case = case
+        self.model = case.model()
         kind, refused = select_engine(case, self.model)
         if refused:
             raise RuntimeError(refused)
         self.output = RunMemory(comm)
         self.output.begin(case.to_toml())
-        self.layout = layout = Layout(self.model, comm)
-        self.engine = kind(self.model, layout)
-        setup = Setup(case, self.model, layout, EnergyMeter(self.model, layout), self.engine, self.output)
+        self.layout = Layout(self.model, comm)
+        self.engine = kind(self.model, self.layout)
+        meter = EnergyMeter(self.model, self.layout)
+        setup = Setup(case, self.model, self.layout, meter, self.engine, self.output)
         self._run = Run(setup, (Guard, Ledger))
 
     def advance(self, begin: int, end: int) -> None:
@@ -56,7 +58,8 @@ class Flight:
         ``ts`` goes from sample to sample, the propagator in blocks, by the run's own loop with its energies. Raises
         RuntimeError where the run fails.
         """
-        n, d = self.layout.owned, self.layout.dofs
+        n = self.layout.owned
+        d = self.layout.dofs
         begin = time.process_time()
         if self.engine.name == "ts":
             sampled = np.empty((self.model.samples, d, n))
@@ -64,6 +67,7 @@ class Flight:
                 self.engine.advance(k * self.model.sample_interval)
                 sampled[k] = self.engine.state.array_r[d * n : 2 * d * n].reshape(d, n)
             return sampled.swapaxes(1, 2), time.process_time() - begin
+
         ending, sentence = self._run.advance()
         seconds = time.process_time() - begin
         if ending != "complete":
@@ -82,19 +86,25 @@ def solve(case: Case) -> Solution:
     return Solution(sampled.reshape(flight.model.samples, -1), seconds)
 
 
+def _by_engine(case: Case, name: str) -> Case:
+    """A copy of ``case`` that asks for the engine ``name``."""
+    return case.model_copy(update={"time": case.time.model_copy(update={"engine": name})})
+
+
 def own_solvers() -> dict[str, Solver]:
     """One solver an engine, by name; each uses its engine whatever the case says."""
 
     def with_engine(name: str) -> Solver:
-        return lambda case: solve(case.model_copy(update={"time": case.time.model_copy(update={"engine": name})}))
+        return lambda case: solve(_by_engine(case, name))
 
     return {f"vipetsc {name}": with_engine(name) for name in engines()}
 
 
 def right_hand_side_us(case: Case, evaluations: int = 20_000) -> float:
     """Microseconds of CPU that one right-hand side of the case costs through PETSc."""
-    flight = Flight(case.model_copy(update={"time": case.time.model_copy(update={"engine": "ts"})}), MPI.COMM_SELF)
-    ts, state = flight.engine.ts, flight.engine.state
+    flight = Flight(_by_engine(case, "ts"), MPI.COMM_SELF)
+    ts = flight.engine.ts
+    state = flight.engine.state
     slope = state.duplicate()
     begin = time.process_time()
     for _ in range(evaluations):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ def lattice_case(overrides: Iterable[str] = ()) -> Case:
 
 
 def at_tolerance(case: Case, rtol: float) -> Case:
-    """The same case at another relative tolerance."""
+    """A copy of ``case`` at the relative tolerance ``rtol``."""
     return case.model_copy(update={"time": case.time.model_copy(update={"rtol": rtol})})
 
 
@@ -40,8 +41,9 @@ def reference(solvers: Mapping[str, Solver], case: Case) -> tuple[np.ndarray, di
         tight["odeint dopri5"] = 1e-14
     else:
         tight["DOP853 numba"] = 3e-14
-    apart = {f"{name} at {rtol:g}": error(solvers[name](at_tolerance(case, rtol)).velocity, exact)
-             for name, rtol in tight.items()}  # fmt: skip
+    apart = {}
+    for name, rtol in tight.items():
+        apart[f"{name} at {rtol:g}"] = error(solvers[name](at_tolerance(case, rtol)).velocity, exact)
     return exact, {"solver": "vipetsc ts at 1e-13", "separation": apart, "end": case.time.end}
 
 
@@ -65,6 +67,7 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
                     continue
                 row["error"] = error(found.velocity, exact)
                 row["all"].append(found.seconds)
+
     for row in rows.values():
         row["seconds"] = statistics.median(row["all"]) if row["all"] else None
     table = sorted(rows.values(), key=lambda row: (list(solvers).index(row["solver"]), -row["rtol"]))
@@ -76,7 +79,7 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
 def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: bool = False) -> float | None:
     """CPU seconds at the error ``wanted`` from ``points`` (error, seconds), interpolated in logarithms.
 
-    Points that another one beats in both are left out, in favour of a solver whose error falls unevenly. None where
+    Points that another one beats in both are left out, which favours a solver whose error falls unevenly. None where
     the points do not reach; with ``bound``, an error larger than all of them costs no more than the largest one.
     """
     front: list[tuple[float, float]] = []
@@ -94,19 +97,26 @@ def equal_error_ratios(rows: list[dict], wanted: list[float]) -> tuple[dict[str,
     names = list(dict.fromkeys(row["solver"] for row in rows))
     rounds = max(len(row["all"]) for row in rows)
 
-    def seconds(name: str, turn: int, at: float) -> float | None:
+    def seconds(name: str, turn: int, wanted_error: float) -> float | None:
         # An error of zero is the reference itself.
         complete = [row for row in rows if row["solver"] == name and len(row["all"]) == rounds and row["error"] > 0]
+        points = [(row["error"], row["all"][turn]) for row in complete]
         # A bound counts against the solver to which it is applied: ours may have one, a peer may not.
-        return at_equal_error([(row["error"], row["all"][turn]) for row in complete], at, name.startswith("vipetsc"))
+        return at_equal_error(points, wanted_error, bound=name.startswith("vipetsc"))
 
-    ratios, spread = {}, {}
-    for engine in (name for name in names if name.startswith("vipetsc")):
-        for peer in (name for name in names if name != engine):
-            for at in wanted:
-                pairs = [(seconds(peer, turn, at), seconds(engine, turn, at)) for turn in range(rounds)]
-                found = [theirs / ours for theirs, ours in pairs if theirs and ours]
-                if found:
-                    name = f"{peer} / {engine} at {at:g}"
-                    ratios[name], spread[name] = statistics.median(found), [min(found), max(found)]
+    ratios = {}
+    spread = {}
+    engines = [name for name in names if name.startswith("vipetsc")]
+    pairs = [(engine, peer) for engine in engines for peer in names if peer != engine]
+    for (engine, peer), wanted_error in product(pairs, wanted):
+        found = []
+        for turn in range(rounds):
+            theirs = seconds(peer, turn, wanted_error)
+            ours = seconds(engine, turn, wanted_error)
+            if theirs and ours:
+                found.append(theirs / ours)
+        if found:
+            name = f"{peer} / {engine} at {wanted_error:g}"
+            ratios[name] = statistics.median(found)
+            spread[name] = [min(found), max(found)]
     return ratios, spread

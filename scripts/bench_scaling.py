@@ -62,10 +62,12 @@ def _pair(engine: str, cells: int, rounds: int) -> list[dict]:
     for ranks, found in turns.items():
         medians = {key: statistics.median(turn[key] for turn in found) for key in found[0] if key != "ranks"}
         rows.append({"engine": engine, "cells": cells, "ranks": ranks} | medians)
+
+    # Gains are medians of ratios, since the machine's speed changes from turn to turn.
     pairs = list(zip(turns[1], turns[2], strict=True))
-    for key, about in (("wall_ms", "speedup"), ("triad_gb_per_second", "memory_speedup")):
-        gain = statistics.median(one[key] / two[key] for one, two in pairs)
-        rows[-1][about] = gain if about == "speedup" else 1 / gain
+    rows[-1]["speedup"] = statistics.median(one["wall_ms"] / two["wall_ms"] for one, two in pairs)
+    slower = statistics.median(one["triad_gb_per_second"] / two["triad_gb_per_second"] for one, two in pairs)
+    rows[-1]["memory_speedup"] = 1 / slower
     return rows
 
 
@@ -86,15 +88,17 @@ def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
     seconds: dict[str, list[float]] = {name: [] for name in engines()}
     for turn in range(rounds + 1):
         for engine, found in seconds.items():
-            case = Case.load(overrides=[f"time.engine={engine}", *(["time.end=0.01"] if turn == 0 else [])])
-            result = simulate(case, folder / f"whole-{engine}", MPI.COMM_SELF, force=True)
+            overrides = [f"time.engine={engine}"]
+            if turn == 0:
+                overrides.append("time.end=0.01")
+            result = simulate(Case.load(overrides=overrides), folder / f"whole-{engine}", MPI.COMM_SELF, force=True)
             if turn:
                 found.append(result.statistics["cpu_seconds"])
     return {engine: statistics.median(found) for engine, found in seconds.items()}
 
 
 def large(folder: Path, rounds: int) -> dict:
-    """A million cells by the whole program on one and on two ranks, in turn, beside what the memory itself gains."""
+    """A million cells by the whole program on one and on two ranks, in turn; what two gain, and what memory does."""
     runs: dict[int, list[dict]] = {1: [], 2: []}
     for _ in range(rounds):
         for ranks, found in runs.items():

@@ -23,29 +23,41 @@ def write_xdmf(folder: Path) -> Path | None:
     A regular mesh of nodes (cell, mass), and at every frame the fields as hyperslabs of the datasets in ``run.h5``.
     """
     with open_run(folder / "run.h5") as run:
-        fields = [name for name in FIELDS if name in run]
-        if not fields:
+        units = {name: run[name].attrs["units"] for name in FIELDS if name in run}
+        if not units:
             return None
-        times, shape = field_time(run), run[fields[0]].shape
+        times = field_time(run)
         cells = run["cell"].values
-        units = {name: run[name].attrs["units"] for name in fields}
-    grid = Xml.Element("Grid", Name="sample {row}", GridType="Uniform")  # of every frame
+        shape = run[next(iter(units))].shape
+
+    frame = _frame(cells, shape, units)
+    rows = range(0, shape[0], -(-shape[0] // MOST_FRAMES))
+    frames = [frame.format(row=row, time=float(times[row])) for row in rows]
+    write_text(folder / "run.xdmf", HEAD + "".join(frames) + TAIL)
+    return folder / "run.xdmf"
+
+
+def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> str:
+    """The grid of a frame, with ``{row}`` and ``{time}`` to be filled in, of fields (t, cell, dof) by their units."""
+    mesh = _words(shape[1:])
+    grid = Xml.Element("Grid", Name="sample {row}", GridType="Uniform")
     _child(grid, "Time", Value="{time!r}")
-    _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=_words(shape[1:]))
+    _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=mesh)
     geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
-    for values in ((cells[0], 1), (cells[1] - cells[0] if len(cells) > 1 else 1, 1)):  # cells along the slow axis
-        _child(geometry, "DataItem", _words(values), Dimensions="2", Format="XML")
-    for name in fields:
-        node = _child(grid, "Attribute", Name=f"{name} ({units[name]})", AttributeType="Scalar", Center="Node")
-        slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=_words(shape[1:]))
-        start_stride_count = f"{{row}} 0 0 1 1 1 1 {_words(shape[1:])}"
+    # Cells along the slow axis.
+    spacing = cells[1] - cells[0] if len(cells) > 1 else 1
+    _child(geometry, "DataItem", _words((cells[0], 1)), Dimensions="2", Format="XML")
+    _child(geometry, "DataItem", _words((spacing, 1)), Dimensions="2", Format="XML")
+
+    for name, unit in units.items():
+        node = _child(grid, "Attribute", Name=f"{name} ({unit})", AttributeType="Scalar", Center="Node")
+        slab = _child(node, "DataItem", ItemType="HyperSlab", Dimensions=mesh)
+        start_stride_count = f"{{row}} 0 0 1 1 1 1 {mesh}"
         _child(slab, "DataItem", start_stride_count, Dimensions="3 3", Format="XML")
         about = {"Format": "HDF", "NumberType": "Float", "Precision": "8", "Dimensions": _words(shape)}
         _child(slab, "DataItem", f"run.h5:/{name}", **about)
     Xml.indent(grid, " ")
-    frame, rows = Xml.tostring(grid, "unicode") + "\n", range(0, shape[0], -(-shape[0] // MOST_FRAMES))
-    write_text(folder / "run.xdmf", HEAD + "".join(frame.format(row=r, time=float(times[r])) for r in rows) + TAIL)
-    return folder / "run.xdmf"
+    return Xml.tostring(grid, "unicode") + "\n"
 
 
 def has_xdmf(folder: Path) -> bool:
@@ -55,20 +67,22 @@ def has_xdmf(folder: Path) -> bool:
 
 
 def _child(parent: Xml.Element, tag: str, text: str | None = None, **attributes: str) -> Xml.Element:
+    """Add an element to ``parent``, and return it."""
     child = Xml.SubElement(parent, tag, attributes)
     child.text = text
     return child
 
 
 def _words(values: Iterable[float]) -> str:
+    """Numbers in all digits, separated by blanks."""
     return " ".join(f"{value:.17g}" for value in values)
 
 
 def write_curves(path: Path) -> list[Path]:
     """Write the curves of the results in ``path`` as CSV files beside them, in ``curves/``; raises as ``open_results``.
 
-    Variables over the same dimensions share a table, with a row a point, their coordinates first, units in the head.
-    Fields and maps, over other dimensions than the axes of a sweep, are none.
+    Variables over the same dimensions are one table, with a row a point, their coordinates first, units in the head.
+    Fields and maps, over other dimensions than the axes of a sweep, are left out.
     """
     written = []
     with open_results(path) as data:
@@ -78,19 +92,28 @@ def write_curves(path: Path) -> list[Path]:
         for name, item in data.data_vars.items():
             if len(item.dims) == 1 or (axes and item.dims == axes):
                 groups.setdefault(tuple(map(str, item.dims)), []).append(str(name))
+
         for dims, names in groups.items():
+            if np.prod([data.sizes[dim] for dim in dims]) > MOST_ROWS:
+                continue
             table = data[names]
-            table = table.drop_vars([n for n, item in table.coords.items() if not set(item.dims) <= set(dims)])
-            if np.prod([data.sizes[dim] for dim in dims]) <= MOST_ROWS:
-                stem = f"{source.stem}-{'-'.join(dims) if dims != axes else 'members'}".replace("/", "-")
-                written.append(_write_table(source.parent / "curves" / f"{stem}.csv", table))
+            foreign = [name for name, item in table.coords.items() if not set(item.dims) <= set(dims)]
+            over = "members" if dims == axes else "-".join(dims)
+            stem = f"{source.stem}-{over}".replace("/", "-")
+            path_of_table = source.parent / "curves" / f"{stem}.csv"
+            written.append(_write_table(path_of_table, table.drop_vars(foreign)))
     return written
 
 
 def _write_table(path: Path, table: xr.Dataset) -> Path:
+    """Write a dataset of variables over the same dimensions as CSV."""
     frame = table.to_dataframe().reset_index()
-    units = {str(name): item.attrs.get("units", "1") for name, item in table.variables.items()}
-    frame.columns = [name if units.get(name, "1") in ("1", "") else f"{name} ({units[name]})" for name in frame.columns]
+    heads = []
+    for name in frame.columns:
+        unit = table[name].attrs.get("units", "1") if name in table.variables else "1"
+        heads.append(name if unit in ("1", "") else f"{name} ({unit})")
+    frame.columns = heads
+
     path.parent.mkdir(exist_ok=True)
     with atomic_write(path) as aside:
         frame.to_csv(aside, index=False, float_format="%.17g")

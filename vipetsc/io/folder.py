@@ -40,21 +40,25 @@ Difference = Callable[[str], str | None]
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What a folder of results holds; patterns as of ``Path.glob``.
+    """Kind of a folder of results; patterns of file names as for ``Path.glob``.
 
-    ``noun``: one of them; ``results``: what shows that a folder holds some; ``beside``: what else is theirs;
-    ``marker``: the file that names what the results are of; ``free``: its section that may change beside results.
+    ``noun``: what messages call one result; ``results``: files that show that a folder holds some; ``companions``: what
+    else goes with them; ``marker``: the file that names what the results are of; ``free``: its section that may change
+    without making the results others.
     """
 
     noun: str
     results: tuple[str, ...]
-    beside: tuple[str, ...] = ("figures", "curves")
+    companions: tuple[str, ...] = ("figures", "curves")
     marker: str = "case.toml"
     free: str = ""
 
 
 RUN = FolderKind(
-    "run", ("run.h5", "parts"), ("summary.json", "analysis.h5", "run.xdmf", "curves", "figures"), free="analysis"
+    noun="run",
+    results=("run.h5", "parts"),
+    companions=("summary.json", "analysis.h5", "run.xdmf", "curves", "figures"),
+    free="analysis",
 )
 BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures", "curves"))
 SEARCH = FolderKind("search", ("design.h5",))
@@ -69,12 +73,16 @@ KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, PAPER)
 class Claim:
     """The right to work in an output folder; ``path`` is the folder itself.
 
-    ``folder`` is where results are to be made, ``path/.new`` while they are to replace others; ``going_on`` tells
-    whether it holds results of the same case.
+    ``folder`` is where results are to be made, ``path/.new`` while they are to replace others; ``going_on``: whether it
+    holds results of the same case.
     """
 
     def __init__(self, comm: MPI.Comm, path: Path, kind: FolderKind, folder: Path, going_on: bool) -> None:
-        self.comm, self.path, self.kind, self.folder, self.going_on = comm, path, kind, folder, going_on
+        self.comm = comm
+        self.path = path
+        self.kind = kind
+        self.folder = folder
+        self.going_on = going_on
 
     def publish(self) -> None:
         """Let the results, which are whole, take the place of earlier ones; all ranks must call it."""
@@ -106,8 +114,8 @@ def claimed(
     All ranks must call it. The folder is made if it is missing, and what a killed command has left in it is put in
     order. ``text``, a resolved case, is kept in it. ``force`` begins anew: earlier results stay until new ones are
     published; what was begun so is gone on with by the next call without ``force``. ``resume`` goes on with what is
-    there, and nothing else. ``difference`` tells of an earlier text why its results are not those asked for, None if
-    they are; by default any change is a reason.
+    there, and nothing else. ``difference`` of an earlier text is why its results are not those asked for, None if they
+    are; by default any change is a reason.
 
     Raises FolderError if the path is a file, another process works in it, it holds anything but results of ``kind`` and
     of this case, which ``force`` allows to differ, or there is nothing to ``resume``.
@@ -123,56 +131,79 @@ def _claim(
 ) -> tuple[Path, bool]:
     """Where to work, and whether results of the same case are there."""
     sys.audit("vipetsc.claim", str(path))
-    marker, aside = path / kind.marker, path / NEW
-    foreign = [pattern for other in KINDS if other is not kind for pattern in other.results]
-    ours = not any(any(folder.glob(name)) for folder in (path, path / READY, path / MOVING) for name in foreign)
-    if ours:
+    # A swap that a kill has ended is finished first, unless the results are another verb's.
+    foreign = _holds_another_kind(path, kind)
+    if not foreign:
         _finish_swap(path, kind)
     filled = any(not entry.is_dir() or _results(entry) for entry in _results(path))
-    if not ours or (filled and not marker.exists()):
+    if foreign or (filled and not (path / kind.marker).exists()):
         raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
     if resume and not filled:
         raise FolderError(f"{path}: holds no {kind.noun} to resume; leave out --resume")
-    folder, going_on = path, filled and not force
-    if not going_on:
-        discard(aside)
-        folder = aside if filled else path
-        folder.mkdir(exist_ok=True)
-    else:
+
+    aside = path / NEW
+    going_on = filled and not force
+    if going_on:
+        # Results begun with --force are gone on with, if they are of this case; else those that they are to replace.
+        folder = path
         if (aside / kind.marker).exists() and not _problem(aside, kind, text, difference):
             folder = aside
         problem = _problem(folder, kind, text, difference)
         if problem:
             raise FolderError(f"{path}: {problem}")
+    else:
+        discard(aside)
+        folder = aside if filled else path
+        folder.mkdir(exist_ok=True)
+
     if not going_on or (folder / kind.marker).read_text(encoding="utf-8") != text:
         write_text(folder / kind.marker, text)
-    for temporary in [p for where in ("", "*/") for p in folder.glob(f"{where}.*.part")]:
-        if temporary.parent == folder or not (temporary.parent / LOCK).exists():  # where nobody else is writing
-            temporary.unlink(missing_ok=True)
+    _remove_temporary_files(folder)
     return folder, going_on
 
 
+def _holds_another_kind(path: Path, kind: FolderKind) -> bool:
+    """Whether ``path`` holds results of a kind other than ``kind``, in their place or on their way there."""
+    patterns = [pattern for other in KINDS if other is not kind for pattern in other.results]
+    matches = [folder.glob(pattern) for folder in (path, path / READY, path / MOVING) for pattern in patterns]
+    return any(any(files) for files in matches)
+
+
+def _remove_temporary_files(folder: Path) -> None:
+    """Remove what a killed command was writing, in ``folder`` and in the folders of its members."""
+    for temporary in [*folder.glob(".*.part"), *folder.glob("*/.*.part")]:
+        if temporary.parent == folder or not (temporary.parent / LOCK).exists():  # where nobody else is writing
+            temporary.unlink(missing_ok=True)
+
+
 def _results(folder: Path) -> list[Path]:
+    """The files and folders in ``folder`` that are results: their names do not begin with a dot."""
     return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
 
 
 def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference | None) -> str | None:
     """Why results in ``folder`` are not those of ``text``; None if they are."""
     earlier = (folder / kind.marker).read_text(encoding="utf-8")
-    if difference or earlier == text:
-        return difference(earlier) if difference else None
+    if difference:
+        return difference(earlier)
+    if earlier == text:
+        return None
     remedy = "--force replaces it, --out chooses another folder"
     try:
-        then, now = (dict(_keys(tomllib.loads(case))) for case in (earlier, text))
+        then = dict(_keys(tomllib.loads(earlier)))
+        now = dict(_keys(tomllib.loads(text)))
     except tomllib.TOMLDecodeError as error:
         return f"its {kind.marker} cannot be read ({error}); {remedy}"
-    differing = [
-        "{} = {} there, {} here".format(key, *(shorten(str(case.get(key, "nothing")), 60) for case in (then, now)))
-        for key in then | now
-        if then.get(key) != now.get(key) and key.partition(".")[0] != kind.free
-    ]
+
+    differing = []
+    for key in then | now:
+        if then.get(key) != now.get(key) and key.partition(".")[0] != kind.free:
+            values = [shorten(str(case.get(key, "nothing")), 60) for case in (then, now)]
+            differing.append(f"{key} = {values[0]} there, {values[1]} here")
+    if not differing:
+        return None
     more = f"; and {len(differing) - MOST_NAMED} more" if len(differing) > MOST_NAMED else ""
-    return f"holds another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}" if differing else None
+    return f"holds another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}"
 
 
 def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
@@ -186,13 +217,18 @@ def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 def _finish_swap(path: Path, kind: FolderKind) -> None:
     """Put results that are ready in the place of earlier ones, from wherever a kill has ended it; remove leftovers."""
-    ready, moving, old = path / READY, path / MOVING, path / OLD
+    ready = path / READY
+    moving = path / MOVING
+    old = path / OLD
+    # Earlier results go first; once ``ready`` has become ``moving``, none of them is left in the new ones' place.
     if ready.is_dir():
         old.mkdir(exist_ok=True)
-        for entry in [p for pattern in (kind.marker, *kind.results, *kind.beside) for p in path.glob(pattern)]:
-            if not entry.name.startswith("."):
-                os.replace(entry, old / entry.name)
+        for pattern in (kind.marker, *kind.results, *kind.companions):
+            for entry in list(path.glob(pattern)):
+                if not entry.name.startswith("."):
+                    os.replace(entry, old / entry.name)
         os.replace(ready, moving)
+
     if moving.is_dir():
         for entry in moving.iterdir():
             os.replace(entry, path / entry.name)
@@ -202,12 +238,15 @@ def _finish_swap(path: Path, kind: FolderKind) -> None:
 
 
 def provenance(comm: MPI.Comm) -> dict[str, Any]:
-    """Versions, when, where and how a result was made, as every output carries them; two of them never compare."""
+    """Record of versions and of when, where and how a result was made, which every output carries.
+
+    Two runs of one command differ in it.
+    """
     return origin() | {"ranks": comm.size}
 
 
 def origin() -> dict[str, Any]:
-    """What ``provenance`` tells of this rank alone, for what is made without the others.
+    """The record of ``provenance`` without the ranks, for results that one rank makes alone.
 
     PETSc options are those of its database: with those that are part of a case, which stand in it, all that were given.
     """
@@ -236,7 +275,7 @@ def revision() -> str:
         return "none"
     command = ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
     try:
-        told = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        described = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return "none"
-    return told.stdout.strip()
+    return described.stdout.strip()

@@ -32,7 +32,11 @@ def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str,
 
 def tabulated(layout: Mapping[str, tuple[str, str, str]], values: Mapping[str, Any]) -> Variables:
     """``values`` by name as variables, whose dimensions (separated by blanks), units and texts ``layout`` gives."""
-    return {name: variable(layout[name][0].split(), value, *layout[name][1:]) for name, value in values.items()}
+    variables = {}
+    for name, value in values.items():
+        dims, units, long_name = layout[name]
+        variables[name] = variable(dims.split(), value, units, long_name)
+    return variables
 
 
 def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
@@ -51,6 +55,7 @@ def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
 
 def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
     """Lay out ``data`` in ``file``; where several ranks share the file all must call it, and one has to ``write``."""
+    # Coordinates first: variables are attached to their scales.
     names = [*data.indexes, *(name for name in data.variables if name not in data.indexes)]
     for name in names:
         item = data.variables[name]
@@ -59,6 +64,7 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
         dataset = add_variable(file, name, item.dims, values.shape, dtype, item.attrs)
         if write and values.size:
             dataset[...] = values.astype(object) if values.dtype.kind == "U" else values
+
     for path, value in data.attrs.items():
         group, _, key = str(path).rpartition("/")
         node = file.require_group(group) if group else file
@@ -70,20 +76,21 @@ def add_variable(
 ) -> h5py.Dataset:
     """An empty dataset over coordinates added before; itself a coordinate if its one dimension has its name.
 
-    Its group gets soft links to coordinates outside it: what opens the group alone finds them there.
+    Its group gets soft links to coordinates outside it: programs that open the group alone find them there. Raises
+    ValueError if a dimension has no coordinate.
     """
-    group = PurePosixPath(str(name)).parent
+    path = PurePosixPath(str(name))
     if name in file:
         del file[str(name)]  # such a link
     dataset = file.create_dataset(str(name), tuple(shape), dtype)
     if tuple(dims) == (name,):
-        dataset.make_scale(PurePosixPath(str(name)).name)
+        dataset.make_scale(path.name)
     else:
         for axis, dim in enumerate(dims):
             if dim not in file:
                 raise ValueError(f"{name}: its dimension {dim} has no coordinate")
             dataset.dims[axis].attach_scale(file[str(dim)])
-            link = group / PurePosixPath(str(dim)).name
+            link = path.parent / PurePosixPath(str(dim)).name
             if str(link) not in file:
                 file[str(link)] = h5py.SoftLink(f"/{dim}")
     dataset.attrs.update(attributes)
@@ -103,11 +110,16 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
         links = _links(path)
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise OSError(f"{path} cannot be opened as a {kind}: {error}") from error
-    data, closing = _flat(groups, links), ExitStack()
+    data = _flat(groups, links)
+    closing = ExitStack()
     for group in groups.values():
         closing.callback(group.close)
     data.set_close(closing.close)
-    present = {str(part) for name in data.variables for part in (name, *PurePosixPath(str(name)).parents)}
+
+    present: set[str] = set()  # variables and groups
+    for name in data.variables:
+        path_in_file = PurePosixPath(str(name))
+        present |= {str(part) for part in (path_in_file, *path_in_file.parents)}
     missing = [name for name in needs if name not in present and name not in data.attrs]
     if missing:
         data.close()
@@ -119,29 +131,44 @@ def _links(path: str | Path) -> set[PurePosixPath]:
     """The soft links in a file, to coordinates outside a group."""
     with h5py.File(path) as file:
         groups = [file]
-        file.visititems(lambda name, item: groups.append(item) if isinstance(item, h5py.Group) else None)
-        links = ((g, key) for g in groups for key in g if isinstance(g.get(key, getlink=True), h5py.SoftLink))
-        return {PurePosixPath(group.name) / key for group, key in links}
+
+        def collect(_: str, item: h5py.Group | h5py.Dataset) -> None:
+            if isinstance(item, h5py.Group):
+                groups.append(item)
+
+        file.visititems(collect)
+        links = set()
+        for group in groups:
+            for key in group:
+                if isinstance(group.get(key, getlink=True), h5py.SoftLink):
+                    links.add(PurePosixPath(group.name) / key)
+    return links
 
 
 def _flat(groups: dict[str, xr.Dataset], links: Collection[PurePosixPath]) -> xr.Dataset:
     """All groups in one dataset, names of variables, dimensions and attributes by their paths; ``links`` are left out.
 
-    The coordinate of a dimension stands in the same group, or in the nearest one around it.
+    The coordinate of a dimension stands in the same group, or in the nearest one that holds it.
     """
-    nodes = {
-        PurePosixPath(g): data.drop_vars([n.name for n in links if n.parent == PurePosixPath(g)])
-        for g, data in groups.items()
-    }
-    scales = {node / str(n) for node, data in nodes.items() for n, item in data.variables.items() if item.dims == (n,)}
+    nodes: dict[PurePosixPath, xr.Dataset] = {}
+    scales: set[PurePosixPath] = set()
+    for group, data in groups.items():
+        node = PurePosixPath(group)
+        nodes[node] = data.drop_vars([link.name for link in links if link.parent == node])
+        scales |= {node / str(name) for name, item in nodes[node].variables.items() if item.dims == (name,)}
+
+    def coordinate(node: PurePosixPath, dim: Hashable) -> str:
+        """The path of the coordinate of a dimension in a group; of one without, as if it stood there."""
+        candidates = [group / str(dim) for group in (node, *node.parents)]
+        nearest = next((path for path in candidates if path in scales), candidates[0])
+        return str(nearest).strip("/")
+
     variables: dict[str, xr.Variable] = {}
     attributes: dict[str, Any] = {}
     for node, data in nodes.items():
         for name, item in data.variables.items():
-            around = [[above / str(dim) for above in (node, *node.parents)] for dim in item.dims]
-            dims = [next((path for path in paths if path in scales), paths[0]) for paths in around]
             renamed = item.copy(deep=False)  # values stay in the file
-            renamed.dims = tuple(str(dim).strip("/") for dim in dims)
+            renamed.dims = tuple(coordinate(node, dim) for dim in item.dims)
             variables[str(node / str(name)).strip("/")] = renamed
         attributes |= {str(node / str(key)).strip("/"): value for key, value in data.attrs.items()}
     return xr.Dataset(variables, attrs=attributes)

@@ -16,7 +16,7 @@ import xarray as xr
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.chain import cells_between
 
-# Of the files in a folder, the one that is opened.
+# Files that are opened where a folder is named: the first of them that it holds.
 FIRST = "run.h5", "optimum.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
 Selectable = TypeVar("Selectable", xr.Dataset, xr.DataArray)
 
@@ -32,7 +32,7 @@ def open_run(path: str | Path) -> xr.Dataset:
 
 
 def open_results(path: str | Path) -> xr.Dataset:
-    """Any file of results, or the one in a folder that tells most, as ``vipetsc.open``; a context manager.
+    """Any file of results, or of a folder the first of ``FIRST``, as ``vipetsc.open``; a context manager.
 
     Names are paths in the file, units attributes of the variables, the resolved case (TOML) is ``attrs["case"]``;
     ``Case.of`` reads it. Episodes of a run have their ``impacts/onset`` as a coordinate. Raises ValueError for a folder
@@ -43,7 +43,8 @@ def open_results(path: str | Path) -> xr.Dataset:
         return open_ensemble(path)
     files = [path]
     if path.is_dir():
-        files = [path / name for name in FIRST if (path / name).exists()][:1] or sorted(path.glob("branch-*.h5"))
+        present = [path / name for name in FIRST if (path / name).exists()]
+        files = present[:1] or sorted(path.glob("branch-*.h5"))
     if len(files) != 1:
         raise ValueError(f"{path}: holds {', '.join(file.name for file in files) or 'no results'}; name a file")
     data = open_netcdf(files[0], "result")
@@ -65,9 +66,12 @@ def field_interval(run: xr.Dataset) -> float:
 def leading_site(run: xr.Dataset) -> int | None:
     """Index (0-based) of the site nearest to the drive, which the wave reaches first; None without sites."""
     cells = run["sites/cell"].values
+    if not len(cells):
+        return None
     case = tomllib.loads(run.attrs["case"])
-    lattice, drive = case["lattice"], case["drive"]["cell"]
-    return int(np.argmin(cells_between(cells, drive, lattice["cells"], lattice["ends"]))) if len(cells) else None
+    lattice = case["lattice"]
+    distance = cells_between(cells, case["drive"]["cell"], lattice["cells"], lattice["ends"])
+    return int(np.argmin(distance))
 
 
 def nearest_cell(run: xr.Dataset, cell: int) -> int:
@@ -83,34 +87,38 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
     ValueError if it is no ensemble of ours, or one of an earlier version.
     """
     folder = Path(folder)
-    if reason := outdated(folder):
+    reason = outdated(folder)
+    if reason:
         raise ValueError(reason)
     with open_netcdf(folder / "ensemble.h5", "sweep's ensemble", ("status", "case")) as file:
         data = file.assign_attrs(folder=str(folder)).load()
-    keys = [key for group in tomllib.loads(data.attrs["case"])["sweep"]["zip"] for key in group]
-    data = data.set_coords(
-        [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in keys]
-    )
+
+    zipped = [key for group in tomllib.loads(data.attrs["case"])["sweep"]["zip"] for key in group]
+    further = [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in zipped]
+    data = data.set_coords(further)
     number = np.arange(data["status"].size).reshape(data["status"].shape)
     return data.assign(number=(data["status"].dims, number, {"long_name": "number of the member, from 0"}))
 
 
 def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
-    """The ensemble without the axis of its samples, if it has one: means in place of what was measured of each.
+    """The ensemble without the axis of its samples, if it has one: means stand in the place of single measures.
 
-    What has no mean is that of the first sample; ``statistics/<name>/quantiles`` stay.
+    A measure without a mean is that of the first sample; ``statistics/<name>/quantiles`` stay.
     """
     if "statistics/samples" not in ensemble:
         return ensemble
     (seed,) = (dim for dim in axes(ensemble) if ensemble[dim].attrs["long_name"] == "disorder.seed")
     first = ensemble.isel({seed: 0}, drop=True)
-    means = {name: (f"statistics/{name}/mean", f"statistics/{name}") for name in map(str, ensemble.data_vars)}
-    replaced = {name: first[path] for name, paths in means.items() for path in paths if path in first}
-    return first.assign({name: item.assign_attrs(ensemble[name].attrs) for name, item in replaced.items()})
+    means = {}
+    for name in map(str, ensemble.data_vars):
+        for path in (f"statistics/{name}/mean", f"statistics/{name}"):
+            if path in first:
+                means[name] = first[path].assign_attrs(ensemble[name].attrs)
+    return first.assign(means)
 
 
 def outdated(folder: Path) -> str:
-    """Empty; of a sweep of an earlier version, which has a folder for every member, what is to be done about it."""
+    """Message about a sweep of an earlier version, which has a folder for every member; empty for one of this."""
     remedy = "the verb sweep makes it again with --force, or elsewhere with --out"
     text = f"{folder}: holds a sweep of an earlier version, a folder for every member; {remedy}"
     return text if (folder / "linear").is_dir() else ""
@@ -127,14 +135,16 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
         if name not in data.coords or data[name].ndim != 1:
             raise KeyError(f"{name} is no coordinate; there are {', '.join(map(str, data.coords))}")
         coordinate = data[name].values
-        numeric = np.issubdtype(coordinate.dtype, np.number)
-        match = np.isclose(coordinate, value, rtol=1e-5, atol=0) if numeric else coordinate == value
+        if np.issubdtype(coordinate.dtype, np.number):
+            match = np.isclose(coordinate, value, rtol=1e-5, atol=0)
+        else:
+            match = coordinate == value
         dimension = str(data[name].dims[0])
         matches[dimension] = matches.get(dimension, np.array(True)) & match
         if not matches[dimension].any():
             others = [n for n in wanted if n != name and n in data.coords and data[n].dims == data[name].dims]
-            beside = f" beside {', '.join(others)}" if others else ""
-            raise KeyError(f"no member has {name} = {value!r}{beside}; there are {list(coordinate)}")
+            with_others = f" beside {', '.join(others)}" if others else ""
+            raise KeyError(f"no member has {name} = {value!r}{with_others}; there are {list(coordinate)}")
     return data.isel({dimension: int(np.argmax(match)) for dimension, match in matches.items()})
 
 
@@ -149,18 +159,18 @@ def member_folder(member: xr.Dataset) -> Path:
 
 
 def curves(ensemble: xr.Dataset, along: str = "amplitude") -> Iterator[tuple[xr.Dataset, int]]:
-    """Every curve over the axis ``along`` with a member that came out, and the number of the first such.
+    """Curves over the axis ``along`` that have a member without failure, each with the number of the first such.
 
-    Nothing if the sweep has no such axis.
+    There are none if the sweep has no such axis.
     """
     others = [name for name in axes(ensemble) if name != along]
     if len(others) == len(axes(ensemble)):
         return
     for index in np.ndindex(*(ensemble.sizes[name] for name in others)):
         curve = ensemble.isel(dict(zip(others, index, strict=True)))
-        came_out = curve["number"].values[np.isfinite(curve["contact_episodes"].values)]
-        if came_out.size:
-            yield curve, int(came_out[0])
+        succeeded = curve["number"].values[np.isfinite(curve["contact_episodes"].values)]
+        if succeeded.size:
+            yield curve, int(succeeded[0])
 
 
 def whole_members(ensemble: xr.Dataset) -> Iterator[tuple[xr.Dataset, Path]]:

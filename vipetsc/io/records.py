@@ -1,6 +1,6 @@
 """Records of a long task: lines of JSON, appended as they come, each with a checksum.
 
-A kill loses at most the line that is being written. What a line with a wrong checksum told is as if it had never been.
+A kill loses at most the line that is being written. A line with a wrong checksum counts as if it had not been written.
 """
 
 import json
@@ -26,13 +26,13 @@ class Line(NamedTuple):
     length: int
 
     def record(self) -> Record:
-        """What the line tells."""
+        """The record, read from the file."""
         with self.path.open("rb") as file:
             file.seek(self.start)
-            return _told(file.read(self.length))
+            return _parsed(file.read(self.length))
 
 
-def _told(line: bytes) -> Record:
+def _parsed(line: bytes) -> Record:
     """The record in a ``line``, without its checksum."""
     return cast(Record, json.loads(line[:-CHECK_LENGTH] + b"}"))
 
@@ -52,12 +52,19 @@ class RecordFile:
             sys.audit("vipetsc.append", str(self.path))
             if self._file is None:
                 self._file = self.path.open("a+b", buffering=0)
-                if self._file.tell() and (self._file.seek(-1, 2), self._file.read(1))[1] != b"\n":
-                    self._file.write(b"\n")  # a line that was cut off must not spoil this one
+                self._end_last_line()
             while line:  # a disk that is nearly full takes a part
                 line = line[self._file.write(line) :]
         except OSError as error:
             raise unwritten(self.path, error) from error
+
+    def _end_last_line(self) -> None:
+        """Begin a new line: one that was cut off must not spoil the next."""
+        if not self._file.tell():
+            return
+        self._file.seek(-1, 2)
+        if self._file.read(1) != b"\n":
+            self._file.write(b"\n")
 
     def close(self) -> None:
         """Close the file until the next record."""
@@ -67,7 +74,7 @@ class RecordFile:
 
 
 def read_records(path: Path, damaged: Callable[[str], None]) -> Iterator[tuple[Record, Line]]:
-    """The records in ``path`` and where they stand; ``damaged`` is told of lines that are not whole.
+    """The records in ``path`` and where they stand; ``damaged`` is called with a message for a line that is not whole.
 
     Raises OSError if the file cannot be read.
     """
@@ -76,7 +83,7 @@ def read_records(path: Path, damaged: Callable[[str], None]) -> Iterator[tuple[R
     with path.open("rb") as file:
         for number, line in enumerate(file, 1):
             if line.endswith(CHECK % zlib.crc32(line[:-CHECK_LENGTH] + b"}")):
-                yield _told(line), Line(path, start, len(line))
+                yield _parsed(line), Line(path=path, start=start, length=len(line))
             else:
                 damaged(f"{path}, line {number}: cut off or damaged; what it told is made again")
             start += len(line)
@@ -86,10 +93,11 @@ def merge_records(path: Path, lines: Iterable[Line], merged: Iterable[Path]) -> 
     """Write the ``lines`` to ``path``, whole or not at all, and remove the files that were ``merged``."""
     with atomic_write(path) as aside, aside.open("wb") as file, ExitStack() as stack:
         sources: dict[Path, BinaryIO] = {}
-        for old, start, length in lines:
-            if old not in sources:
-                sources[old] = stack.enter_context(old.open("rb"))
-            sources[old].seek(start)
-            file.write(sources[old].read(length))
+        for line in lines:
+            if line.path not in sources:
+                sources[line.path] = stack.enter_context(line.path.open("rb"))
+            sources[line.path].seek(line.start)
+            file.write(sources[line.path].read(line.length))
+
     for old in merged:
         old.unlink(missing_ok=True)

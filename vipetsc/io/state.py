@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import xarray as xr
 
 from vipetsc.io.netcdf import open_netcdf
 
@@ -33,20 +32,31 @@ class State(NamedTuple):
         """
         with open_netcdf(path, "state") as file:
             prefix = "states/" if "states/displacement" in file else ""
-            if missing := [n for n in ("displacement", "velocity", "cell") if prefix + n not in file]:
-                raise ValueError(f"{path} holds no state: it has no {', '.join(prefix + name for name in missing)}")
-            u, v, cell = (file[prefix + name] for name in ("displacement", "velocity", "cell"))
-            told: dict[str, Any] = {}
+            names = [prefix + name for name in ("displacement", "velocity", "cell")]
+            missing = [name for name in names if name not in file]
+            if missing:
+                raise ValueError(f"{path} holds no state: it has no {', '.join(missing)}")
+            u, v, cell = (file[name] for name in names)
+
+            origin: dict[str, Any] = {}  # which state of the file it is
             if prefix:
-                number = _row(u, np.arange(1, len(u) + 1), orbit, 0.5, f"{path} has orbits")
-                told = {"orbit": number + 1, "period": float(file["states/period"][number])}
+                row = _row(np.arange(1, len(u) + 1), orbit, 0.5, f"{path} has orbits")
+                origin = {"orbit": row + 1, "period": float(file["states/period"][row])}
             elif u.ndim == 3:
                 times = file[str(u.dims[0])].values
                 interval = float(times[1] - times[0]) if len(times) > 1 else np.inf
-                number = _row(u, times, time, 0.5 * interval, f"{path} has samples in s")
-                told = {"time": float(times[number]), "case": file.attrs.get("case")}
-            here, rate = (np.asarray(field[number] if u.ndim == 3 else field, float) for field in (u, v))
-            state = cls(cell.values.astype(np.int64), here, rate, **told)
+                row = _row(times, time, 0.5 * interval, f"{path} has samples in s")
+                origin = {"time": float(times[row]), "case": file.attrs.get("case")}
+            if u.ndim == 3:
+                u = u[row]
+                v = v[row]
+            state = cls(
+                cell=cell.values.astype(np.int64),
+                displacement=np.asarray(u, float),
+                velocity=np.asarray(v, float),
+                **origin,
+            )
+
         if not (np.isfinite(state.displacement).all() and np.isfinite(state.velocity).all()):
             raise ValueError(f"{path} holds a state that is not finite")
         return state
@@ -54,28 +64,35 @@ class State(NamedTuple):
     def on(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
         """Displacement and velocity (cell, dof) of cells ``start`` to ``stop`` (0-based, half open)."""
         inside = (self.cell > start) & (self.cell <= stop)
+        rows = self.cell[inside] - 1 - start
         u, v = np.zeros((2, stop - start, self.velocity.shape[1]))
-        for field, values in ((u, self.displacement), (v, self.velocity)):
-            field[self.cell[inside] - 1 - start] = values[inside]
+        u[rows] = self.displacement[inside]
+        v[rows] = self.velocity[inside]
         return u, v
 
     def frequency(self) -> float | None:
         """Frequency in rad/s of an orbit, or that of a run's drive; None if it is not known."""
         if self.period:
             return 2 * np.pi / self.period
-        return float(tomllib.loads(self.case)["drive"]["frequency"]) if self.case else None
+        if self.case:
+            return float(tomllib.loads(self.case)["drive"]["frequency"])
+        return None
 
     def largest(self, frequency: float) -> tuple[float, int]:
         """Largest displacement, or velocity over ``frequency`` in rad/s, in m, and the cell (1-based) that has it."""
-        each = np.maximum(np.abs(self.displacement), np.abs(self.velocity) / frequency).max(axis=1, initial=0.0)
-        return (float(each.max()), int(self.cell[np.argmax(each)])) if each.size else (0.0, 1)
+        if not self.cell.size:
+            return 0.0, 1
+        sizes = np.maximum(np.abs(self.displacement), np.abs(self.velocity) / frequency).max(axis=1, initial=0.0)
+        return float(sizes.max()), int(self.cell[np.argmax(sizes)])
 
 
-def _row(field: xr.DataArray, values: np.ndarray, wanted: float | None, reach: float, text: str) -> int:
-    """The row of the value ``wanted``, within ``reach``, or the last one; raises ValueError."""
+def _row(values: np.ndarray, wanted: float | None, reach: float, text: str) -> int:
+    """The row of the value ``wanted``, within ``reach``, or the last one; raises ValueError, which ``text`` begins."""
     if not len(values):
         raise ValueError(f"{text.split(' has ')[0]} holds no state: it is empty")
-    row = len(values) - 1 if wanted is None else int(np.argmin(np.abs(values - wanted)))
-    if wanted is not None and abs(values[row] - wanted) > reach:
+    if wanted is None:
+        return len(values) - 1
+    row = int(np.argmin(np.abs(values - wanted)))
+    if abs(values[row] - wanted) > reach:
         raise ValueError(f"{text} from {values[0]:g} to {values[-1]:g}, not {wanted:g}")
     return row
