@@ -1,4 +1,4 @@
-"""Work and precision of vipetsc's engines beside their peers, interleaved, in CPU time at equal error.
+"""Work and precision of vipetsc's engines and of their peers, interleaved, in CPU time at equal error.
 
 The lattice is the four-band one of 300 cells with its five sites, A = 30 N, conservative; all solvers return the
 velocities every 2e-4 s, on one core. Then members of a sweep, the paper's budget (from where ``paper`` left it),
@@ -17,6 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
+# Before numpy is imported: every solver on one core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -71,6 +72,7 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="where results go")
     parser.add_argument("--paper", type=Path, default=Path("runs/paper"), help="folder that `paper` left")
     parser.add_argument("--table", action="store_true", help="print the README's tables from the last results, no more")
+
     options = parser.parse_args(arguments)
     if options.rounds is not None and options.rounds < 1:
         parser.error(f"--rounds {options.rounds}: must be at least 1")
@@ -81,11 +83,19 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
 
 
 def measure(case: Case, options: argparse.Namespace) -> dict:
-    """All parts asked for."""
+    """The results of all parts asked for, as ``latest.json`` holds them."""
     parts = options.only or PARTS
-    found: dict = {"mode": "quick" if options.quick else "full", "rounds": options.rounds, "rows": [], "ratios": {}}
-    found |= {"cells": case.lattice.cells, "degrees_of_freedom": case.lattice.cells * case.lattice.unit_cell().dofs}
-    found |= {"case": case.model_dump(by_alias=True, mode="json")}
+    cells = case.lattice.cells
+    found: dict = {
+        "mode": "quick" if options.quick else "full",
+        "rounds": options.rounds,
+        "rows": [],
+        "ratios": {},
+        "cells": cells,
+        "degrees_of_freedom": cells * case.lattice.unit_cell().dofs,
+        "case": case.model_dump(by_alias=True, mode="json"),
+    }
+
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         if "precision" in parts:
@@ -106,11 +116,13 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
             found["builds"] = builds(options.sizes)
         if options.large:
             found["large"] = large(Path(folder), 1)
+
     found["minutes"] = (time.perf_counter() - begin) / 60
-    return found | {"provenance": provenance(MPI.COMM_WORLD)}
+    found["provenance"] = provenance(MPI.COMM_WORLD)
+    return found
 
 
-def tell(found: dict) -> None:
+def print_rows(found: dict) -> None:
     """Print rows and ratios for people."""
     for row in found["rows"]:
         result = row.get("failure") or f"error {row['error']:.2e}  {row['seconds']:.3f} s CPU"
@@ -120,8 +132,9 @@ def tell(found: dict) -> None:
             low, high = found["spread"][name]
             print(f"{name}: {ratio:.2f} ({low:.2f} to {high:.2f})")
     for run in found.get("large", {}).get("runs", []):
-        print(f"runs/large.toml, {run['ranks']} rank(s): {run['steps']} steps, {run['wall']:.1f} s, "
-              f"{run['peak_gib_a_rank']:.2f} GiB a rank, triad {run['triad_gb_per_second']:.1f} GB/s")  # fmt: skip
+        speed = f"{run['steps']} steps, {run['wall']:.1f} s"
+        memory = f"{run['peak_gib_a_rank']:.2f} GiB a rank, triad {run['triad_gb_per_second']:.1f} GB/s"
+        print(f"runs/large.toml, {run['ranks']} rank(s): {speed}, {memory}")
     print(f"measured in {found['minutes']:.1f} min\n")
 
 
@@ -135,16 +148,19 @@ def main(arguments: list[str]) -> int:
             return 2
         print(markdown(json.loads(latest.read_text(encoding="utf-8"))), end="")
         return 0
+
+    # Refused before anything is measured, if the peers cannot solve it.
     try:
         case = lattice_case(options.set)
         parameters(case.model())
     except ValueError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
+
     found = measure(case, options)
     options.out.mkdir(parents=True, exist_ok=True)
     write_text(latest, json.dumps(found, indent=2) + "\n")
-    tell(found)
+    print_rows(found)
     print(markdown(found))
     for path in draw(found, options.out):
         print(path)

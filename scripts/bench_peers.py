@@ -1,4 +1,4 @@
-"""The peers: C++ odeint, ARKODE and plain TSRK compiled from scripts/peers, diffrax, SciPy's DOP853 (numpy, numba).
+"""Solvers to compare with: C++ odeint, ARKODE and plain TSRK from scripts/peers, diffrax, SciPy's DOP853.
 
 All of them solve the case's own lattice and return its velocities at the case's samples. ARKODE ends its steps at
 contact changes by its root finding; the others step over kinks of the contact law. Conservative cases only.
@@ -50,9 +50,12 @@ Solver = Callable[[Case], Solution]
 
 def parameters(model: Model) -> str:
     """The lattice as the C++ peers read it; raises ValueError for what they do not know."""
-    chain, contact, drive = model.chain, model.contact, model.drive
+    chain = model.chain
+    contact = model.contact
+    drive = model.drive
     if contact.restitution != 1 or chain.ends == "periodic":
         raise ValueError("the peers know conservative lattices with fixed or free ends only")
+
     couplings = chain.cell.couplings()
     lines = [
         ("lattice", chain.cells, chain.cell.dofs, int(chain.ends == "fixed")),
@@ -80,6 +83,8 @@ def compile_peers(folder: Path) -> dict[str, Path]:
         petsc = subprocess.run(["pkg-config", "--cflags", "--libs", "PETSc"], capture_output=True, text=True)
         if petsc.returncode == 0:
             commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc.stdout.split()]
+
+    # All at once: each takes some seconds.
     programs = {name: (folder / name).resolve() for name in commands}
     building = {name: subprocess.Popen([*commands[name], "-o", str(path)]) for name, path in programs.items()}
     ended = {name: compiler.wait() for name, compiler in building.items()}
@@ -91,16 +96,18 @@ def compiled(program: Path, method: str, folder: Path) -> Solver:
 
     def solve(case: Case) -> Solution:
         model = case.model()
-        given, output = folder / "parameters.txt", folder / "samples.bin"
+        given = folder / "parameters.txt"
+        output = folder / "samples.bin"
         given.write_text(parameters(model))
         rtol = case.time.rtol
-        command = list(map(str, [program, given, method, rtol, WEAKEST * rtol, output]))
+        command = [str(word) for word in (program, given, method, rtol, WEAKEST * rtol, output)]
         try:
             ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
         except subprocess.TimeoutExpired as error:
             raise RuntimeError(f"{program.name} {method} took more than {PATIENCE} s") from error
         if ended.returncode:
-            raise RuntimeError(f"{program.name} {method} failed: {(ended.stderr.strip() or '?').splitlines()[-1]}")
+            reason = (ended.stderr.strip() or "?").splitlines()[-1]
+            raise RuntimeError(f"{program.name} {method} failed: {reason}")
         return _solution(output, model, json.loads(ended.stdout)["cpu_seconds"])
 
     return solve
@@ -114,12 +121,14 @@ def _solution(output: Path, model: Model, seconds: float) -> Solution:
 
 def diffrax(folder: Path) -> Solver:
     """diffrax's Dopri8 as a solver: one process, which compiles once, on one core; it ends with its input."""
-    given, output = folder / "parameters.txt", folder / "diffrax.bin"
-    core = min(os.sched_getaffinity(0))
+    given = folder / "parameters.txt"
+    output = folder / "diffrax.bin"
+    core = min(os.sched_getaffinity(0))  # every solver has one
     command = ["taskset", "-c", str(core), str(DIFFRAX), str(SOURCES / "diffrax_dopri8.py"), str(output)]
 
     @cache
     def process() -> subprocess.Popen[str]:
+        # This package's path would lead diffrax to another numpy.
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | ONE_THREAD
         return subprocess.Popen(
             command,
@@ -131,14 +140,15 @@ def diffrax(folder: Path) -> Solver:
         )
 
     def solve(case: Case) -> Solution:
-        model, running = case.model(), process()
+        model = case.model()
+        running = process()
         given.write_text(parameters(model))
         assert running.stdin and running.stdout
         try:
             running.stdin.write(f"{given} {case.time.rtol} {WEAKEST * case.time.rtol}\n")
             running.stdin.flush()
         except BrokenPipeError:
-            pass
+            pass  # it has ended: there will be no answer
         answer = running.stdout.readline()
         if not answer:
             raise RuntimeError("diffrax failed")
@@ -148,7 +158,7 @@ def diffrax(folder: Path) -> Solver:
 
 
 def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
-    """SciPy's DOP853 as a solver, on the right-hand side that ``right_hand_side`` makes of a model."""
+    """SciPy's DOP853 as a solver; ``right_hand_side`` returns that of a model."""
 
     def solve(case: Case) -> Solution:
         model = case.model()
@@ -156,6 +166,7 @@ def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
         n = model.chain.masses().size
         times = np.arange(model.samples) * model.sample_interval
         atol = np.repeat(model.atol, n)
+
         begin = time.process_time()
         found = solve_ivp(slope, (0.0, times[-1]), np.zeros(2 * n), "DOP853", times, rtol=case.time.rtol, atol=atol)
         if not found.success:
@@ -173,10 +184,13 @@ def _pairs(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def plain_right_hand_side(model: Model) -> RightHandSide:
     """The lattice in numpy, its stiffness as a sparse matrix."""
-    stiffness, inverse_mass = model.chain.stiffness_matrix().tocsr(), 1 / model.chain.masses()
+    stiffness = model.chain.stiffness_matrix().tocsr()
+    inverse_mass = 1 / model.chain.masses()
+    n = inverse_mass.size
     host, resonator, clearance = _pairs(model.chain)
-    contact, drive = model.contact, model.drive
-    driven, n = model.drive_cell * model.chain.cell.dofs + model.drive_mass, inverse_mass.size
+    driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
+    contact = model.contact
+    drive = model.drive
 
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         u = y[:n]
@@ -191,15 +205,20 @@ def plain_right_hand_side(model: Model) -> RightHandSide:
 
 
 def compiled_right_hand_side(model: Model) -> RightHandSide:
-    """The same by numba, row by row."""
+    """The lattice by numba, row by row of its stiffness."""
     driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
     return _compile(model.chain, model.contact, model.drive, driven)
 
 
 @cache
 def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> RightHandSide:
-    stiffness, inverse_mass = chain.stiffness_matrix().tocsr(), 1 / chain.masses()
-    first, columns, values = stiffness.indptr, stiffness.indices, stiffness.data
+    # Arrays and numbers of this function are constants in the kernel: it is compiled for one lattice.
+    stiffness = chain.stiffness_matrix().tocsr()
+    first = stiffness.indptr
+    columns = stiffness.indices
+    values = stiffness.data
+    inverse_mass = 1 / chain.masses()
+    n = inverse_mass.size
     host, resonator, clearance = _pairs(chain)
     contact, exponent, n = law.stiffness, law.exponent, inverse_mass.size
     amplitude, frequency, cycles, end = drive.window_amplitude, drive.frequency, drive.cycles, drive.duration
@@ -208,19 +227,23 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         f = np.empty_like(y)
         f[:n] = y[n:]
+
         for i in range(n):
             total = 0.0
             for k in range(first[i], first[i + 1]):
                 total -= values[k] * y[columns[k]]
             f[n + i] = total * inverse_mass[i]
+
         for site in range(host.size):
-            h, r = host[site], resonator[site]
+            h = host[site]
+            r = resonator[site]
             w = y[r] - y[h]
             x = abs(w) - clearance[site]
             if x > 0.0:
                 force = np.copysign(contact * x**exponent, w)
                 f[n + h] += force * inverse_mass[h]
                 f[n + r] -= force * inverse_mass[r]
+
         if 0.0 < t < end:
             phase = frequency * t
             f[n + driven] += amplitude * (1.0 - np.cos(phase / cycles)) * np.sin(phase) * inverse_mass[driven]
@@ -233,6 +256,7 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
 def peers(folder: Path) -> dict[str, Solver]:
     """Every peer this machine has, by name; ``folder`` takes programs and passing files."""
     programs = compile_peers(folder)
+    # Name: program and method.
     methods = {
         "odeint dopri5": ("odeint", "dopri5"),
         "odeint fehlberg78": ("odeint", "fehlberg78"),
@@ -240,11 +264,12 @@ def peers(folder: Path) -> dict[str, Solver]:
         "TSRK 5dp": ("tsrk", "5dp"),
         "TSRK 8vr": ("tsrk", "8vr"),
     }
-    found = {
-        name: compiled(programs[program], method, folder)
-        for name, (program, method) in methods.items()
-        if program in programs
-    }
+    solvers = {}
+    for name, (program, method) in methods.items():
+        if program in programs:
+            solvers[name] = compiled(programs[program], method, folder)
     if DIFFRAX.exists():
-        found["diffrax Dopri8"] = diffrax(folder)
-    return found | {"DOP853 numba": scipys(compiled_right_hand_side), "DOP853 numpy": scipys(plain_right_hand_side)}
+        solvers["diffrax Dopri8"] = diffrax(folder)
+    solvers["DOP853 numba"] = scipys(compiled_right_hand_side)
+    solvers["DOP853 numpy"] = scipys(plain_right_hand_side)
+    return solvers

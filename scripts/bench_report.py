@@ -1,4 +1,4 @@
-"""What the bench shows, from ``latest.json`` alone: Markdown tables and pictures."""
+"""Tables in Markdown and pictures of a bench, from ``latest.json`` alone."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def markdown(found: dict[str, Any]) -> str:
         "scaling": _scaling_table,
         "builds": _builds_table,
     }
-    told = [tell(found) for key, tell in parts.items() if found.get(key)]
-    told += [model_tables(found.get("scaling", [])), target_table(found)]
-    return "\n\n".join(filter(None, told)) + "\n"
+    sections = [part(found) for key, part in parts.items() if found.get(key)]
+    sections += [model_tables(found.get("scaling", [])), target_table(found)]
+    return "\n\n".join(filter(None, sections)) + "\n"
 
 
 def _precision_table(found: dict[str, Any]) -> str:
@@ -63,17 +63,27 @@ def _precision_table(found: dict[str, Any]) -> str:
         f"| CPU seconds (ratio to {engine}) at error | " + " | ".join(_power(e) for e in ERRORS) + " |",
         "|---|" + "---|" * len(ERRORS),
     ]
+
     for name in names:
         cells = []
         for wanted in ERRORS:
-            points, own = curve(found, name), name.startswith("vipetsc")
-            seconds = at_equal_error(points, wanted, own) if wanted >= reference["floor"] else None
+            seconds = None
+            if wanted >= reference["floor"]:  # below it, references differ
+                seconds = at_equal_error(curve(found, name), wanted, bound=name.startswith("vipetsc"))
             ratio = found["ratios"].get(f"{name} / {engine} at {wanted:g}")
-            cells.append("-" if seconds is None else f"{seconds:.3g}" + (f" ({ratio:.3g})" if ratio else ""))
+            cells.append(_seconds_and_ratio(seconds, ratio))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
+
     apart = ", ".join(f"{name} {value:.1e}" for name, value in reference["separation"].items())
     lines += ["", f"Reference: {reference['solver']}, to {reference['end']:g} s; distances from it: {apart}."]
     return "\n".join(lines)
+
+
+def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
+    """An entry of the table: CPU seconds, with the ratio if it is known; "-" for none."""
+    if seconds is None:
+        return "-"
+    return f"{seconds:.3g} ({ratio:.3g})" if ratio else f"{seconds:.3g}"
 
 
 def _whole_sentence(found: dict[str, Any]) -> str:
@@ -96,12 +106,12 @@ def _builds_table(found: dict[str, Any]) -> str:
         "|---" * 7 + "|",
     ]
     for row in found["builds"]:
-        told = f"| {row['cells']:,} | {row['sites']:,} | {row['ranks']} | "
+        lattice = f"{row['cells']:,} | {row['sites']:,} | {row['ranks']}"
         if "failure" in row:
-            lines.append(told + "failed | | | |")
+            lines.append(f"| {lattice} | failed | | | |")
             continue
         written = f"{row['file_gb']:.2g} | {row['write_s']:.2g}"
-        lines.append(told + f"{row['set_up_s']:.2g} | {written} | {row['peak_gib_a_rank']:.2f} |")
+        lines.append(f"| {lattice} | {row['set_up_s']:.2g} | {written} | {row['peak_gib_a_rank']:.2f} |")
     return "\n".join(lines)
 
 
@@ -111,6 +121,7 @@ def _scaling_table(found: dict[str, Any]) -> str:
         " | share of bandwidth limit |",
         "|---|---|---|---|---|---|---|",
     ]
+
     for row in found["scaling"]:
         if "failure" in row:
             lines.append(f"| {row['engine']} | {row['cells']:,} | | failed | | | |")
@@ -132,10 +143,12 @@ def draw(found: dict[str, Any], folder: Path) -> list[Path]:
     pictures = {"rows": ("work-precision", work_precision_figure), "scaling": ("scaling", scaling_figure)}
     found = found | {"scaling": [row for row in found.get("scaling", []) if "failure" not in row]}
     paths = []
-    for name, make in (picture for key, picture in pictures.items() if found.get(key)):
-        paths.append(folder / f"{name}.png")
-        with style.rc_style(), atomic_write(paths[-1]) as aside:
-            make(found).savefig(aside, format="png")
+    for key, (name, make) in pictures.items():
+        if found.get(key):
+            path = folder / f"{name}.png"
+            with style.rc_style(), atomic_write(path) as aside:
+                make(found).savefig(aside, format="png")
+            paths.append(path)
     return paths
 
 
@@ -148,12 +161,15 @@ def work_precision_figure(found: dict[str, Any]) -> Figure:
         if points.size:
             colour, marker, line = _LOOKS.get(name, _OTHER)
             axes.loglog(*points.T, line, color=colour, marker=marker, ms=3, label=name)
+
+    # Errors below the distance of the references cannot be told from theirs.
     floor = max(found["reference"]["separation"].values())
     left = min(axes.get_xlim()[0], floor / 5)
     axes.axvspan(left, floor, color=style.PALE, lw=0)
     axes.set_xlim(left=left)
     axes.text(np.sqrt(left * floor), 0.03, "references differ", ha="center", va="bottom", rotation=90, fontsize=6,
               color=style.GREY, transform=axes.get_xaxis_transform())  # fmt: skip
+
     axes.set_xlabel("relative error of the sampled velocities")
     axes.set_ylabel("CPU time (s)")
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
@@ -173,6 +189,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
             label = f"{engine}, {ranks} rank{'s' if ranks > 1 else ''}"
             left.loglog(cells, [r["wall_ms"] for r in rows], line, color=colour, marker=marker, ms=3, label=label)
             right.semilogx(cells, [r["peak_gib_a_rank"] for r in rows], line, color=colour, marker=marker, ms=3)
+
     _limit(left, found["scaling"])
     right.set_ylim(0, 1.15 * max(row["peak_gib_a_rank"] for row in found["scaling"]))
     left.set_ylabel("wall time per 2e-4 s of model time (ms)")

@@ -22,20 +22,22 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 INDEX = ROOT / "vipetsc/manual/gallery.md"
-WIDTH, COLOURS = 900, 200
+WIDTH = 900  # pixels
+COLOURS = 200
 MOST = {".png": 125_000, ".gif": 1_500_000}  # bytes
 
 
 def pages() -> dict[str, Path]:
     """The pages of the gallery by name, in the order of its index."""
-    names = re.findall(r"\]\(gallery/([\w-]+)\.md\)", INDEX.read_text(encoding="utf-8"))
+    names: list[str] = re.findall(r"\]\(gallery/([\w-]+)\.md\)", INDEX.read_text(encoding="utf-8"))
     return {name: INDEX.with_suffix("") / f"{name}.md" for name in names}
 
 
 def commands(page: Path) -> list[list[str]]:
     """The words of every command of a page, in its order."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.M | re.S)
-    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line.strip()]
+    lines = "".join(blocks).splitlines()
+    return [shlex.split(line, comments=True) for line in lines if line.strip()]
 
 
 def pictures(page: Path) -> list[Path]:
@@ -68,10 +70,10 @@ def make(page: Path, folder: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Renew the pictures; says how long each page took."""
-    every = pages()
+    """Renew the pictures, and print how long each page took."""
+    all_pages = pages()
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("page", nargs="*", default=list(every), help=f"{', '.join(every)}; all if left out")
+    parser.add_argument("page", nargs="*", default=list(all_pages), help=f"{', '.join(all_pages)}; all if left out")
     parser.add_argument("--folder", type=Path, help="where runs are made and stay; a temporary one if left out")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
@@ -79,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
         shutil.copytree(ROOT / "runs", folder / "runs", ignore=shutil.ignore_patterns("*.h5"), dirs_exist_ok=True)
         for name in options.page:
             begin = time.monotonic()
-            make(every[name], folder)
+            make(all_pages[name], folder)
             print(f"{name}: {time.monotonic() - begin:.0f} s", flush=True)
 
 

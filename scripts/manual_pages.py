@@ -26,8 +26,13 @@ sys.path.insert(0, str(ROOT))
 import vipetsc
 from vipetsc.case.keys import chapter as all_keys
 
-PACKAGE, CHAPTERS, GALLERY = ROOT / "vipetsc", ROOT / "vipetsc/manual", ROOT / "vipetsc/manual/gallery"
-START, KEYS, API = "start", "case-keys", "api"
+PACKAGE = ROOT / "vipetsc"
+CHAPTERS = PACKAGE / "manual"
+GALLERY = CHAPTERS / "gallery"
+# Pages that are no chapters.
+START = "start"
+KEYS = "case-keys"
+API = "api"
 CONFIGURATION = {
     "project": "vipetsc",
     "release": vipetsc.__version__,
@@ -50,41 +55,50 @@ Named = ast.ClassDef | ast.FunctionDef
 def write_sources(folder: Path, packages: list[str]) -> None:
     """All pages as Markdown in ``folder``, with their pictures; the interface of ``packages``, all if there is none."""
     (folder / GALLERY.name).mkdir(parents=True)
+
+    # Chapters in the order of the index, then those that it leaves out.
     index = (CHAPTERS / "index.md").read_text(encoding="utf-8")
     names = re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", index, flags=re.M)
     names += sorted({path.stem for path in CHAPTERS.glob("*.md")} - {"index", *names})
-    folders = sorted(path.parent for path in PACKAGE.rglob("__init__.py"))
-    pages = {dotted(path): interface(path) for path in folders if not packages or dotted(path) in packages}
     put(folder / "index.md", index + contents("Chapters", [START, *names, KEYS]) + contents("Python", [API]), CHAPTERS)
     start = (ROOT / "README.md").read_text(encoding="utf-8")
     put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
     put(folder / f"{KEYS}.md", all_keys(), CHAPTERS)
     for name in names:
         text = (CHAPTERS / f"{name}.md").read_text(encoding="utf-8")
-        studies = re.findall(r"\]\((gallery/[\w-]+)\.md\)", text)
-        put(folder / f"{name}.md", text + (contents("", studies) if name == GALLERY.name else ""), CHAPTERS)
+        if name == GALLERY.name:
+            text += contents("", re.findall(r"\]\((gallery/[\w-]+)\.md\)", text))
+        put(folder / f"{name}.md", text, CHAPTERS)
     for path in GALLERY.glob("*.md"):
         text = path.read_text(encoding="utf-8")
         put(folder / GALLERY.name / path.name, text + case_files(text), GALLERY)
+
+    folders = sorted(path.parent for path in PACKAGE.rglob("__init__.py"))
+    pages = {dotted(path): interface(path) for path in folders if not packages or dotted(path) in packages}
     put(folder / f"{API}.md", "# The Python interface\n" + contents("", list(pages), hidden=False), CHAPTERS)
     for name, text in pages.items():
         put(folder / f"{name}.md", text, CHAPTERS)
 
 
 def contents(caption: str, names: list[str], hidden: bool = True) -> str:
-    """A table of contents, beside the pages if ``hidden``."""
-    options = f":caption: {caption}\n" * bool(caption) + (":hidden:\n" if hidden else ":maxdepth: 1\n")
+    """A table of contents, in the margin alone if ``hidden``."""
+    options = f":caption: {caption}\n" if caption else ""
+    options += ":hidden:\n" if hidden else ":maxdepth: 1\n"
     return f"\n```{{toctree}}\n{options}\n" + "\n".join(names) + "\n```\n"
 
 
 def case_files(text: str) -> str:
     """The case files that a study's commands name, as blocks."""
-    names = [name for name in dict.fromkeys(re.findall(r"\bruns/[\w/-]+\.toml", text)) if (ROOT / name).exists()]
-    return "".join(f"\n## {name}\n\n```toml\n{(ROOT / name).read_text(encoding='utf-8')}```\n" for name in names)
+    blocks = []
+    for name in dict.fromkeys(re.findall(r"\bruns/[\w/-]+\.toml", text)):
+        path = ROOT / name
+        if path.exists():
+            blocks.append(f"\n## {name}\n\n```toml\n{path.read_text(encoding='utf-8')}```\n")
+    return "".join(blocks)
 
 
 def put(path: Path, text: str, home: Path) -> None:
-    """Write a page whose links are those of a file in ``home``: chapters beside it, pictures copied there."""
+    """Write a page to ``path`` whose links are those of a file in ``home``; pictures are copied to its folder."""
     up = "../" if home == GALLERY else ""
 
     def link(match: re.Match[str]) -> str:
@@ -105,13 +119,16 @@ def dotted(path: Path) -> str:
 
 
 def interface(package: Path) -> str:
-    """The page of a folder: what its modules say of themselves and of their public names."""
+    """The page of a folder: the docstrings of its modules and of their public names."""
     lines = [f"# {dotted(package)}", ""]
-    for path in [package / "__init__.py", *sorted(set(package.glob("*.py")) - {package / "__init__.py"})]:
+    first = package / "__init__.py"
+    for path in [first, *sorted(set(package.glob("*.py")) - {first})]:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        if path.name != "__init__.py":
-            lines += [f"## {dotted(path)}", ""]
-        lines += [f":::{{py:module}} {dotted(path) if path.stem != '__init__' else dotted(package)}", ":::", ""]
+        module = dotted(package)
+        if path != first:
+            module = dotted(path)
+            lines += [f"## {module}", ""]
+        lines += [f":::{{py:module}} {module}", ":::", ""]
         lines += [prose(tree), ""]
         for node in public(tree):
             lines += [*described(node), ""]
@@ -129,17 +146,21 @@ def public(tree: ast.Module | ast.ClassDef) -> Iterator[Named]:
 
 
 def described(node: Named, depth: int = 6) -> Iterator[str]:
-    """A name with its signature and docstring as a directive, which others within it make longer."""
+    """The directive of a name: signature, docstring and, within it, a class's methods; ``depth`` colons open it."""
+    inner: list[str] = []
+    signature = node.name
     if isinstance(node, ast.ClassDef):
-        kind, signature = "class", node.name
-        inner = [line for method in public(node) for line in ["", *described(method, depth - 1)]]
+        kind = "class"
+        for method in public(node):
+            inner += ["", *described(method, depth - 1)]
+    elif {ast.unparse(decorator) for decorator in node.decorator_list} & {"property", "cached_property"}:
+        kind = "property"
     else:
-        decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
-        kind = "property" if decorators & {"property", "cached_property"} else "function" if depth == 6 else "method"
-        returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
-        signature, inner = f"{node.name}({ast.unparse(node.args)}){returns}", []
-        if kind == "property":
-            signature = node.name
+        kind = "function" if depth == 6 else "method"
+        signature += f"({ast.unparse(node.args)})"
+        if node.returns:
+            signature += f" -> {ast.unparse(node.returns)}"
+
     yield f"{':' * depth}{{py:{kind}}} {signature}"
     yield prose(node)
     yield from inner
@@ -149,9 +170,12 @@ def described(node: Named, depth: int = 6) -> Iterator[str]:
 def prose(node: Named | ast.Module) -> str:
     """A docstring as Markdown: its headings are bold words, what looks like a tag is text."""
     text = re.sub(r"(?m)^(.+)\n-{3,}$", r"**\1**\n", ast.get_docstring(node) or "")
-    parts = re.split(r"(``.*?``|^ {4}.*$)", text.replace("::\n", ":\n"), flags=re.M | re.S)
-    escaped = (part if i % 2 else re.sub(r"([<*|])", r"\\\1", part.replace("**", "\0")) for i, part in enumerate(parts))
-    return "".join(escaped).replace("\0", "**")
+    text = text.replace("::\n", ":\n")
+    parts = re.split(r"(``.*?``|^ {4}.*$)", text, flags=re.M | re.S)
+    for i in range(0, len(parts), 2):  # the others are code, which stays
+        bold_kept = parts[i].replace("**", "\0")
+        parts[i] = re.sub(r"([<*|])", r"\\\1", bold_kept)
+    return "".join(parts).replace("\0", "**")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -160,6 +184,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "runs/manual", help="runs/manual if left out")
     parser.add_argument("--python", nargs="+", default=[], metavar="PACKAGE", help="of the interface only these")
     options = parser.parse_args(arguments)
+
     folder = options.folder.resolve()
     source = folder / "source"
     shutil.rmtree(source, ignore_errors=True)

@@ -21,7 +21,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_platforms", "cpu")
 
 
-def words_of(path: str) -> Iterator[str]:
+def words_in(path: str) -> Iterator[str]:
     """The words of a parameter file in turn."""
     with open(path, encoding="utf-8") as file:
         yield from file.read().split()
@@ -31,7 +31,7 @@ class Lattice:
     """The lattice of a parameter file, in units of the drive's linear wave: see lattice.hpp."""
 
     def __init__(self, path: str) -> None:
-        words = words_of(path)
+        words = words_in(path)
 
         def numbers(count: int, key: str = "") -> list[float]:
             if key and next(words) != key:
@@ -44,14 +44,21 @@ class Lattice:
         self.masses = np.array(numbers(self.dofs, "masses")) * self.rate**2
         self.couplings = [numbers(4) for _ in range(int(numbers(1, "couplings")[0]))]
         hertz, stiffness, host, resonator = numbers(4, "contact")
-        self.exponent = 1.5 if hertz else 1.0
-        self.stiffness = stiffness * (np.sqrt(self.scale) if hertz else 1.0)
-        self.host, self.resonator = int(host), int(resonator)
+        self.exponent = 1.0
+        self.stiffness = stiffness
+        if hertz:
+            self.exponent = 1.5
+            self.stiffness = stiffness * np.sqrt(self.scale)
+        self.host = int(host)
+        self.resonator = int(resonator)
         sites = np.array(numbers(2 * int(numbers(1, "sites")[0]))).reshape(-1, 2)
-        self.sites, self.clearances = sites[:, 0].astype(int), sites[:, 1] / self.scale
+        self.sites = sites[:, 0].astype(int)
+        self.clearances = sites[:, 1] / self.scale
+
         cell, mass, amplitude, frequency, self.cycles = numbers(5, "drive")
         self.driven = int(mass), int(cell)
-        self.drive, self.drive_rate = amplitude / (self.scale * self.masses[int(mass)]), frequency / self.rate
+        self.drive = amplitude / (self.scale * self.masses[int(mass)])
+        self.drive_rate = frequency / self.rate
         self.times = np.arange(int(samples)) * interval * self.rate
 
     def derivative(self, t: jax.Array, y: jax.Array, _: None) -> jax.Array:
@@ -60,16 +67,20 @@ class Lattice:
         outside = jnp.pad(u, ((0, 0), (1, 1)))
         pulls = [jnp.zeros(self.cells) for _ in range(self.dofs)]
         for mass, offset, other, stiffness in self.couplings:
-            m, o, shift = int(mass), int(other), int(offset)
+            m = int(mass)
+            o = int(other)
+            shift = int(offset)
             strengths = np.full(self.cells, stiffness / self.masses[m])
-            if shift and not self.walls:
+            if shift and not self.walls:  # a free end has no spring there
                 strengths[0 if shift < 0 else -1] = 0.0
             pulls[m] += strengths * (outside[o, 1 + shift : 1 + shift + self.cells] - u[m])
         acceleration = jnp.stack(pulls)
+
         w = u[self.resonator, self.sites] - u[self.host, self.sites]
         force = jnp.sign(w) * self.stiffness * jnp.maximum(jnp.abs(w) - self.clearances, 0.0) ** self.exponent
         acceleration = acceleration.at[self.host, self.sites].add(force / self.masses[self.host])
         acceleration = acceleration.at[self.resonator, self.sites].add(-force / self.masses[self.resonator])
+
         phase = self.drive_rate * t
         driving = (phase > 0) & (phase < 2 * np.pi * self.cycles)
         burst = self.drive * (1 - jnp.cos(phase / self.cycles)) * jnp.sin(phase)
@@ -77,7 +88,8 @@ class Lattice:
 
     def solver(self) -> Callable[[float, float], diffrax.Solution]:
         """The compiled solution as a function of the two tolerances."""
-        term, times = diffrax.ODETerm(self.derivative), jnp.asarray(self.times)
+        term = diffrax.ODETerm(self.derivative)
+        times = jnp.asarray(self.times)
 
         @jax.jit
         def solve(rtol: float, atol: float) -> diffrax.Solution:
@@ -96,7 +108,7 @@ def main(output: str) -> None:
     compiled: dict[str, tuple[Lattice, Callable[[float, float], diffrax.Solution]]] = {}
     for line in sys.stdin:
         path, rtol, atol = line.split()
-        text = "\n".join(words_of(path))
+        text = "\n".join(words_in(path))
         if text not in compiled:
             lattice = Lattice(path)
             compiled[text] = lattice, lattice.solver()
