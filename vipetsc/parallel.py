@@ -83,7 +83,7 @@ class _Attempt(NamedTuple):
 
 
 def _attempt(function: Callable[[], T]) -> _Attempt:
-    """What a call of ``function`` gives, without raising."""
+    """Call ``function``, and keep what it raises."""
     try:
         return _Attempt(value=function(), error=None)
     except Exception as error:
@@ -206,7 +206,7 @@ class StopRequest:
 
 
 class Progress:
-    """How far a run is, on rank 0: a bar on a terminal, otherwise a line of the log every five seconds."""
+    """Progress of a run, on rank 0: a bar on a terminal, otherwise a line of the log every five seconds."""
 
     def __init__(self, comm: MPI.Comm, total: float, unit: str, show: bool = True) -> None:
         self._total = total

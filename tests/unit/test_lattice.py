@@ -141,6 +141,19 @@ def test_ends_hold_or_let_go(cell, n):
     assert np.allclose(fixed - free, np.diag(walls), atol=1e-9)
 
 
+def test_a_springs_slope_and_energy_are_derivative_and_integral_of_its_force():
+    spring = Spring(0, 1, 1e3, quadratic=3e4, cubic=-2e6)
+    z = np.linspace(-2e-3, 2e-3, 9)
+    h = 1e-6
+    slope = (spring.nonlinear_force(z + h) - spring.nonlinear_force(z - h)) / (2 * h)
+    force = (spring.nonlinear_energy(z + h) - spring.nonlinear_energy(z - h)) / (2 * h)
+    assert spring.nonlinear_slope(z) == pytest.approx(slope, rel=1e-5, abs=1e-4)
+    assert spring.nonlinear_force(z) == pytest.approx(force, rel=1e-5, abs=1e-6)
+    assert spring.nonlinear_energy(np.zeros(1)) == 0
+    assert not spring.is_linear and not spring.is_odd
+    assert Spring(0, 1, 1e3, cubic=1.0).is_odd and Spring(0, 1, 1e3).is_linear
+
+
 def test_cell_problems_are_all_named():
     springs = (Spring(0, 0, 1.0), Spring(0, 5, -1.0))
     keys = [key for key, _ in cell_problems((1.0, -1.0), springs, 1, 1)]

@@ -129,7 +129,7 @@ def claimed(
 def _claim(
     path: Path, kind: FolderKind, text: str, force: bool, resume: bool, difference: Difference | None
 ) -> tuple[Path, bool]:
-    """Where to work, and whether results of the same case are there."""
+    """The folder to work in, and whether results of the same case are there; see ``claimed``."""
     sys.audit("vipetsc.claim", str(path))
     # A swap that a kill has ended is finished first, unless the results are another verb's.
     foreign = _holds_another_kind(path, kind)
@@ -182,7 +182,7 @@ def _results(folder: Path) -> list[Path]:
 
 
 def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference | None) -> str | None:
-    """Why results in ``folder`` are not those of ``text``; None if they are."""
+    """Message why results in ``folder`` are not those of ``text``; None if they are."""
     earlier = (folder / kind.marker).read_text(encoding="utf-8")
     if difference:
         return difference(earlier)
@@ -251,6 +251,8 @@ def origin() -> dict[str, Any]:
     PETSc options are those of its database: with those that are part of a case, which stand in it, all that were given.
     """
     options = PETSc.Options().getAll()
+    given = " ".join(f"-{name} {value}".strip() for name, value in sorted(options.items()))
+
     return {
         "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,
@@ -261,7 +263,7 @@ def origin() -> dict[str, Any]:
         "numpy_version": np.__version__,
         "python_version": platform.python_version(),
         "command": " ".join(["vipetsc", *sys.argv[1:]]),
-        "petsc_options": " ".join(f"-{name} {value}".strip() for name, value in sorted(options.items())) or "none",
+        "petsc_options": given or "none",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "host": platform.node(),
     }
@@ -271,6 +273,7 @@ def origin() -> dict[str, Any]:
 def revision() -> str:
     """The commit of the package's sources by git, with a "+" if they were changed since; else "none"."""
     root = Path(vipetsc.__file__).parents[1]
+    # An installed package may lie in a repository that is not its own.
     if not ((root / ".git").exists() and (root / "pyproject.toml").exists()):
         return "none"
     command = ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]

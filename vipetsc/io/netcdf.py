@@ -122,7 +122,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
         present |= {str(part) for part in (path_in_file, *path_in_file.parents)}
     missing = [name for name in needs if name not in present and name not in data.attrs]
     if missing:
-        data.close()
+        data.close()  # nobody else would
         raise ValueError(f"{path} is not a {kind} of vipetsc: it has no {', '.join(missing)}")
     return data
 

@@ -130,10 +130,12 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
     ``select(ensemble, law="hertz", sites=5, cycles=30)["ibtet"]``. Keys of one zipped axis have to meet in one
     member; numbers match to a relative 1e-5. Raises KeyError if a name is no coordinate, or no member has the values.
     """
+    # By dimension, since keys of a zipped axis have theirs in common: which members have all values so far.
     matches: dict[str, np.ndarray] = {}
     for name, value in wanted.items():
         if name not in data.coords or data[name].ndim != 1:
             raise KeyError(f"{name} is no coordinate; there are {', '.join(map(str, data.coords))}")
+
         coordinate = data[name].values
         if np.issubdtype(coordinate.dtype, np.number):
             match = np.isclose(coordinate, value, rtol=1e-5, atol=0)
@@ -145,6 +147,7 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
             others = [n for n in wanted if n != name and n in data.coords and data[n].dims == data[name].dims]
             with_others = f" beside {', '.join(others)}" if others else ""
             raise KeyError(f"no member has {name} = {value!r}{with_others}; there are {list(coordinate)}")
+
     return data.isel({dimension: int(np.argmax(match)) for dimension, match in matches.items()})
 
 

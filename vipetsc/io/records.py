@@ -19,7 +19,7 @@ CHECK_LENGTH = len(CHECK % 0)
 
 
 class Line(NamedTuple):
-    """Where a record stands: its file, and the first byte and the number of bytes in it."""
+    """Place of a record: its file, and the first byte and the number of bytes in it."""
 
     path: Path
     start: int

@@ -47,7 +47,7 @@ class State(NamedTuple):
                 interval = float(times[1] - times[0]) if len(times) > 1 else np.inf
                 row = _row(times, time, 0.5 * interval, f"{path} has samples in s")
                 origin = {"time": float(times[row]), "case": file.attrs.get("case")}
-            if u.ndim == 3:
+            if u.ndim == 3:  # read one state, not all
                 u = u[row]
                 v = v[row]
             state = cls(

@@ -1,4 +1,4 @@
-"""Where a run goes: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
+"""Output of a run: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
 
 While a run goes on, its samples are kept as chunks: chunk k holds those between the checkpoints k - 1 and k. A chunk
 and a checkpoint are named arrays; a rank writes its part of each into a file of its own, so nothing is sent while a

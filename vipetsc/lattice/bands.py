@@ -68,7 +68,7 @@ def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
 
 
 def _maximum(function: Callable[[float], float], values: np.ndarray) -> tuple[float, float]:
-    """Where in [0, pi] ``function`` is largest, and its value there: the best of its ``values`` on GRID, refined."""
+    """Argument in [0, pi] and value of a function's maximum: the best of its ``values`` on GRID, refined."""
     best = int(np.argmax(values))
     bracket = GRID[max(best - 1, 0)], GRID[min(best + 1, len(GRID) - 1)]
     refined = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
@@ -96,7 +96,7 @@ def gaps(bands: Sequence[Band]) -> list[tuple[float, float]]:
 
 @lru_cache
 def max_group_velocity(cell: UnitCell, band: int) -> tuple[float, float, float]:
-    """Where ``band`` (1-based) is fastest: wavenumber (rad per cell), frequency (rad/s), |v_g| (cells/s)."""
+    """Wavenumber (rad per cell), frequency (rad/s) and |v_g| (cells/s) at which ``band`` (1-based) is fastest."""
     speeds = np.abs(bloch(cell, GRID).group_velocity[:, band - 1])
     fastest, largest = _maximum(lambda kappa: float(abs(bloch(cell, kappa).group_velocity[band - 1])), speeds)
     return fastest, _frequency(cell, band, fastest), largest

@@ -19,7 +19,7 @@ LONGEST = 400  # cells whose linear response is solved for
 
 
 class Pair(NamedTuple):
-    """What a contact joins: masses (0-based; host -1 is ground), ``resonator`` in the next cell if ``next_cell``."""
+    """Masses that a contact joins (0-based; host -1 is ground), the ``resonator`` in the next cell if ``next_cell``."""
 
     host: int
     resonator: int

@@ -92,7 +92,7 @@ class Stretch(NamedTuple):
     length: int
 
     def unknowns(self, half: int) -> int:
-        """How many amplitudes it has, of lattices with ``half`` waves each way; none between neighbouring cells."""
+        """Number of amplitudes of the stretch, with ``half`` waves in each direction; 0 between neighbouring cells."""
         if self.left is None or self.right is None:
             return half
         return 2 * half if self.length else 0

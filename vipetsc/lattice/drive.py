@@ -1,4 +1,4 @@
-r"""What drives a lattice: forces on masses, and motion of the walls that its ends are tied to.
+r"""Drives of a lattice: forces on masses, and motion of the walls that its ends are tied to.
 
 A waveform F(t), in N or in m, is a tone burst, or pieces one after another; x being the time since a piece's start,
 

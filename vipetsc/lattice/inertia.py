@@ -1,4 +1,4 @@
-"""How many eigenvalues of a symmetric band matrix lie below a number: Sylvester's law of inertia.
+"""Number of eigenvalues of a symmetric band matrix below a bound, by Sylvester's law of inertia.
 
 A - s = L D L^T has as many negative pivots in D as A has eigenvalues below s (Parlett, The Symmetric Eigenvalue
 Problem, 1998, section 3.3), at a cost that grows as the rows.
@@ -11,7 +11,7 @@ from vipetsc.compiled import kernel
 
 @kernel
 def count_below(band: np.ndarray, shift: float, smallest: float) -> int:
-    """How many eigenvalues are below ``shift``; ``band`` (n, width + 1) has A[j + k, j] at [j, k], and is overwritten.
+    """Number of eigenvalues below ``shift``; ``band`` (n, width + 1) has A[j + k, j] at [j, k], and is overwritten.
 
     A pivot smaller than ``smallest`` is taken for minus that.
     """

@@ -69,11 +69,11 @@ class Modes:
         return np.concatenate([forward.reshape(nt, -1), back.reshape(nt, -1)], axis=1)
 
     def _backward(self, count: int) -> slice:
-        """Of ``count`` wavenumbers k >= 0 those whose opposites are others."""
+        """Slice of ``count`` wavenumbers k >= 0 that leaves out 0 and pi, which are their own opposites."""
         return slice(1, count - (self.cells % 2 == 0))
 
     def force(self, cell: int, mass: int) -> np.ndarray:
-        """What 1 N on a ``mass`` of a ``cell`` (0-based) adds to z' (mode), in 1/sqrt(kg)."""
+        """Rate z' (mode) in 1/sqrt(kg) that a force of 1 N on a ``mass`` of a ``cell`` (0-based) adds."""
         root = np.sqrt(self.chain.coefficients(cell, cell + 1).masses[0, mass])
         if self.vectors.ndim == 2:
             return np.asarray(self.vectors[cell * self.chain.cell.dofs + mass] / root)
@@ -89,7 +89,7 @@ class Modes:
         return np.asarray(amplitudes * np.exp(1j * self.frequency * interval))
 
     def driven(self, drive: Waveform, start: float, stop: float) -> np.ndarray:
-        """What ``drive`` adds from ``start`` to ``stop`` (s) to the amplitudes (mode) at ``stop``, for ``force`` 1."""
+        """Change of the amplitudes (mode) by a ``drive`` from ``start`` to ``stop`` in s, for ``force`` 1."""
         return drive.response(self.frequency, start, stop)
 
 

@@ -32,7 +32,7 @@ class PowerLaw:
 
 
 def doubt(points: float, r2: float) -> str:
-    """Why a fit over ``points`` with the adjusted R^2 ``r2`` is not to be called a power law; empty if it is one."""
+    """Reason not to call a fit over ``points`` with the adjusted R^2 ``r2`` a power law; empty if it is one."""
     if points < FEWEST:
         return f"too few points ({points:g})"
     if np.isnan(r2):
