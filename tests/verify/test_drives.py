@@ -14,7 +14,7 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 from vipetsc.case import Case, CaseError
-from vipetsc.case.drive import waveform_of
+from vipetsc.case.waveforms import waveform_of
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
 

@@ -6,7 +6,7 @@ A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,25 +14,17 @@ import numpy as np
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
 from vipetsc.case.contacts import check_pairs, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
-from vipetsc.case.drive import (
-    DriveTable,
-    build_drives,
-    check_drives,
-    check_wave,
-    drive_tables,
-    driven_wave,
-    packet_speed,
-)
+from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
 from vipetsc.case.features import FEATURES, refusals
 from vipetsc.case.inhomogeneity import check_inhomogeneity
-from vipetsc.case.initial import InitialTable, beginning_of, check_initial
+from vipetsc.case.initial import Beginning, InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.resolve import (
     build_chain,
     check_cell,
     check_contacts,
     check_unsprung,
-    resolved,
+    resolve,
     site_cells,
     with_preset,
 )
@@ -40,7 +32,8 @@ from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import of_losses, warnings_of
-from vipetsc.lattice import UnitCell, pass_bands
+from vipetsc.case.waveforms import DEFAULT
+from vipetsc.lattice import Chain, Drive, UnitCell, pass_bands
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
@@ -65,6 +58,7 @@ class Case(CaseFile):
     builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}}
 
     @classmethod
+    @cache
     def sections(cls) -> dict[str, type[Section]]:
         """The class of each section that the verb reads, in the order in which the manual shows them."""
         classes = super().sections() | {"disorder": DisorderTable}  # which a resolved case holds no more
@@ -75,68 +69,72 @@ class Case(CaseFile):
         """The resolved sections, and everything that is wrong with them."""
         table, unread = with_samples(with_preset(table))
         sections, problems = super().read(table)
+        # A file of samples that cannot be read leaves keys empty, which are no problems of their own.
         problems = unread + [p for p in problems if not unread or ".samples" not in p.key]
         disorder, wrong = read_section(DisorderTable, table.get("disorder", {}), "disorder")
-        if problems := problems + wrong:
+        problems += wrong
+        if problems:
             return sections, problems
-        beginning, drive = None, sections["drive"]
-        if (initial := sections.get("initial")) and initial.moves:
-            frequency = driven_wave(sections["lattice"].unit_cell(), drive)[0] if drive.ways else None
-            beginning, problems = beginning_of(initial, sections["lattice"], frequency)
-            if problems:
-                return sections, problems
-        samples = sections["time"].samples
+
+        beginning, problems = _beginning(sections)
+        if problems:
+            return sections, problems
         try:
-            tables = resolved(sections, beginning)
-            driven = [one["cell"] for one in drive_tables(tables["drive"])]
-            if problems := list(check_inhomogeneity(LatticeTable(**tables["lattice"]), driven)):
-                return sections, problems
+            resolved = resolve(sections, beginning)
         except ValueError as error:
-            given = sections["lattice"].absorbing
-            return sections, [Problem("lattice.absorbing.reflection", given and given.reflection, str(error))]
-        count = tables["time"]["end"] / tables["time"]["sample_interval"]
-        if count > MOST_SAMPLES:
-            remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} can be taken, and the bands need so many"
-            return tables, [Problem("time.end", sections["time"].end, remedy)]
-        if samples is not None:
-            cell, interval = sections["lattice"].unit_cell(), tables["time"]["sample_interval"]
-            problems = _too_coarse(cell, interval, "time.samples", samples)
-        if "disorder" in table and not problems:
-            nominal, (tables, problems) = tables, scatter(tables, disorder, sections["lattice"], sections["contacts"])
-            if tables is not nominal:
-                problems = [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in super().read(tables)[1]]
-        return tables, problems
+            reflection = sections["lattice"].absorbing and sections["lattice"].absorbing.reflection
+            return sections, [Problem("lattice.absorbing.reflection", reflection, str(error))]
+
+        problems = _resolved_problems(sections, resolved)
+        if problems or "disorder" not in table:
+            return resolved, problems
+        return cls._scattered(resolved, disorder, sections["contacts"])
+
+    @classmethod
+    def _scattered(
+        cls, resolved: dict[str, Any], disorder: DisorderTable, contacts: ContactsTable
+    ) -> tuple[dict[str, Any], list[Problem]]:
+        """The ``resolved`` sections with what is drawn; ``contacts`` are those that the file has."""
+        drawn, problems = scatter(resolved, disorder, contacts)
+        if problems or not drawn:
+            return resolved, problems
+
+        # What is drawn may be out of bounds: it is checked as if it stood in the file.
+        tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in resolved.items()}
+        sections, problems = super().read(tables | drawn)
+        return sections, [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in problems]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """What is wrong between keys."""
-        lattice, contacts = sections["lattice"], sections["contacts"]
-        cell, problems = check_cell(lattice) if valid("lattice") else (None, [])
-        yield from problems
+        lattice, contacts, drive, time = (sections[name] for name in ("lattice", "contacts", "drive", "time"))
+        cell: UnitCell | None = None
+        if valid("lattice"):
+            cell, problems = check_cell(lattice)
+            yield from problems
         if cell and valid("drive"):
-            driven = [one.cell for _, one in sections["drive"].every if one.end is None]
+            driven = [one.cell for _, one in drive.every if one.end is None]
             yield from check_inhomogeneity(lattice, driven)
+
         if valid("lattice.cells", "contacts.sites"):
             yield from check_contacts(lattice, contacts, valid)
             if cell and valid("contacts"):
                 yield from check_pairs(lattice, contacts, cell, site_cells(lattice, contacts))
-        length = lattice.cells if valid("lattice.cells") else None
-        initial, undriven = sections.get("initial", InitialTable.model_validate({})), sections["drive"].amplitude == 0
-        if valid("initial.kind"):
-            yield from check_initial(initial, lattice, cell, valid)
+        if valid("initial.kind") and "initial" in sections:
+            yield from check_initial(sections["initial"], lattice, cell, valid)
         yield from refusals(cls, sections, valid)
-        if undriven and not initial.moves and valid("initial") and sections["drive"].kind == "burst":
-            yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
-        if undriven and sections["time"].atol == "paper":
-            yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
-        of_drive, drive = list(check_drives(sections["drive"], lattice, cell, length, valid)), sections["drive"]
-        yield from of_drive
-        if cell and not of_drive and drive.ways and valid("lattice", "drive", "time.end"):
-            yield from check_wave(cell, drive, sections["time"])
+
+        yield from _check_undriven(sections, valid)
+        length = lattice.cells if valid("lattice.cells") else None
+        problems = list(check_drives(drive, lattice, cell, length, valid))
+        yield from problems
+        if cell and not problems and drive.wave_choices and valid("lattice", "drive", "time.end"):
+            yield from check_wave(cell, drive, time)
         if cell and not cell.springs and valid("drive", "time"):
-            yield from check_unsprung(sections["drive"], sections["time"])
-            cell = None
-        yield from _check_sampling(sections["time"], cell, valid)
+            yield from check_unsprung(drive, time)
+            cell = None  # it has no bands that samples could be too coarse for
+        yield from _check_sampling(time, cell, valid)
+
         window = sections["output"].window
         if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
             yield Problem("output.window", window, f"must be [first, last] within cells 1 to {length}")
@@ -147,19 +145,11 @@ class Case(CaseFile):
 
     @cached_property
     def _model(self) -> Model:
-        contacts, drive, time = self.contacts, self.drive, self.time
-        assert drive.frequency is not None and time.end != "traverse" and time.sample_interval != "auto"
+        contacts, time = self.contacts, self.time
+        assert time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
-        drives, scale = build_drives(drive, chain), 0.0
-        for one in drives if drive.amplitude else ():
-            scale += chain.wave_scale(one.waveform, one.cell, one.mass) * (one.stiffness or 1.0)
-        if self.initial:
-            scale = max(scale, self.initial.amplitude or 0.0)
-        if time.atol == "scaled":
-            small = WEAKEST * time.rtol * scale
-            atol = small, small * drive.frequency
-        else:
-            atol = (1e-9 * abs(drive.amplitude) if time.atol == "paper" else time.atol,) * 2
+        drives = build_drives(self.drive, chain)
+        scale = self._scale(chain, drives)
         return Model(
             chain=chain,
             contact=contact_of(contacts),
@@ -168,13 +158,35 @@ class Case(CaseFile):
             sample_interval=time.sample_interval,
             method=time.method,
             rtol=time.rtol,
-            atol=atol,
+            atol=self._tolerances(scale),
             scale=scale,
-            speed=packet_speed(chain.cell, drive),
+            speed=packet_speed(chain.cell, self.drive),
             initial=self.initial,
             laws=laws_of_sites(contacts, len(chain.sites)),
             gaps=gaps_of_sites(contacts, list(chain.clearances)),
         )
+
+    def _scale(self, chain: Chain, drives: tuple[Drive, ...]) -> float:
+        """Displacement in m of the drives' linear waves together, or of the motion at the beginning if that is more."""
+        scale = 0.0
+        if self.drive.amplitude:
+            for drive in drives:
+                scale += chain.wave_scale(drive.waveform, drive.cell, drive.mass) * (drive.stiffness or 1.0)
+        if self.initial:
+            scale = max(scale, self.initial.amplitude or 0.0)
+        return scale
+
+    def _tolerances(self, scale: float) -> tuple[float, float]:
+        """Absolute tolerances of displacements in m and velocities in m/s where waves have the ``scale`` in m."""
+        time, drive = self.time, self.drive
+        assert drive.frequency is not None
+        if time.atol == "scaled":
+            small = WEAKEST * time.rtol * scale
+            return small, small * drive.frequency
+        if time.atol == "paper":
+            small = 1e-9 * abs(drive.amplitude)
+            return small, small
+        return time.atol, time.atol
 
     def varied(
         self,
@@ -216,6 +228,47 @@ class Case(CaseFile):
         """What is allowed but likely not meant, one sentence each."""
         options = self.petsc.model_extra or {} if self.petsc else {}
         return [*of_losses(self.lattice), *warnings_of(self.model(), self.output, options)]
+
+
+def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem]]:
+    """What the motion at t = 0 is, if there is some, or what is wrong with it."""
+    initial, drive = sections.get("initial"), sections["drive"]
+    if initial is None or not initial.moves:
+        return None, []
+    frequency = None
+    if drive.wave_choices:
+        frequency, _ = driven_wave(sections["lattice"].unit_cell(), drive)
+    return beginning_of(initial, sections["lattice"], frequency)
+
+
+def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[Problem]:
+    """What can be wrong only once the ``given`` sections are ``resolved``: the absorbing end, the samples."""
+    driven = [drive.cell for _, drive in resolved["drive"].every]
+    problems = list(check_inhomogeneity(resolved["lattice"], driven))
+    if problems:
+        return problems
+
+    time = resolved["time"]
+    count = time.end / time.sample_interval
+    if count > MOST_SAMPLES:
+        remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} can be taken, and the bands need so many"
+        return [Problem("time.end", given["time"].end, remedy)]
+    samples = given["time"].samples
+    if samples is None:
+        return []
+    return _too_coarse(given["lattice"].unit_cell(), time.sample_interval, "time.samples", samples)
+
+
+def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
+    """A lattice without a force needs a motion to begin with, and a tolerance that is no part of the force."""
+    drive, initial = sections["drive"], sections.get("initial")
+    if drive.amplitude != 0:
+        return
+    moves = initial is not None and initial.moves
+    if not moves and valid("initial") and drive.kind == DEFAULT:
+        yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
+    if sections["time"].atol == "paper":
+        yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

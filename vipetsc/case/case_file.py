@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
 
@@ -86,6 +87,7 @@ class CaseFile(Section):
     builtin_table: ClassVar[Table] = {}
 
     @classmethod
+    @cache  # every case that is read asks for those of all verbs
     def sections(cls) -> dict[str, type[Section]]:
         """The class of each section that the verb reads, by the section's name."""
         classes: dict[str, type[Section]] = {}

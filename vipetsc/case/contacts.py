@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from vipetsc.case.case_file import Problem, Table, Valid
+from vipetsc.case.case_file import Problem, Valid
 from vipetsc.case.schema import LatticeTable
-from vipetsc.case.sites import ContactsTable
+from vipetsc.case.sites import ContactsTable, PerSiteTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness
 from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.contact import LEAST_RESTITUTION, PARAMETERS
@@ -67,14 +67,13 @@ def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid
             return
 
 
-def resolved_per_site(contacts: ContactsTable, count: int) -> Table:
+def resolved_per_site(contacts: ContactsTable, count: int) -> PerSiteTable | None:
     """The lists over sites, with a stiffness in place of a material."""
-    each = lists_of(contacts)
-    if each.keys() & {*MATERIAL}:
-        rows = zip(*(values_of_sites(contacts, key, count) for key in MATERIAL), strict=True)
-        each = {key: values for key, values in each.items() if key not in MATERIAL}
-        each["stiffness"] = [float(contact_stiffness(*row)) for row in rows]
-    return each
+    if contacts.each is None or not lists_of(contacts).keys() & {*MATERIAL}:
+        return contacts.each
+    rows = zip(*(values_of_sites(contacts, key, count) for key in MATERIAL), strict=True)
+    stiffness = [float(contact_stiffness(*row)) for row in rows]
+    return contacts.each.model_copy(update=dict.fromkeys(MATERIAL) | {"stiffness": stiffness})
 
 
 def contact_of(contacts: ContactsTable) -> Contact:

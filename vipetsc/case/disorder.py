@@ -47,79 +47,116 @@ class DisorderTable(Section):
 
 
 def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Sequence[float]]:
-    """The quantities of a resolved case by name, those it has not empty; ``modulus`` is what is proportional to it."""
-    cell, sites, clearance = lattice.unit_cell(), contacts.sites, contacts.clearance
+    """The quantities of a resolved case by name; one that it does not have is empty.
+
+    ``modulus`` is the stiffness, which is proportional to it.
+    """
+    cell = lattice.unit_cell()
+    sites, clearance = contacts.sites, contacts.clearance
     assert isinstance(sites, list) and isinstance(clearance, list)
-    each = lists_of(contacts)
-    stiffness = each.get("stiffness") or ([contacts.stiffness] if contacts.stiffness else [])
-    of_sites: dict[str, Sequence[float]] = {"clearance": clearance, "sites": sites}
-    of_law = {"restitution": values_of_sites(contacts, "restitution", len(sites)), "stiffness": stiffness}
-    of_law["modulus"] = [contacts.stiffness] if contacts.stiffness else []
-    return of_sites | of_law | {"masses": cell.masses, "springs": [spring.stiffness for spring in cell.springs]}
+    stiffness = [contacts.stiffness] if contacts.stiffness else []
+    return {
+        "clearance": clearance,
+        "sites": sites,
+        "restitution": values_of_sites(contacts, "restitution", len(sites)),
+        "stiffness": lists_of(contacts).get("stiffness") or stiffness,
+        "modulus": stiffness,
+        "masses": cell.masses,
+        "springs": [spring.stiffness for spring in cell.springs],
+    }
 
 
 def scatter(
-    tables: dict[str, Table], disorder: DisorderTable, lattice: LatticeTable, contacts: ContactsTable
+    sections: Mapping[str, Any], disorder: DisorderTable, given: ContactsTable
 ) -> tuple[dict[str, Table], list[Problem]]:
-    """The resolved ``tables`` of a run with what ``disorder`` draws, and the problems of that.
+    """The tables of the resolved ``sections`` of a run that change by what ``disorder`` draws, and its problems.
 
-    ``lattice`` and ``contacts`` are the sections before they were resolved. A drive and times that follow from the
-    cell are those of the case without scatter.
+    ``given`` are the contacts before they were resolved. A drive and times that follow from the cell are those of the
+    case without scatter.
     """
-    law, problems, drawn = dict(tables["contacts"]), list[Problem](), dict[str, list[float]]()
-    known = values_of(lattice, ContactsTable(**law))
-    known["modulus"] = [contacts.modulus] if contacts.modulus and known["stiffness"] else []
+    lattice, contacts = sections["lattice"], sections["contacts"]
+    if not (disorder.quantities() or disorder.cells):
+        remedy = "names nothing that scatters, as in: clearance = { relative = 0.01 }"
+        return {}, [Problem("disorder", disorder.seed, remedy)]
+
+    values = values_of(lattice, contacts)
+    values["modulus"] = [given.modulus] if given.modulus and values["stiffness"] else []
+    drawn, problems = _draw(disorder, values)
+    if problems:
+        return {}, problems
+
+    changed: dict[str, Table] = {}
+    table: Table = lattice.model_dump(by_alias=True, exclude_none=True)
+    if disorder.cells:
+        quantities = {key: deviation.model_dump(exclude_none=True) for key, deviation in disorder.cells.items()}
+        table["scatter"] = {"seed": disorder.seed, "quantities": quantities}
+        changed["lattice"] = table
+    if drawn:
+        changed["contacts"] = _drawn_contacts(contacts, drawn, given.modulus)
+    if drawn.keys() & {"masses", "springs"}:
+        changed["lattice"] = with_cell(table, lattice.undamped_cell(), drawn)
+        # A cell of its own has no preset that would say the radius.
+        if lattice.preset and "stiffness" in changed["contacts"]:
+            changed["contacts"].setdefault("radius", CONTACTS["radius"])
+    return changed, []
+
+
+def _draw(
+    disorder: DisorderTable, values: Mapping[str, Sequence[float]]
+) -> tuple[dict[str, list[float]], list[Problem]]:
+    """What is drawn of each quantity about its ``values``, and what is wrong with that."""
+    drawn: dict[str, list[float]] = {}
+    problems: list[Problem] = []
     for name, deviation in disorder.quantities().items():
-        key, values = f"disorder.{name}", np.asarray(known[name], float)
+        key = f"disorder.{name}"
+        about = np.asarray(values[name], float)
         if name == "sites" and deviation.relative:
             problems.append(Problem(key, deviation.model_dump(exclude_none=True), "give absolute, in cells"))
-        elif not values.size:
+        elif not about.size:
             problems.append(Problem(key, None, "the case has none that could scatter"))
         elif deviation.relative or deviation.absolute:  # none leaves the case as it is, to the last bit
-            new = deviation.draw(values, disorder.seed, name)
-            if (wrong := ~(new * values > 0) & (new != values)).any():
-                numbers = [float(f"{x:.4g}") for x in new[wrong]]
-                remedy = (
-                    f"drawn with seed {disorder.seed}, but a sign cannot change: take a smaller deviation, or lognormal"
-                )
-                problems.append(Problem(key, numbers, remedy))
+            new = deviation.draw(about, disorder.seed, name)
+            changes_sign = ~(new * about > 0) & (new != about)
+            if changes_sign.any():
+                numbers = [float(f"{x:.4g}") for x in new[changes_sign]]
+                remedy = "but a sign cannot change: take a smaller deviation, or lognormal"
+                problems.append(Problem(key, numbers, f"drawn with seed {disorder.seed}, {remedy}"))
             drawn[name] = new.tolist()
-    if disorder.cells and not problems:
-        scattered = {key: deviation.model_dump(exclude_none=True) for key, deviation in disorder.cells.items()}
-        tables = tables | {"lattice": tables["lattice"] | {"scatter": {"seed": disorder.seed, "quantities": scattered}}}
-    if problems or not drawn:
-        empty = Problem(
-            "disorder", disorder.seed, "names nothing that scatters, as in: clearance = { relative = 0.01 }"
-        )
-        return tables, problems if disorder.quantities() or disorder.cells else [empty]
-    law |= {name: drawn[name] for name in ("clearance",) if name in drawn}
-    of_each = law.get("each", {})
-    for name in [name for name in ("restitution", "stiffness") if name in drawn]:
-        if name in of_each or len(drawn[name]) > 1:
-            of_each = law["each"] = of_each | {name: drawn[name]}
+    return drawn, problems
+
+
+def _drawn_contacts(contacts: ContactsTable, drawn: Mapping[str, list[float]], modulus: float | None) -> Table:
+    """The table of resolved ``contacts`` with what is ``drawn``, a modulus about ``modulus`` in Pa."""
+    table: Table = contacts.model_dump(by_alias=True, exclude_none=True)
+    if "clearance" in drawn:
+        table["clearance"] = drawn["clearance"]
+    for name in ("restitution", "stiffness"):
+        if name not in drawn:
+            continue
+        if name in table.get("each", {}) or len(drawn[name]) > 1:
+            table["each"] = table.get("each", {}) | {name: drawn[name]}
         else:
-            law[name] = drawn[name][0]
+            table[name] = drawn[name][0]
     if "sites" in drawn:
-        law["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
-    if "modulus" in drawn and contacts.modulus:
-        law["stiffness"] *= drawn["modulus"][0] / contacts.modulus
-    tables = tables | {"contacts": law}
-    if drawn.keys() & {"masses", "springs"}:
-        tables["lattice"] = with_cell(tables["lattice"], lattice.undamped_cell(), drawn)
-        if lattice.preset and "stiffness" in law:
-            law.setdefault("radius", CONTACTS["radius"])
-    return tables, []
+        table["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
+    if "modulus" in drawn and modulus:
+        table["stiffness"] *= drawn["modulus"][0] / modulus
+    return table
 
 
 def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) -> Table:
     """The table ``lattice`` with a cell of its own: ``cell`` with the masses (kg) and springs (N/m) ``drawn``."""
-    stiffness: list[float] = drawn.get("springs", [spring.stiffness for spring in cell.springs])
-    springs: list[dict[str, Any]] = [
-        {"start": s.start + 1, "end": s.end + 1, "stiffness": k, "next_cell": s.next_cell}
-        | {key: getattr(s, key) for key in ("damping", "quadratic", "cubic") if getattr(s, key)}
-        for s, k in zip(cell.springs, stiffness, strict=True)
-    ]
-    table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}
-    rest = {key: value for key, value in lattice.items() if key not in ("preset", "lambda", "eta")}
-    table |= {"grounding": list(cell.grounding)} if cell.grounding else {}
-    return rest | {"cell": table | {"contact": [cell.host + 1, cell.resonator + 1]}}
+    stiffness = drawn.get("springs", [spring.stiffness for spring in cell.springs])
+    springs: list[Table] = []
+    for spring, value in zip(cell.springs, stiffness, strict=True):
+        table = {"start": spring.start + 1, "end": spring.end + 1, "stiffness": value, "next_cell": spring.next_cell}
+        table |= {key: getattr(spring, key) for key in ("damping", "quadratic", "cubic") if getattr(spring, key)}
+        springs.append(table)
+
+    own: Table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}
+    if cell.grounding:
+        own["grounding"] = list(cell.grounding)
+    own["contact"] = [cell.host + 1, cell.resonator + 1]
+    # A preset and its parameters would contradict the cell.
+    kept_keys = {key: value for key, value in lattice.items() if key not in ("preset", "lambda", "eta")}
+    return kept_keys | {"cell": own}

@@ -1,28 +1,43 @@
 """The section ``[initial]`` of a run: the motion that it begins with, and the numbers that follow from it."""
 
 import hashlib
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from vipetsc.case.case_file import CaseError, Problem, Section, Table, Valid
+from vipetsc.case.case_file import CaseError, Problem, Section, Valid
 from vipetsc.case.schema import LatticeTable, Positive, Wavenumber
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
 from vipetsc.lattice.packet import Packet, gaussian_packet
 
-# Which keys a kind needs all of, and of which it needs one; others that it takes.
-NEEDS: dict[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
-    "zero": ((), (), ()),
-    "mode": ((), ("number", "near"), ()),
-    "packet": (("band", "wavenumber", "cell", "width"), (), ("direction",)),
-    "file": (("path",), (), ("time", "orbit", "sha256", "amplitude")),
+
+class KindKeys(NamedTuple):
+    """The keys of one kind of motion: those that it ``needs``, of which it needs ``one_of``, others that it takes."""
+
+    needs: tuple[str, ...] = ()
+    one_of: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+    is_scaled: bool = False
+
+    @property
+    def choices(self) -> list[tuple[str, ...]]:
+        """Groups of keys of each of which one is given."""
+        groups = [self.one_of, ("amplitude", "energy")] if self.is_scaled else [self.one_of]
+        return [group for group in groups if group]
+
+
+KINDS = {
+    "zero": KindKeys(),
+    "mode": KindKeys(one_of=("number", "near"), is_scaled=True),
+    "packet": KindKeys(needs=("band", "wavenumber", "cell", "width"), others=("direction",), is_scaled=True),
+    "file": KindKeys(needs=("path",), others=("time", "orbit", "sha256", "amplitude")),
 }
-SCALED = "mode", "packet"  # kinds that want one of amplitude and energy
 
 
 class InitialTable(Section):
@@ -64,9 +79,9 @@ class InitialTable(Section):
 
 
 class Beginning(NamedTuple):
-    """The resolved section, the frequency in rad/s of the motion, the cell (1-based) in its middle."""
+    """The resolved ``section``, the frequency in rad/s of the motion, the cell (1-based) in its middle."""
 
-    table: Table
+    section: InitialTable
     frequency: float
     cell: int
 
@@ -75,76 +90,104 @@ def check_initial(
     initial: InitialTable, lattice: LatticeTable, cell: UnitCell | None, valid: Valid
 ) -> Iterator[Problem]:
     """What is wrong with the keys of a section."""
-    needed, one_of, others = NEEDS[initial.kind]
-    ways = [one_of, ("amplitude", "energy")] if initial.kind in SCALED else [one_of]
+    keys = KINDS[initial.kind]
     given = initial.model_dump(exclude_none=True, exclude={"kind"})
-    known = {*needed, *others, *(key for way in ways for key in way)}
-    for key in given.keys() - known:
+    taken = {*keys.needs, *keys.others, *itertools.chain(*keys.choices)}
+    for key in given.keys() - taken:
         yield Problem(f"initial.{key}", given[key], f"belongs to another kind than {initial.kind!r}")
-    for key in needed:
+    for key in keys.needs:
         if key not in given and valid(f"initial.{key}"):
-            yield Problem(f"initial.{key}", None, f"missing; kind = {initial.kind!r} needs {', '.join(needed)}")
-    for way in filter(None, ways):
-        if len(given.keys() & {*way}) != 1 and valid(*(f"initial.{key}" for key in way)):
-            yield Problem(f"initial.{way[0]}", given.get(way[0]), f"give one of {' and '.join(way)}")
+            yield Problem(f"initial.{key}", None, f"missing; kind = {initial.kind!r} needs {', '.join(keys.needs)}")
+    for group in keys.choices:
+        if len(given.keys() & {*group}) != 1 and valid(*(f"initial.{key}" for key in group)):
+            yield Problem(f"initial.{group[0]}", given.get(group[0]), f"give one of {' and '.join(group)}")
+
     if initial.cell and valid("lattice.cells") and initial.cell > lattice.cells:
         remedy = f"outside the lattice; cells count from 1 to {lattice.cells}"
         yield Problem("initial.cell", initial.cell, remedy)
     if cell and initial.band and initial.band > cell.dofs:
         yield Problem("initial.band", initial.band, f"the cell has {cell.dofs} bands")
+
     dofs = lattice.cells * cell.dofs if cell and valid("lattice.cells") else None
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
     elif initial.kind == "mode" and (lattice.profiles or lattice.scatter):
-        yield Problem(
-            "initial.kind", "mode", "the mode of a lattice whose cells differ; a packet, or a state in a file"
-        )
+        remedy = "the mode of a lattice whose cells differ; a packet, or a state in a file"
+        yield Problem("initial.kind", "mode", remedy)
 
 
 def beginning_of(
     initial: InitialTable, lattice: LatticeTable, frequency: float | None
 ) -> tuple[Beginning | None, list[Problem]]:
-    """What follows from a valid section, or what is wrong with it; ``frequency`` in rad/s is the case's, if any."""
+    """What follows from a valid section that moves, or what is wrong with it.
+
+    ``frequency`` in rad/s is the case's, if any.
+    """
     chain = Chain(lattice.unit_cell(), lattice.cells, lattice.ends)
-    read = {"mode": _mode, "packet": _packet, "file": _file}[initial.kind]
+    resolve = {"mode": _mode, "packet": _packet, "file": _file}[initial.kind]
     try:
-        table, told, cell = read(initial, chain, frequency)
+        return resolve(initial, chain, frequency), []
     except CaseError as error:
         return None, error.problems
-    table = initial.model_dump(exclude_none=True) | table
-    return Beginning({k: v for k, v in table.items() if v is not None}, told, cell), []
 
 
-def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> tuple[Table, float, int]:
+def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
+    """A mode by its number and its amplitude."""
     number = initial.number or number_near(chain, initial.near or 0.0)
     omega = mode_frequency(chain, number)
     if omega == 0:
         raise CaseError([Problem("initial.number", number, "the frequency of this mode is 0; another one moves")])
-    table: Table = {"number": number, "near": None}
+
+    update: dict[str, Any] = {"number": number, "near": None}
     if initial.energy:
+        # At its turning point a mode's energy is that of its springs, omega^2 a^2 / 2 times the sum of m phi^2.
         weights = mode_shape(chain, number) ** 2 @ np.asarray(chain.cell.masses)
-        table |= {"amplitude": float(np.sqrt(2 * initial.energy / weights.sum()) / omega), "energy": None}
-    return table, frequency or omega, 1
+        update["amplitude"] = float(np.sqrt(2 * initial.energy / weights.sum()) / omega)
+        update["energy"] = None
+    return Beginning(initial.model_copy(update=update), frequency or omega, cell=1)
 
 
-def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> tuple[Table, float, int]:
+def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
+    """A packet by its amplitude."""
     assert initial.band and initial.wavenumber and initial.cell
     omega = float(bloch(chain.cell, initial.wavenumber).frequency[initial.band - 1])
-    table: Table = {}
     if initial.energy:
-        table = {"amplitude": float(np.sqrt(initial.energy / initial.packet(chain.cell).energy)), "energy": None}
-    return table, frequency or omega, initial.cell
+        amplitude = float(np.sqrt(initial.energy / initial.packet(chain.cell).energy))
+        initial = initial.model_copy(update={"amplitude": amplitude, "energy": None})
+    return Beginning(initial, frequency or omega, cell=initial.cell or 1)
 
 
-def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> tuple[Table, float, int]:
-    """A resolved section, which has a hash, is taken as it is: runs are read where their file is gone."""
+def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
+    """A state in a file by its path, hash and largest displacement."""
+    # A resolved section, which has a hash, is taken as it is: runs are read where their file is gone.
     if initial.sha256 and initial.amplitude and frequency:
-        return {}, frequency, 1
+        return Beginning(initial, frequency, cell=1)
+
     path = Path(str(initial.path)).resolve()
+    state, digest = _read_state(path, initial)
+    _check_state(state, path, initial, chain)
+    frequency = frequency or state.frequency()
+    if not frequency:
+        remedy = "tells no frequency; give drive.frequency, that of the motion in rad/s, and drive.amplitude = 0"
+        raise CaseError([Problem("initial.path", initial.path, remedy)])
+
+    amplitude, cell = state.largest(frequency)
+    if amplitude == 0:
+        raise CaseError([Problem("initial.path", initial.path, "the state in it is at rest")])
+    update = {"path": str(path), "sha256": digest, "amplitude": amplitude, "time": state.time, "orbit": state.orbit}
+    return Beginning(initial.model_copy(update=update), frequency, cell)
+
+
+def _read_state(path: Path, initial: InitialTable) -> tuple[State, str]:
+    """The state in a file and the file's hash; raises CaseError."""
     try:
-        state, digest = State.read(path, initial.time, initial.orbit), file_hash(path)
+        return State.read(path, initial.time, initial.orbit), file_hash(path)
     except (OSError, ValueError, KeyError) as error:
         raise CaseError([Problem("initial.path", initial.path, str(error))]) from None
+
+
+def _check_state(state: State, path: Path, initial: InitialTable, chain: Chain) -> None:
+    """Raise CaseError for a state of another lattice, and for an instant or an orbit that its file does not have."""
     if state.velocity.shape[1] != chain.cell.dofs or not np.all((state.cell >= 1) & (state.cell <= chain.cells)):
         here = f"{chain.cells} cells of {chain.cell.dofs} masses"
         held = f"cells up to {state.cell.max(initial=0)} of {state.velocity.shape[1]} masses"
@@ -152,15 +195,6 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> tuple
     for key, value in (("time", initial.time), ("orbit", initial.orbit)):
         if value is not None and getattr(state, key) is None:
             raise CaseError([Problem(f"initial.{key}", value, f"{path.name} has no such thing")])
-    frequency = frequency or state.frequency()
-    if not frequency:
-        remedy = "tells no frequency; give drive.frequency, that of the motion in rad/s, and drive.amplitude = 0"
-        raise CaseError([Problem("initial.path", initial.path, remedy)])
-    amplitude, cell = state.largest(frequency)
-    if amplitude == 0:
-        raise CaseError([Problem("initial.path", initial.path, "the state in it is at rest")])
-    table: Table = {"path": str(path), "sha256": digest, "amplitude": amplitude}
-    return table | {"time": state.time, "orbit": state.orbit}, frequency, cell
 
 
 def file_hash(path: str | Path) -> str:

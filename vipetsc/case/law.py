@@ -1,7 +1,8 @@
 """The case of the verb ``law``: a lattice run, of which cell, contact law and burst are taken, and ``[law]``."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field
@@ -16,6 +17,7 @@ from vipetsc.lattice.packet import packet_speeds
 
 LARGEST = 1e9  # cells times samples of a run
 SHORTEST = 64  # cells of the ring: more than the propagator's band
+SLOWEST = 1e-9  # cells/s, so that a wave that stands asks for a run that is too large, and is refused for that
 
 
 class LawTable(Section):
@@ -72,21 +74,40 @@ class LawCase(Case):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
+        # Many runs want the fastest engine that a case allows.
         time = table.get("time", {})
-        table = table | ({"time": {"engine": "auto"} | time} if isinstance(time, dict) else {})
-        fields, problems = super().read(table)
+        if isinstance(time, dict):
+            table = table | {"time": {"engine": "auto"} | time}
+        sections, problems = super().read(table)
         if problems:
-            return fields, problems
-        law, contacts = fields["law"], fields["contacts"]
-        if law.get("clearance") is None:
-            gaps = contacts["clearance"] or _given(with_preset(table))
-            law["clearance"] = float(np.exp(np.mean(np.log(gaps)))) if gaps else None
-        if law["clearance"] is None:
+            return sections, problems
+
+        contacts = sections["contacts"]
+        clearance = sections["law"].clearance
+        if clearance is None:
+            gaps = contacts.clearance or _given_clearances(with_preset(table))
+            clearance = float(np.exp(np.mean(np.log(gaps)))) if gaps else None
+        if clearance is None:
             problems.append(Problem("law.clearance", None, "missing; give the clearance of the site in m"))
-        if "stiffness" not in contacts:
+        if contacts.stiffness is None:
             remedy = "missing; give it or contacts.modulus, radius and poisson"
             problems.append(Problem("contacts.stiffness", None, remedy))
-        return fields, problems or _place(fields)
+        if problems:
+            return sections, problems
+
+        case = cls._of_sections(sections, clearance=clearance)
+        problems = case._place_problems()
+        if problems:
+            return sections, problems
+        if case.law.distance is None:
+            case = cls._of_sections(sections, clearance=clearance, distance=case._default_distance())
+        return sections | {"law": case.law}, case._size_problems()
+
+    @classmethod
+    def _of_sections(cls, sections: Mapping[str, Any], **update: Any) -> Self:
+        """The case of resolved ``sections`` in which the section ``[law]`` is changed."""
+        changed = {**sections, "law": sections["law"].model_copy(update=update)}
+        return cls(name="law", **changed)
 
     def fastest(self) -> float:
         """The largest group velocity of all bands in cells/s."""
@@ -95,57 +116,85 @@ class LawCase(Case):
 
     def one_site(self) -> OneSite:
         """The lattice and the times of the law's runs (see ``studies.ring``)."""
-        distance, clearance, model = self.law.distance, self.law.clearance, self.model()
-        assert distance is not None and clearance is not None
+        law, model = self.law, self.model()
+        assert law.distance is not None and law.clearance is not None
         cell, interval = model.chain.cell, model.sample_interval
         band, slow, _ = packet_speeds(cell, model.drive, model.drive_mass)
-        samples = int(np.ceil((distance / max(slow, 1e-9) + self.law.settle * model.drive.duration) / interval))
-        cells = max(int(np.ceil(distance + self.fastest() * samples * interval)) + 1, SHORTEST)
-        towards = _way(self.contacts.sites, self.drive.cell, self.lattice.cells, self.lattice.ends)[1]
-        site = towards * distance % cells
-        return OneSite(cells, site, distance, clearance, towards, band, slow, samples * interval, samples)
+        end = law.distance / max(slow, SLOWEST) + law.settle * model.drive.duration
+        samples = int(np.ceil(end / interval))
+        # Nothing that the site sends out comes around the ring before the end.
+        cells = max(int(np.ceil(law.distance + self.fastest() * samples * interval)) + 1, SHORTEST)
+        _, towards = self._nearest_site()
+        return OneSite(
+            cells=cells,
+            site=towards * law.distance % cells,
+            distance=law.distance,
+            clearance=law.clearance,
+            towards=towards,
+            band=band,
+            slow=slow,
+            end=samples * interval,
+            samples=samples,
+        )
 
+    def _nearest_site(self) -> tuple[int, int]:
+        """Cells from the driven one to the nearest site in another (0 without any), and whether up (1) or down (-1)."""
+        drive, cells = self.drive.cell, self.lattice.cells
+        assert isinstance(self.contacts.sites, list)
+        offsets = [site - drive for site in self.contacts.sites if site != drive]
+        if self.lattice.ends == "periodic":
+            offsets = [(offset + cells // 2) % cells - cells // 2 for offset in offsets]
 
-def _given(table: Table) -> list[float]:
-    """The clearances of a case without sites."""
-    contacts, preset = table["contacts"], PRESETS.get(str(table["lattice"].get("preset")))
-    given = ContactsTable(**{k: v for k, v in contacts.items() if k == "clearance"}).clearance
-    if given is None:
-        return list(preset.clearance_span(1)) if preset else []
-    return given if isinstance(given, list) else [given] if isinstance(given, float) else [given.first, given.last]
+        offset = min(offsets, key=abs, default=0)
+        if offset == 0:  # towards the farther end
+            return 0, 1 if 2 * drive <= cells + 1 else -1
+        return abs(offset), 1 if offset > 0 else -1
 
+    def _least_distance(self) -> int:
+        """Cells from the driven one to the site such that the burst is over before a wave is back from there."""
+        return int(np.ceil(self.fastest() * self.model().drive.duration / 2))
 
-def _way(sites: Any, drive: int, cells: int, ends: str) -> tuple[int, int]:
-    """Cells from the driven one to the nearest site that is another (0 without any), and whether up (1) or down."""
-    ways = [site - drive for site in sites if site != drive]
-    if ends == "periodic":
-        ways = [(way + cells // 2) % cells - cells // 2 for way in ways]
-    way = min(ways, key=abs, default=0)
-    return abs(way), 1 if way > 0 or (way == 0 and 2 * drive <= cells + 1) else -1
+    def _default_distance(self) -> int:
+        """The distance of the nearest site, without sites the length of the burst, but no less than the least."""
+        model = self.model()
+        distance, _ = self._nearest_site()
+        if not distance:
+            length = model.drive.duration * packet_speeds(model.chain.cell, model.drive, model.drive_mass)[1]
+            distance = int(min(length, LARGEST))
+        return max(distance, self._least_distance())
 
+    def _place_problems(self) -> list[Problem]:
+        """What is wrong with the wave of a resolved case and with the distance that it gives."""
+        frequency = self.drive.frequency or 0.0
+        if not waves_at(self.lattice.unit_cell(), frequency):
+            return [Problem("drive.frequency", frequency, "lies in no pass band, so that nothing arrives at a site")]
+        least = self._least_distance()
+        if self.law.distance is not None and self.law.distance < least:
+            remedy = f"the burst must be over before a wave from the site is back at the drive; at least {least} cells"
+            return [Problem("law.distance", self.law.distance, remedy)]
+        return []
 
-def _place(fields: dict[str, Any]) -> list[Problem]:
-    """Fill in the distance of a resolved case; what is wrong with its waves."""
-    sections = {name: section for name, section in fields.items() if name in LawCase.model_fields}
-    case = LawCase(name="law", **sections)
-    cell, frequency, drive = case.lattice.unit_cell(), case.drive.frequency or 0.0, case.drive
-    if not waves_at(cell, frequency):
-        return [Problem("drive.frequency", frequency, "lies in no pass band, so that nothing arrives at a site")]
-    model = case.model()
-    least = int(np.ceil(case.fastest() * model.drive.duration / 2))
-    if case.law.distance is not None and case.law.distance < least:
-        remedy = f"the burst must be over before a wave from the site is back at the drive; at least {least} cells"
-        return [Problem("law.distance", case.law.distance, remedy)]
-    if case.law.distance is None:
-        length = model.drive.duration * packet_speeds(cell, model.drive, model.drive_mass)[1]
-        way = _way(case.contacts.sites, drive.cell, case.lattice.cells, case.lattice.ends)[0]
-        fields["law"]["distance"] = max(way or int(min(length, LARGEST)), least)
-        case = LawCase(name="law", **sections)
-    setting = case.one_site()
-    if setting.cells * setting.samples > LARGEST:
+    def _size_problems(self) -> list[Problem]:
+        """Runs that would be too large, since the wave is too slow."""
+        setting = self.one_site()
+        if setting.cells * setting.samples <= LARGEST:
+            return []
         remedy = (
-            f"has waves of {setting.slow:.3g} cells/s, too slow to wait for: {setting.cells} cells and"
+            f"the burst has waves of {setting.slow:.3g} cells/s, too slow to wait for: {setting.cells} cells and"
             f" {setting.samples} samples; more cycles, another frequency or a shorter law.distance need less"
         )
-        return [Problem("drive.frequency", frequency, f"the burst {remedy}")]
-    return []
+        return [Problem("drive.frequency", self.drive.frequency, remedy)]
+
+
+def _given_clearances(table: Table) -> list[float]:
+    """The clearances of a case without sites."""
+    contacts = {key: value for key, value in table["contacts"].items() if key == "clearance"}
+    clearance = ContactsTable(**contacts).clearance
+    if isinstance(clearance, list):
+        return clearance
+    if isinstance(clearance, float):
+        return [clearance]
+    if clearance:
+        return [clearance.first, clearance.last]
+    preset = PRESETS.get(str(table["lattice"].get("preset")))
+    return list(preset.clearance_span(1)) if preset else []

@@ -64,18 +64,20 @@ class NfrcCase(Case):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
-        fields, problems = super().read(table)
+        sections, problems = super().read(table)
         if problems:
-            return fields, problems
-        nfrc, case = fields["nfrc"], cls(name="nfrc", **{k: v for k, v in fields.items() if k in cls.model_fields})
-        cell, frequency = case.lattice.unit_cell(), case.drive.frequency or 0.0
-        nfrc["restitutions"] = nfrc["restitutions"] or [case.contacts.restitution]
-        if nfrc["over"] == "amplitude":
-            nfrc["fixed"] = nfrc["fixed"] or [frequency]
-        if nfrc["source"] == "wave" and nfrc.get("band") is None:
-            first = nfrc["fixed"][0] if nfrc["over"] == "amplitude" else nfrc["range"][0]
-            nfrc["band"] = max(waves_at(cell, first), key=lambda wave: wave[2], default=(None,))[0]
-        return fields, list(_check_waves(NfrcTable(**nfrc), cell))
+            return sections, problems
+
+        nfrc, cell = sections["nfrc"], sections["lattice"].unit_cell()
+        update: dict[str, Any] = {"restitutions": nfrc.restitutions or [sections["contacts"].restitution]}
+        if nfrc.over == "amplitude":
+            update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
+        nfrc = nfrc.model_copy(update=update)
+        if nfrc.source == "wave" and nfrc.band is None:
+            first = nfrc.fixed[0] if nfrc.over == "amplitude" else nfrc.range[0]
+            fastest = max(waves_at(cell, first), key=lambda wave: wave[2], default=None)
+            nfrc = nfrc.model_copy(update={"band": fastest and fastest[0]})
+        return sections | {"nfrc": nfrc}, list(_check_waves(nfrc, cell))
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
@@ -118,9 +120,10 @@ def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:
     """There is a wave of the band at every frequency where a curve begins."""
     if nfrc.source != "wave":
         return
-    over = nfrc.over == "amplitude"
-    for frequency in nfrc.fixed if over else nfrc.range[:1]:
+    key, frequencies = "nfrc.range", nfrc.range[:1]
+    if nfrc.over == "amplitude":
+        key, frequencies = "nfrc.fixed", nfrc.fixed
+    for frequency in frequencies:
         if nfrc.band not in [band for band, *_ in waves_at(cell, frequency)]:
-            key = "nfrc.fixed" if over else "nfrc.range"
             where = "in no pass band" if nfrc.band is None else f"not in band {nfrc.band}"
             yield Problem(key, frequency, f"lies {where}, so that no such wave comes in (rad/s)")

@@ -1,10 +1,11 @@
 """The case of the verb ``predict``: a lattice run with its sites, and the amplitudes at which it is predicted."""
 
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from vipetsc.case.case_file import Problem, Section, Table
+from vipetsc.case.case_file import Problem, Section, Valid
 from vipetsc.case.law import LawCase
 from vipetsc.case.schema import Positive
 
@@ -33,10 +34,8 @@ class PredictCase(LawCase):
     takes = LawCase.takes - {"rings"}
 
     @classmethod
-    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The resolved sections, and everything that is wrong with them."""
-        fields, problems = super().read(table)
-        contacts = fields.get("contacts")
-        if isinstance(contacts, dict) and not contacts["sites"]:
-            problems = [Problem("contacts.sites", [], "there is no site to predict; list cells or give a count")]
-        return fields, problems
+    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
+        """What is wrong between keys."""
+        yield from super().check(sections, valid)
+        if valid("contacts.sites") and sections["contacts"].sites in (0, []):
+            yield Problem("contacts.sites", [], "there is no site to predict; list cells or give a count")

@@ -1,18 +1,19 @@
 """From the choices of a case file to plain numbers: presets, cell, sites, clearances, stiffness, frequency, times."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from vipetsc.case.case_file import Problem, Table, Valid
 from vipetsc.case.contacts import check_per_site, pairs_of_sites, resolved_per_site
-from vipetsc.case.drive import CYCLES, SINES, DriveTable, drive_tables, packet_speed, resolved_drive, waveform_of
+from vipetsc.case.drive import DriveTable, packet_speed, resolve_drives, waveform_of
 from vipetsc.case.inhomogeneity import cell_variation, designed_end
 from vipetsc.case.initial import Beginning
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
+from vipetsc.case.waveforms import DEFAULT, SINES
 from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import cell_problems, connected_groups
 
@@ -23,6 +24,7 @@ REPLACES = {
     "wavenumber": {"at"},
     "at": {"wavenumber"},
 }
+SAMPLES_OF_HALF_PERIOD = 3  # of the top band's edge, at least, where no sample interval is given
 
 
 def with_default_preset(table: Table) -> Table:
@@ -38,40 +40,60 @@ def with_preset(table: Table) -> Table:
 
     With an initial state, and no section for a drive, there is none.
     """
-    table, initial = with_default_preset(table), table.get("initial", {})
+    table = with_default_preset(table)
+    initial = table.get("initial", {})
     if isinstance(initial, dict) and initial.get("kind", "zero") != "zero" and "drive" not in table:
         table = table | {"drive": {"amplitude": 0.0}}
+
     lattice = table.get("lattice", {})
     if not isinstance(lattice, dict) or "cell" in lattice or str(lattice["preset"]) not in PRESETS:
         return table
+
     preset = PRESETS[str(lattice["preset"])]
     table = table | {"lattice": {"cells": preset.cells} | lattice}
-    for name, defaults in (("contacts", preset.contacts), ("drive", preset.drive)):
-        given = table.get(name, {})
-        if isinstance(given, dict):
-            if given.get("amplitude") == 0:
-                defaults = {}  # of an initial state alone
-            if given.get("waveform", "burst") != "burst":  # of the paper's burst, but for where its wave is
-                waves = REPLACES["frequency"] if given["waveform"] in SINES else ()
-                defaults = {key: value for key, value in defaults.items() if key in waves}
-            replaced = {key for choice in given.keys() & REPLACES.keys() for key in REPLACES[choice]}
-            table[name] = {k: v for k, v in defaults.items() if k not in replaced} | given
+    if isinstance(table.get("contacts", {}), dict):
+        table["contacts"] = _with_defaults(preset.contacts, table.get("contacts", {}))
+    if isinstance(table.get("drive", {}), dict):
+        drive = table.get("drive", {})
+        table["drive"] = _with_defaults(_preset_drive(preset.drive, drive), drive)
     return table
+
+
+def _preset_drive(defaults: Table, given: Table) -> Table:
+    """What of a preset's drive belongs to a ``given`` one: the paper's burst, or where on a band its wave is."""
+    if given.get("amplitude") == 0:
+        return {}  # the motion at t = 0 alone
+    waveform = given.get("waveform", DEFAULT)
+    if waveform == DEFAULT:
+        return defaults
+    if waveform in SINES:
+        return {key: value for key, value in defaults.items() if key in REPLACES["frequency"]}
+    return {}
+
+
+def _with_defaults(defaults: Table, given: Table) -> Table:
+    """``given`` with the ``defaults`` that none of its keys replaces."""
+    replaced = {key for choice in given.keys() & REPLACES.keys() for key in REPLACES[choice]}
+    return {key: value for key, value in defaults.items() if key not in replaced} | given
 
 
 def site_cells(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
     """The cells (1-based) with a contact; [] for a count without a preset to place it."""
-    sites, preset = contacts.sites, PRESETS.get(str(lattice.preset))
+    sites = contacts.sites
     if isinstance(sites, list):
         return sites
     if isinstance(sites, int):
+        preset = PRESETS.get(str(lattice.preset))
         if preset is None or sites == 0:
             return []
-        first, last, count = *preset.site_span(lattice.cells, sites), sites
-    elif sites.last is None:
+        first, last = preset.site_span(lattice.cells, sites)
+        return _spread(first, last, sites)
+    if sites.last is None:
         return [sites.first + (sites.spacing or 1) * i for i in range(sites.count)]
-    else:
-        first, last, count = sites.first, sites.last, sites.count
+    return _spread(sites.first, sites.last, sites.count)
+
+
+def _spread(first: float, last: float, count: int) -> list[int]:
     return [int(cell) for cell in np.round(np.linspace(first, last, count))]
 
 
@@ -90,11 +112,17 @@ def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> li
 
 def build_chain(lattice: LatticeTable, contacts: ContactsTable) -> Chain:
     """The lattice with its contact sites."""
+    cell = lattice.unit_cell()
     sites = site_cells(lattice, contacts)
-    gaps = clearances(lattice, contacts, len(sites))
-    cell, places = lattice.unit_cell(), tuple(c - 1 for c in sites)
-    pairs = pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites))
-    return Chain(cell, lattice.cells, lattice.ends, places, tuple(gaps), cell_variation(lattice), pairs)
+    return Chain(
+        cell,
+        lattice.cells,
+        lattice.ends,
+        sites=tuple(site - 1 for site in sites),
+        clearances=tuple(clearances(lattice, contacts, len(sites))),
+        variation=cell_variation(lattice),
+        pairs=pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites)),
+    )
 
 
 def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
@@ -180,47 +208,81 @@ def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> I
         yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
 
 
-def resolved(sections: dict[str, Any], beginning: Beginning | None) -> dict[str, Table]:
-    """The sections of a valid lattice run as tables in which every choice is made, and how it begins."""
-    tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in sections.items()}
-    lattice, contacts, drive, time = (sections[name] for name in ("lattice", "contacts", "drive", "time"))
-    cell, sites, law = lattice.unit_cell(), site_cells(lattice, contacts), tables["contacts"]
+def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[str, Any]:
+    """The ``sections`` of a valid lattice run in which every choice is made, and how it begins.
+
+    Raises ValueError if no end absorbs as much as is asked of it.
+    """
+    lattice = sections["lattice"]
+    cell = lattice.unit_cell()
+    drive = _resolved_drive(sections["drive"], cell, lattice.cells, beginning)
+
+    resolved = dict(sections)
+    resolved["lattice"] = _resolved_lattice(lattice, cell, drive)
+    resolved["contacts"] = _resolved_contacts(sections["contacts"], lattice)
+    resolved["drive"] = drive
+    resolved["time"] = _resolved_time(sections["time"], cell, lattice.cells, drive)
+    resolved.pop("initial", None)  # a lattice at rest says nothing
+    if beginning:
+        resolved["initial"] = beginning.section
+    return resolved
+
+
+def _resolved_drive(drive: DriveTable, cell: UnitCell, cells: int, beginning: Beginning | None) -> DriveTable:
+    """The drives; without a force, frequency and cell are those of the motion at the beginning."""
+    if beginning is None or drive.amplitude != 0:
+        return resolve_drives(drive, cell, cells)
+    resolved = resolve_drives(drive, cell, cells, beginning.frequency)
+    if "cell" in drive.model_fields_set:
+        return resolved
+    return resolved.model_copy(update={"cell": beginning.cell})
+
+
+def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) -> LatticeTable:
+    """The lattice with an absorbing end that does for the bursts of the ``drive``, and with fitted dashpots."""
+    update: dict[str, Any] = {}
+    absorbing = lattice.absorbing
+    if absorbing and not (absorbing.cells and absorbing.strength):
+        bursts = tuple((one.frequency or 0.0, one.cycles) for _, one in drive.every)
+        update["absorbing"] = designed_end(absorbing, cell, lattice.ends, bursts, lattice.cells // 3)
+
+    damping = lattice.damping
+    if damping and damping.loss:
+        grounding, springs = damping.fitted(lattice.undamped_cell())
+        fitted = {"grounding": grounding.tolist(), "springs": springs.tolist()}
+        update["damping"] = damping.model_copy(update=fitted)
+    return lattice.model_copy(update=update)
+
+
+def _resolved_contacts(contacts: ContactsTable, lattice: LatticeTable) -> ContactsTable:
+    """The contacts with a cell and a clearance for every site, and a stiffness in place of a material."""
+    sites = site_cells(lattice, contacts)
+    update: dict[str, Any] = {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
+    update["each"] = resolved_per_site(contacts, len(sites))
     if contacts.damping == "paper":
-        del law["damping"]  # as if left out: the same case
-    law |= {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
-    if each := resolved_per_site(contacts, len(sites)):
-        law["each"] = each
-    if contacts.stiffness is None and law.keys() >= REPLACES["stiffness"]:
-        law["stiffness"] = float(contact_stiffness(law.pop("modulus"), law["radius"], law.pop("poisson")))
-        if lattice.preset and law["radius"] == CONTACTS["radius"]:
-            del law["radius"]  # it goes without saying
-    told = beginning if beginning and drive.amplitude == 0 else None
-    tables["drive"] = resolved_drive(drive, cell, lattice.cells, told.frequency if told else None)
-    if drive.more:
-        tables["drive"]["more"] = [resolved_drive(more, cell, lattice.cells) for more in drive.more]
-    end, interval = time.end, time.sample_interval
+        update["damping"] = None  # as if left out: the same case
+
+    modulus, radius, poisson = contacts.modulus, contacts.radius, contacts.poisson
+    if contacts.stiffness is None and modulus is not None and radius is not None and poisson is not None:
+        update |= {"stiffness": float(contact_stiffness(modulus, radius, poisson)), "modulus": None, "poisson": None}
+        if lattice.preset and radius == CONTACTS["radius"]:
+            update["radius"] = None  # the preset says it
+    return contacts.model_copy(update=update)
+
+
+def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTable) -> TimeTable:
+    """The end and the sample interval in s of a lattice of ``cells`` cells under a resolved ``drive``."""
+    end = time.end
     if end == "traverse":
-        told_drive = DriveTable(**tables["drive"])
-        end = max(waveform_of(one).settled for _, one in told_drive.every)
-        end += lattice.cells / packet_speed(cell, told_drive)
+        settled = max(waveform_of(one).settled for _, one in drive.every)
+        end = settled + cells / packet_speed(cell, drive)
+
+    interval = time.sample_interval
     if time.samples is not None:
         interval = end / (time.samples - 1)
     elif interval == "auto":
-        interval = _round_down(np.pi / (3 * pass_bands(cell)[-1].high))
-    if (absorbing := lattice.absorbing) and not (absorbing.cells and absorbing.strength):
-        sent = tuple((one["frequency"], one.get("cycles", CYCLES)) for one in drive_tables(tables["drive"]))
-        designed = designed_end(absorbing, cell, lattice.ends, sent, lattice.cells // 3)
-        tables["lattice"]["absorbing"] = designed.model_dump()
-    if (damping := lattice.damping) and damping.loss:
-        fitted = (values.tolist() for values in damping.fitted(lattice.undamped_cell()))
-        tables["lattice"]["damping"] |= dict(zip(("grounding", "springs"), fitted, strict=True))
-    tables.pop("initial", None)
-    tables |= {"initial": beginning.table} if beginning else {}
-    if told and "cell" not in drive.model_fields_set:
-        tables["drive"]["cell"] = told.cell
-    tables["time"] |= {"sample_interval": float(interval), "end": float(end)}
-    tables["time"].pop("samples", None)
-    return tables
+        interval = _round_down(np.pi / (SAMPLES_OF_HALF_PERIOD * pass_bands(cell)[-1].high))
+    return time.model_copy(update={"end": float(end), "sample_interval": float(interval), "samples": None})
 
 
 def check_unsprung(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:

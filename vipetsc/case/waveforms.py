@@ -1,0 +1,220 @@
+"""The waveforms of a drive, one record each: its keys, its frequency, its words, and the waveform that is built.
+
+A new waveform is one more record in ``WAVEFORMS``, and a field of ``OneDrive`` for each key that no other one has: the
+choices of ``drive.waveform``, the checks of its keys and the schema follow from these.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from vipetsc.case.case_file import Section
+from vipetsc.case.samples import SamplesTable
+from vipetsc.case.schema import Finite, Positive, Wavenumber
+from vipetsc.lattice import ToneBurst, Waveform
+from vipetsc.lattice.drive import impulse, main_frequency, ramped, spline
+
+CYCLES = 30  # of a burst, where they are not given
+RAMP_PERIODS = 10  # of a harmonic drive's ramp, where it is not given
+RAMP_FRACTION = 0.1  # of a chirp's duration that its ramp takes, where it is not given
+
+
+class WaveformRecord(NamedTuple):
+    """One waveform of a drive.
+
+    ``build(drive)`` makes the waveform of a resolved drive, ``describe(drive)`` says it in words. ``needs`` are the
+    keys without which there is none, ``takes`` the others that it has; keys of other waveforms are refused. A waveform
+    whose wave is chosen by the case has no ``frequency``; of the others ``frequency(drive, highest)`` is the one in
+    rad/s that they are about, at most the ``highest`` that the lattice can follow. ``ramp(drive, frequency)`` is the
+    ramp in s where none is given; ``unit`` is the amplitude's.
+    """
+
+    build: Callable[["OneDrive"], Waveform]
+    describe: Callable[["OneDrive"], str]
+    needs: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
+    frequency: Callable[["OneDrive", float], float] | None = None
+    ramp: Callable[["OneDrive", float], float] | None = None
+    unit: str = "N"
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys of the waveform."""
+        return (*self.needs, *self.takes)
+
+
+def _build_burst(drive: "OneDrive") -> Waveform:
+    return ToneBurst(drive.amplitude, _given(drive.frequency), drive.cycles, drive.envelope)
+
+
+def _build_harmonic(drive: "OneDrive") -> Waveform:
+    return ramped(drive.amplitude, _given(drive.frequency), _given(drive.ramp), drive.duration or np.inf)
+
+
+def _build_chirp(drive: "OneDrive") -> Waveform:
+    duration = _given(drive.duration)
+    return ramped(drive.amplitude, _given(drive.frequency), _given(drive.ramp), duration, sweep=drive.bandwidth)
+
+
+def _build_impulse(drive: "OneDrive") -> Waveform:
+    return impulse(drive.amplitude, _given(drive.duration))
+
+
+def _build_step(drive: "OneDrive") -> Waveform:
+    frequency = _given(drive.frequency)
+    return ramped(drive.amplitude, frequency, _given(drive.ramp), drive.duration or np.inf, sweep=None)
+
+
+def _build_samples(drive: "OneDrive") -> Waveform:
+    assert drive.samples
+    # A wall stays where its motion ends; a force does not go on.
+    hold = drive.end is not None
+    return spline(drive.amplitude, drive.samples.time, drive.samples.value, _given(drive.frequency), hold)
+
+
+def _given(value: float | None) -> float:
+    """The value of a key that a resolved drive has."""
+    assert value is not None
+    return value
+
+
+def _samples_frequency(drive: "OneDrive", highest: float) -> float:
+    assert drive.samples
+    return main_frequency(drive.samples.time, drive.samples.value)
+
+
+def _impulse_frequency(drive: "OneDrive", highest: float) -> float:
+    return float(min(np.pi / (drive.duration or 1.0), highest))
+
+
+def _step_frequency(drive: "OneDrive", highest: float) -> float:
+    return float(min(np.pi / (drive.ramp or 1.0), highest))
+
+
+def _harmonic_ramp(drive: "OneDrive", frequency: float) -> float:
+    longest = (drive.duration or np.inf) / 2
+    return float(min(2 * np.pi * RAMP_PERIODS / frequency, longest))
+
+
+def _chirp_ramp(drive: "OneDrive", frequency: float) -> float:
+    return float(RAMP_FRACTION * (drive.duration or 0.0))
+
+
+def _omega(drive: "OneDrive") -> str:
+    return f"Om = {drive.frequency or 0:.4f} rad/s"
+
+
+def _describe_chirp(drive: "OneDrive") -> str:
+    return f"{_omega(drive)} +- {(drive.bandwidth or 0) / 2:g} rad/s in {drive.duration or np.inf:g} s"
+
+
+def _describe_samples(drive: "OneDrive") -> str:
+    count = len(drive.samples.time) if drive.samples else 0
+    return f"{count} samples, joined by a cubic spline"
+
+
+WAVEFORMS = {
+    "burst": WaveformRecord(
+        build=_build_burst,
+        describe=lambda drive: f"{drive.cycles} cycles, {_omega(drive)}",
+        takes=("cycles", "envelope"),
+    ),
+    "harmonic": WaveformRecord(
+        build=_build_harmonic,
+        describe=lambda drive: f"{_omega(drive)}, ramp {drive.ramp or 0:g} s",
+        takes=("ramp", "duration"),
+        ramp=_harmonic_ramp,
+    ),
+    "chirp": WaveformRecord(
+        build=_build_chirp, describe=_describe_chirp, needs=("bandwidth", "duration"), takes=("ramp",), ramp=_chirp_ramp
+    ),
+    "impulse": WaveformRecord(
+        build=_build_impulse,
+        describe=lambda drive: f"half a sine of {drive.duration or np.inf:g} s",
+        needs=("duration",),
+        frequency=_impulse_frequency,
+        unit="N s",
+    ),
+    "step": WaveformRecord(
+        build=_build_step,
+        describe=lambda drive: f"ramp {drive.ramp or 0:g} s",
+        needs=("ramp",),
+        takes=("duration",),
+        frequency=_step_frequency,
+    ),
+    "samples": WaveformRecord(
+        build=_build_samples, describe=_describe_samples, needs=("samples",), frequency=_samples_frequency
+    ),
+}
+"""The record of every waveform, by the name that ``drive.waveform`` gives it."""
+
+DEFAULT = "burst"
+SINES = tuple(name for name, record in WAVEFORMS.items() if record.frequency is None)
+"""Waveforms whose frequency the case gives."""
+
+
+class OneDrive(Section):
+    """A waveform of a force on one mass, or of the motion of an end's wall.
+
+    ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``.
+    """
+
+    waveform: Literal[tuple(WAVEFORMS)] | None = None  # type: ignore[valid-type]  # names stand in WAVEFORMS alone
+    amplitude: Finite = 1.0
+    cycles: int = Field(CYCLES, ge=1)
+    envelope: Literal["paper", "hann"] = "paper"
+    ramp: Positive | None = None
+    duration: Positive | None = None
+    bandwidth: Finite | None = None
+    samples: SamplesTable | None = None
+    frequency: Positive | None = None
+    wavenumber: Wavenumber | None = None
+    band: Annotated[int, Field(ge=1)] | None = None
+    at: Literal["max-group-velocity"] | None = None
+    cell: int = Field(1, ge=1)
+    mass: int = Field(1, ge=1)
+    end: Literal["left", "right"] | None = None
+
+    @property
+    def kind(self) -> str:
+        """The waveform's name."""
+        return self.waveform or DEFAULT
+
+    @property
+    def record(self) -> WaveformRecord:
+        """The waveform's record."""
+        return WAVEFORMS[self.kind]
+
+    @property
+    def is_sine(self) -> bool:
+        """Whether the case gives the frequency."""
+        return self.kind in SINES
+
+    @property
+    def foreign(self) -> set[str]:
+        """The keys that belong to other waveforms alone."""
+        every = {key for record in WAVEFORMS.values() for key in record.keys}
+        return every - {*self.record.keys}
+
+    @property
+    def wave_choices(self) -> list[Any]:
+        """What is given of the wave: frequency, wavenumber or ``at``; more than one contradict each other."""
+        return [given for given in (self.frequency, self.wavenumber, self.at) if given is not None]
+
+    def describe(self) -> str:
+        """A resolved drive in words."""
+        about = self.record.describe(self)
+        if self.end:
+            return f"{self.amplitude:g} m, {about}; {self.kind} of the {self.end} wall"
+
+        size = f"{self.amplitude:g} {self.record.unit}, {about}"
+        if self.waveform is None and self.cell == self.mass == 1:
+            return size
+        return f"{size}; {self.kind} on mass {self.mass} of cell {self.cell}"
+
+
+def waveform_of(drive: OneDrive) -> Waveform:
+    """The waveform of a resolved drive."""
+    return drive.record.build(drive)
