@@ -153,10 +153,10 @@ def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) 
         table |= {key: getattr(spring, key) for key in ("damping", "quadratic", "cubic") if getattr(spring, key)}
         springs.append(table)
 
-    own: Table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}
+    cell_table: Table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}
     if cell.grounding:
-        own["grounding"] = list(cell.grounding)
-    own["contact"] = [cell.host + 1, cell.resonator + 1]
+        cell_table["grounding"] = list(cell.grounding)
+    cell_table["contact"] = [cell.host + 1, cell.resonator + 1]
     # A preset and its parameters would contradict the cell.
     kept_keys = {key: value for key, value in lattice.items() if key not in ("preset", "lambda", "eta")}
-    return kept_keys | {"cell": own}
+    return kept_keys | {"cell": cell_table}
