@@ -7,12 +7,14 @@ from typing import NamedTuple, Self
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import band_of, percentile_norm
+from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import select
@@ -24,6 +26,7 @@ FACETS = ("reading", "wavenumber")
 SPAN = 4e-3, 40.0  # of the logarithmic axes: room for what is written above the peak
 FEWEST = 4  # amplitudes that show a peak and a power law
 MOST_COLUMNS = 3  # of histories
+FIT_VALUES = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
 
 
 class EntropyCurve(NamedTuple):
@@ -40,136 +43,185 @@ class EntropyCurve(NamedTuple):
 
     @classmethod
     def of(cls, row: xr.Dataset, average: str) -> Self | None:
-        """The curve of an average; None where fewer than two members came out, or all are equal."""
-        value, error = row[f"entropy/{average}"].values, row["entropy/error"].values
-        valid = np.isfinite(value)
-        if valid.sum() < 2 or np.ptp(value[valid]) == 0:
+        """Return the curve of an average; None where fewer than two members came out, or all are equal."""
+        entropy = row[f"entropy/{average}"].values
+        valid = np.isfinite(entropy)
+        value = entropy[valid]
+        if valid.sum() < 2 or np.ptp(value) == 0:
             return None
-        names = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
-        fit = {name: float(row[f"fits/entropy/{average}/{name}"]) for name in names}
-        scale = 0.99 / np.ptp(value[valid])
+
+        # Of normalised values, which lie between 0.01 and 1.
+        scale = 0.99 / np.ptp(value)
         ends = band_of(row, f"entropy/{average}")
-        band = ends and [0.01 + scale * (end[valid] - value[valid].min()) for end in ends]
-        return cls(row[AMPLITUDE].values[valid], normalised(value[valid]), scale * error[valid], fit, band)
+        return cls(
+            amplitude=row[AMPLITUDE].values[valid],
+            value=normalised(value),
+            error=scale * row["entropy/error"].values[valid],
+            fit={name: float(row[f"fits/entropy/{average}/{name}"]) for name in FIT_VALUES},
+            band=ends and [0.01 + scale * (end[valid] - value.min()) for end in ends],
+        )
 
 
-def entropy(sweeps: Sweeps) -> Iterator[style.Drawing]:
-    """Entropy against amplitude for each reading, wavenumber and average: linear above, log-log with fits below."""
-    for ensemble, rows, stem in _facets(sweeps):
-        for average in _averages(rows):
-            yield style.Drawing(f"{stem}-{average}", partial(_entropy, ensemble, rows, average))
+class Facet(NamedTuple):
+    """What stands on one page: configurations of an ``ensemble``, the members of each a row over rising amplitude.
 
-
-def entropy_all(sweeps: Sweeps) -> Iterator[style.Drawing]:
-    """Every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
-    for ensemble, rows, stem in _facets(sweeps, ("reading",)):
-        if len({_driven_wavenumber(row, ensemble) for row in rows}) > 1:
-            for average in _averages(rows):
-                yield style.Drawing(f"{stem}-{average}", partial(_entropy_all, ensemble, rows, average))
-
-
-def entropy_history(sweeps: Sweeps) -> Iterator[style.Drawing]:
-    """H(t) against amplitude as an image for every configuration of a reading and wavenumber."""
-    for ensemble, rows, stem in _facets(sweeps, needs="entropy/history"):
-        shown = [row for row in rows if np.isfinite(row["entropy/history"]).any()]
-        if shown:
-            yield style.Drawing(stem, partial(_history, ensemble, shown))
-
-
-def _facets(
-    sweeps: Sweeps, names: Collection[str] = FACETS, needs: str = "entropy/energy_weighted"
-) -> Iterator[tuple[xr.Dataset, list[xr.Dataset], str]]:
-    """Every ensemble with entropies at ``FEWEST`` amplitudes or more, by those of the axes ``names`` that it has.
-
-    With it a configuration's members over rising amplitude, for each of them, and what tells the facet from others.
+    ``name`` tells the facet from others in a file's name.
     """
-    measured = [e for e in sweeps if "entropy/energy_weighted" in e and AMPLITUDE in axes_of(e)]
-    measured = [e for e in measured if e.sizes[AMPLITUDE] >= FEWEST]
-    for ensemble in (e for e in measured if needs in e):
-        others = [name for name in axes_of(ensemble) if name != AMPLITUDE]
-        ordered = ensemble.sortby(AMPLITUDE)
-        indices = np.ndindex(*(ensemble.sizes[name] for name in others))
-        rows = (ordered.isel(dict(zip(others, index, strict=True))) for index in indices)
-        stem = partial(suffix, ensemble=ensemble, named=len(measured) > 1, dims=names)
-        yield from ((ensemble, of_facet, name) for name, of_facet in grouped(rows, stem).items())
+
+    ensemble: xr.Dataset
+    rows: Sequence[xr.Dataset]
+    name: str
+
+    @property
+    def averages(self) -> list[str]:
+        """The averages of which any row has a curve."""
+        return [average for average in AVERAGES if any(EntropyCurve.of(row, average) for row in self.rows)]
+
+    def row_title(self, row: xr.Dataset) -> str:
+        """Return what tells a configuration from others of its facet: "5 sites"."""
+        parts = []
+        for name in axes_of(self.ensemble):
+            if name not in (*FACETS, AMPLITUDE):
+                value = row[name].item()
+                parts.append(counted(value, "site") if name == "sites" else f"{name} {value}")
+        return ", ".join(parts) or "all members"
+
+    def heading(self, shown: str, wave: bool = True) -> str:
+        """Return the sweep's name, the reading, the wavenumber unless it varies, and what is ``shown``."""
+        parts = [f"{self._reading()} reading"]
+        if wave:
+            parts.append(_driven_wavenumber(self.rows[0], self.ensemble))
+        parts.append(shown)
+        return f"{table(self.ensemble)['name']}: {', '.join(part for part in parts if part)}"
+
+    def _reading(self) -> str:
+        if "reading" in axes_of(self.ensemble):
+            return str(self.rows[0]["reading"].item())
+        return reading_of(self.ensemble)
 
 
-def _averages(rows: Sequence[xr.Dataset]) -> list[str]:
-    """The averages of which some of the ``rows`` has a curve."""
-    return [average for average in AVERAGES if any(EntropyCurve.of(row, average) for row in rows)]
+def entropy(sweeps: Sweeps) -> Iterator[Drawing]:
+    """Offer each reading, wavenumber and average: entropy against amplitude, below in logarithms with fits."""
+    for facet in _facets(sweeps):
+        for average in facet.averages:
+            yield Drawing(f"{facet.name}-{average}", partial(_entropy, facet, average))
 
 
-def _row_title(row: xr.Dataset, ensemble: xr.Dataset) -> str:
-    """A configuration in its facet: "5 sites"."""
-    values = {name: row[name].item() for name in axes_of(ensemble) if name not in (*FACETS, AMPLITUDE)}
-    parts = (counted(value, "site") if name == "sites" else f"{name} {value}" for name, value in values.items())
-    return ", ".join(parts) or "all members"
+def entropy_all(sweeps: Sweeps) -> Iterator[Drawing]:
+    """Offer every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
+    for facet in _facets(sweeps, names=("reading",)):
+        if len({_driven_wavenumber(row, facet.ensemble) for row in facet.rows}) > 1:
+            for average in facet.averages:
+                yield Drawing(f"{facet.name}-{average}", partial(_entropy_all, facet, average))
+
+
+def entropy_history(sweeps: Sweeps) -> Iterator[Drawing]:
+    """Offer H(t) against amplitude as an image for every configuration of a reading and wavenumber."""
+    for facet in _facets(sweeps, needs="entropy/history"):
+        measured = [row for row in facet.rows if np.isfinite(row["entropy/history"]).any()]
+        if measured:
+            yield Drawing(facet.name, partial(_history, facet._replace(rows=measured)))
+
+
+def _facets(sweeps: Sweeps, names: Collection[str] = FACETS, needs: str = "entropy/energy_weighted") -> Iterator[Facet]:
+    """Yield every ensemble with entropies at ``FEWEST`` amplitudes or more, by those of the axes ``names`` it has."""
+    measured = []
+    for ensemble in sweeps:
+        has_entropy = "entropy/energy_weighted" in ensemble and AMPLITUDE in axes_of(ensemble)
+        if has_entropy and ensemble.sizes[AMPLITUDE] >= FEWEST:
+            measured.append(ensemble)
+
+    for ensemble in measured:
+        if needs in ensemble:
+            others = [name for name in axes_of(ensemble) if name != AMPLITUDE]
+            ordered = ensemble.sortby(AMPLITUDE)
+            indices = np.ndindex(*(ensemble.sizes[name] for name in others))
+            rows = (ordered.isel(dict(zip(others, index, strict=True))) for index in indices)
+            facet_name = partial(suffix, ensemble=ensemble, named=len(measured) > 1, dims=names)
+            for name, facet_rows in grouped(rows, facet_name).items():
+                yield Facet(ensemble, facet_rows, name)
 
 
 def _driven_wavenumber(row: xr.Dataset, ensemble: xr.Dataset) -> str:
-    """The drive's wavenumber as a fraction of pi; empty if the sweep drives by frequency."""
+    """Return the drive's wavenumber as a fraction of pi; empty if the sweep drives by frequency."""
     if "wavenumber" in axes_of(ensemble):
         return f"κ* = {in_pi(row['wavenumber'].item())}"
-    shared = table(ensemble).get("drive", {}).get("wavenumber")
-    return "" if shared is None else f"κ* = {in_pi(coordinate([shared])[0])}"
+    wavenumber = table(ensemble).get("drive", {}).get("wavenumber")
+    return "" if wavenumber is None else f"κ* = {in_pi(coordinate([wavenumber])[0])}"
 
 
-def _heading(row: xr.Dataset, ensemble: xr.Dataset, shown: str, wave: bool = True) -> str:
-    """The sweep's name, its reading and wavenumber, and what is ``shown``."""
-    reading = row["reading"].item() if "reading" in axes_of(ensemble) else reading_of(ensemble)
-    parts = f"{reading} reading", _driven_wavenumber(row, ensemble) if wave else "", shown
-    return f"{table(ensemble)['name']}: {', '.join(filter(None, parts))}"
-
-
-def _entropy(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
-    figure, grid = _panels(2, len(rows), 1.55, _heading(rows[0], ensemble, f"{AVERAGES[average]} mean entropy"))
-    for (upper, lower), row in zip(grid.T, rows, strict=True):
-        upper.set_title(_row_title(row, ensemble))
+def _entropy(facet: Facet, average: str) -> Figure:
+    """Draw an average over the amplitude for each row: with the other averages, and below in logarithms."""
+    figure, grid = _panels(2, len(facet.rows), 1.55, facet.heading(f"{AVERAGES[average]} mean entropy"))
+    for (upper, lower), row in zip(grid.T, facet.rows, strict=True):
+        upper.set_title(facet.row_title(row))
         curve = _curve_or_reason(upper, row, average)
         if curve is None:
             lower.set_axis_off()
             continue
+
         for name, label in AVERAGES.items():
             other = EntropyCurve.of(row, name)
             if other and name != average:
                 upper.plot(other.amplitude, other.value, color=COLOURS[name], lw=0.6, alpha=0.5, label=label)
-        _points(upper, curve, average, 2.2)
-        same = {name: row[name].item() for name in axes_of(ensemble) if name != AMPLITUDE}
-        for reading in ensemble["reading"].values if "reading" in same else ():
-            other = EntropyCurve.of(select(ensemble, **same | {"reading": reading}).sortby(AMPLITUDE), average)
-            if other and reading != same["reading"]:
-                line = {"color": style.GREY, "lw": 0.7, "ls": (0, (3, 1.5)), "label": f"{reading} reading"}
-                lower.plot(other.amplitude, other.value, **line)
-        _log_panel(lower, curve, average, 2.2)
+        _draw_points(upper, curve, average, size=2.2)
         upper.set(xlim=(0, 1.04 * curve.amplitude[-1]), ylim=(-0.05, 1.45))
+
+        _draw_other_readings(lower, facet.ensemble, row, average)
+        _draw_log_panel(lower, curve, average, size=2.2)
+
     figure.supylabel("Normalised entropy")
-    pairs = [pair for axes in grid.flat for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    handles = {label: handle for handle, label in pairs}
-    columns = 3 if len(rows) > 4 else 2
-    strip = (0.05 + 0.13 * -(-len(handles) // columns)) / figure.get_figheight()
-    figure.get_layout_engine().set(rect=(0, strip, 1, 1 - strip))
-    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=columns)
+    _add_legend(figure, grid, columns=3 if len(facet.rows) > 4 else 2)
     return figure
 
 
-def _entropy_all(ensemble: xr.Dataset, rows: Sequence[xr.Dataset], average: str) -> Figure:
-    by_wavenumber = grouped(rows, partial(_driven_wavenumber, ensemble=ensemble))
-    heading = _heading(rows[0], ensemble, f"{AVERAGES[average]} mean entropy", wave=False)
-    figure, grid = _panels(len(by_wavenumber), len(rows) // len(by_wavenumber), 1.25, heading)
-    for line, (wavenumber, of_wavenumber) in zip(grid, by_wavenumber.items(), strict=True):
+def _draw_other_readings(axes: Axes, ensemble: xr.Dataset, row: xr.Dataset, average: str) -> None:
+    """Draw the curves of the configuration of ``row`` in the other readings of the sweep, thin and grey."""
+    same = {name: row[name].item() for name in axes_of(ensemble) if name != AMPLITUDE}
+    if "reading" not in same:
+        return
+    for reading in ensemble["reading"].values:
+        other_row = select(ensemble, **same | {"reading": reading}).sortby(AMPLITUDE)
+        other = EntropyCurve.of(other_row, average)
+        if other and reading != same["reading"]:
+            line = {"color": style.GREY, "lw": 0.7, "ls": (0, (3, 1.5))}
+            axes.plot(other.amplitude, other.value, label=f"{reading} reading", **line)
+
+
+def _add_legend(figure: Figure, grid: np.ndarray, columns: int) -> None:
+    """Write one legend for all panels of ``grid`` into a strip below them, each label once."""
+    handles = {}
+    for axes in grid.flat:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles[label] = handle
+
+    rows = -(-len(handles) // columns)
+    strip = (0.05 + 0.13 * rows) / figure.get_figheight()
+    figure.get_layout_engine().set(rect=(0, strip, 1, 1 - strip))
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=columns)
+
+
+def _entropy_all(facet: Facet, average: str) -> Figure:
+    """Draw an average in logarithms: wavenumbers in rows, configurations in columns."""
+    by_wavenumber = grouped(facet.rows, partial(_driven_wavenumber, ensemble=facet.ensemble))
+    columns = len(facet.rows) // len(by_wavenumber)
+    heading = facet.heading(f"{AVERAGES[average]} mean entropy", wave=False)
+    figure, grid = _panels(len(by_wavenumber), columns, 1.25, heading)
+    for line, (wavenumber, rows) in zip(grid, by_wavenumber.items(), strict=True):
         line[0].set_ylabel(wavenumber)
-        for axes, row in zip(line, of_wavenumber, strict=True):
+        for axes, row in zip(line, rows, strict=True):
             curve = _curve_or_reason(axes, row, average)
             if curve is not None:
-                _log_panel(axes, curve, average, 1.6)
+                _draw_log_panel(axes, curve, average, size=1.6)
             axes.label_outer()
-    for axes, row in zip(grid[0], rows, strict=False):
-        axes.set_title(_row_title(row, ensemble))
+
+    for axes, row in zip(grid[0], facet.rows, strict=False):
+        axes.set_title(facet.row_title(row))
     return figure
 
 
 def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve | None:
-    """The curve of ``row``; ``axes`` say why if there is none."""
+    """Return the curve of ``row``; if there is none, None, and write the reason into ``axes``."""
     curve = EntropyCurve.of(row, average)
     if curve is None:
         none_came_out = np.isfinite(row[f"entropy/{average}"]).sum() < 2
@@ -178,27 +230,33 @@ def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve 
 
 
 def _panels(rows: int, columns: int, height: float, heading: str) -> tuple[Figure, np.ndarray]:
-    """A page with a grid of panels over the amplitude, each row ``height`` inches."""
-    figure = style.new_figure(style.PAGE * max(columns, 4) / 6, 0.6 + rows * height, heading)
+    """Return a page with a grid of panels over the amplitude, each row ``height`` inches."""
+    width = style.PAGE * max(columns, 4) / 6
+    figure = style.new_figure(width, 0.6 + rows * height, heading)
     grid = figure.subplots(rows, columns, sharex="row", sharey="row", squeeze=False)
     for axes in grid[-1]:
         axes.set_xlabel("A (N)")
     return figure, grid
 
 
-def _points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
+def _draw_points(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
+    """Draw the points of a curve with bars for the deviation over the cells, over a band for the samples."""
+    colour = COLOURS[average]
     if curve.band:
-        shade = {"color": COLOURS[average], "alpha": 0.25, "lw": 0, "label": "5 to 95 % of samples"}
+        shade = {"color": colour, "alpha": 0.25, "lw": 0, "label": "5 to 95 % of samples"}
         axes.fill_between(curve.amplitude, *curve.band, **shade)
-    pale = tuple(0.5 + 0.5 * np.array(to_rgb(COLOURS[average])))
-    axes.errorbar(curve.amplitude, curve.value, curve.error, fmt="o-", color=COLOURS[average], ecolor=pale, ms=size,
-                  mew=0, lw=0.6, elinewidth=0.4, label=f"{AVERAGES[average]}, ± std over the cells")  # fmt: skip
+
+    # Bars of a solid pale colour: transparent ones would darken where they overlap.
+    pale = tuple(0.5 + 0.5 * np.array(to_rgb(colour)))
+    look = {"fmt": "o-", "color": colour, "ecolor": pale, "ms": size, "mew": 0, "lw": 0.6, "elinewidth": 0.4}
+    axes.errorbar(curve.amplitude, curve.value, curve.error, label=f"{AVERAGES[average]}, ± std over the cells", **look)
 
 
-def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
-    """The curve in logarithms, the power law from the peak on as a thick black line with both adjusted R^2."""
-    _points(axes, curve, average, size)
-    amplitude, fit = curve.amplitude, curve.fit
+def _draw_log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) -> None:
+    """Draw the curve in logarithms, the power law from the peak on as a thick black line with both adjusted R^2."""
+    _draw_points(axes, curve, average, size)
+    amplitude = curve.amplitude
+    fit = curve.fit
     doubts = doubt(fit["points"], fit["r2_log_log"])
     if not doubts:
         x = amplitude[amplitude >= fit["peak_amplitude"] * (1 - 1e-9)]
@@ -207,37 +265,55 @@ def _log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) -> No
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", fontsize=6)
     else:
+        # Out of the layout, which would make room for a long reason by narrowing all panels.
         text = f"no power law:\n{doubts}"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", color=style.GREY, fontsize=6, in_layout=False)
     axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * amplitude[0], 1.25 * amplitude[-1]))
 
 
-def _history(ensemble: xr.Dataset, configurations: Sequence[xr.Dataset]) -> Figure:
-    """Images of H(t) over amplitude, dashed where averages over time begin, dotted where contact begins."""
-    columns = min(len(configurations), MOST_COLUMNS)
-    rows = -(-len(configurations) // columns)
+def _history(facet: Facet) -> Figure:
+    """Draw images of H(t) over amplitude, dashed where averages over time begin, dotted where contact begins."""
+    columns = min(len(facet.rows), MOST_COLUMNS)
+    rows = -(-len(facet.rows) // columns)
     width = max(style.PAGE * columns / MOST_COLUMNS, style.COLUMN)
-    heading = _heading(configurations[0], ensemble, "entropy H(t) of every amplitude")
-    figure = style.new_figure(width, 0.7 + 1.9 * rows, heading)
+    figure = style.new_figure(width, 0.7 + 1.9 * rows, facet.heading("entropy H(t) of every amplitude"))
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    # When the averages over time begin.
-    shown = [(row, float(np.nanmin(row["entropy/start"].values))) for row in configurations]
-    norm = percentile_norm(row["entropy/history"].where(row["entropy/time"] >= start) for row, start in shown)
-    for axes, (row, start) in zip(grid.flat, shown, strict=False):
-        times, history, amplitude = (row[name].values for name in ("entropy/time", "entropy/history", AMPLITUDE))
-        time = times[np.argmax(np.isfinite(times).sum(axis=1))]
-        finite = np.isfinite(time)
-        image = axes.pcolormesh(time[finite], amplitude, history[:, finite], norm=norm, rasterized=True)
-        axes.set(title=_row_title(row, ensemble), yscale="log", xlim=time[finite][[0, -1]])
-        touched = row["contact_episodes"].values > 0
-        if touched.any() and not touched.all():
-            first = int(np.argmax(touched))
-            axes.axhline(np.sqrt(amplitude[first - 1] * amplitude[first]), color="white", lw=0.8, ls=":")
+
+    # One scale for all, of the times that are averaged: from the wave's arrival at the first site on.
+    starts = [float(np.nanmin(row["entropy/start"].values)) for row in facet.rows]
+    norm = percentile_norm(
+        row["entropy/history"].where(row["entropy/time"] >= start)
+        for row, start in zip(facet.rows, starts, strict=True)
+    )
+    for axes, row, start in zip(grid.flat, facet.rows, starts, strict=False):
+        image = _draw_history(axes, row, norm)
+        axes.set_title(facet.row_title(row))
         if start > 0:
             axes.axvline(start, color="white", lw=0.7, ls="--")
-    for axes in grid.flat[len(configurations) :]:
+    for axes in grid.flat[len(facet.rows) :]:
         axes.set_axis_off()
+
     figure.supxlabel("Time (s)")
     figure.supylabel("Amplitude A (N)")
     panels.colour_bar(image, grid, "H(t) (bit)", extend="both")
     return figure
+
+
+def _draw_history(axes: Axes, row: xr.Dataset, norm: Normalize) -> QuadMesh:
+    """Draw H(t) of every amplitude of ``row``, and a dotted line where contact begins."""
+    times = row["entropy/time"].values
+    amplitude = row[AMPLITUDE].values
+
+    # Members that failed have no times; the others have the same ones.
+    time = times[np.argmax(np.isfinite(times).sum(axis=1))]
+    finite = np.isfinite(time)
+    history = row["entropy/history"].values[:, finite]
+    image = axes.pcolormesh(time[finite], amplitude, history, norm=norm, rasterized=True)
+    axes.set(yscale="log", xlim=time[finite][[0, -1]])
+
+    touched = row["contact_episodes"].values > 0
+    if touched.any() and not touched.all():
+        first = int(np.argmax(touched))
+        onset = np.sqrt(amplitude[first - 1] * amplitude[first])
+        axes.axhline(onset, color="white", lw=0.8, ls=":")
+    return image
