@@ -8,7 +8,7 @@ from PIL import Image
 from tests.unit.test_figures import NT, SHAPES, write_run
 from vipetsc.cli.main import main
 from vipetsc.figures import movie
-from vipetsc.figures.movie_frames import FADE, Shot, scenes
+from vipetsc.figures.movie_frames import FADE, Shot, movie_frames
 from vipetsc.figures.style import rc_style
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import field_time, open_run
@@ -44,7 +44,7 @@ def opened(folder):
 @pytest.fixture(scope="module")
 def stage(opened):
     with rc_style():
-        return movie.Stage(opened[0], scenes(*opened, Shot(speed=0.016, rate=3.0, width=320)), 320)
+        return movie.MovieFigure(opened[0], movie_frames(*opened, Shot(speed=0.016, rate=3.0, width=320)), 320)
 
 
 def test_envelopes_of_bands_sum_to_the_energy_of_a_ring_and_are_where_the_wave_is():
@@ -73,7 +73,7 @@ def test_envelopes_of_bands_sum_to_the_energy_of_a_ring_and_are_where_the_wave_i
 
 
 def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
-    content = scenes(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))  # a frame is 1.5 ms
+    content = movie_frames(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))  # a frame is 1.5 ms
     onsets = np.linspace(0.01, 0.04, 6)
     for site in (0, 1):
         for k in range(1, len(content.time)):
@@ -98,9 +98,9 @@ def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(
     own = np.tile(CELL.masses, (24, 1))
     own[:, 0] = np.linspace(0.005, 0.01, 24)
     with open_run(tmp_path / "run.h5") as run:
-        content = scenes(run, None, Shot(speed=0.016, rate=3.0))
-        part = scenes(run, None, Shot(speed=0.016, rate=3.0, cells=(11, 24)))
-        fast = scenes(run, None, Shot("velocity", speed=0.016, rate=3.0))
+        content = movie_frames(run, None, Shot(speed=0.016, rate=3.0))
+        part = movie_frames(run, None, Shot(speed=0.016, rate=3.0, cells=(11, 24)))
+        fast = movie_frames(run, None, Shot("velocity", speed=0.016, rate=3.0))
     rows = np.rint(content.time / 2e-4).astype(int)
     kinetic = 0.5 * (own * velocity[rows] ** 2).sum(axis=(1, 2))
     assert content.waves.sum(axis=(1, 2)) == pytest.approx(kinetic, rel=1e-12)
@@ -123,7 +123,7 @@ def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monk
     with h5py.File(folder / "run.h5") as file:
         time, velocity = (file[name][...] for name in ("time", "velocity"))
     monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
-    content = scenes(*opened, Shot("velocity", 0.01, 0.0308, 0.0208, 8.0, cells=(5, 14)))
+    content = movie_frames(*opened, Shot("velocity", 0.01, 0.0308, 0.0208, 8.0, cells=(5, 14)))
     assert content.time == pytest.approx(0.01 + np.arange(9) * 0.0026)
     rows = np.abs(time - content.time[:, None]).argmin(axis=1)
     assert np.array_equal(content.wave[:, 0], velocity[rows, 4:14, CELL.host])
@@ -212,9 +212,9 @@ def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
     write_run(tmp_path / "run.h5", **SHAPES[shape])
     with rc_style(), open_run(tmp_path / "run.h5") as run:
         shot = Shot("velocity", rate=0.3, width=320)
-        stage = movie.Stage(run, scenes(run, None, shot), shot.width)
+        stage = movie.MovieFigure(run, movie_frames(run, None, shot), shot.width)
         assert field_time(run)[-1] >= stage.content.time[-1]
         assert np.ptp(stage.frame(1)) > 0
         if shape == "single cell":
             with pytest.raises(ValueError, match="side by side"):
-                scenes(run, None, Shot())
+                movie_frames(run, None, Shot())

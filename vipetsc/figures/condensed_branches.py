@@ -12,6 +12,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import style
 from vipetsc.figures.frequency_energy import MARKS, draw_branch
+from vipetsc.figures.panels import annotate_empty, empty_figure
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import pass_bands
 
@@ -25,9 +26,11 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
     """Draw frequency and elongation at phase 0 over energy, and stored motions over the cells; a row for each file."""
     branches = []
     for path in paths:
-        with open_netcdf(path, "branch", ("states/number", "harmonics")) as file:
+        with open_netcdf(path, "branch", ("harmonics", "elongation", "kind")) as file:
             names = np.array(file["kind"].attrs["flag_meanings"].split())
             branches.append(file.load().assign(kind=("point", names[file["kind"].values])))
+    if not all(branch.sizes["point"] for branch in branches):
+        return empty_figure("no point of the branch was found")
 
     figure = style.new_figure(style.PAGE, 2.5 * len(branches))
     grid = figure.subplots(len(branches), 3, squeeze=False)
@@ -44,7 +47,10 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
         _draw_elongation(elongation, branch)
         for axes in (frequency, elongation):
             _set_energy_axis(axes, branch)
-        if is_lattice:
+        if "states/number" not in branch:
+            # They are stored when a branch ends: this one was interrupted.
+            annotate_empty(motions, "no motions stored")
+        elif is_lattice:
             _draw_over_cells(motions, branch)
         else:
             _draw_over_masses(motions, branch)
@@ -64,9 +70,10 @@ def _draw_frequency(axes: Axes, branch: xr.Dataset) -> None:
         if at.any():
             axes.plot(energy[at], frequency[at], mark, label=label, ms=3, mfc="white", mec=style.BLACK, mew=0.6)
 
-    stored = zip(branch["states/energy"].values, branch["states/period"].values, COLOURS, strict=False)
-    for state_energy, period, colour in stored:
-        axes.plot(state_energy, 1 / period, "x", color=colour, ms=5, mew=1.2)
+    if "states/number" in branch:
+        stored = zip(branch["states/energy"].values, branch["states/period"].values, COLOURS, strict=False)
+        for state_energy, period, colour in stored:
+            axes.plot(state_energy, 1 / period, "x", color=colour, ms=5, mew=1.2)
     axes.set_ylabel("frequency (Hz)")
 
 

@@ -1,4 +1,6 @@
-"""The scattering law of one site: shares over z, those of bands and directions, and the onset from close by."""
+"""The scattering law of one site: energies over z, those of bands and directions, and the onset from close by."""
+
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -8,67 +10,86 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.figures import style
 
-SHARES = {
+ENERGIES = {
     "transmitted": ("T, transmitted", style.BLUE),
     "reflected": ("R, reflected", style.SKY),
     "upper": ("U, upper bands", style.VERMILION),
     "dissipated": ("L, dissipated", style.ORANGE),
 }
 COLOURS = style.VERMILION, style.PURPLE, style.GREEN, style.YELLOW, style.GREY
-FLOOR = 1e-5  # of a share that a logarithmic axis shows
+FLOOR = 1e-5  # of the energy that arrives, which a logarithmic axis shows
+DASHES = {"forward": "-", "backward": "--"}
+FEW_DECADES = 20  # largest z up to which 2 and 5 are labelled between the powers of ten
+
+
+class LawCurve(NamedTuple):
+    """A fraction of the energy that arrives, over z, and its standard deviation over the runs at each z."""
+
+    value: np.ndarray
+    scatter: np.ndarray
 
 
 def law(data: xr.Dataset) -> Figure:
-    """Three panels over z: T, R, U and L; what leaves by band and direction; T, U and U/(1-T) from the onset on."""
-    z, best = data["z"].values, float(data.attrs["matched_z"])
+    """Draw over z: T, R, U and L; what leaves by band and direction; T, U and U/(1-T) from the onset on."""
+    z = data["z"].values
     figure = style.new_figure(style.PAGE, 2.9)
-    left, middle, right = figure.subplots(1, 3)
-    for name, (label, colour) in SHARES.items():
-        _curve(left, z, data[name].values, data[f"{name}_scatter"].values, colour, "-", label)
-    drive, colours = int(data.attrs["drive_band"]), iter(COLOURS * len(data["band"]))
-    for number in data["band"].values:
-        colour = style.BLUE if number == drive else next(colours)
-        for way, line in (("forward", "-"), ("backward", "--")):
-            of = {"band": data["band"].values == number, "direction": data["direction"].values == way}
-            share, scatter = (
-                data[name].values[:, of["band"]][:, 0][:, of["direction"]][:, 0] for name in ("share", "share_scatter")
-            )
-            _curve(
-                middle,
-                z,
-                np.where(share > FLOOR, share, np.nan),
-                scatter,
-                colour,
-                line,
-                f"band {number}" if way == "forward" else "",
-            )
-    over = z - 1
+    all_energies, by_band, onset = figure.subplots(1, 3)
+    for name, (label, colour) in ENERGIES.items():
+        _draw_curve(all_energies, z, _curve(data, name), colour, label=label)
+    _draw_bands(by_band, data)
     for name in ("transmitted", "upper"):
-        label, colour = SHARES[name]
-        _curve(right, over, data[name].values, data[f"{name}_scatter"].values, colour, "-", label)
-    efficiency = np.where(data["efficiency"].values > 0, data["efficiency"].values, np.nan)
-    right.plot(over, efficiency, color=style.BLACK, lw=1.2, label="U/(1 - T)")
-    for axes in (left, middle):
+        label, colour = ENERGIES[name]
+        _draw_curve(onset, z - 1, _curve(data, name), colour, label=label)
+    efficiency = data["efficiency"].values
+    positive = np.where(efficiency > 0, efficiency, np.nan)
+    onset.plot(z - 1, positive, color=style.BLACK, lw=1.2, label="U/(1 - T)")
+
+    for axes in (all_energies, by_band):
         axes.set(xscale="log", xlabel="z = linear displacement / clearance", xlim=(0.9, z[-1]))
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if z[-1] > 20 else (1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if z[-1] > FEW_DECADES else (1.0, 2.0, 5.0)))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-    left.set(ylim=(0, 1.02), ylabel="share of the energy that arrives")
-    middle.set(yscale="log", ylim=(FLOOR / 10, 1.5))
-    right.set(xscale="log", xlabel="z - 1", xlim=(max(over[1] / 2, 1e-4), 3), ylim=(0, 1.02))
-    if np.isfinite(best):
-        for axes, at in ((left, best), (middle, best), (right, best - 1)):
+    all_energies.set(ylim=(0, 1.02), ylabel="share of the energy that arrives")
+    by_band.set(yscale="log", ylim=(FLOOR / 10, 1.5))
+    onset.set(xscale="log", xlabel="z - 1", xlim=(max((z[1] - 1) / 2, 1e-4), 3), ylim=(0, 1.02))
+
+    all_energies.set_title("T + R + U + L + other bands = 1", fontsize=8)
+    by_band.set_title("by band; dashed: backward", fontsize=8)
+    matched = float(data.attrs["matched_z"])
+    if np.isfinite(matched):
+        for axes, at in ((all_energies, matched), (by_band, matched), (onset, matched - 1)):
             axes.axvline(at, color=style.GREY, lw=0.8, ls=style.DOTTED)
-        right.set_title(f"z* = {best:.3g}, T = {float(data.attrs['matched_transmitted']):.3g}", fontsize=8)
-    left.set_title("T + R + U + L + other bands = 1", fontsize=8)
-    middle.set_title("by band; dashed: backward", fontsize=8)
-    left.legend(fontsize=6, loc="center right")
-    middle.legend(fontsize=6, loc="lower left", ncols=2)
-    right.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45))
+        transmitted = float(data.attrs["matched_transmitted"])
+        onset.set_title(f"z* = {matched:.3g}, T = {transmitted:.3g}", fontsize=8)
+
+    all_energies.legend(fontsize=6, loc="center right")
+    by_band.legend(fontsize=6, loc="lower left", ncols=2)
+    onset.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45))
     return figure
 
 
-def _curve(axes: Axes, x: np.ndarray, y: np.ndarray, scatter: np.ndarray, colour: str, line: str, label: str) -> None:
-    """A curve with its scatter, one deviation either way."""
-    axes.plot(x, y, color=colour, ls=line, lw=1.0, label=label or None)
-    axes.fill_between(x, y - scatter, y + scatter, color=colour, alpha=0.25, lw=0)
+def _curve(data: xr.Dataset, name: str) -> LawCurve:
+    return LawCurve(data[name].values, data[f"{name}_scatter"].values)
+
+
+def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
+    """Draw what leaves in every band (a colour, the driven one blue), forward (full) and backward (dashed)."""
+    z = data["z"].values
+    driven = int(data.attrs["drive_band"])
+    bands = data["band"].values.tolist()
+    directions = data["direction"].values.tolist()
+    other_colours = iter(COLOURS * len(bands))
+    for i, number in enumerate(bands):
+        colour = style.BLUE if number == driven else next(other_colours)
+        for direction, dashes in DASHES.items():
+            j = directions.index(direction)
+            value = data["share"].values[:, i, j]
+            curve = LawCurve(np.where(value > FLOOR, value, np.nan), data["share_scatter"].values[:, i, j])
+            label = f"band {number}" if direction == "forward" else ""
+            _draw_curve(axes, z, curve, colour, dashes, label)
+
+
+def _draw_curve(axes: Axes, x: np.ndarray, curve: LawCurve, colour: str, dashes: str = "-", label: str = "") -> None:
+    """Draw a curve with its scatter, one deviation either way."""
+    axes.plot(x, curve.value, color=colour, ls=dashes, lw=1.0, label=label or None)
+    axes.fill_between(x, curve.value - curve.scatter, curve.value + curve.scatter, color=colour, alpha=0.25, lw=0)

@@ -1,5 +1,7 @@
 """The energies of a run's linear modes: their steps at impacts, and what each site moved between the bands."""
 
+from typing import NamedTuple, Self
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -9,81 +11,129 @@ from matplotlib.figure import Figure
 from vipetsc.figures import panels, style
 
 COLOURS = style.GREY, style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.YELLOW
-LEAST = 1e-4  # share of the energy at the end or in transfers below which a gap is not drawn
+LEAST = 1e-4  # of the largest energy, at the end or in transfers, below which a gap is not drawn
 MOST_ROWS = 24  # sites of a matrix; of more, the ones that moved most
+MOST_TICKS = 6  # of sites beside the raster of impacts
 SEVERAL = "several"  # sites in contact between the same samples
 
 
+class MovedEnergies(NamedTuple):
+    """Energies (row, part) in J that each site moved into the parts of the spectrum; in the last column what it lost.
+
+    ``labels`` (row) are cells, or ``SEVERAL`` for episodes that cannot be told apart by site.
+    """
+
+    labels: list[str]
+    energy: np.ndarray
+
+    @classmethod
+    def of(cls, run: xr.Dataset, analysis: xr.Dataset, parts: list[int]) -> Self:
+        """Return what the sites of ``run`` moved into ``parts``, of at most ``MOST_ROWS`` of them, in their order."""
+        transfer = analysis["bands/transfer"].values  # (cluster, part)
+        cluster = analysis["bands/cluster_of_episode"].values - 1
+        site = run["impacts/site"].values.astype(int) - 1
+        sites = run["sites/cell"].values
+
+        # A cluster is of one site if the lowest and the highest of its episodes are the same.
+        lowest = np.full(len(transfer), len(sites))
+        highest = np.full(len(transfer), -1)
+        np.minimum.at(lowest, cluster, site)
+        np.maximum.at(highest, cluster, site)
+        row = np.where(lowest == highest, lowest, len(sites))
+
+        moved = np.zeros((len(sites) + 1, len(parts) + 1))
+        np.add.at(moved, row, np.column_stack([transfer[:, parts], -transfer.sum(axis=1)]))
+
+        rows = np.unique(row)
+        by_size = np.argsort(-np.abs(moved[rows]).sum(axis=1), kind="stable")
+        rows = np.sort(rows[by_size][:MOST_ROWS])
+        labels = [*map(str, sites), SEVERAL]
+        return cls(labels=[labels[i] for i in rows], energy=moved[rows])
+
+
 def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
-    """Energies of the linear modes by pass band over time, the impacts under them, and transfers by site and band."""
+    """Draw energies of the linear modes by pass band over time, the impacts below, and transfers by site and band."""
     if analysis is None or "bands/transfer" not in analysis:
         return panels.empty_figure("Modal energies: needs the analysis of a run with all displacements and velocities")
-    energy, names = analysis["bands/modal_energy"], list(analysis["bands/modal_energy"].attrs["parts"])
+    energy = analysis["bands/modal_energy"]
     largest = float(energy.sum("bands/part").max())
     if largest == 0:
         return panels.empty_figure("Modal energies: the drive has done no work")
+
+    # Bands are always drawn, gaps where they have or had any energy to speak of.
+    names = list(energy.attrs["parts"])
     weight = np.maximum(energy.values[:, -1], np.abs(analysis["bands/transfer"].values).sum(axis=0))
-    shown = [p for p, name in enumerate(names) if "band" in name or weight[p] > LEAST * largest]
-    rows, moved = _moved(run, analysis, shown)
-    figure = style.new_figure(style.PAGE if rows else style.COLUMN, 3.3 if rows else 2.4)
-    places = [["steps", "matrix"], ["impacts", "matrix"]] if rows else [["steps"]]
-    ratios = {"width_ratios": (1.55, 1), "height_ratios": (2.6, 1)} if rows else {}
-    axes = figure.subplot_mosaic(places, **ratios)
-    steps, time = axes["steps"], analysis["bands/instant"]
-    for p, colour in zip(shown, _colours(names, shown), strict=True):
-        share = float(energy[p, -1] / energy[:, -1].sum())
-        steps.plot(time, energy[p], color=colour, lw=0.9, label=f"{names[p]}: {share:.1%}")
-    steps.set(ylabel="Energy of the linear modes (J)", xlim=run["time"][[0, -1]], ylim=(0, None))
-    steps.legend(loc="best", ncols=1 + (len(shown) > 5), title="share at the end", title_fontsize=7)
-    if not rows:
-        steps.set(xlabel="Time (s)")
+    parts = [p for p, name in enumerate(names) if "band" in name or weight[p] > LEAST * largest]
+    moved = MovedEnergies.of(run, analysis, parts)
+    if not moved.labels:
+        figure = style.new_figure(style.COLUMN, 2.4)
+        axes = figure.subplots()
+        _draw_steps(axes, run, analysis, parts)
+        axes.set(xlabel="Time (s)")
         return figure
-    steps.set_title("(a) Steps at impacts")
-    steps.tick_params(labelbottom=False)
-    raster = axes["impacts"]
-    raster.plot(run["impacts/onset"], run["impacts/site"], "|", color=style.BLACK, ms=4, mew=0.5)
-    sites = run["sites/cell"].values
-    some = np.unique(np.linspace(0, len(sites) - 1, min(len(sites), 6)).astype(int))
-    raster.set_yticks(some + 1, sites[some])
-    raster.set(xlabel="Time (s)", ylabel="Site (cell)", xlim=run["time"][[0, -1]], ylim=(0.4, len(sites) + 0.6))
-    _matrix(axes["matrix"], rows, [*(names[p] for p in shown), "lost"], 100 * moved / float(run["energy/work"][-1]))
+
+    figure = style.new_figure(style.PAGE, 3.3)
+    ratios = {"width_ratios": (1.55, 1), "height_ratios": (2.6, 1)}
+    panel = figure.subplot_mosaic([["steps", "matrix"], ["impacts", "matrix"]], **ratios)
+    _draw_steps(panel["steps"], run, analysis, parts)
+    panel["steps"].set_title("(a) Steps at impacts")
+    panel["steps"].tick_params(labelbottom=False)
+    _draw_impacts(panel["impacts"], run)
+    percent = 100 * moved.energy / float(run["energy/work"][-1])
+    _draw_matrix(panel["matrix"], moved.labels, [*(names[p] for p in parts), "lost"], percent)
     return figure
 
 
-def _colours(names: list[str], shown: list[int]) -> list[str]:
-    """A colour for each part: bands in turn, what is no band in black."""
+def _draw_steps(axes: Axes, run: xr.Dataset, analysis: xr.Dataset, parts: list[int]) -> None:
+    """Draw the energies of ``parts`` over time, with their fractions of all modal energy at the end."""
+    energy = analysis["bands/modal_energy"]
+    names = list(energy.attrs["parts"])
+    at_end = energy[:, -1].sum()
+    for p, colour in zip(parts, _colours(names, parts), strict=True):
+        fraction = float(energy[p, -1] / at_end)
+        axes.plot(analysis["bands/instant"], energy[p], color=colour, lw=0.9, label=f"{names[p]}: {fraction:.1%}")
+    axes.set(ylabel="Energy of the linear modes (J)", xlim=run["time"][[0, -1]], ylim=(0, None))
+    axes.legend(loc="best", ncols=2 if len(parts) > 5 else 1, title="share at the end", title_fontsize=7)
+
+
+def _colours(names: list[str], parts: list[int]) -> list[str]:
+    """Return a colour for each part: bands in turn, what is no band in black."""
     bands = [name for name in names if "band" in name]
-    return [COLOURS[bands.index(names[p]) % len(COLOURS)] if names[p] in bands else style.BLACK for p in shown]
+    return [COLOURS[bands.index(names[p]) % len(COLOURS)] if names[p] in bands else style.BLACK for p in parts]
 
 
-def _moved(run: xr.Dataset, analysis: xr.Dataset, shown: list[int]) -> tuple[list[str], np.ndarray]:
-    """Labels of the sites, and energies (site, part) in J that they moved, what was lost in the last column."""
-    transfer, site = analysis["bands/transfer"].values, run["impacts/site"].values.astype(int) - 1
-    cluster = analysis["bands/cluster_of_episode"].values - 1
+def _draw_impacts(axes: Axes, run: xr.Dataset) -> None:
+    """Draw a stroke at the onset of every episode in the row of its site."""
+    axes.plot(run["impacts/onset"], run["impacts/site"], "|", color=style.BLACK, ms=4, mew=0.5)
     sites = run["sites/cell"].values
-    lowest, highest = (np.full(len(transfer), start) for start in (len(sites), -1))
-    np.minimum.at(lowest, cluster, site)
-    np.maximum.at(highest, cluster, site)
-    row = np.where(lowest == highest, lowest, len(sites))
-    moved = np.zeros((len(sites) + 1, len(shown) + 1))
-    np.add.at(moved, row, np.column_stack([transfer[:, shown], -transfer.sum(axis=1)]))
-    keep = np.unique(row)
-    keep = np.sort(keep[np.argsort(-np.abs(moved[keep]).sum(axis=1), kind="stable")][:MOST_ROWS])
-    labels = [*map(str, sites), SEVERAL]
-    return [labels[i] for i in keep], moved[keep]
+    ticks = np.unique(np.linspace(0, len(sites) - 1, min(len(sites), MOST_TICKS)).astype(int))
+    axes.set_yticks(ticks + 1, sites[ticks])
+    axes.set(xlabel="Time (s)", ylabel="Site (cell)", xlim=run["time"][[0, -1]], ylim=(0.4, len(sites) + 0.6))
 
 
-def _matrix(axes: Axes, rows: list[str], columns: list[str], share: np.ndarray) -> None:
-    """Shares (site, part) of the work in % as a matrix with numbers."""
-    top = max(float(np.abs(share).max()), 1e-300)
-    axes.imshow(share, cmap="RdBu_r", norm=SymLogNorm(top / 10, vmin=-top, vmax=top), aspect="auto", origin="upper")
-    wide, size = len(columns) > 7, 5 if len(rows) > 12 or len(columns) > 7 else 7
-    for (y, x), value in np.ndenumerate(share):
-        text = f"{value:+.{1 if wide and abs(value) >= 9.995 else 2}f}" if abs(value) >= 0.005 else "0"
+def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.ndarray) -> None:
+    """Draw ``percent`` (site, part) of the work as a matrix with numbers."""
+    # Linear within a tenth of the largest: small transfers of either sign keep a colour.
+    top = max(float(np.abs(percent).max()), 1e-300)
+    norm = SymLogNorm(top / 10, vmin=-top, vmax=top)
+    axes.imshow(percent, cmap="RdBu_r", norm=norm, aspect="auto", origin="upper")
+
+    is_wide = len(columns) > 7
+    is_long = len(rows) > 12
+    size = 5 if is_long or is_wide else 7
+    for (y, x), value in np.ndenumerate(percent):
         colour = "white" if abs(value) > 0.35 * top else style.BLACK
-        axes.text(x, y, text, ha="center", va="center", fontsize=size, color=colour)
+        axes.text(x, y, _in_cell(value, is_wide), ha="center", va="center", fontsize=size, color=colour)
     axes.set_xticks(range(len(columns)), columns, rotation=40, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(len(rows)), rows, fontsize=6 if len(rows) > 12 else 8)
+    axes.set_yticks(range(len(rows)), rows, fontsize=6 if is_long else 8)
     axes.tick_params(length=0)
     axes.grid(visible=False)
     axes.set(title="(b) Moved by each site (% of the work)", ylabel="Contact site (cell)")
+
+
+def _in_cell(value: float, is_wide: bool) -> str:
+    """Return a percentage in two decimals, or in one where a wide matrix has no room for more."""
+    if abs(value) < 0.005:
+        return "0"
+    decimals = 1 if is_wide and abs(value) >= 9.995 else 2
+    return f"{value:+.{decimals}f}"

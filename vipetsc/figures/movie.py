@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -19,36 +19,63 @@ from PIL import Image
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
 from vipetsc.figures.modal import COLOURS
-from vipetsc.figures.movie_frames import WIDTH, Scenes
+from vipetsc.figures.movie_frames import WIDTH, MovieFrames
 from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
 
-SHAPE, INCHES = 9 / 16, 8.0  # height over width; the width that type is set for
+SHAPE = 9 / 16  # height over width
+INCHES = 8.0  # the width that type is set for
 DECADES = 4  # of energy that are shown
 FAINTEST = 0.05  # light that is shown
 LARGEST = 60.0  # area in square points of the dot of the wave with the most energy
-STAYS = 255  # the colour of pixels of a GIF that stay as they are
+UNCHANGED = 255  # the colour of pixels of a GIF that stay as they are
 REMEDY = "an MP4 needs ffmpeg: apt-get install --no-install-recommends ffmpeg, or pip install imageio-ffmpeg"
 
 
 def colour_of(band: int) -> str:
-    """The colour of a band, from 0."""
+    """Return the colour of a band, from 0."""
     return COLOURS[band % len(COLOURS)]
 
 
-class Stage:
+class EnergyCurve(NamedTuple):
+    """An ``energy`` in J over ``time`` in s that a line grows along."""
+
+    name: str
+    time: np.ndarray
+    energy: np.ndarray
+
+    @property
+    def band(self) -> int | None:
+        """The band, from 0; of several together the lowest; None of what is no band."""
+        if not self.name.startswith("band"):
+            return None
+        return int(self.name.split()[1].split("+")[0]) - 1
+
+
+class Moving(NamedTuple):
+    """An ``artist`` that changes from frame to frame, and the ``axes`` that draw it."""
+
+    axes: Any
+    artist: Any
+
+
+class MovieFigure:
     """The figure of ``content``, ``width`` pixels wide; ``frame`` draws what moves."""
 
-    def __init__(self, run: xr.Dataset, content: Scenes, width: int = WIDTH) -> None:
+    def __init__(self, run: xr.Dataset, content: MovieFrames, width: int = WIDTH) -> None:
         self.content = content
-        figure = style.new_figure(INCHES, round(width * SHAPE / 2) * 2 * INCHES / width)
+        height = round(width * SHAPE / 2) * 2  # even, as the colours of an MP4 need it
+        figure = style.new_figure(INCHES, height * INCHES / width)
         figure.set_dpi(width / INCHES)
         ratios = {"width_ratios": (1.6, 1), "height_ratios": (1.4, 1)}
         axes = figure.subplot_mosaic([["wave", "waves"], ["energy", "waves"]], **ratios)
-        self._moving: list[tuple[Any, Any]] = []
+
+        self._moving: list[Moving] = []
         self._draw_wave(axes["wave"], Case.of(run).name)
         self._draw_waves(axes["waves"], content.cell)
         self._draw_energies(axes["energy"], run)
+
+        # Laid out and drawn once without what moves: a frame is this picture with the moving artists on top.
         self._canvas = FigureCanvasAgg(figure)
         figure.get_layout_engine().execute(figure)
         figure.set_layout_engine("none")
@@ -56,15 +83,20 @@ class Stage:
         self._background = self._canvas.copy_from_bbox(figure.bbox)
 
     def _add(self, axes: Any, artist: Any) -> Any:
+        """Take ``artist`` out of the background, and return it."""
         artist.set_animated(True)
-        self._moving.append((axes, artist))
+        self._moving.append(Moving(axes, artist))
         return artist
 
     def _draw_wave(self, axes: Any, name: str) -> None:
-        content, across = self.content, axes.get_xaxis_transform()
+        """Draw the panel of the wave over the cells, with sites, impacts and the time."""
+        content = self.content
+        across = axes.get_xaxis_transform()
         largest = float(np.abs(content.wave).max()) or 1.0
         self._light = self._add(axes, axes.vlines(content.sites, 0, 1, lw=2.5, transform=across))
-        lines = axes.plot(content.cells, np.full((len(content.cells), content.wave.shape[1]), np.nan), lw=1.1)
+
+        nothing = np.full((len(content.cells), content.wave.shape[1]), np.nan)
+        lines = axes.plot(content.cells, nothing, lw=1.1)
         self._wave = [self._add(axes, line) for line in lines]
         if content.quantity == "energy":
             for band, line in enumerate(lines):
@@ -72,19 +104,26 @@ class Stage:
             axes.set(yscale="log", ylim=(largest * 10.0**-DECADES, 2 * largest), ylabel="Energy of a cell (J)")
         else:
             axes.set(ylim=(-1.08 * largest, 1.08 * largest), ylabel="Velocity of the host (m/s)")
+
         axes.set(xlim=content.cells[[0, -1]] + np.array([-0.5, 0.5]), xlabel="Cell", title=name)
-        axes.plot(content.sites, np.full(len(content.sites), 0.02), "^", color=style.SKY, ms=4, transform=across)
+        edge = np.full(len(content.sites), 0.02)
+        axes.plot(content.sites, edge, "^", color=style.SKY, ms=4, transform=across)
         self._time = self._add(axes, axes.text(1, 1.02, "", ha="right", va="bottom", transform=axes.transAxes, size=8))
 
     def _draw_waves(self, axes: Any, cell: UnitCell) -> None:
-        content, kappa, self._waves = self.content, np.linspace(-np.pi, np.pi, 361), None
+        """Draw the panel of the dispersion, with a dot for every wave."""
+        content = self.content
+        self._waves = None
         if not content.wavenumber.size:
-            panels.annotate_empty(axes, "Waves are told apart where displacement and velocity\nof cells side by side"
-                                        " were recorded")  # fmt: skip
+            reason = "Waves are told apart where displacement and velocity\nof cells side by side were recorded"
+            panels.annotate_empty(axes, reason)
             return
+
+        kappa = np.linspace(-np.pi, np.pi, 361)
         axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color=style.GREY, lw=0.5)
         frequency = bloch(cell, content.wavenumber).frequency / 1e3
-        colours = np.tile([to_rgba(colour_of(b), 0.7) for b in range(cell.dofs)], (len(frequency), 1))
+        band_colours = [to_rgba(colour_of(band), 0.7) for band in range(cell.dofs)]
+        colours = np.tile(band_colours, (len(frequency), 1))
         x = np.repeat(content.wavenumber / np.pi, cell.dofs)
         self._waves = self._add(axes, axes.scatter(x, frequency.ravel(), 0 * x, colours, lw=0))
         axes.axvline(0, color=style.PALE, lw=0.6, zorder=0)
@@ -92,32 +131,46 @@ class Stage:
         axes.set(title="Energy of the waves", xlabel=panels.KAPPA, ylabel=panels.OMEGA)
 
     def _draw_energies(self, axes: Any, run: xr.Dataset) -> None:
-        content = self.content
-        curves = [(content.instants, *curve) for curve in zip(content.energies, content.parts, strict=True)]
-        curves.append((run["time"].values, run["energy/dissipated"].values, "dissipated"))
-        self._curves = []
-        for t, energy, name in curves:
-            band = name.startswith("band")
-            colour = colour_of(int(name.split()[1].split("+")[0]) - 1) if band else style.BLACK
-            (line,) = axes.plot([], [], color=colour, ls="-" if band else style.DASHED, lw=1.2, label=name)
-            self._curves.append((self._add(axes, line), t, energy))
-        top = max(float(energy.max()) for _, energy, _ in curves) or 1.0
-        axes.set(xlim=content.time[[0, -1]], ylim=(0, 1.08 * top), xlabel="Time (s)", ylabel="Energy (J)")
+        """Draw the panel of energies over time, whose lines grow."""
+        energies = self.content.energies
+        curves = [
+            EnergyCurve(name, energies.instants, energy)
+            for name, energy in zip(energies.parts, energies.energy, strict=True)
+        ]
+        curves.append(EnergyCurve("dissipated", run["time"].values, run["energy/dissipated"].values))
+
+        self._growing = []
+        for curve in curves:
+            look: dict[str, Any] = {"color": style.BLACK, "ls": style.DASHED}
+            if curve.band is not None:
+                look = {"color": colour_of(curve.band), "ls": "-"}
+            (line,) = axes.plot([], [], lw=1.2, label=curve.name, **look)
+            self._growing.append((self._add(axes, line), curve))
+
+        top = max(float(curve.energy.max()) for curve in curves) or 1.0
+        axes.set(xlim=self.content.time[[0, -1]], ylim=(0, 1.08 * top), xlabel="Time (s)", ylabel="Energy (J)")
         axes.legend(loc="lower left", ncols=6, bbox_to_anchor=(0, 1.0))
 
     def frame(self, k: int) -> np.ndarray:
-        """Frame ``k`` as (row, column, RGBA) bytes, valid until the next one is drawn."""
-        content, now = self.content, self.content.time[k]
+        """Return frame ``k`` as (row, column, RGBA) bytes, valid until the next one is drawn."""
+        content = self.content
+        now = content.time[k]
         for line, values in zip(self._wave, content.wave[k], strict=True):
             line.set_ydata(values)
-        self._light.set_color([to_rgba(style.ORANGE, light * (light > FAINTEST)) for light in content.flash[k]])
+        lights = [light if light > FAINTEST else 0.0 for light in content.flash[k]]
+        self._light.set_color([to_rgba(style.ORANGE, light) for light in lights])
         self._time.set_text(f"t = {now:.4f} s")
+
         if self._waves is not None:
-            level = np.log10(np.maximum(content.waves[k].ravel() / (content.waves.max() or 1.0), 1e-30)) / DECADES + 1
+            relative = content.waves[k].ravel() / (content.waves.max() or 1.0)
+            level = np.log10(np.maximum(relative, 1e-30)) / DECADES + 1  # 1 of the largest, 0 of the least shown
             self._waves.set_sizes(LARGEST * np.maximum(level, 0.0) ** 2)
-        for line, t, energy in self._curves:
-            past = slice(0, int(np.searchsorted(t, now, side="right")))
-            line.set_data(np.append(t[past], now), np.append(energy[past], np.interp(now, t, energy)))
+
+        for line, curve in self._growing:
+            past = slice(0, int(np.searchsorted(curve.time, now, side="right")))
+            energy_now = np.interp(now, curve.time, curve.energy)
+            line.set_data(np.append(curve.time[past], now), np.append(curve.energy[past], energy_now))
+
         self._canvas.restore_region(self._background)
         for axes, artist in self._moving:
             axes.draw_artist(artist)
@@ -125,69 +178,97 @@ class Stage:
 
 
 def ffmpeg() -> str | None:
-    """The command of ffmpeg: on the path, or of the package imageio-ffmpeg; None if there is none."""
-    if found_at := shutil.which("ffmpeg"):
-        return found_at
+    """Return the command of ffmpeg: on the path, or of the package imageio-ffmpeg; None if there is none."""
+    command = shutil.which("ffmpeg")
+    if command:
+        return command
     try:
         return str(import_module("imageio_ffmpeg").get_ffmpeg_exe())
     except (ImportError, RuntimeError):
         return None
 
 
-def write_movie(stage: Stage, rate: float, paths: Sequence[Path]) -> list[Path]:
-    """Write the frames of ``stage`` at ``rate`` a second to ``paths``, ``.gif`` and ``.mp4``, each whole or not at all.
+def write_movie(movie: MovieFigure, rate: float, paths: Sequence[Path]) -> list[Path]:
+    """Write the frames of ``movie`` at ``rate`` a second to ``paths``, ``.gif`` and ``.mp4``, each whole or not at all.
 
     Raises OSError, as when there is no ffmpeg for an MP4.
     """
-    frames = range(len(stage.content.time))
     for path in paths:
         sys.audit("vipetsc.draw", path.stem)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as aside:
-            (_write_gif if path.suffix == ".gif" else _write_mp4)((stage.frame(k) for k in frames), stage, rate, aside)
+            if path.suffix == ".gif":
+                _write_gif(movie, rate, aside)
+            else:
+                _write_mp4(movie, rate, aside)
     return list(paths)
 
 
-def _write_gif(frames: Iterator[np.ndarray], stage: Stage, rate: float, path: Path) -> None:
-    """A GIF that repeats: one palette; pixels that stay are transparent, which makes it several times smaller."""
-    count = len(stage.content.time)
-    some = np.concatenate([stage.frame(k)[..., :3].copy() for k in np.linspace(0, count - 1, 4).astype(int)])
-    palette = Image.fromarray(some).quantize(STAYS, dither=Image.Dither.NONE)
-    colours = np.reshape(palette.getpalette(), (-1, 3))
-    colours[colours.min(axis=1) > 247] = 255  # Pillow takes the nearest to 252 for white
-    palette.putpalette(colours.ravel().tolist())
+def _write_gif(movie: MovieFigure, rate: float, path: Path) -> None:
+    """Write a GIF that repeats: one palette; pixels that stay are transparent, which makes it several times smaller."""
+    count = len(movie.content.time)
+    palette = _palette(movie)
 
     def images() -> Iterator[Image.Image]:
         before: Any = -1
-        for frame in frames:
-            index = np.asarray(Image.fromarray(frame[..., :3]).quantize(palette=palette, dither=Image.Dither.NONE))
-            image = Image.fromarray(np.where(index == before, STAYS, index).astype(np.uint8))
+        for k in range(count):
+            frame = Image.fromarray(movie.frame(k)[..., :3])
+            index = np.asarray(frame.quantize(palette=palette, dither=Image.Dither.NONE))
+            image = Image.fromarray(np.where(index == before, UNCHANGED, index).astype(np.uint8))
             image.putpalette(palette.getpalette())
             before = index
             yield image
 
     # The format counts hundredths of a second: frames differ by one where that keeps the whole in time.
-    lengths = [10 * int(length) for length in np.diff(np.rint(np.arange(count + 1) * 100 / rate))]
-    every, form = images(), {"duration": lengths, "loop": 0, "transparency": STAYS, "disposal": 1, "optimize": False}
-    next(every).save(path, "GIF", save_all=True, append_images=every, **form)
+    ends = np.rint(np.arange(count + 1) * 100 / rate)
+    durations = [10 * int(length) for length in np.diff(ends)]
+    following = images()
+    first = next(following)
+    first.save(
+        path,
+        "GIF",
+        save_all=True,
+        append_images=following,
+        duration=durations,
+        loop=0,
+        transparency=UNCHANGED,
+        disposal=1,
+        optimize=False,
+    )
 
 
-def _write_mp4(frames: Iterator[np.ndarray], stage: Stage, rate: float, path: Path) -> None:
+def _palette(movie: MovieFigure) -> Image.Image:
+    """Return an image with the colours of four frames, one fewer than a GIF may have."""
+    count = len(movie.content.time)
+    chosen = np.linspace(0, count - 1, 4).astype(int)
+    frames = np.concatenate([movie.frame(k)[..., :3].copy() for k in chosen])
+    palette = Image.fromarray(frames).quantize(UNCHANGED, dither=Image.Dither.NONE)
+    colours = np.reshape(palette.getpalette(), (-1, 3))
+    colours[colours.min(axis=1) > 247] = 255  # Pillow takes the nearest to 252 for white
+    palette.putpalette(colours.ravel().tolist())
+    return palette
+
+
+def _write_mp4(movie: MovieFigure, rate: float, path: Path) -> None:
+    """Write an MP4 that browsers play, by ffmpeg, which reads the frames from its standard input."""
     command = ffmpeg()
     if command is None:
         raise FileNotFoundError(REMEDY)
-    height, width = stage.frame(0).shape[:2]
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{width}x{height}", "-r", f"{rate:g}", "-i", "-"]
-    form = ["-an", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)]
+    height, width = movie.frame(0).shape[:2]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{width}x{height}", "-r", f"{rate:g}", "-i", "-"]
+    target = ["-an", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)]
+
     with ExitStack() as stack:
-        told = stack.enter_context(tempfile.TemporaryFile())
-        call = [command, "-y", "-loglevel", "error", *raw, *form]
-        process = stack.enter_context(subprocess.Popen(call, stdin=subprocess.PIPE, stderr=told))
+        # Its messages go to a file: a pipe that nobody reads would fill up and stop it.
+        messages = stack.enter_context(tempfile.TemporaryFile())
+        call = [command, "-y", "-loglevel", "error", *source, *target]
+        process = stack.enter_context(subprocess.Popen(call, stdin=subprocess.PIPE, stderr=messages))
         assert process.stdin is not None
-        with suppress(BrokenPipeError):  # what ffmpeg told says why
-            for frame in frames:
-                process.stdin.write(frame.data)
+        with suppress(BrokenPipeError):  # the messages say why
+            for k in range(len(movie.content.time)):
+                process.stdin.write(movie.frame(k).data)
             process.stdin.close()
         if process.wait():
-            told.seek(0)
-            raise OSError(f"{command}: {told.read().decode(errors='replace').strip()[-300:]}")
+            messages.seek(0)
+            reason = messages.read().decode(errors="replace").strip()[-300:]
+            raise OSError(f"{command}: {reason}")

@@ -9,10 +9,15 @@ from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.figures import panels
 from vipetsc.io.read import field_time
-from vipetsc.lattice import UnitCell
+from vipetsc.lattice import Chain, UnitCell
 
-LENGTH, RATE, WIDTH = 10.0, 15.0, 960  # in s, frames a second and pixels where none are asked for
-MOST_FRAMES, MOST_CELLS = 5000, 20_000
+# Where none are asked for.
+LENGTH = 10.0  # s
+RATE = 15.0  # frames a second
+WIDTH = 960  # pixels
+
+MOST_FRAMES = 5000
+MOST_CELLS = 20_000
 FADE = 0.6  # of an impact's light from frame to frame
 
 
@@ -31,13 +36,32 @@ class Shot(NamedTuple):
     width: int = WIDTH
 
 
-class Scenes(NamedTuple):
+class CheckedShot(NamedTuple):
+    """A shot that a run allows: a ``window`` of its recorded cells and the ``time`` (frame) in s.
+
+    ``has_waves``: whether waves can be told apart, which takes displacement and velocity of cells side by side.
+    """
+
+    window: slice
+    time: np.ndarray
+    has_waves: bool
+
+
+class BandEnergies(NamedTuple):
+    """Energies (part, instant) in J of ``parts`` at ``instants`` in s."""
+
+    parts: tuple[str, ...]
+    instants: np.ndarray
+    energy: np.ndarray
+
+
+class MovieFrames(NamedTuple):
     """What frames show: ``wave`` (frame, curve, cell), ``waves`` (frame, wavenumber, band) in J.
 
     ``time`` (frame) in s; ``cells`` (cell) from 1; ``wave`` is the energy in J of the bands by cell or the velocity in
     m/s of the host; ``wavenumber`` in rad/cell, empty if waves cannot be told apart; ``flash`` (frame, site), the light
-    of impacts: 1 for one since the frame before, fading then; ``energies`` (part, instant) in J of ``parts``. Where
-    cells differ ``cell`` has the means of those shown, and masses are their own.
+    of impacts at the cells ``sites``: 1 for one since the frame before, fading then. Where cells differ ``cell`` has
+    the means of those shown, and masses are their own.
     """
 
     quantity: str
@@ -49,76 +73,134 @@ class Scenes(NamedTuple):
     waves: np.ndarray
     sites: np.ndarray
     flash: np.ndarray
-    parts: tuple[str, ...]
-    instants: np.ndarray
-    energies: np.ndarray
+    energies: BandEnergies
 
 
-def check(run: xr.Dataset, shot: Shot) -> tuple[slice, np.ndarray, bool]:
-    """The recorded cells and the times (frame) in s of a ``shot`` of ``run``; whether waves can be told apart.
-
-    Raises ValueError that names the option that cannot be.
-    """
+def check(run: xr.Dataset, shot: Shot) -> CheckedShot:
+    """Return what ``run`` has of a ``shot``; raise ValueError that names the option that cannot be."""
     if "velocity" not in run:
         raise ValueError("--movie: the run recorded no velocity")
-    every = run["cell"].values
-    first, last = shot.cells or every[[0, -1]]
-    if shot.cells and not every[0] <= first < last <= every[-1]:
-        raise ValueError(f"--cells {first}:{last}: the run recorded cells {every[0]} to {every[-1]}")
-    cells = every[window := slice(*np.searchsorted(every, (first, last + 1)).tolist())]
-    if len(cells) > MOST_CELLS:
-        raise ValueError(f"--movie: {len(cells)} cells are more than {MOST_CELLS}; name some with --cells A:B")
-    whole = "displacement" in run and len(cells) > 1 and bool(np.all(np.diff(cells) == 1))
-    if shot.quantity == "energy" and not whole:
+    window = _check_cells(run, shot)
+
+    cells = run["cell"].values[window]
+    are_side_by_side = len(cells) > 1 and bool(np.all(np.diff(cells) == 1))
+    has_waves = "displacement" in run and are_side_by_side
+    if shot.quantity == "energy" and not has_waves:
         raise ValueError("--movie energy: needs displacement and velocity of cells side by side; --movie velocity")
+    return CheckedShot(window=window, time=_check_times(run, shot), has_waves=has_waves)
+
+
+def _check_cells(run: xr.Dataset, shot: Shot) -> slice:
+    """Return the part of the recorded cells that the shot shows, by default all."""
+    recorded = run["cell"].values
+    first, last = shot.cells or (recorded[0], recorded[-1])
+    if shot.cells and not recorded[0] <= first < last <= recorded[-1]:
+        raise ValueError(f"--cells {first}:{last}: the run recorded cells {recorded[0]} to {recorded[-1]}")
+
+    begin, end = np.searchsorted(recorded, (first, last + 1)).tolist()
+    if end - begin > MOST_CELLS:
+        raise ValueError(f"--movie: {end - begin} cells are more than {MOST_CELLS}; name some with --cells A:B")
+    return slice(begin, end)
+
+
+def _check_times(run: xr.Dataset, shot: Shot) -> np.ndarray:
+    """Return the times (frame) in s of the frames."""
     time = field_time(run)
-    start, stop = (end if given is None else given for end, given in zip(time[[0, -1]], shot[1:3], strict=True))
+    start = time[0] if shot.start is None else shot.start
+    stop = time[-1] if shot.stop is None else shot.stop
     if not time[0] <= start < stop <= time[-1] * (1 + 1e-12):
         raise ValueError(f"--from {start:g} --to {stop:g}: the run recorded {time[0]:g} to {time[-1]:g} s")
+
+    # A frame at the end as well, although rounding may put it a little behind.
     step = (shot.speed or (stop - start) / LENGTH) / shot.rate
     count = (stop - start) / step * (1 + 1e-9) + 1
     if not 2 <= count < MOST_FRAMES + 1:
         how = "slow" if count > 2 else "fast"
         raise ValueError(f"--speed {step * shot.rate:g}: is too {how}: {count:.4g} frames, not 2 to {MOST_FRAMES}")
-    return window, start + step * np.arange(int(count)), whole
+    return start + step * np.arange(int(count))
 
 
-def scenes(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> Scenes:
-    """The content of the frames, from the samples nearest to them; others are not read. Raises as ``check``."""
-    window, instants, whole = check(run, shot)
-    time, cells, chain = field_time(run), run["cell"].values[window], Case.of(run).model().chain
-    shown, count = (int(cells[0]) - 1, int(cells[-1])), len(cells)
+def movie_frames(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> MovieFrames:
+    """Return the content of the frames, from the samples nearest to them; others are not read. Raise as ``check``."""
+    checked = check(run, shot)
+    time = field_time(run)
+    cells = run["cell"].values[checked.window]
+    chain = Case.of(run).model().chain
+    shown = int(cells[0]) - 1, int(cells[-1])
     cell = chain.mean_cell(*shown)
+
     # A cell with its own masses moves as one with the mean masses and the same kinetic energy.
-    weight = np.sqrt(chain.coefficients(*shown).masses / cell.masses) if whole and cell is not chain.cell else 1.0
-    # Of a ring, which joins the ends: cells at rest between them.
-    beyond = 0 if chain.ends == "periodic" and count == chain.cells else count // 8 + 1
-    ends = np.ones(count) if count == run.sizes["cell"] else spectra.taper(count, spectra.TAPER)
-    ends = np.pad(ends, (0, beyond))[:, None]
-    wave, waves = [], []
-    for row in np.rint((instants - time[0]) / (time[1] - time[0])).astype(int):  # samples are even in time
-        fields = [run[name][row, window].values for name in ("velocity", "displacement")[: 1 + whole]]
-        v, *u = (np.pad(field * weight, ((0, beyond), (0, 0))) for field in fields)
-        by_band = shot.quantity == "energy"
-        wave.append(spectra.band_envelopes(cell, u[0], v)[:, :count] if by_band else fields[0][None, :, cell.host])
-        waves.append(spectra.wave_energies(cell, u[0] * ends, v * ends)[0] if whole else np.zeros((0, cell.dofs)))
-    sites, site = panels.recorded_sites(run, cells), run["impacts/site"].values.astype(int) - 1
-    at, onset = run["sites/cell"].values[site], run["impacts/onset"].values
-    flash = np.zeros((len(instants), len(sites)))
-    for k, now in enumerate(instants):
-        struck = np.isin(sites, at[(onset > now - (instants[1] - instants[0])) & (onset <= now)])
-        flash[k] = np.where(struck, 1.0, FADE * flash[k - 1] if k else 0.0)
-    wavenumber = 2 * np.pi * np.fft.fftfreq(count + beyond, 1.0) if whole else np.zeros(0)
-    energies = _energies(run, analysis)
-    content = np.array(wave), wavenumber, np.array(waves)
-    return Scenes(shot.quantity, cell, instants, cells, *content, sites, flash, *energies)
+    weight = np.ones(1)
+    if checked.has_waves and cell is not chain.cell:
+        weight = np.sqrt(chain.coefficients(*shown).masses / cell.masses)
+    taper = _taper(run, chain, len(cells))
+    at_rest = np.zeros((len(taper) - len(cells), cell.dofs))
+
+    wave = []
+    waves = []
+    for row in np.rint((checked.time - time[0]) / (time[1] - time[0])).astype(int):  # samples are even in time
+        velocity = run["velocity"][row, checked.window].values
+        if not checked.has_waves:
+            wave.append(velocity[None, :, cell.host])
+            waves.append(np.zeros((0, cell.dofs)))
+            continue
+
+        v = np.concatenate([velocity * weight, at_rest])
+        u = np.concatenate([run["displacement"][row, checked.window].values * weight, at_rest])
+        waves.append(spectra.wave_energies(cell, u * taper, v * taper)[0])
+        if shot.quantity == "energy":
+            wave.append(spectra.band_envelopes(cell, u, v)[:, : len(cells)])
+        else:
+            wave.append(velocity[None, :, cell.host])
+
+    sites = panels.recorded_sites(run, cells)
+    wavenumber = 2 * np.pi * np.fft.fftfreq(len(taper), 1.0)
+    return MovieFrames(
+        quantity=shot.quantity,
+        cell=cell,
+        time=checked.time,
+        cells=cells,
+        wave=np.array(wave),
+        wavenumber=wavenumber if checked.has_waves else np.zeros(0),
+        waves=np.array(waves),
+        sites=sites,
+        flash=_flash(run, sites, checked.time),
+        energies=_energies(run, analysis),
+    )
 
 
-def _energies(run: xr.Dataset, analysis: xr.Dataset | None) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Parts, instants (s) and energies (part, instant) in J: of linear modes, or else kinetic; gaps are left out."""
+def _taper(run: xr.Dataset, chain: Chain, cells: int) -> np.ndarray:
+    """Return the weights (cell, 1) of the shown cells, and of those at rest behind them, in a transform."""
+    # A part of the recorded cells is cut out of a wave, the whole is not.
+    weights = np.ones(cells) if cells == run.sizes["cell"] else spectra.taper(cells, spectra.TAPER)
+
+    # A transform joins the ends, which only a ring has joined: cells at rest between them.
+    is_ring = chain.ends == "periodic" and cells == chain.cells
+    beyond = 0 if is_ring else cells // 8 + 1
+    return np.pad(weights, (0, beyond))[:, None]
+
+
+def _flash(run: xr.Dataset, sites: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return the light (frame, site) of impacts: 1 for one since the frame before, fading then."""
+    onset = run["impacts/onset"].values
+    struck_cell = run["sites/cell"].values[run["impacts/site"].values.astype(int) - 1]
+    step = time[1] - time[0]
+    flash = np.zeros((len(time), len(sites)))
+    light = np.zeros(len(sites))
+    for k, now in enumerate(time):
+        struck = np.isin(sites, struck_cell[(onset > now - step) & (onset <= now)])
+        light = np.where(struck, 1.0, FADE * light)
+        flash[k] = light
+    return flash
+
+
+def _energies(run: xr.Dataset, analysis: xr.Dataset | None) -> BandEnergies:
+    """Return energies of bands without gaps, of linear modes or else kinetic ones; or else that of the lattice."""
     for name, axis in (("bands/modal_energy", "bands/instant"), ("bands/energy", "bands/sample")):
         if analysis is not None and name in analysis:
-            names, energy = np.array(analysis[name].attrs["parts"]), analysis[name].values
-            bands = np.char.startswith(names, "band")
-            return tuple(names[bands]), analysis[axis].values, energy[bands]
-    return ("kinetic and springs",), run["time"].values, (run["energy/kinetic"] + run["energy/spring"]).values[None]
+            names = np.array(analysis[name].attrs["parts"])
+            is_band = np.char.startswith(names, "band")
+            return BandEnergies(tuple(names[is_band]), analysis[axis].values, analysis[name].values[is_band])
+
+    total = run["energy/kinetic"] + run["energy/spring"]
+    return BandEnergies(("kinetic and springs",), run["time"].values, total.values[None])

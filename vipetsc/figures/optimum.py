@@ -1,5 +1,7 @@
 """A search for the best design: how it went, the designs it compares, what they do over the amplitude."""
 
+from typing import NamedTuple
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -8,6 +10,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
 from vipetsc.figures import style
 
+# The names of compared designs, in the order of drawing.
 COLOURS = {"case": style.GREY, "best-1": style.VERMILION, "best": style.BLUE, "best-2": style.GREEN}
 MARKERS = {"case": "s", "best-1": "^", "best": "o", "best-2": "v"}
 SYMBOLS = {
@@ -16,99 +19,163 @@ SYMBOLS = {
     "ibtet": "ibtet",
     "entropy": "entropy (bit)",
 }
+MOST_LINES = 12  # variables whose names have the usual size
+
+
+class ComparedDesign(NamedTuple):
+    """A design that a search compares with others: its ``name``, and its ``number`` among all, from 0."""
+
+    name: str
+    number: int
 
 
 def _label(objective: ObjectiveTable) -> str:
-    """What an objective measures, for an axis."""
+    """Return what an objective measures, for an axis."""
     part = f", {objective.part[0]:g}-{objective.part[1]:g} rad/s" if objective.part else ""
     return SYMBOLS.get(objective.measure, f"band {objective.band}{part} at the end / work")
 
 
-def _compared(optimum: xr.Dataset) -> list[str]:
-    """The names of the compared designs, once each; what is drawn last lies on top."""
+def _compared(optimum: xr.Dataset) -> list[ComparedDesign]:
+    """Return the compared designs, once each; what is drawn last lies on top."""
     numbers = dict(zip(optimum["compared"].values, optimum["comparison/number"].values.tolist(), strict=True))
-    return [name for name in COLOURS if name in numbers and (name == "best" or numbers[name] != numbers.get("best"))]
+    best = numbers.get("best")
+    compared = []
+    for name in COLOURS:
+        # Of two names of one design, as of the case where nothing is better, "best" is shown.
+        if name in numbers and (name == "best" or numbers[name] != best):
+            compared.append(ComparedDesign(name, numbers[name]))
+    return compared
 
 
 def convergence(optimum: xr.Dataset) -> Figure:
-    """The values of all designs, in their order or over both objectives, and what else became of them."""
-    objectives, number = OptimiseCase.of(optimum).options.objective, optimum["design"].values
-    value, failed = optimum["value"].values, optimum["reason"].values != ""
+    """Draw the values of all designs, in their order or over both objectives, and what else became of them."""
+    objectives = OptimiseCase.of(optimum).options.objective
     figure = style.new_figure(style.PAGE, 2.8, "; ".join(objective.describe() for objective in objectives))
-    left, right = figure.subplots(1, 2)
-    compared = {name: int(optimum["comparison/number"].sel(compared=name)) for name in _compared(optimum)}
+    values, others = figure.subplots(1, 2)
     if len(objectives) == 1:
-        best = np.fmax if objectives[0].goal == "maximise" else np.fmin
-        left.plot(number, value[:, 0], ".", color=style.SKY, ms=3, label="designs")
-        left.step(number, best.accumulate(value[:, 0]), where="post", color=style.BLACK, lw=0.8, label="best so far")
-        places = {name: (at, value[at, 0]) for name, at in compared.items()}
-        if failed.any():
-            look = {"color": style.RED, "ms": 3, "clip_on": False, "label": "failed"}
-            left.plot(number[failed], np.zeros(failed.sum()), "x", transform=left.get_xaxis_transform(), **look)
-        left.set(xlabel="Design", ylabel=_label(objectives[0]), title="Objective")
+        _draw_one_objective(values, optimum, objectives[0])
     else:
-        left.scatter(*value.T, c=number, cmap="Blues", s=6, vmin=-0.5 * len(number), label="designs (later: darker)")
-        left.plot(*value[optimum["front"].values].T, color=style.BLACK, lw=0.8, label="front")
-        places = {name: tuple(value[at]) for name, at in compared.items()}
-        left.set(xlabel=f"{objectives[0].goal} {_label(objectives[0])}", title="Both objectives")
-        left.set_ylabel(f"{objectives[1].goal} {_label(objectives[1])}")
-    for name, place in places.items():
-        left.plot(
-            *place, MARKERS[name], color=COLOURS[name], mec="white", mew=0.5, ms=6, label=f"{name} ({compared[name]})"
-        )
-    left.legend(loc="best", fontsize=6)
+        _draw_two_objectives(values, optimum, objectives[0], objectives[1])
+    values.legend(loc="best", fontsize=6)
+
+    number = optimum["design"].values
     for name, colour in (("upper_share_at_end", style.PURPLE), ("dissipated", style.ORANGE)):
-        right.plot(number, optimum[name].values, ".", color=colour, ms=3, label=name.replace("_", " "))
-    right.set(xlabel="Design", ylabel="share of the work, mean", ylim=(0, None), title="All designs")
-    right.legend(loc="best")
+        others.plot(number, optimum[name].values, ".", color=colour, ms=3, label=name.replace("_", " "))
+    others.set(xlabel="Design", ylabel="share of the work, mean", ylim=(0, None), title="All designs")
+    others.legend(loc="best")
     return figure
 
 
+def _draw_one_objective(axes: Axes, optimum: xr.Dataset, objective: ObjectiveTable) -> None:
+    """Draw the objective over the designs in their order, the best so far, and the designs that failed."""
+    number = optimum["design"].values
+    value = optimum["value"].values[:, 0]
+    best = np.fmax if objective.goal == "maximise" else np.fmin
+    axes.plot(number, value, ".", color=style.SKY, ms=3, label="designs")
+    axes.step(number, best.accumulate(value), where="post", color=style.BLACK, lw=0.8, label="best so far")
+
+    failed = optimum["reason"].values != ""
+    if failed.any():
+        # They have no value: on the lower edge of the panel.
+        look = {"color": style.RED, "ms": 3, "clip_on": False, "label": "failed"}
+        axes.plot(number[failed], np.zeros(failed.sum()), "x", transform=axes.get_xaxis_transform(), **look)
+    axes.set(xlabel="Design", ylabel=_label(objective), title="Objective")
+    for design in _compared(optimum):
+        _mark(axes, design, design.number, value[design.number])
+
+
+def _draw_two_objectives(axes: Axes, optimum: xr.Dataset, first: ObjectiveTable, second: ObjectiveTable) -> None:
+    """Draw one objective over the other, later designs darker, and the front of those that no other one dominates."""
+    number = optimum["design"].values
+    value = optimum["value"].values
+    # The scale of colours begins below zero: the first designs would be white.
+    shades = {"c": number, "cmap": "Blues", "vmin": -0.5 * len(number)}
+    axes.scatter(value[:, 0], value[:, 1], s=6, label="designs (later: darker)", **shades)
+    front = value[optimum["front"].values]
+    axes.plot(front[:, 0], front[:, 1], color=style.BLACK, lw=0.8, label="front")
+    axes.set(xlabel=f"{first.goal} {_label(first)}", title="Both objectives")
+    axes.set_ylabel(f"{second.goal} {_label(second)}")
+    for design in _compared(optimum):
+        _mark(axes, design, *value[design.number])
+
+
+def _mark(axes: Axes, design: ComparedDesign, x: float, y: float) -> None:
+    """Draw the marker of a compared design, named with its number."""
+    look = {"color": COLOURS[design.name], "mec": "white", "mew": 0.5, "ms": 6}
+    axes.plot(x, y, MARKERS[design.name], label=f"{design.name} ({design.number})", **look)
+
+
 def compared_designs(optimum: xr.Dataset) -> Figure:
-    """Clearances over the cells of the sites, and where within its bounds all that varies lies."""
-    plan, names = OptimiseCase.of(optimum), _compared(optimum)
+    """Draw clearances over the cells of the sites, and where within its bounds all that varies lies."""
+    plan = OptimiseCase.of(optimum)
     figure = style.new_figure(style.PAGE, 2.6)
-    left, right = figure.subplots(1, 2)
-    for shift, name in enumerate(names):
-        row = optimum.sel(compared=name)
-        cells, gaps = row["comparison/cell"].values, 1e3 * row["comparison/clearance"].values
-        left.plot(cells, gaps, MARKERS[name] + "-", color=COLOURS[name], lw=0.5, ms=4, label=name)
-        place = plan.to_unit(optimum["parameter"].values[int(row["comparison/number"])])
-        right.plot(place, np.arange(len(place)) + 0.12 * shift, MARKERS[name], color=COLOURS[name], ms=3.5)
-    left.set(xlabel="Cell", ylabel="Clearance (mm)", ylim=(0, None), title="Sites")
-    left.legend(loc="best")
-    variables = optimum["variable"].values
-    right.set(xlim=(-0.02, 1.02), xlabel="between its bounds", title="What varies", ylim=(len(variables) - 0.3, -0.7))
-    right.set_yticks(np.arange(len(variables)), variables, fontsize=6 if len(variables) > 12 else None)
-    right.grid(axis="y", color=style.PALE, lw=0.5)
+    sites, variables = figure.subplots(1, 2)
+    for i, design in enumerate(_compared(optimum)):
+        row = optimum.sel(compared=design.name)
+        colour = COLOURS[design.name]
+        marker = MARKERS[design.name]
+        clearance = 1e3 * row["comparison/clearance"].values
+        sites.plot(
+            row["comparison/cell"].values, clearance, f"{marker}-", color=colour, lw=0.5, ms=4, label=design.name
+        )
+
+        # A little apart, so that designs of equal values are all seen.
+        position = plan.to_unit(optimum["parameter"].values[int(row["comparison/number"])])
+        variables.plot(position, np.arange(len(position)) + 0.12 * i, marker, color=colour, ms=3.5)
+    sites.set(xlabel="Cell", ylabel="Clearance (mm)", ylim=(0, None), title="Sites")
+    sites.legend(loc="best")
+
+    names = optimum["variable"].values
+    variables.set(xlim=(-0.02, 1.02), xlabel="between its bounds", title="What varies", ylim=(len(names) - 0.3, -0.7))
+    variables.set_yticks(np.arange(len(names)), names, fontsize=6 if len(names) > MOST_LINES else None)
+    variables.grid(axis="y", color=style.PALE, lw=0.5)
     return figure
 
 
 def compared_curves(optimum: xr.Dataset) -> Figure:
-    """What the objectives measure over the amplitude, and the band energies, of the compared designs."""
-    plan, names = OptimiseCase.of(optimum), _compared(optimum)
-    objectives, amplitude = plan.options.objective, optimum["amplitude"].values
-    measures = {objective.name: (i, objective) for i, objective in enumerate(objectives)}
+    """Draw what the objectives measure over the amplitude, and the band energies, of the compared designs."""
+    plan = OptimiseCase.of(optimum)
+    # Objectives of one measure, at different amplitudes, have one panel and the curve of the last of them.
+    measures = {objective.name: i for i, objective in enumerate(plan.options.objective)}
     figure = style.new_figure(style.PAGE, 2.6)
-    panels: list[Axes] = list(figure.subplots(1, len(measures) + 1, squeeze=False)[0])
-    for axes, (i, objective) in zip(panels, measures.values(), strict=False):
-        for name in names:
-            curve = optimum["curve/value"].sel(compared=name).values[:, i]
-            axes.plot(amplitude, curve, MARKERS[name] + "-", color=COLOURS[name], lw=0.8, ms=3, label=name)
-        for at in {
-            a for o in objectives if o.name == objective.name for a in o.amplitudes or [plan.base.drive.amplitude]
-        }:
-            axes.axvline(at, color=style.GREY, lw=0.5, ls=style.DOTTED)
-        axes.set(xscale="log", xlabel="Amplitude (N)", ylabel=_label(objective), title="dotted: amplitudes searched")
+    *panels, at_case = figure.subplots(1, len(measures) + 1, squeeze=False)[0]
+    for axes, i in zip(panels, measures.values(), strict=True):
+        _draw_measure(axes, optimum, plan, i)
     panels[0].legend(loc="best")
-    at = int(np.argmin(np.abs(np.log(amplitude / plan.base.drive.amplitude))))
-    bands = optimum["band"].values
-    labels, width = [*(f"band {band}" for band in bands), "lost"], 0.8 / len(names)
-    for shift, name in enumerate(names):
-        row = optimum.sel(compared=name)
-        shares = [*row["curve/bands"].values[at], row["curve/dissipated"].values[at]]
-        places = np.arange(len(shares)) + (shift - (len(names) - 1) / 2) * width
-        panels[-1].bar(places, shares, width, color=COLOURS[name])
-    panels[-1].set_xticks(np.arange(len(labels)), labels)
-    panels[-1].set(ylabel="share of the work at the end", title=f"At {amplitude[at]:.4g} N")
+    _draw_energies(at_case, optimum, plan.base.drive.amplitude)
     return figure
+
+
+def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:
+    """Draw what objective number ``index`` measures over the amplitude, and the amplitudes that were searched."""
+    objectives = plan.options.objective
+    objective = objectives[index]
+    for design in _compared(optimum):
+        values = optimum["curve/value"].sel(compared=design.name).values[:, index]
+        look = {"color": COLOURS[design.name], "lw": 0.8, "ms": 3}
+        axes.plot(optimum["amplitude"].values, values, f"{MARKERS[design.name]}-", label=design.name, **look)
+
+    searched = set()
+    for other in objectives:
+        if other.name == objective.name:
+            searched.update(other.amplitudes or [plan.base.drive.amplitude])
+    for amplitude in searched:
+        axes.axvline(amplitude, color=style.GREY, lw=0.5, ls=style.DOTTED)
+    axes.set(xscale="log", xlabel="Amplitude (N)", ylabel=_label(objective), title="dotted: amplitudes searched")
+
+
+def _draw_energies(axes: Axes, optimum: xr.Dataset, amplitude: float) -> None:
+    """Draw bars of the energy in every band, and what was lost, of each design at the ``amplitude`` (N), or near it."""
+    amplitudes = optimum["amplitude"].values
+    nearest = int(np.argmin(np.abs(np.log(amplitudes / amplitude))))
+    labels = [*(f"band {band}" for band in optimum["band"].values), "lost"]
+
+    designs = _compared(optimum)
+    width = 0.8 / len(designs)
+    for i, design in enumerate(designs):
+        row = optimum.sel(compared=design.name)
+        energies = [*row["curve/bands"].values[nearest], row["curve/dissipated"].values[nearest]]
+        x = np.arange(len(energies)) + (i - (len(designs) - 1) / 2) * width
+        axes.bar(x, energies, width, color=COLOURS[design.name])
+    axes.set_xticks(np.arange(len(labels)), labels)
+    axes.set(ylabel="share of the work at the end", title=f"At {amplitudes[nearest]:.4g} N")

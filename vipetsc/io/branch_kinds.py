@@ -34,6 +34,6 @@ def branch_kind(branch: xr.Dataset) -> str:
 def _kind_by_variables(branch: xr.Dataset) -> str:
     if "share" in branch:
         return RESPONSES
-    if "harmonics" in branch and "states/number" in branch:
+    if "harmonics" in branch:
         return CONDENSED
     return ORBITS

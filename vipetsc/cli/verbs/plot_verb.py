@@ -137,7 +137,7 @@ def film(
 
         prepare(pictures, [folder])
         analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
-        stage = movie.Stage(run, movie_frames.scenes(run, analysis, shot), shot.width)
+        stage = movie.MovieFigure(run, movie_frames.movie_frames(run, analysis, shot), shot.width)
         paths = [folder / "figures" / f"movie-{quantity}.{name}" for name in MOVIE_FORMATS if name in formats]
         return movie.write_movie(stage, shot.rate, paths), missing
 

@@ -1,0 +1,174 @@
+"""The contact episodes of a run: their onsets by site, or the indentation of pressed contacts, and sums by site."""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vipetsc.case import Case, Model
+from vipetsc.figures import panels, style
+from vipetsc.figures.panels import empty_figure
+from vipetsc.io.read import field_time
+
+MOST_ROWS = 16  # sites with a row of their own
+MOST_MARKERS = 2000  # episodes with a marker of their own
+MAP_ROWS = 150
+MAP_COLUMNS = 300
+MOST_LABELS = 12  # of sites beside a map
+SPEEDS = "viridis_r"
+
+
+class Episodes(NamedTuple):
+    """Contact episodes of a run (episode), and the sites (site) where they may be.
+
+    ``site`` counts from 1; ``side`` is 1 or -1; ``onset`` in s, ``speed`` of the approach in m/s, ``force`` in N,
+    ``loss`` in J, 0 where it is not known; ``cells`` from 1; ``span`` is the first and the last time of the run.
+    """
+
+    site: np.ndarray
+    side: np.ndarray
+    onset: np.ndarray
+    speed: np.ndarray
+    force: np.ndarray
+    loss: np.ndarray
+    cells: np.ndarray
+    span: np.ndarray
+
+    @classmethod
+    def of(cls, run: xr.Dataset) -> Self:
+        """Return the episodes of ``run``."""
+        return cls(
+            site=run["impacts/site"].values,
+            side=run["impacts/side"].values,
+            onset=run["impacts/onset"].values,
+            speed=np.abs(run["impacts/approach_velocity"].values),
+            force=np.abs(run["impacts/force"].values),
+            loss=np.nan_to_num(run["impacts/loss"].values),
+            cells=run["sites/cell"].values,
+            span=run["time"].values[[0, -1]],
+        )
+
+    @property
+    def site_index(self) -> np.ndarray:
+        """The site (episode) of each, from 0."""
+        return self.site.astype(int) - 1
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The heights (site) in the panels, which share the axis of sites."""
+        return np.arange(1, len(self.cells) + 1)
+
+    @property
+    def are_few(self) -> bool:
+        """Whether each site has a row, and each episode a marker."""
+        return len(self.cells) <= MOST_ROWS and len(self.site) <= MOST_MARKERS
+
+
+def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
+    """Draw the onset of every contact episode by site and side, coloured by approach speed; energy lost per site.
+
+    More sites or episodes than ``MOST_ROWS`` and ``MOST_MARKERS`` become a map of the largest approach speed. Contacts
+    that touch or are pressed from the beginning have no impacts: a map of their indentation.
+    """
+    episodes = Episodes.of(run)
+    if not len(episodes.cells):
+        return empty_figure("Impacts: the lattice has no contact sites")
+    if not len(episodes.site):
+        return empty_figure("Impacts: no contact in this run")
+
+    model = Case.of(run).model()
+    are_pressed = bool(model.gaps) and max(min(gap) for gap in model.gaps) <= 0 and "displacement" in run
+    has_indentation = are_pressed and len(run["cell"]) == model.chain.cells
+    has_rows = episodes.are_few and not has_indentation
+
+    figure = style.new_figure(style.PAGE, min(1.3 + 0.24 * len(episodes.cells), 4.5))
+    raster, bars = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
+    if has_indentation:
+        _draw_indentation(raster, run, model)
+    elif has_rows:
+        _draw_markers(raster, episodes)
+    else:
+        _draw_speed_map(raster, episodes)
+    _label_sites(raster, episodes, every=1 if has_rows else -(-len(episodes.cells) // MOST_LABELS))
+    _draw_bars(bars, episodes, are_pressed, has_rows)
+    return figure
+
+
+def _draw_indentation(axes: Axes, run: xr.Dataset, model: Model) -> None:
+    """Draw a map of the indentation of every contact over time."""
+    depth = panels.indentations(run, model)
+    rows = np.arange(1, len(depth) + 1)
+    image = panels.draw_map(axes, field_time(run), rows, depth, panels.log_norm(depth, decades=3))
+    axes.set_title("(a) Indentation")
+    panels.colour_bar(image, axes, "Indentation (m)")
+
+
+def _draw_markers(axes: Axes, episodes: Episodes) -> None:
+    """Draw a triangle at the onset of every episode, those of the two sides a little above and below their row."""
+    norm = panels.log_norm(episodes.speed, decades=2)
+    for side, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
+        at = episodes.side == side
+        heights = episodes.site[at] + shift
+        look = {"marker": marker, "lw": 0, "rasterized": True, "norm": norm, "cmap": SPEEDS}
+        image = axes.scatter(episodes.onset[at], heights, 14, episodes.speed[at], **look)
+    axes.grid(axis="y", color=style.PALE, lw=0.5)
+    axes.set_axisbelow(True)
+    axes.set_title(f"(a) {len(episodes.site)} contact episodes (▲ positive side, ▼ negative side)")
+    panels.colour_bar(image, axes, "Approach speed (m/s)")
+
+
+def _draw_speed_map(axes: Axes, episodes: Episodes) -> None:
+    """Draw a map of the largest approach speed by site and time, blank where there is no episode."""
+    sites_per_row = -(-len(episodes.cells) // MAP_ROWS)
+    rows = -(-len(episodes.cells) // sites_per_row)
+    begin, end = episodes.span
+    column = (episodes.onset - begin) / (end - begin) * MAP_COLUMNS
+    column = np.minimum(column, MAP_COLUMNS - 1).astype(int)  # an onset at the end of the run is in the last one
+
+    # fmax passes over the NaN of a place without an episode so far.
+    largest = np.full((rows, MAP_COLUMNS), np.nan)
+    np.fmax.at(largest, (episodes.site_index // sites_per_row, column), episodes.speed)
+
+    extent = (begin, end, 0.5, 0.5 + sites_per_row * rows)
+    norm = panels.log_norm(episodes.speed, decades=2)
+    image = axes.imshow(largest, extent=extent, norm=norm, cmap=SPEEDS)
+    axes.set_title(f"(a) {len(episodes.site)} contact episodes")
+    panels.colour_bar(image, axes, "Largest approach speed (m/s)")
+
+
+def _label_sites(axes: Axes, episodes: Episodes, every: int) -> None:
+    """Label the axis of sites, which all panels share, with the cells of every so many, and the axis of time."""
+    shown = episodes.rows[::every]
+    axes.set_yticks(shown, [f"{cell}" for cell in episodes.cells[shown - 1]])
+    axes.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=episodes.span)
+    axes.set_ylim(0.4, len(episodes.cells) + 0.6)
+
+
+def _draw_bars(axes: Axes, episodes: Episodes, are_pressed: bool, has_rows: bool) -> None:
+    """Draw a bar for every site: the largest force of pressed contacts, or else the loss, or the number of episodes."""
+    sites = len(episodes.cells)
+    count = np.bincount(episodes.site_index, minlength=sites)
+    loss = np.bincount(episodes.site_index, episodes.loss, sites)
+    length: np.ndarray
+    if are_pressed:
+        length = np.zeros(sites)
+        np.fmax.at(length, episodes.site_index, episodes.force)
+        axes.set(title="(b) Largest force", xlabel="Force (N)")
+    elif loss.any():
+        length = loss
+        axes.set(title="(b) Loss, episodes" if has_rows else "(b) Loss", xlabel="Energy lost (J)")
+    else:
+        length = count
+        axes.set(title="(b) Episodes", xlabel="Episodes")
+
+    colour = style.VERMILION if loss.any() else style.BLUE
+    height = 0.6 if has_rows else 1.0
+    row = axes.barh(episodes.rows, length, height, color=colour)
+    room = 1.05
+    if has_rows:
+        axes.bar_label(row, count, padding=2)
+        room = 1.25
+    axes.set_xlim(0, room * length.max())
+    axes.tick_params(left=False)
