@@ -1,0 +1,165 @@
+"""Verbs that compute results behave alike: warnings, options, lock, pictures, exit codes; tables and recognition."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from vipetsc.case import Case
+from vipetsc.case.verb_cases import VERB_CASES
+from vipetsc.cli.verb import DONE, FAILED, STOPPED, Outcome
+from vipetsc.cli.verbs.plot_verb import pictures_of
+from vipetsc.cli.verbs.verb_list import VERBS, study_verbs, verb_of
+from vipetsc.io.folder import KINDS, FolderError
+
+ROOT = Path(__file__).parents[2]
+NAMES = [verb.name for verb in study_verbs()]
+pytestmark = pytest.mark.parallel(1)
+
+
+def example_case(name: str) -> Path:
+    """The case file of a verb's example."""
+    return ROOT / shlex.split(VERBS[name].example)[1]
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The sources of pictures that were asked for; nothing is drawn."""
+    sources = []
+
+    def draw(pictures, folders, comm, afresh):
+        sources.append(pictures.source)
+        return [folders[0] / "figures" / "picture.png"]
+
+    monkeypatch.setattr("vipetsc.cli.verb.draw_pictures", draw)
+    return sources
+
+
+@pytest.fixture
+def call(monkeypatch, in_process, tmp_path, drawn):
+    """Call a verb on its example's case with another study: ``call(name, study, ...)``."""
+
+    def call_with(name, study, *arguments):
+        monkeypatch.setitem(VERBS, name, replace(VERBS[name], study=study))
+        return in_process(name, example_case(name), "--out", tmp_path / "out", *arguments)
+
+    return call_with
+
+
+def finish(case, work) -> Outcome:
+    """A study that computes nothing."""
+    return Outcome()
+
+
+def test_the_case_of_every_verb_is_in_the_list_of_cases():
+    assert {verb.case for verb in study_verbs()} == set(VERB_CASES)
+    for verb in study_verbs():
+        assert verb.name == verb.case.verb
+        assert verb.results in KINDS
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_warnings_are_printed_once_and_the_folder_is_locked(call, monkeypatch, name):
+    monkeypatch.setattr(VERBS[name].case, "warnings", lambda case: ["beware", "beware", "and mind the gap"])
+
+    def study(case, work):
+        assert (work.folder / ".lock").exists()
+        work.warn(["beware", "of the result"])
+        return Outcome()
+
+    ended = call(name, study)
+    assert ended.returncode == DONE, ended.stderr
+    warnings = re.findall(r"^vipetsc: warning: (.*)$", ended.stderr, flags=re.M)
+    assert warnings == ["beware", "and mind the gap", "of the result"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_petsc_options_of_what_is_simulated_are_checked(call, tmp_path, name):
+    ended = call(name, finish, "--set", "petsc.ts_rk_type=magic")
+    if VERBS[name].case.load(example_case(name)).runs():
+        assert ended.returncode == 2
+        assert "petsc.ts_rk_type = 'magic'" in ended.stderr
+        assert not (tmp_path / "out").exists()
+    else:
+        assert name in ("nnm", "design")  # which step nothing by PETSc's options
+        assert ended.returncode == DONE
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pictures_are_drawn_where_they_are_wanted_and_can_be(call, drawn, name):
+    ended = call(name, finish)
+    assert drawn == [VERBS[name].pictures.source]
+    assert "figures/picture.png" in ended.stdout
+    assert call(name, lambda case, work: Outcome(drawable=False)).returncode == DONE
+    assert len(drawn) == 1
+    if VERBS[name].case.verb not in ("nnm", "design"):  # which have no [output]
+        call(name, finish, "--set", "output.figures=false")
+        assert len(drawn) == 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_exit_codes_say_how_a_study_ended(call, drawn, name):
+    def stop(case, work):
+        work.stop.requested = True
+        return Outcome()
+
+    failed = call(name, lambda case, work: Outcome(failures=["curve 2: failed: no convergence"]))
+    assert failed.returncode == FAILED
+    assert failed.stderr.endswith("vipetsc: curve 2: failed: no convergence\n")
+    assert call(name, lambda case, work: Outcome(complete=False)).returncode == FAILED
+    drawn.clear()
+    stopped = call(name, stop)
+    assert stopped.returncode == STOPPED
+    assert "stopped on request" in stopped.stderr
+    assert drawn == []
+
+
+def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
+    response = in_process("validate", example_case("nfrc")).stdout
+    assert re.search(r"^  nfrc +3 curves over the amplitude, 0.4 to 1.6 of the clearance$", response, flags=re.M)
+    assert re.search(r"^  lattice +infinite, ", response, flags=re.M)
+    assert not re.search(r"^  (samples|burst, end|engine|disk)", response, flags=re.M)  # of a run
+
+    prediction = in_process("validate", example_case("predict")).stdout
+    assert re.search(r"^  predict +19 amplitudes, 17 to 1500 N$", prediction, flags=re.M)
+    assert re.search(r"^  composed of +24 runs of one site ", prediction, flags=re.M)
+    assert not re.search(r"^  law ", prediction, flags=re.M)
+    rows = re.findall(r"^  (\w[\w ]*?)  ", prediction, flags=re.M)
+    assert len(rows) == len(set(rows))  # run and predict read it, and share the rows of the lattice
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_results_are_recognised_by_their_file(tmp_path, name):
+    pictures = VERBS[name].pictures
+    file = tmp_path / pictures.file.replace("*", "x")
+    file.touch()
+    assert pictures_of([tmp_path]) == (pictures, [tmp_path])
+    if "*" not in pictures.file:
+        assert pictures_of([file]) == (pictures, [tmp_path])
+
+
+def test_only_sweeps_and_branches_share_a_page(tmp_path):
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for folder in folders:
+        folder.mkdir()
+        (folder / "branch-x.h5").touch()
+    assert pictures_of(folders)[0].source == "branches"
+    (folders[0] / "ensemble.h5").touch()
+    (folders[0] / "branch-x.h5").unlink()
+    assert pictures_of(folders)[0].source == "sweep"
+    (folders[0] / "ensemble.h5").rename(folders[0] / "law.h5")
+    with pytest.raises(FolderError, match="only sweeps and folders of branches can share a page"):
+        pictures_of(folders)
+
+
+def test_a_folder_that_holds_nothing_known_is_taken_for_a_run(tmp_path):
+    assert pictures_of([tmp_path])[0].source == "run"
+
+
+def test_the_verb_of_a_case_is_found_by_its_class():
+    assert verb_of(Case.load(example_case("run"))) is VERBS["run"]
+    assert verb_of(VERBS["predict"].case.load(example_case("predict"))) is VERBS["predict"]
