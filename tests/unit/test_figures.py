@@ -138,8 +138,8 @@ def test_analysis_opens_in_xarray_and_agrees_with_the_run(tmp_path):
 
 def test_ranks_share_the_figures_and_formats(tmp_path):
     write_run(tmp_path / "run.h5")
-    drawn = [p.name for rank in range(2) for p in draw("run", [tmp_path], formats=("pdf",), rank=rank, ranks=2)]
-    assert sorted(drawn) == sorted(f"{n}.pdf" for n in figure_names("run"))
+    written = [p.name for rank in range(2) for p in draw("run", [tmp_path], formats=("pdf",), rank=rank, ranks=2)]
+    assert sorted(written) == sorted(f"{n}.pdf" for n in figure_names("run"))
 
 
 def test_a_wrong_name_and_a_foreign_file_are_refused(tmp_path):

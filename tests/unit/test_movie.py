@@ -1,4 +1,4 @@
-"""Movies: what the frames show, that they read no more than that, files whole or not at all, bad input told."""
+"""Movies: what the frames show, that they read no more than that, files whole or not at all, bad input refused."""
 
 import h5py
 import numpy as np
@@ -169,7 +169,7 @@ def test_without_ffmpeg_there_is_a_gif_and_a_remedy(clear, monkeypatch, capsys):
     few = ["plot", str(clear), "--movie", "--speed", "0.016", "--rate", "2", "--width", "320"]
     assert main(few) == 0
     assert [p.name for p in (clear / "figures").iterdir()] == ["movie-energy.gif"]
-    assert "apt-get install" in (told := capsys.readouterr().err) and "imageio-ffmpeg" in told
+    assert "apt-get install" in (message := capsys.readouterr().err) and "imageio-ffmpeg" in message
     assert main([*few, "--format", "mp4"]) == 2
     assert "apt-get install" in capsys.readouterr().err
 
@@ -203,7 +203,7 @@ def test_what_cannot_be_is_told_and_nothing_written(clear, words, capsys):
     except SystemExit as ended:
         code = ended.code
     assert code == 2
-    assert words.split()[-2] in (told := capsys.readouterr().err) or words.split()[0] in told
+    assert words.split()[-2] in (message := capsys.readouterr().err) or words.split()[0] in message
     assert sorted(clear.rglob("*")) == before
 
 

@@ -46,7 +46,7 @@ OF_FIELDS = ("amplitudes", "wavelets", "partition", "partition_explained", "reco
 OF_CURVES = ("entropy", "entropy_all", "entropy_history")
 
 
-def made(table, tmp_path_factory) -> Path:
+def swept(table, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp(table["name"])
     assert run_sweep(Sweep.from_table(BASE | table), folder).complete
     return folder
@@ -54,12 +54,12 @@ def made(table, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    return open_ensemble(made(WHOLE, tmp_path_factory))
+    return open_ensemble(swept(WHOLE, tmp_path_factory))
 
 
 @pytest.fixture(scope="module")
 def curves(tmp_path_factory):
-    return open_ensemble(made(CURVES, tmp_path_factory))
+    return open_ensemble(swept(CURVES, tmp_path_factory))
 
 
 @pytest.fixture(autouse=True)
@@ -70,11 +70,11 @@ def style():
 
 def only(name, study):
     """The one figure of ``name`` that a study yields."""
-    (figure,) = drawn(name, study).values()
+    (figure,) = offered_figures(name, study).values()
     return figure
 
 
-def drawn(name, study):
+def offered_figures(name, study):
     """Suffixes and figures of ``name`` that a study offers."""
     return {suffix: make() for suffix, make in FIGURES[name].function(Sweeps(study, Files()))}
 
@@ -239,7 +239,7 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
 
 @pytest.mark.parametrize("average", AVERAGES)
 def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
-    figures = drawn("entropy", [curves])
+    figures = offered_figures("entropy", [curves])
     assert len(figures) == 2 * 2 * len(AVERAGES)
     figure = figures[f"calibrated-5pi-9-{average}"]
     grid = np.reshape(figure.axes, (2, 2))
@@ -286,7 +286,7 @@ def test_some_configuration_has_a_power_law(curves):
 
 
 def test_all_panels_by_wavenumber_and_configuration(curves):
-    figures = drawn("entropy_all", [curves])
+    figures = offered_figures("entropy_all", [curves])
     assert len(figures) == 2 * len(AVERAGES)
     grid = np.reshape(figures["printed-masked"].axes, (2, 2))
     assert [axes.get_ylabel() for axes in grid[:, 0]] == ["κ* = 4π/9", "κ* = 5π/9"]
@@ -318,7 +318,7 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
 
 
 def test_entropy_history_is_an_image_over_amplitude(curves):
-    figure = drawn("entropy_history", [curves])["calibrated-5pi-9"]
+    figure = offered_figures("entropy_history", [curves])["calibrated-5pi-9"]
     for axes, sites in zip(figure.axes, (2, 3), strict=False):
         mesh = axes.collections[0]
         fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9, "sites": sites}

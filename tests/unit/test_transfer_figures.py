@@ -32,7 +32,7 @@ TABLE = {
 }
 
 
-def made(folder, **options):
+def swept(folder, **options):
     """A sweep of 20 cells with one site in ``folder``; ``options`` go into ``[sweep]``."""
     table = TABLE | {"sweep": TABLE["sweep"] | options}
     result = run_sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
@@ -43,7 +43,7 @@ def made(folder, **options):
 @pytest.fixture(scope="module")
 def reduced(tmp_path_factory):
     """A sweep over both laws and seven amplitudes without fields, and a branch of the Hertz law beside it."""
-    folder = made(tmp_path_factory.mktemp("reduced"))
+    folder = swept(tmp_path_factory.mktemp("reduced"))
     branch = tmp_path_factory.mktemp("branch")
     energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, 1e6, 60)])
     region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING, energy < 1e5], [1, 2, 3], 4)
@@ -60,7 +60,7 @@ def reduced(tmp_path_factory):
 def whole(tmp_path_factory):
     """Two Hertz members with full fields: one without contact, one with."""
     table = {"contacts": {"law": ["hertz"]}, "drive": {"amplitude": [1.0, 60.0]}, "fields": True}
-    return made(tmp_path_factory.mktemp("whole"), **table)
+    return swept(tmp_path_factory.mktemp("whole"), **table)
 
 
 def contact_motion(folder):
@@ -68,7 +68,7 @@ def contact_motion(folder):
         return transfer_curves.ContactMotion.of(member)
 
 
-def drawn(name, *folders):
+def offered_figures(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     with rc_style():
         sweeps = Sweeps(map(open_ensemble, folders), Files())
@@ -100,7 +100,7 @@ def test_a_relation_says_what_its_values_are(reduced):
 
 
 def test_ibtet_shows_the_ensembles_values(reduced):
-    (figure,) = drawn("ibtet", reduced).values()
+    (figure,) = offered_figures("ibtet", reduced).values()
     for law in ("hertz", "bilinear"):
         for row in (1, 2):
             axes = panel(figure, f".{row}) {law.capitalize()}, calibrated")
@@ -121,7 +121,7 @@ def test_floor_is_that_of_members_without_contact(reduced):
 
 
 def test_shares_are_the_ensembles_and_sum_to_one(reduced):
-    figures = drawn("band_energies", reduced)
+    figures = offered_figures("band_energies", reduced)
     assert list(figures) == ["shares-calibrated-1-site-4-cycles"]
     (figure,) = figures.values()
     share = select(open_ensemble(reduced), law="bilinear")["bands/share"]
@@ -133,7 +133,7 @@ def test_shares_are_the_ensembles_and_sum_to_one(reduced):
 
 
 def test_backbone_is_aligned_exactly(reduced):
-    figures = drawn("ibtet_backbone", reduced)
+    figures = offered_figures("ibtet_backbone", reduced)
     assert list(figures) == ["calibrated-1-site-4-cycles"]  # no branch of the bilinear law was given
     (axes,) = all_axes(figures["calibrated-1-site-4-cycles"])
     assert "branch of the printed reading" in axes.get_title(loc="left")
@@ -167,17 +167,17 @@ def test_backbone_of_another_sweep_is_passed_over(reduced, tmp_path):
         (tmp_path / name).write_bytes((reduced / name).read_bytes())
     with h5py.File(tmp_path / "backbone.h5", "r+") as file:
         file.attrs["case"] = "another"
-    assert not drawn("ibtet_backbone", tmp_path)
+    assert not offered_figures("ibtet_backbone", tmp_path)
 
 
 def test_reduced_sweeps_have_no_pictures_of_fields(reduced):
     for name in ("transfer", "transfer_dispersions", "phase_regimes"):
-        assert not drawn(name, reduced)
+        assert not offered_figures(name, reduced)
 
 
 def test_whole_members_alone_make_no_curves(whole):
     for name in ("ibtet", "ibtet_backbone"):
-        assert not drawn(name, whole)
+        assert not offered_figures(name, whole)
 
 
 def test_nothing_to_draw_from_nothing():
@@ -185,7 +185,7 @@ def test_nothing_to_draw_from_nothing():
 
 
 def test_transfer_has_a_panel_a_band_and_both_segments(whole):
-    figures = drawn("transfer", whole)
+    figures = offered_figures("transfer", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
     figure = figures["hertz-calibrated-1-site-4-cycles-60N"]
     heading = figure.get_suptitle() if hasattr(figure, "get_suptitle") else figure._suptitle.get_text()
@@ -205,7 +205,7 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole):
 
 
 def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
-    figure = drawn("transfer", whole)["hertz-calibrated-1-site-4-cycles-60N"]
+    figure = offered_figures("transfer", whole)["hertz-calibrated-1-site-4-cycles-60N"]
     axes = panel(figure, "cell 10")
     with open_run(member_folder(open_ensemble(whole).isel(law=0, amplitude=1)) / "run.h5") as run:
         velocity, driven = run["velocity"][:, 9].values, 1e-3 * Case.of(run).model().drive.frequency
@@ -217,7 +217,7 @@ def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
 
 
 def test_dispersions_stand_by_law_and_amplitude(whole):
-    (figure,) = drawn("transfer_dispersions", whole).values()
+    (figure,) = offered_figures("transfer_dispersions", whole).values()
     found = all_axes(figure)
     assert [a.get_title(loc="left") for a in found] == ["(a.1) Hertz, 1 N", "(a.2) Hertz, 60 N"]
     for axes, value in zip(found, open_ensemble(whole)["ibtet"].values.ravel(), strict=True):
@@ -227,7 +227,7 @@ def test_dispersions_stand_by_law_and_amplitude(whole):
 
 def test_band_energies_sum_to_the_total(whole):
     """Over the whole record the parts are orthogonal; the running mean differs from the total by cross terms."""
-    figures = drawn("band_energies", whole)
+    figures = offered_figures("band_energies", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
     for _, folder in whole_members(open_ensemble(whole)):
         with h5py.File(folder / "analysis.h5") as file:
@@ -249,7 +249,7 @@ def test_closing_error_is_exact_for_parts_in_quadrature():
 
 
 def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
-    (figure,) = drawn("phase_regimes", whole, reduced).values()
+    (figure,) = offered_figures("phase_regimes", whole, reduced).values()
     curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
     grey = curve.lines[0].get_xydata().T
     np.testing.assert_array_equal(grey[1], select(open_ensemble(reduced), law="hertz")["ibtet"])
@@ -281,7 +281,7 @@ def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatc
 
 
 def test_regimes_without_an_ensemble_beside_them(whole):
-    (figure,) = drawn("phase_regimes", whole).values()
+    (figure,) = offered_figures("phase_regimes", whole).values()
     assert len(all_axes(figure)[0].lines) == 2  # the two points themselves
 
 

@@ -63,7 +63,7 @@ class EntropyCurve(NamedTuple):
 
 
 class Facet(NamedTuple):
-    """What stands on one page: configurations of an ``ensemble``, the members of each a row over rising amplitude.
+    """The configurations of an ``ensemble`` on one page; the members of each are a row over rising amplitude.
 
     ``name`` tells the facet from others in a file's name.
     """

@@ -1,4 +1,4 @@
-"""What a figure shows, as numbers: positions, scales and labels of its axes, their curves, values of a map's colours.
+"""A figure as numbers: positions, scales and labels of its axes, their curves, the values of a map's colours.
 
 A page lays this over the picture, so that values can be read off and curves drawn again, larger or without some.
 """

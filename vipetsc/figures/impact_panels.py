@@ -62,7 +62,7 @@ class Episodes(NamedTuple):
 
     @property
     def are_few(self) -> bool:
-        """Whether each site has a row, and each episode a marker."""
+        """True if each site can have a row, and each episode a marker."""
         return len(self.cells) <= MOST_ROWS and len(self.site) <= MOST_MARKERS
 
 
@@ -139,7 +139,7 @@ def _draw_speed_map(axes: Axes, episodes: Episodes) -> None:
 
 
 def _label_sites(axes: Axes, episodes: Episodes, every: int) -> None:
-    """Label the axis of sites, which all panels share, with the cells of every so many, and the axis of time."""
+    """Label the axis of time, and that of sites, which all panels share: the cells of every ``every``-th site."""
     shown = episodes.rows[::every]
     axes.set_yticks(shown, [f"{cell}" for cell in episodes.cells[shown - 1]])
     axes.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=episodes.span)

@@ -1,4 +1,4 @@
-"""What the frames of a movie of one run show: its wave, the waves that it consists of, impacts, energies of bands."""
+"""The content of the frames of a movie of one run: its wave, the Bloch waves in it, impacts, energies of bands."""
 
 from typing import NamedTuple
 
@@ -22,9 +22,10 @@ FADE = 0.6  # of an impact's light from frame to frame
 
 
 class Shot(NamedTuple):
-    """What to show: "energy" or "velocity", from ``start`` to ``stop`` (s), ``speed`` s of the run in a second.
+    """A request for a movie of ``quantity`` ("energy" or "velocity"), from ``start`` to ``stop`` in s.
 
-    ``rate`` in frames a second; ``cells`` are the first and the last one, from 1; ``width`` in pixels.
+    ``speed`` in s of the run a second; ``rate`` in frames a second; ``cells``: the first and the last one, from 1;
+    ``width`` in pixels.
     """
 
     quantity: str = "energy"
@@ -56,7 +57,7 @@ class BandEnergies(NamedTuple):
 
 
 class MovieFrames(NamedTuple):
-    """What frames show: ``wave`` (frame, curve, cell), ``waves`` (frame, wavenumber, band) in J.
+    """The content of frames: ``wave`` (frame, curve, cell), ``waves`` (frame, wavenumber, band) in J.
 
     ``time`` (frame) in s; ``cells`` (cell) from 1; ``wave`` is the energy in J of the bands by cell or the velocity in
     m/s of the host; ``wavenumber`` in rad/cell, empty if waves cannot be told apart; ``flash`` (frame, site), the light

@@ -108,7 +108,7 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
 
 
 class SpringEnd(NamedTuple):
-    """Where a spring ends: the middle of a mass and half the mass's width, which is 0 for the cell's border."""
+    """The end of a spring: the middle of a mass and half the mass's width, which is 0 for the cell's border."""
 
     x: float
     y: float
@@ -116,7 +116,7 @@ class SpringEnd(NamedTuple):
 
 
 class CellLayout(NamedTuple):
-    """Where masses stand and half their widths; the cell's borders; whether the resonator sits inside its host."""
+    """The centres of masses, half their widths, the cell's borders; ``nested``: the resonator sits inside its host."""
 
     centre: dict[int, Point]
     half: dict[int, float]

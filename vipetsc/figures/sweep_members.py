@@ -1,4 +1,4 @@
-"""What the pictures of sweeps are drawn from: ensembles, members with their fields, and how they are named."""
+"""Sources of the pictures of sweeps: ensembles, members with their fields, and the names of both."""
 
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -114,7 +114,7 @@ class AmplitudeSeries(NamedTuple):
 
     @property
     def headings(self) -> list[str]:
-        """What stands above each amplitude's panels."""
+        """The texts above each amplitude's panels."""
         levels = zip(LEVELS, self.runs, strict=True)
         return [f"{level} amplitude, {run.case.drive.amplitude:g} N" for level, run in levels]
 
@@ -301,7 +301,7 @@ def sites_of(case: Case) -> list[int]:
 
 
 class Labels(NamedTuple):
-    """How a case is named on pages and, as a ``stem``, in their files' names."""
+    """The names of a case on pages and, as a ``stem``, in their files' names."""
 
     law: str  # Hertz
     configuration: str  # 5 sites, 30 cycles

@@ -37,7 +37,7 @@ BACKBONE_LABEL = "Inter-band transfer, normalised slope (1)"
 
 
 class TransferCurve(NamedTuple):
-    """What was measured of one law, reading and configuration, by name; ``case`` stands for its members."""
+    """The measures of one law, reading and configuration, by name; ``case`` stands for its members."""
 
     case: Case
     data: Mapping[Any, Any]
@@ -94,7 +94,7 @@ def ibtet(sweeps: Sweeps) -> Iterator[Drawing]:
 
 
 class _Look(NamedTuple):
-    """How a configuration is drawn and named on all panels of a page."""
+    """The label, colour and marker of a configuration on all panels of a page."""
 
     label: str
     colour: str

@@ -1,4 +1,4 @@
-"""What the points of a branch file are: the attribute ``branch_kind`` of the file names it.
+"""The kinds of branch files: orbits, condensed motions, responses; the attribute ``branch_kind`` of a file names it.
 
 Readers of all rooms ask `branch_kind`; the branch format of ``vipetsc.modes.branches`` writes the attribute. The module
 stands here because figures, which read branches, do not load PETSc.
