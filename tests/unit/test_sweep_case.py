@@ -145,3 +145,10 @@ def test_a_range_has_its_ends_and_rises(first, ratio, count, kind):
     assert values[[0, -1]] == pytest.approx([first, first * ratio], rel=1e-12)
     steps = np.diff(np.log(values) if kind == "log" else values)
     assert steps == pytest.approx(np.full(count - 1, steps[0]), rel=1e-6)
+
+
+def test_a_member_is_made_once():
+    plan = read("[sweep.drive]\namplitude = [1.0, 2.0]")
+    members = plan.members()
+    assert plan.member(1) is members[1] is plan.members()[1]
+    assert plan.model_copy(update={"name": "other"}).member(1) is not members[1]

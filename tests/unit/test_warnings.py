@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from tests.conftest import small_case
-from vipetsc.case import Case
+from vipetsc.case import Case, LawCase
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.predict import PredictCase
 from vipetsc.lattice import Contact
 
 SILENT = ("diatomic", "four-band", "four-band-bilinear", "interband", "interband-one-site", "packet", "chirp",
@@ -85,3 +88,15 @@ def test_contacts_that_are_brief():
     (sentence,) = told(petsc={"ts_adapt_type": "none", "ts_dt": "1e-4"})
     assert "ts takes fixed steps of 0.0001 s" in sentence and "the propagator" in sentence
     assert told(petsc={"ts_adapt_type": "none", "ts_dt": "1e-5"}) == []
+
+
+def test_verbs_warn_of_what_concerns_them():
+    sparse = ["output.every=2"]
+    assert "one cell in 2" in Case.load("runs/law.toml", sparse).warnings()[0]
+    assert LawCase.load("runs/law.toml", sparse).warnings() == []
+    assert NfrcCase.load("runs/nfrc.toml", sparse).warnings() == []
+    search = OptimiseCase.load("runs/optimise-clearances.toml", sparse)
+    assert search.warnings() == search.base.warnings() != []
+
+    (sentence,) = PredictCase.load("runs/predict.toml", ["output.every=2", "time.end=20.0"]).warnings()[:1]
+    assert "before time.end" in sentence

@@ -31,7 +31,7 @@ from vipetsc.case.resolve import (
 from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.warnings import of_losses, warnings_of
+from vipetsc.case.warnings import loss_warnings, warnings_of
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice import Chain, Drive, UnitCell, pass_bands
 
@@ -226,8 +226,8 @@ class Case(CaseFile):
 
     def warnings(self) -> list[str]:
         """What is allowed but likely not meant, one sentence each."""
-        options = self.petsc.model_extra or {} if self.petsc else {}
-        return [*of_losses(self.lattice), *warnings_of(self.model(), self.output, options)]
+        options = (self.petsc.model_extra if self.petsc else None) or {}
+        return [*loss_warnings(self.lattice), *warnings_of(self.model(), self.output, options)]
 
 
 def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem]]:

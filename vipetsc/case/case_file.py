@@ -11,7 +11,7 @@ import math
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -27,7 +27,10 @@ FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
 # The types that pydantic tried a value as, in the path of an error: "float", "list[int]", "Span".
 BRANCH = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
 LARGEST = 1e50
+MISTYPED = 100  # errors within a value that weigh as much as another type: more than anybody makes in one
+LONGEST_VALUE = 200  # characters of a value that a message shows
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
+Location = tuple[int | str, ...]  # the path of an error in a section, as pydantic gives it
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
 
@@ -41,16 +44,20 @@ class Problem:
     remedy: str
 
     def __str__(self) -> str:
+        if self.value is None:
+            return f"{self.key}: {self.remedy}"
         text = repr(self.value)
-        value = "" if self.value is None else f" = {text[:200]}{' ...' * (len(text) > 200)}"
-        return f"{self.key}{value}: {self.remedy}"
+        if len(text) > LONGEST_VALUE:
+            text = f"{text[:LONGEST_VALUE]} ..."
+        return f"{self.key} = {text}: {self.remedy}"
 
 
 class CaseError(ValueError):
     """A case that cannot be used; ``problems`` holds all reasons."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
-        self.problems, self.source = list(problems), source
+        self.problems = list(problems)
+        self.source = source
         super().__init__(self.problems, source)  # what it is pickled by, on its way to other ranks
 
     def __str__(self) -> str:
@@ -117,15 +124,14 @@ class CaseFile(Section):
     @classmethod
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
         """The resolved case of a parsed table; raises CaseError with everything that is wrong."""
-        table, problems = with_overrides(table, overrides) if overrides else (table, [])
+        problems: list[Problem] = []
+        if overrides:
+            table, problems = with_overrides(table, overrides)
         valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}  # a section of another verb may stand by
         problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
-        if not isinstance(name, str) or not name:
-            problems.append(Problem("name", name, "must be a non-empty string"))
-        elif not (name.isprintable() and FOLDER.fullmatch(name) and len(name.encode()) <= LONGEST_NAME):
-            remedy = f"names the output folder: {LONGEST_NAME} bytes at most, without / or \\, no dot or dash first"
-            problems.append(Problem("name", name, remedy))
+        problems += _check_name(name)
+
         fields, wrong = cls.read(table)
         if problems + wrong:
             raise CaseError(problems + wrong, source)
@@ -134,12 +140,14 @@ class CaseFile(Section):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The fields besides ``name``, and everything wrong with the sections they come from."""
-        fields, problems = {}, []
+        fields: dict[str, Any] = {}
+        problems: list[Problem] = []
         for key, field in cls.model_fields.items():
             if key != "name" and (key in table or field.is_required()):
                 kind = next(sections_in(field.annotation))
                 fields[key], wrong = read_section(kind, table.get(key, {}), key)
                 problems += wrong
+
         invalid = {problem.key for problem in problems}
 
         def valid(*keys: str) -> bool:
@@ -189,6 +197,15 @@ def _declared_sections(kind: type[CaseFile]) -> Iterator[str]:
         yield from _declared_sections(subclass)
 
 
+def _check_name(name: Any) -> Iterator[Problem]:
+    """What is wrong with the name of a case, which is that of a folder."""
+    if not isinstance(name, str) or not name:
+        yield Problem("name", name, "must be a non-empty string")
+    elif not (name.isprintable() and FOLDER.fullmatch(name) and len(name.encode()) <= LONGEST_NAME):
+        remedy = f"names the output folder: {LONGEST_NAME} bytes at most, without / or \\, no dot or dash first"
+        yield Problem("name", name, remedy)
+
+
 def read_toml(path: str | Path) -> Table:
     """The table in a TOML file, named after the file if it has no name; raises CaseError."""
     sys.audit("vipetsc.read", str(path))
@@ -215,21 +232,27 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
 
     ``section.key=`` takes the key out.
     """
-    table, problems = copy.deepcopy(table), []
+    table = copy.deepcopy(table)
+    problems: list[Problem] = []
     for override in overrides:
         path, equals, text = (part.strip() for part in override.partition("="))
         if not equals or not all(path.split(".")):
             problems.append(Problem("--set", override, "write section.key=value"))
             continue
-        value: Any = text or None  # a bare word; nothing takes the key out
-        for read in (lambda text: tomllib.loads(f"value = {text}")["value"], float):
-            try:
-                value = read(text)
-                break
-            except (ValueError, RecursionError):  # not TOML; not a number such as .5
-                continue
-        problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
+        problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, _value_of(text))]
     return table, problems
+
+
+def _value_of(text: str) -> Any:
+    """The value that ``text`` is: TOML, a number such as .5, or a bare word; None of nothing."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        return text or None
 
 
 def put(table: Table, path: str, value: Any) -> list[Problem]:
@@ -242,9 +265,11 @@ def put(table: Table, path: str, value: Any) -> list[Problem]:
         return [Problem(path, value, f"{'.'.join(parents)} is a value, not a section")]
     if value is None and key not in section:
         return [Problem(path, None, "is not in the case, so there is nothing to take out")]
-    section[key] = value
+
     if value is None:
         del section[key]
+    else:
+        section[key] = value
     return []
 
 
@@ -252,18 +277,21 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
     """The section ``name`` and its problems; with problems, the section holds the valid keys and defaults."""
     if not isinstance(table, dict):
         return kind(), [Problem(name, table, f"must be a section [{name}]")]
+
     problems: dict[str, Problem] = {}
     invalid = {key for key, value in table.items() if any(_out_of_range(value, ""))}
     try:
         section = kind(**table)
     except ValidationError as error:
-        for item in _as_the_nearest(error.errors(include_url=False)):
+        for item in _of_nearest_type(error.errors(include_url=False)):
             problem = _problem_of(kind, name, item)
             problems.setdefault(problem.key, problem)
             invalid.add(item["loc"][0])
+
     mistyped = tuple(problems)
     problems |= {p.key: p for p in _out_of_range(table, name) if not p.key.startswith(mistyped)}
     if problems:
+        # Read again without them: what is valid can still be checked against other sections.
         section, _ = read_section(kind, {k: v for k, v in table.items() if k not in invalid}, name)
     return section, list(problems.values())
 
@@ -280,16 +308,37 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
         yield Problem(path, value, f"must be of a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
 
 
-def _as_the_nearest(errors: Iterable[Any]) -> list[Any]:
-    """Of pydantic's ``errors`` with a value that may be of several types those with the one that it is nearest to."""
-    branches: dict[tuple[Any, ...], dict[Any, list[int]]] = {}
-    places = [next((i for i, part in enumerate(e["loc"]) if BRANCH.fullmatch(str(part))), None) for e in errors]
-    for item, at in zip(errors, places, strict=True):
-        if at is not None:
-            mistyped = len(item["loc"]) == at + 1 and item["type"].endswith("_type")
-            branches.setdefault(item["loc"][:at], {}).setdefault(item["loc"][at], []).append(100 if mistyped else 1)
-    nearest = {path: min(of, key=lambda name: sum(of[name])) for path, of in branches.items()}
-    return [e for e, at in zip(errors, places, strict=True) if at is None or e["loc"][at] == nearest[e["loc"][:at]]]
+def _of_nearest_type(errors: Sequence[Any]) -> list[Any]:
+    """Pydantic's ``errors`` without those of types that a value is not nearest to.
+
+    A value that may be of several types (a number, a list, a table) is tried as each, and has the errors of all. The
+    nearest type is the one with the lowest cost: an error within the value, such as an item of a list, costs 1, a value
+    that is not of the type at all ``MISTYPED``.
+    """
+    costs: dict[Location, dict[str, int]] = {}
+    for error in errors:
+        value, tried_type = _tried_type(error["loc"])
+        if tried_type:
+            is_whole_value = len(error["loc"]) == len(value) + 1
+            is_mistyped = is_whole_value and error["type"].endswith("_type")
+            types = costs.setdefault(value, {})
+            types[tried_type] = types.get(tried_type, 0) + (MISTYPED if is_mistyped else 1)
+
+    nearest = {value: min(types, key=lambda name: types[name]) for value, types in costs.items()}
+    kept_errors = []
+    for error in errors:
+        value, tried_type = _tried_type(error["loc"])
+        if not tried_type or tried_type == nearest[value]:
+            kept_errors.append(error)
+    return kept_errors
+
+
+def _tried_type(location: Location) -> tuple[Location, str]:
+    """The path of the value in an error's ``location`` that may be of several types, and the one tried; "" if one."""
+    for i, part in enumerate(location):
+        if BRANCH.fullmatch(str(part)):
+            return location[:i], str(part)
+    return location, ""
 
 
 def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:

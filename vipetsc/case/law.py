@@ -12,6 +12,7 @@ from vipetsc.case.case_file import Problem, Section, Table
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.sites import ContactsTable
+from vipetsc.case.warnings import wave_warnings
 from vipetsc.lattice import max_group_velocity, waves_at
 from vipetsc.lattice.packet import packet_speeds
 
@@ -108,6 +109,10 @@ class LawCase(Case):
         """The case of resolved ``sections`` in which the section ``[law]`` is changed."""
         changed = {**sections, "law": sections["law"].model_copy(update=update)}
         return cls(name="law", **changed)
+
+    def warnings(self) -> list[str]:
+        """What is likely not meant about the wave; the runs are of another lattice, other times and one site."""
+        return list(wave_warnings(self.model()))
 
     def fastest(self) -> float:
         """The largest group velocity of all bands in cells/s."""

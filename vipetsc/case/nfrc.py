@@ -102,6 +102,10 @@ class NfrcCase(Case):
             if sections["contacts"].sites in (0, []):
                 yield Problem("contacts.sites", sections["contacts"].sites, "name a cell with a contact")
 
+    def warnings(self) -> list[str]:
+        """Nothing: what a run in time is warned of does not concern steady states."""
+        return []
+
     @property
     def frequency(self) -> float:
         """A frequency of the curves in rad/s."""

@@ -130,6 +130,10 @@ class OptimiseCase(CaseFile):
         problems += [p for p in wrong if not invalid or not p.key.startswith(("optimise.variables", *invalid))]
         return {"table": table, "options": options, "base": base}, problems
 
+    def warnings(self) -> list[str]:
+        """What is likely not meant about the case to begin with."""
+        return self.base.warnings()
+
     def to_toml(self) -> str:
         """The case as TOML; reading it back gives the same search."""
         section = self.options.model_dump(exclude_none=True)

@@ -8,6 +8,7 @@ from pydantic import Field
 from vipetsc.case.case_file import Problem, Section, Valid
 from vipetsc.case.law import LawCase
 from vipetsc.case.schema import Positive
+from vipetsc.case.warnings import end_warnings, length_warnings, wave_warnings
 
 MOST = 10_000  # amplitudes
 
@@ -32,6 +33,11 @@ class PredictCase(LawCase):
 
     verb = section = "predict"
     takes = LawCase.takes - {"rings"}
+
+    def warnings(self) -> list[str]:
+        """What is likely not meant about the waves that are composed; fields are not kept of the runs."""
+        model = self.model()
+        return [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:

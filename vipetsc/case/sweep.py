@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -70,6 +71,7 @@ class Sweep(CaseFile):
         sections = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
+
         values: Values = {}
         for key, value in _leaves(varying):
             try:
@@ -79,6 +81,7 @@ class Sweep(CaseFile):
         if not varying:
             remedy = "names no key that varies, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
+
         axes, wrong = _axes(values, options.zip)
         count = math.prod(len(next(iter(axis.values()))) for axis in axes)
         if count > MOST_MEMBERS:
@@ -108,20 +111,21 @@ class Sweep(CaseFile):
         whole = hashlib.sha256(json.dumps(self.table, sort_keys=True, default=str).encode())
 
         def name(texts: Iterable[str]) -> str:
-            one = whole.copy()
-            one.update("".join(sorted(texts)).encode())
-            return one.hexdigest()[:16]
+            digest = whole.copy()
+            digest.update("".join(sorted(texts)).encode())
+            return digest.hexdigest()[:16]
 
         # What stands on an axis is written once; a sweep may have a million members.
-        rows = [
-            [dict(zip(axis, values, strict=True)) for values in zip(*axis.values(), strict=True)] for axis in self.axes
-        ]
-        texts = [[json.dumps(row, sort_keys=True, default=str) for row in axis] for axis in rows]
+        texts: list[list[str]] = []
+        for axis in self.axes:
+            rows = [dict(zip(axis, values, strict=True)) for values in zip(*axis.values(), strict=True)]
+            texts.append([json.dumps(row, sort_keys=True, default=str) for row in rows])
         return [name(chosen) for chosen in itertools.product(*texts)]
 
     def member_table(self, index: Sequence[int]) -> tuple[Table, list[Problem]]:
         """The table of the member with that ``index`` on every axis, and what could not be put into it."""
-        table, problems = copy.deepcopy(self.table), list[Problem]()
+        table = copy.deepcopy(self.table)
+        problems: list[Problem] = []
         for axis, i in zip(self.axes, index, strict=True):
             for key, values in axis.items():
                 problems += put(table, key, copy.deepcopy(values[i]))
@@ -129,10 +133,25 @@ class Sweep(CaseFile):
 
     def member(self, number: int) -> SweepMember:
         """The member ``number`` (from 0) in the order of the axes, the last varying fastest."""
+        if number in self._made:
+            return self._made[number]
+        member = self._make_member(number)
+        # A sweep may have a million members: those that are tried before it begins are asked for again, not all.
+        if len(self._made) < MOST_TRIED:
+            self._made[number] = member
+        return member
+
+    @cached_property
+    def _made(self) -> dict[int, SweepMember]:
+        return {}
+
+    def _make_member(self, number: int) -> SweepMember:
         index = tuple(map(int, np.unravel_index(number, self.shape)))
         table, problems = self.member_table(index)
+        if problems:
+            return SweepMember(index, None, problems)
         try:
-            return SweepMember(index, None, problems) if problems else SweepMember(index, Case.from_table(table))
+            return SweepMember(index, Case.from_table(table))
         except CaseError as error:
             return SweepMember(index, None, error.problems)
 
@@ -160,7 +179,7 @@ class Sweep(CaseFile):
         numbers = np.arange(self.count)
         if most < self.count:
             numbers = np.sort(np.random.default_rng(0).choice(self.count, most, replace=False))
-        members = [self.member(number) for number in numbers]
+        members = [self.member(int(number)) for number in numbers]
         if refused := {str(p): p for member in members for p in member.problems if p.key.startswith("disorder")}:
             raise CaseError(refused.values(), self.name)
         if not any(member.case for member in members):
@@ -198,21 +217,25 @@ def _values(value: Any) -> tuple[Any, ...]:
     if isinstance(value, list) and value:
         return tuple(value)
     if isinstance(value, dict) and value.keys() == {"count"} and type(value["count"]) is int and value["count"] > 0:
-        return tuple(range(min(value["count"], MOST_MEMBERS + 1)))
+        return tuple(range(min(value["count"], MOST_MEMBERS + 1)))  # one more than allowed is refused as a sweep
+
     remedy = "give a list of values, { log = [first, last], count = n } or { linear = [first, last], count = n }"
     if not isinstance(value, dict) or len(value) != 2 or "count" not in value:
         raise ValueError(remedy)
     (kind,) = value.keys() - {"count"}
     ends, count = value[kind], value["count"]
-    numbers = isinstance(ends, list) and len(ends) == 2 and all(type(e) in (int, float) for e in ends)
-    if not numbers or type(count) is not int or not 1 <= count <= MOST_MEMBERS:
-        raise ValueError(remedy + f", n from 1 to {MOST_MEMBERS}" * numbers)
+    if not (isinstance(ends, list) and len(ends) == 2 and all(type(end) in (int, float) for end in ends)):
+        raise ValueError(remedy)
+    if type(count) is not int or not 1 <= count <= MOST_MEMBERS:
+        raise ValueError(f"{remedy}, n from 1 to {MOST_MEMBERS}")
     if not all(abs(end) <= LARGEST for end in ends):
         raise ValueError(f"the ends of a range must be numbers up to {LARGEST:g}")
     if kind == "log" and min(ends) <= 0:
         raise ValueError("the ends of a log range must be positive")
+
     first, last = map(float, ends)
-    return tuple((np.geomspace if kind == "log" else np.linspace)(first, last, count).tolist())
+    spaced = np.geomspace if kind == "log" else np.linspace
+    return tuple(spaced(first, last, count).tolist())
 
 
 def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:
@@ -221,7 +244,8 @@ def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], 
     group_of: dict[str, tuple[str, ...]] = {}
     for group in groups:
         lengths = {key: len(values[key]) for key in group if key in values}
-        if missing := [key for key in group if key not in values]:
+        missing = [key for key in group if key not in values]
+        if missing:
             problems.append(Problem("sweep.zip", missing, f"not among the keys that vary: {', '.join(values)}"))
         elif len(set(lengths.values())) > 1:
             problems.append(Problem("sweep.zip", lengths, "keys that vary together need as many values each"))
@@ -230,6 +254,7 @@ def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], 
         group_of |= dict.fromkeys(group, tuple(group))
     if problems:
         return (), problems
+
     axes = dict.fromkeys(group_of.get(key, (key,)) for key in values)
     return tuple({key: values[key] for key in keys} for keys in axes), []
 

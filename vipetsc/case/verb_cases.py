@@ -22,6 +22,9 @@ OF_SECTION = {kind.section: kind for kind in VERB_CASES if kind.section}
 SECTIONS: dict[str, type[Section]] = {name: table for kind in VERB_CASES for name, table in kind.sections().items()}
 """Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
 
+# Sections that tell that a file is of a run, or of verbs that are made of runs; normal modes read the others too.
+SECTIONS_OF_RUNS = {"disorder", "drive", "initial", "time", "output", "sweep", "optimise"}
+
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:
     """The cases that the verbs of the file's sections read from it, ``run`` first; the built-in one without a file.
@@ -30,18 +33,17 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     lacks: then its first possible member stands for the run. Raises CaseError with the problems of all verbs.
     """
     table, source = _table(path)
-    sections = with_overrides(table, overrides := list(overrides))[0].keys()
-    kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in sections]
-    if not kinds or {"sweep", "disorder", "drive", "initial", "time", "output", "optimise"} & sections:
-        kinds.insert(0, Case)
+    overrides = list(overrides)
     cases: list[CaseFile] = []
     problems: dict[str, Problem] = {}
-    for kind in kinds:
+    for kind in _kinds(with_overrides(table, overrides)[0]):
         try:
             case = kind.from_table(table, overrides, source)
             if isinstance(case, Sweep):
+                # What a run lacks the sweep may give: a member stands for it, and its problems are none.
                 possible = [member.case for member in case.members(MOST_TRIED) if member.case]
-                cases, problems = cases or [*possible[:1]], {}
+                cases = cases or [*possible[:1]]
+                problems = {}
             cases.append(case)
         except CaseError as error:
             problems |= {str(problem): problem for problem in error.problems}
@@ -50,19 +52,36 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     return cases
 
 
-def disorder_of(path: str | Path | None, overrides: Iterable[str]) -> tuple[DisorderTable, Case, Case] | None:
-    """What scatters in a valid case file, the case without and with it; of a sweep, its first possible member's."""
+def _kinds(table: Table) -> list[type[CaseFile]]:
+    """The cases of the verbs that read a ``table``."""
+    kinds: list[type[CaseFile]] = [kind for section, kind in OF_SECTION.items() if section in table]
+    if not kinds or SECTIONS_OF_RUNS & table.keys():
+        kinds.insert(0, Case)
+    return kinds
+
+
+def disorder_of(
+    path: str | Path | None, overrides: Iterable[str], cases: Iterable[CaseFile] = ()
+) -> tuple[DisorderTable, Case, Case] | None:
+    """What scatters in a valid case file, the case without and with it; of a sweep, its first possible member's.
+
+    The sweep is taken from the ``cases`` that were read from the file, if it is among them: its members are made once.
+    """
     table, _ = with_overrides(_table(path)[0], overrides)
     if "sweep" in table:
-        plan = Sweep.from_table(table)
-        table, _ = plan.member_table(next(member.index for member in plan.members(MOST_TRIED) if member.case))
+        plan = next((case for case in cases if isinstance(case, Sweep)), None) or Sweep.from_table(table)
+        first = next(member for member in plan.members(MOST_TRIED) if member.case)
+        table, _ = plan.member_table(first.index)
     if "disorder" not in table:
         return None
-    disorder, nominal = read_section(DisorderTable, table["disorder"], "disorder")[0], table.copy()
-    del nominal["disorder"]
+
+    disorder, _ = read_section(DisorderTable, table["disorder"], "disorder")
+    nominal = {key: section for key, section in table.items() if key != "disorder"}
     return disorder, Case.from_table(nominal), Case.from_table(table)
 
 
 def _table(path: str | Path | None) -> tuple[Table, str]:
     """The table of a case file and what it is called; the built-in one without a file."""
-    return (read_toml(path), str(path)) if path else (Case.builtin_table, "built-in case")
+    if path:
+        return read_toml(path), str(path)
+    return Case.builtin_table, "built-in case"

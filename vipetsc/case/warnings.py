@@ -15,13 +15,22 @@ from vipetsc.lattice.damped import KAPPAS, damped_bloch
 
 SLOW = 0.1  # of the band's fastest group velocity
 WAVELENGTHS = 4.0  # that a lattice should hold
-MISSED, TINY = 0.1, 1e-6  # of the loss asked, in the mean over the wavenumbers of a band; a loss that is none
-BRIEF, STEPS = 0.1, 10.0  # a contact over the sample interval; fixed steps that a contact should take
+MISSED = 0.1  # of the loss asked, in the mean over the wavenumbers of a band
+TINY = 1e-6  # a loss that is none
+BRIEF = 0.1  # a contact's time over the sample interval
+STEPS = 10.0  # of fixed length that a contact should take
+DEFAULT_STEP = 0.05  # of 1/frequency: the first step of ``ts`` where -ts_dt does not give one
 
 
 def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> list[str]:
     """The sentences about a run of ``model`` of which ``output`` is kept, with these options of PETSc."""
-    return [*_of_waves(model), *_of_ends(model, output), *_of_fields(model, output), *_of_contacts(model, petsc)]
+    return [
+        *wave_warnings(model),
+        *length_warnings(model),
+        *end_warnings(model, output),
+        *field_warnings(model, output),
+        *contact_warnings(model, petsc),
+    ]
 
 
 def losses(lattice: LatticeTable) -> np.ndarray:
@@ -36,36 +45,51 @@ def losses(lattice: LatticeTable) -> np.ndarray:
     return np.column_stack([asked, loss.min(axis=0), loss.mean(axis=0), loss.max(axis=0)])
 
 
-def of_losses(lattice: LatticeTable) -> Iterator[str]:
+def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
     """Bands whose loss is another than the one asked: by more than ``MISSED``, or by a factor of 2 somewhere."""
-    rows = enumerate(losses(lattice), 1)
-    if off := [
-        f"band {band} {least:.3g} to {most:.3g} (mean {mean:.3g}, asked {asked:.3g})"
-        for band, (asked, least, mean, most) in rows
-        if abs(mean - asked) > MISSED * asked + TINY or most > 2 * asked + TINY or least < asked / 2
-    ]:
+    off: list[str] = []
+    for band, (asked, least, mean, most) in enumerate(losses(lattice), 1):
+        is_off_in_mean = abs(mean - asked) > MISSED * asked + TINY
+        is_off_somewhere = most > 2 * asked + TINY or least < asked / 2
+        if is_off_in_mean or is_off_somewhere:
+            off.append(f"band {band} {least:.3g} to {most:.3g} (mean {mean:.3g}, asked {asked:.3g})")
+    if off:
         yield (
             f"lattice.damping.loss: dashpots of the cell's masses and springs can give no more like it than"
             f" {', '.join(off)}; fewer bands, and those that matter, come nearer"
         )
 
 
-def _of_waves(model: Model) -> Iterator[str]:
-    """Evanescent, slow or long waves; a run that ends before its drive."""
+def wave_warnings(model: Model) -> Iterator[str]:
+    """Evanescent and slow waves."""
+    cell, drive = model.chain.cell, model.drive
+    if not model.is_driven or not cell.springs:
+        return
+
+    waves = waves_at(cell, drive.frequency)
+    frequency = f"drive.frequency = {drive.frequency:.6g} rad/s"
+    if not waves:
+        yield f"{frequency} lies in no pass band, so the wave is evanescent; see the verb `bands`"
+        return
+    band, _, speed = max(waves, key=lambda wave: wave[2])
+    _, best, fastest = max_group_velocity(cell, band)
+    if speed < SLOW * fastest:
+        yield (
+            f"{frequency} lies at an edge of band {band}: its waves make {speed:.3g} of {fastest:.3g} cells/s"
+            f" and spread; the fastest are at {best:.6g} rad/s"
+        )
+
+
+def length_warnings(model: Model) -> Iterator[str]:
+    """Waves that are long for the lattice; a run that ends before its drive."""
     cell, drive, cells = model.chain.cell, model.drive, model.chain.cells
-    waves, frequency = waves_at(cell, drive.frequency), f"drive.frequency = {drive.frequency:.6g} rad/s"
     if model.is_driven and not cell.springs:
         return
-    if model.is_driven and not waves:
-        yield f"{frequency} lies in no pass band, so the wave is evanescent; see the verb `bands`"
-    elif model.is_driven:
-        band, kappa, speed = max(waves, key=lambda wave: wave[2])
-        _, best, fastest = max_group_velocity(cell, band)
-        if speed < SLOW * fastest:
-            yield (
-                f"{frequency} lies at an edge of band {band}: its waves make {speed:.3g} of {fastest:.3g} cells/s"
-                f" and spread; the fastest are at {best:.6g} rad/s"
-            )
+
+    waves = waves_at(cell, drive.frequency)
+    if model.is_driven and waves:
+        _, kappa, _ = max(waves, key=lambda wave: wave[2])
+        # The wave of 2 pi - kappa is the same one, in the other direction.
         wavelength = 2 * pi / max(min(kappa, 2 * pi - kappa), 1e-300)
         if wavelength * WAVELENGTHS > cells:
             yield (
@@ -77,7 +101,7 @@ def _of_waves(model: Model) -> Iterator[str]:
         yield f"time.end = {model.end:.6g} s comes before the burst is over"
 
 
-def _of_ends(model: Model, output: OutputTable) -> Iterator[str]:
+def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     """A wave that comes back from an end to what is measured: to the sites, else to the window or the drive."""
     chain, drive, at = model.chain, model.drive, model.drive_cell
     if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
@@ -100,18 +124,22 @@ def _of_ends(model: Model, output: OutputTable) -> Iterator[str]:
             )
 
 
-def _of_fields(model: Model, output: OutputTable) -> Iterator[str]:
+def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     """Fields that do not resolve the waves, in the words of the analysis, so that each is said once."""
-    chain, top = model.chain, pass_bands(model.chain.cell)[-1].high
-    interval, (first, last) = output.stride * model.sample_interval, output.window or (1, chain.cells)
+    chain = model.chain
+    top = pass_bands(chain.cell)[-1].high
+    interval = output.stride * model.sample_interval
     if output.fields and interval * top >= np.pi:
         coarse = f"fields kept every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
         yield f"{coarse}: dispersion, bands and ibtet are not measured"
     if output.fields and output.every > 1:
         sparse = f"fields of one cell in {output.every} do not resolve waves shorter than {2 * output.every} cells"
         yield f"{sparse}: wavenumber_content, dispersion, partition and entropy are not measured"
+
+    first, last = output.window or (1, chain.cells)
     if output.fields and chain.sites and not any(first <= site + 1 <= last for site in chain.sites):
         yield f"output.window = [{first}, {last}] holds none of the contact sites"
+
     highest = max(drive.waveform.highest for drive in model.drives)
     if model.is_driven and highest > np.pi / model.sample_interval:
         interval = np.pi / highest
@@ -122,14 +150,15 @@ def _of_fields(model: Model, output: OutputTable) -> Iterator[str]:
         )
 
 
-def _of_contacts(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
+def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     """Contacts that samples, or steps of fixed length, do not see."""
     speed = model.scale * model.drive.frequency
     if not model.chain.sites or not speed:
         return
+
     laws = {*(model.laws or (model.contact,))}
     time = min(law.impact_time(speed, model.chain.cell.reduced_mass) for law in laws)
-    step = float(petsc.get("ts_dt", 0.05 / model.drive.frequency))
+    step = float(petsc.get("ts_dt", DEFAULT_STEP / model.drive.frequency))
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:
         yield (
             f"ts takes fixed steps of {step:.3g} s, and a contact at {speed:.3g} m/s lasts {time:.3g} s: ts_dt ="

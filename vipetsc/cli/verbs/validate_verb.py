@@ -34,7 +34,7 @@ def report_of(options: argparse.Namespace, ranks: int) -> str:
         check_options(case)
         rows += verb_of(case).table(case, ranks)
         warnings += case.warnings()
-    disorder = disorder_of(options.case, options.set)
+    disorder = disorder_of(options.case, options.set, cases)
     if disorder:
         rows += disorder_rows(*disorder)
 
