@@ -12,7 +12,7 @@ from tests.cli.browser import NEEDED, browsing
 from vipetsc.figures import panels
 from vipetsc.figures.style import new_figure, rc_style, save
 from vipetsc.paper.paper_figures import PaperFigure
-from vipetsc.paper.report import write_report
+from vipetsc.paper.report import ReportContents, write_report
 
 CELLS = 100
 ENERGY = np.geomspace(1e-7, 1e-1, CELLS)  # six decades, of which a map shows five
@@ -36,7 +36,10 @@ def shown(tmp_path_factory):
         axes = json.loads(save(figure, folder / "fig99-both.json").read_text())
     one = PaperFigure("fig99", "Fig. 99", "A map and two points", "", (), ())
     versions, cpu = {"date": ""}, {"steps": {}}
-    write_report(folder / "report.html", "", [], [(one, [picture])], {}, versions, cpu)
+    contents = ReportContents(
+        note="", claims=[], pictures=[(one, [picture])], statistics={}, versions=versions, cpu=cpu
+    )
+    write_report(folder / "report.html", contents)
     with browsing(folder) as browser:
         session = browser.open(folder / "report.html", 1280, 500)  # which scrolls
         image = "const i = document.querySelector('figure img');"

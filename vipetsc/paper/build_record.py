@@ -1,4 +1,4 @@
-"""What was made of the paper, from which inputs, and at what cost: ``made.json``."""
+"""The record of what there is of the paper, from which inputs and at what cost: ``made.json``."""
 
 import json
 from pathlib import Path
@@ -7,9 +7,10 @@ from typing import Any
 from vipetsc.io.atomic import write_text
 from vipetsc.paper.plan import read_json
 
-MADE = "made.json"
+RECORD = "made.json"
 FORMATS = ("png", "pdf", "json")
-LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".json": b"]", ".html": b"</html>"}  # what such files end with
+# What files of each kind end with: one that was cut off does not.
+LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".json": b"]", ".html": b"</html>"}
 
 BuildRecord = dict[str, Any]
 """Hashes of inputs of "claims" and "report", of "figures" by id with the stems of their pictures.
@@ -20,14 +21,14 @@ BuildRecord = dict[str, Any]
 
 def read_record(root: Path) -> BuildRecord:
     """``made.json``, or an empty record, after which everything is made again."""
-    cpu = {"steps": {}, "figures": 0.0, "claims": 0.0, "report": 0.0}
-    return {"figures": {}, "cpu": cpu} | (read_json(root / MADE) or {})
+    empty = {"figures": {}, "cpu": {"steps": {}, "figures": 0.0, "claims": 0.0, "report": 0.0}}
+    return empty | (read_json(root / RECORD) or {})
 
 
 def write_record(root: Path, record: BuildRecord) -> None:
     """Write ``made.json`` if it holds another record."""
     if record != read_record(root):
-        write_text(root / MADE, json.dumps(record, indent=1) + "\n")
+        write_text(root / RECORD, json.dumps(record, indent=1) + "\n")
 
 
 def is_whole(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The figures of the paper drawn, as far as they are missing or were made from other results, on all ranks."""
+"""Drawing the figures of the paper that are missing or were drawn from other results, on all ranks."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,31 +24,35 @@ def draw_paper(
     The ranks draw pictures from one count, the dearest first; none is begun after a request to stop.
     """
     begin = time.process_time()
-    folders, record = on_root(comm, lambda: (plan.folders(root), _drop_stale(plan, root, inputs)))
+    folders = on_root(comm, lambda: plan.folders(root))
+    record = on_root(comm, lambda: _drop_stale(plan, root, inputs))
     missing = on_root(comm, lambda: [f for f in plan.figures if not _is_complete(f.id, record, root)])
     if not missing:
         return ()
+
     if comm.rank == 0:
         tell("figures")
     with Files() as files, style.rc_style():
         offers = on_every_rank(comm, lambda: {f.id: [*f.offers(folders, files)] for f in missing})
         for key, pictures in offers.items():
             record["figures"][key]["pictures"] = [picture.stem for picture in pictures]
-        undrawn = {stem for f in missing for stem in record["figures"][f.id]["pictures"]}
-        undrawn = on_root(comm, lambda: {stem for stem in undrawn if not is_drawn(root, stem)})
-        wanted = [picture for pictures in offers.values() for picture in pictures if picture.stem in undrawn]
-        wanted.sort(key=lambda picture: -picture.cost)
-        drawn = _draw_shared([Drawing(stem, make) for stem, make, _ in wanted], root, comm, stop, plan.note)
+        offered = [picture for pictures in offers.values() for picture in pictures]
+        undrawn = on_root(comm, lambda: {p.stem for p in offered if not is_drawn(root, p.stem)})
+        wanted = [picture for picture in offered if picture.stem in undrawn]
+        wanted.sort(key=lambda picture: -picture.cost)  # the dearest first: ranks then end together
+        drawn = _draw_shared([Drawing(p.stem, p.make) for p in wanted], root, comm, stop, plan.note)
+
     spent = comm.allreduce(time.process_time() - begin)
     if drawn:
-        every = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
-        record["cpu"]["figures"] = spent + (0.0 if every else record["cpu"]["figures"])
+        drawn_anew = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
+        earlier = 0.0 if drawn_anew else record["cpu"]["figures"]
+        record["cpu"]["figures"] = spent + earlier
     on_root(comm, lambda: write_record(root, record))
     return tuple(drawn)
 
 
 def _draw_shared(drawings: Sequence[Drawing], root: Path, comm: MPI.Comm, stop: StopRequest, note: str) -> list[Path]:
-    """Draw on all ranks, each the next one that none has begun."""
+    """Draw on all ranks, each the next picture that none has begun."""
     counter = SharedCounter(comm)
 
     def turns() -> Iterator[int]:
@@ -57,10 +61,10 @@ def _draw_shared(drawings: Sequence[Drawing], root: Path, comm: MPI.Comm, stop: 
         counter.draw(MANY)  # so that no rank begins another
 
     try:
-        mine = on_every_rank(comm, lambda: draw_each(drawings, root / "figures", FORMATS, turns(), note))
+        written = on_every_rank(comm, lambda: draw_each(drawings, root / "figures", FORMATS, turns(), note))
     finally:
         counter.free()
-    return sorted(path for paths in comm.allgather(mine) for path in paths)
+    return sorted(path for paths in comm.allgather(written) for path in paths)
 
 
 def _is_complete(key: str, record: BuildRecord, root: Path) -> bool:

@@ -8,7 +8,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,22 +16,22 @@ from typing import Any
 from mpi4py import MPI
 
 from vipetsc.io.folder import PAPER, Claim, claimed, provenance
-from vipetsc.paper.build_record import FORMATS, is_whole, read_record, write_record
+from vipetsc.paper.build_record import FORMATS, BuildRecord, is_whole, read_record, write_record
 from vipetsc.paper.claims import write_claims
 from vipetsc.paper.draw import draw_paper
-from vipetsc.paper.paper_figures import RELATED, TRANSFER
+from vipetsc.paper.paper_figures import RELATED, TRANSFER, PaperFigure
 from vipetsc.paper.plan import DONE, MISSING, STALE, Plan, fingerprint, read_json
-from vipetsc.paper.report import write_report
+from vipetsc.paper.report import ReportContents, write_report
 from vipetsc.paper.steps import duration, make_steps, noted
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
 
-Tell = Callable[[str], None]
+Announce = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class PaperResult:
-    """What was done: steps ``made``, files ``drawn``; the rows of ``claims.json``.
+    """How the paper ended: steps ``made`` now, files ``drawn`` now, the rows of ``claims.json``.
 
     ``complete``: every step asked for is there, without failures; ``notes`` are warnings, and say what failed and why.
     """
@@ -50,7 +50,7 @@ def make_paper(
     *,
     only: Sequence[str] = (),
     stop: StopRequest | None = None,
-    tell: Tell = lambda text: None,
+    tell: Announce = lambda text: None,
 ) -> PaperResult:
     """Make what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``.
 
@@ -64,16 +64,19 @@ def make_paper(
     if a case file cannot be used, StoppedError after a request to stop.
     """
     sys.audit("vipetsc.plan", str(root))
-    root, part = Path(root), plan.only(only)
+    root = Path(root)
+    part = plan.only(only)
     with _claimed(plan, root, comm):
         return _make_paper(plan, part, root, comm, stop or StopRequest(), tell)
 
 
-def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Tell) -> PaperResult:
+def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Announce) -> PaperResult:
     """Make the steps and figures of ``part``, and from all of ``plan`` that is there the claims and the report."""
     notes: list[str] = []
     made = make_steps(part, root, comm, stop, tell, notes)
     stop.check(comm)
+
+    # What is made from results begins when all of them are there: inputs are hashes of their contents.
     with noted(comm, "backbone", notes):
         on_root(comm, lambda: _relate(plan.folders(root)))
     inputs = on_root(comm, lambda: plan.inputs(root))
@@ -83,8 +86,9 @@ def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRe
     stop.check(comm)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell, inputs["claims"]))
 
-    complete = not on_root(comm, lambda: part.left(root)) and not any(note.startswith("failed") for note in notes)
-    return PaperResult(made, drawn, claims, complete, notes)
+    left = on_root(comm, lambda: part.left(root))
+    failed = any(note.startswith("failed") for note in notes)
+    return PaperResult(made=made, drawn=drawn, claims=claims, complete=not (left or failed), notes=notes)
 
 
 def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:
@@ -93,11 +97,14 @@ def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[C
         _ = step.text
 
     def difference(text: str) -> str | None:
-        with suppress(ValueError, KeyError):
+        """Why ``plan.json`` with this ``text`` is of another plan; None if it is of this one."""
+        try:
             grid = json.loads(text)["grid"]
-            other = f"holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
-            return other if grid != plan.grid else None
-        return f"its plan.json cannot be read; remove it if the folder holds the paper on the {plan.grid} grid"
+        except (ValueError, KeyError):
+            return f"its plan.json cannot be read; remove it if the folder holds the paper on the {plan.grid} grid"
+        if grid == plan.grid:
+            return None
+        return f"holds the paper on the {grid} grid; choose another --out for the {plan.grid} one"
 
     return claimed(comm, root, PAPER, json.dumps({"grid": plan.grid}) + "\n", difference=difference)
 
@@ -109,51 +116,87 @@ def _relate(folders: Mapping[str, Path]) -> None:
         relate_folders([folders[TRANSFER], *branches])
 
 
-def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Tell, inputs: str) -> list[dict[str, Any]]:
-    """``claims.json`` and ``report.html`` as far as their ``inputs`` changed; returns the claims."""
-    record, begin = read_record(root), time.process_time()
-    path, report = root / "claims.json", root / "report.html"
+def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: str) -> list[dict[str, Any]]:
+    """Write ``claims.json`` and ``report.html`` as far as their ``inputs`` changed; returns the claims."""
+    record = read_record(root)
+    path = root / "claims.json"
     if read_json(path) is None or record.get("claims") != inputs:
         tell("claims")
         sys.audit("vipetsc.claims")
+        begin = time.process_time()
         write_claims(plan.measure(root), path)
-        record["claims"], record["cpu"]["claims"] = inputs, time.process_time() - begin
-    text = path.read_text(encoding="utf-8")
+        record["claims"] = inputs
+        record["cpu"]["claims"] = time.process_time() - begin
+
+    claims = path.read_text(encoding="utf-8")
     about = provenance(comm)
     versions = {key: value for key, value in about.items() if key.endswith("_version")}
     cpu = {key: seconds for key, seconds in record["cpu"].items() if key != "report"}
-    inputs = fingerprint(text, json.dumps([inputs, record["figures"], versions, cpu]))
-    if not is_whole(report) or record.get("report") != inputs:
+    report_inputs = fingerprint(claims, json.dumps([inputs, record["figures"], versions, cpu]))
+    if not is_whole(root / "report.html") or record.get("report") != report_inputs:
         tell("report")
         sys.audit("vipetsc.report")
         begin = time.process_time()
-        stems = {key: entry["pictures"] for key, entry in record["figures"].items()}
-        paths = [[root / "figures" / f"{stem}.png" for stem in stems.get(f.id, ())] for f in plan.figures]
-        pictures = [(f, list(filter(Path.exists, ps))) for f, ps in zip(plan.figures, paths, strict=True)]
-        statistics = {step.name: step.statistics(root) for step in plan.steps if step.state(root) == DONE}
-        write_report(report, plan.note, json.loads(text), pictures, statistics, about, cpu)
-        record["report"], record["cpu"]["report"] = inputs, time.process_time() - begin
+        contents = ReportContents(
+            note=plan.note,
+            claims=json.loads(claims),
+            pictures=_pictures(plan, root, record),
+            statistics={step.name: step.statistics(root) for step in plan.steps if step.state(root) == DONE},
+            versions=about,
+            cpu=cpu,
+        )
+        write_report(root / "report.html", contents)
+        record["report"] = report_inputs
+        record["cpu"]["report"] = time.process_time() - begin
     write_record(root, record)
-    return json.loads(text)
+    return json.loads(claims)
+
+
+def _pictures(plan: Plan, root: Path, record: BuildRecord) -> list[tuple[PaperFigure, list[Path]]]:
+    """The figures of the ``plan`` with their pictures (PNG), as far as they are there."""
+    pictures = []
+    for figure in plan.figures:
+        stems = record["figures"].get(figure.id, {}).get("pictures", ())
+        paths = [root / "figures" / f"{stem}.png" for stem in stems]
+        pictures.append((figure, [path for path in paths if path.exists()]))
+    return pictures
 
 
 def plan_table(plan: Plan, root: Path, ranks: int) -> str:
     """What is done and what is left of ``plan`` in ``root``: steps with the time they need, figures, claims."""
-    lines, total = [f"{'step':<26}{'state':<10}{'left':>9}  claims"], 0.0
+    lines = [f"{'step':<26}{'state':<10}{'left':>9}  claims"]
+    total = 0.0
     for step in plan.steps:
         left = step.left(root) / ranks
         total += left
         lines.append(f"{step.name:<26}{step.state(root):<10}{duration(left):>9}  {' '.join(plan.claims_of(step))}")
-    lines += [f"{'all steps on ' + str(ranks) + (' ranks' if ranks > 1 else ' rank'):<36}{duration(total):>9}", ""]
+    all_steps = f"all steps on {ranks} {'rank' if ranks == 1 else 'ranks'}"
+    lines += [f"{all_steps:<36}{duration(total):>9}", ""]
+
     lines.append(f"{'figure':<8}{'paper':<9}{'pictures':<10}{'state':<9}claims      shows")
-    record, inputs = read_record(root)["figures"], plan.inputs(root)
+    record = read_record(root)["figures"]
+    inputs = plan.inputs(root)
     for figure in plan.figures:
-        unrecorded = {path.stem for path in (root / "figures").glob(f"{figure.id}-*")}
-        entry = record.get(figure.id, {"inputs": "", "pictures": unrecorded})
-        paths = [root / "figures" / f"{stem}.{kind}" for stem in entry["pictures"] for kind in FORMATS]
-        drawn = sum(path.exists() for path in paths)
-        current = drawn == len(paths) and entry["inputs"] == inputs[figure.id]
-        state = MISSING if not drawn else DONE if current else STALE
-        row = f"{figure.id:<8}{figure.label:<9}{drawn // len(FORMATS):<10}{state:<9}{' '.join(figure.claims):<12}"
+        drawn, state = _figure_state(root, figure, record.get(figure.id), inputs[figure.id])
+        row = f"{figure.id:<8}{figure.label:<9}{drawn:<10}{state:<9}{' '.join(figure.claims):<12}"
         lines.append(row + figure.title)
     return "\n".join(lines)
+
+
+def _figure_state(root: Path, figure: PaperFigure, entry: BuildRecord | None, inputs: str) -> tuple[int, str]:
+    """How many pictures of a ``figure`` are there, and whether they are those of its ``inputs``.
+
+    ``entry`` is what is recorded of it, None if nothing is.
+    """
+    if entry is None:
+        stems = {path.stem for path in (root / "figures").glob(f"{figure.id}-*")}
+        entry = {"inputs": "", "pictures": stems}
+    paths = [root / "figures" / f"{stem}.{kind}" for stem in entry["pictures"] for kind in FORMATS]
+    files = sum(path.exists() for path in paths)
+    if not files:
+        state = MISSING
+    elif files == len(paths) and entry["inputs"] == inputs:
+        state = DONE
+    else:
+        state = STALE
+    return files // len(FORMATS), state

@@ -18,9 +18,9 @@ from vipetsc.figures.registry import FIGURES, drawings
 from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.sweep_members import Files
 
-READINGS = "calibrated", "printed"
+READINGS = ("calibrated", "printed")
 TRANSFER = "interband"  # the sweep that is laid over branches
-RELATED = "nnm-hertz", "nnm-bilinear", "nnm-hertz-calibrated", "nnm-bilinear-calibrated"
+RELATED = ("nnm-hertz", "nnm-bilinear", "nnm-hertz-calibrated", "nnm-bilinear-calibrated")
 
 
 class Picture(NamedTuple):
@@ -71,13 +71,16 @@ class PaperFigure:
     def offers(self, folders: Mapping[str, Path], files: Files) -> Iterator[Picture]:
         """The pictures that the ``folders`` of finished steps (by name) allow, drawn while ``files`` are open."""
         for part in self.parts:
-            for reading in READINGS if part.schematic else ():
-                schematic = partial(SCHEMATICS[part.schematic], reading, *part.arguments)
-                yield Picture(f"{self.id}-{part.stem}-{reading}", schematic, part.cost)
+            if part.schematic:
+                for reading in READINGS:
+                    schematic = partial(SCHEMATICS[part.schematic], reading, *part.arguments)
+                    yield Picture(f"{self.id}-{part.stem}-{reading}", schematic, part.cost)
+
             finished = [folders[step] for step in part.steps if step in folders]
-            for stem, make in drawings(FIGURES[part.figure].source, finished, files, [part.figure]) if finished else ():
-                if all(f"-{word}-" in f"{stem}-" for word in part.only):
-                    yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", make, part.cost)
+            if finished:
+                for stem, make in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
+                    if all(f"-{word}-" in f"{stem}-" for word in part.only):
+                        yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", make, part.cost)
 
 
 def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:
@@ -88,9 +91,9 @@ def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:
 def two_masses(reading: str) -> Figure:
     """The reduced model of the four-band cell: host and resonator."""
     cell = _case("four-band", reading).lattice.unit_cell()
-    masses = cell.masses[cell.host], cell.masses[cell.resonator]
+    masses = (cell.masses[cell.host], cell.masses[cell.resonator])
     inner = [s.stiffness for s in cell.springs if {s.start, s.end} == {cell.host, cell.resonator}]
-    # Half of the total of springs that are held at their middles, as the paper shares them out.
+    # Half of the total of springs that are held at their middles, as the paper divides them.
     outer = [s.stiffness for s in cell.springs if cell.host in (s.start, s.end) and s.stiffness not in inner]
     return reduced_model(masses, (sum(outer), sum(inner)), PRESETS["four-band"].clearance_span(1)[0])
 
@@ -125,5 +128,5 @@ NAMES = (
 
 
 def describe(stem: str) -> str:
-    """What the name of a picture's file says, in words: "calibrated reading, 5π/9, energy-weighted average"."""
+    """The name of a picture's file in words: "calibrated reading, 5π/9, energy-weighted average"."""
     return ", ".join(match.expand(text) for pattern, text in NAMES for match in re.finditer(pattern, stem))

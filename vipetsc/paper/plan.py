@@ -1,6 +1,6 @@
-"""What the verb ``paper`` makes, in full or on coarse grids: steps, a case file each made in a folder of its own.
+"""The plan of the verb ``paper``, in full or on coarse grids: steps, each of which makes a case file in its own folder.
 
-How far each step has come, and what figures and claims are made from.
+A step knows how far it has come, and the plan what figures and claims are made from.
 """
 
 import hashlib
@@ -33,29 +33,32 @@ from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.paper_figures import PAPER_FIGURES, RELATED, PaperFigure
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.engines import agreement, sampled
-from vipetsc.studies.ensemble import FAILED, Results
+from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, Results
 from vipetsc.studies.prediction import predict
 from vipetsc.studies.sweep import run_sweep
 
 FULL, QUICK = "full", "quick"
-COARSE = "quick: coarse grid"
+COARSE = "quick: coarse grid"  # the note on every picture of the quick grid
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
 SEED = 2024  # of the members that are made by the other engine as well
 TS_COST = 2.5  # s of CPU time of one of them
 IN_PHASE = 10  # times as long as the other branch takes the one that goes through all tongues
 RELATION = "backbone.h5"  # beside a sweep that is laid over branches
 
-# Steps that a claim is measured from, and figures that bear on it are drawn from, besides those that these show.
+# Steps that a claim is measured from besides those whose results its figures show.
 FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
 
 StepCase = Sweep | NnmCase | DesignCase | PredictCase
 KINDS: dict[str, type[StepCase]] = {
-    "sweep": Sweep, "branches": NnmCase, "search": DesignCase, "prediction": PredictCase
-}  # fmt: skip
+    "sweep": Sweep,
+    "branches": NnmCase,
+    "search": DesignCase,
+    "prediction": PredictCase,
+}
 
 
-class Claimed(NamedTuple):
-    """How a part of a step is made, on one rank, and how all of them take the place of earlier ones, on all ranks."""
+class PartMaker(NamedTuple):
+    """How one rank makes a part of a step, and how on all ranks all parts take the place of earlier ones."""
 
     make: Callable[[int], object]
     publish: Callable[[], None] = lambda: None
@@ -79,14 +82,16 @@ class PaperStep:
     sample: int = 0
 
     def folder(self, root: Path) -> Path:
-        """Where the step's files are."""
+        """The folder of the step's files."""
         return root / self.name
 
     @cached_property
     def case(self) -> StepCase:
         """The resolved case; raises CaseError."""
         case = self.kind.load(self.file, self.changes)
-        return sampled(case, self.sample, SEED) if self.checks and isinstance(case, Sweep) else case
+        if self.checks and isinstance(case, Sweep):
+            return sampled(case, self.sample, SEED)
+        return case
 
     @cached_property
     def text(self) -> str:
@@ -95,10 +100,15 @@ class PaperStep:
 
     def results(self, root: Path) -> list[Path]:
         """The files that pictures and claims are made from."""
-        names = [{Sweep: "ensemble.h5", PredictCase: "prediction.h5"}.get(self.kind, "design.h5")]
         if isinstance(self.case, NnmCase):
             system = System.from_case(self.case)
             names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
+        elif isinstance(self.case, Sweep):
+            names = ["ensemble.h5"]
+        elif isinstance(self.case, PredictCase):
+            names = ["prediction.h5"]
+        else:
+            names = ["design.h5"]
         return [self.folder(root) / name for name in names]
 
     @property
@@ -106,19 +116,22 @@ class PaperStep:
         """What single ranks make, by number with CPU times in s: branches by mode, the search; else nothing."""
         if isinstance(self.case, NnmCase):
             return {mode: self.cost * (IN_PHASE if mode == 1 else 1) for mode in self.case.nnm.modes}
-        return {} if isinstance(self.case, Sweep | PredictCase) else {1: self.cost}
+        if isinstance(self.case, DesignCase):
+            return {1: self.cost}
+        return {}
 
     @contextmanager
-    def claimed(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> Iterator[Claimed]:
-        """The folder of a step of parts, claimed on all ranks to make what is missing, everything if ``afresh``."""
-        case, folder = self.case, self.folder(root)
+    def claimed(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> Iterator[PartMaker]:
+        """Claim the folder of a step of parts on all ranks, to make what is missing, everything if ``afresh``."""
+        case = self.case
+        folder = self.folder(root)
         if isinstance(case, NnmCase):
             with claim_branches(case, folder, comm, afresh) as claim:
                 follower = partial(Follower, case, claim.folder, provenance(comm), stop=stop, resume=claim.going_on)
-                yield Claimed(lambda mode: follower().follow(mode - 1), claim.publish)
+                yield PartMaker(lambda mode: follower().follow(mode - 1), claim.publish)
         else:
             assert isinstance(case, DesignCase)
-            yield Claimed(lambda part: search_design(case, folder, MPI.COMM_SELF, force=afresh))
+            yield PartMaker(lambda part: search_design(case, folder, MPI.COMM_SELF, force=afresh))
 
     def sweep(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
         """Make what is missing of a sweep or prediction on all ranks, all if ``afresh``; may leave early on ``stop``.
@@ -132,16 +145,21 @@ class PaperStep:
         return run_sweep(self.case, self.folder(root), comm, force=afresh, stop=stop, progress=True).warnings
 
     def state(self, root: Path) -> str:
-        """DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
-        marker = self.folder(root) / "case.toml"
-        if not marker.exists():
+        """How far the step has come: DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
+        folder = self.folder(root)
+        if not (folder / "case.toml").exists():
             return MISSING
-        if not self._is_same_case(marker.read_text(encoding="utf-8")):
-            begun = self.folder(root) / NEW / "case.toml"  # what is to replace them
-            return BEGUN if begun.exists() and self._is_same_case(begun.read_text(encoding="utf-8")) else STALE
-        if outdated(self.folder(root)):
+        if not self._is_case_of(folder):
+            # Results of this case may be on their way to replace those of the other.
+            return BEGUN if self._is_case_of(folder / NEW) else STALE
+        if outdated(folder):
             return STALE
         return DONE if all(map(self._is_complete, self.results(root))) else BEGUN
+
+    def _is_case_of(self, folder: Path) -> bool:
+        """Whether a ``folder`` is there for results of this case."""
+        marker = folder / "case.toml"
+        return marker.exists() and self._is_same_case(marker.read_text(encoding="utf-8"))
 
     def _is_complete(self, path: Path) -> bool:
         """Whether a result is of this case; a branch has ended, by itself or in a failure that it names."""
@@ -167,22 +185,34 @@ class PaperStep:
             return 0.0
         if not isinstance(self.case, Sweep):
             return sum(self.parts.values()) or self.cost
-        times = [*Results(self.case, self.folder(root)).cpu_seconds.values()] if state == BEGUN else []
-        rate = max(float(np.mean(times)), self.cost) if times else self.cost  # measuring a run takes time as well
+
+        times: list[float] = []
+        if state == BEGUN:
+            times = [*Results(self.case, self.folder(root)).cpu_seconds.values()]
+        rate = self.cost
+        if times:
+            rate = max(float(np.mean(times)), self.cost)  # measuring a run takes time as well
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
 
     def failures(self, root: Path) -> int:
         """How many members or branches of a step that is done failed."""
         if isinstance(self.case, NnmCase):
             return int(_branch_statistics(self.results(root))["failed"])
-        return int((open_ensemble(self.folder(root))["status"] == FAILED).sum()) if isinstance(self.case, Sweep) else 0
+        if isinstance(self.case, Sweep):
+            return int((open_ensemble(self.folder(root))["status"] == FAILED).sum())
+        return 0
 
     def statistics(self, root: Path) -> dict[str, Any]:
-        """Numbers about the results for a report, once they are there; empty where there are none to tell."""
+        """Numbers about the results for a report, once they are there; empty where there are none."""
         if isinstance(self.case, NnmCase):
             return _branch_statistics(self.results(root))
-        told = _sweep_statistics(self.folder(root)) if isinstance(self.case, Sweep) else {}
-        return told | ({"agreement": agreement(root / self.checks, self.folder(root))} if self.checks else {})
+
+        statistics: dict[str, Any] = {}
+        if isinstance(self.case, Sweep):
+            statistics |= _sweep_statistics(self.folder(root))
+        if self.checks:
+            statistics["agreement"] = agreement(root / self.checks, self.folder(root))
+        return statistics
 
 
 @dataclass(frozen=True)
@@ -203,12 +233,15 @@ class Plan:
         """The part of the plan that figures and claims need; all of it without ``ids``; raises FolderError."""
         if not ids:
             return self
+
         names = {figure.id.lower() for figure in self.figures}
         unknown = [i for i in ids if i.lower() not in names and i.upper() not in CLAIMS]
         if unknown:
             known = f"figures are {', '.join(f.id for f in self.figures)}; claims are C1 to C{len(CLAIMS)}"
             raise FolderError(f"--only {' '.join(unknown)}: {known}")
-        wanted, claims = {i.lower() for i in ids}, {i.upper() for i in ids}
+
+        wanted = {i.lower() for i in ids}
+        claims = {i.upper() for i in ids}
         figures = [f for f in self.figures if f.id.lower() in wanted or claims & set(f.claims)]
         shown = claims.union(*(figure.claims for figure in figures))
         needed = {step for figure in figures for step in figure.steps}
@@ -231,10 +264,13 @@ class Plan:
 
     def inputs(self, root: Path) -> dict[str, str]:
         """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
-        steps = {step.name: step.identity(root) for step in self.steps if step.state(root) == DONE}
-        version = vipetsc.__version__, self.note
-        inputs = {f.id: fingerprint(*version, *(n + steps[n] for n in f.steps if n in steps)) for f in self.figures}
-        return inputs | {"claims": fingerprint(*version, *(name + identity for name, identity in steps.items()))}
+        steps = {step.name: step.name + step.identity(root) for step in self.steps if step.state(root) == DONE}
+        version = (vipetsc.__version__, self.note)
+        inputs: dict[str, str] = {}
+        for figure in self.figures:
+            inputs[figure.id] = fingerprint(*version, *(steps[name] for name in figure.steps if name in steps))
+        inputs["claims"] = fingerprint(*version, *steps.values())
+        return inputs
 
 
 def paper_plan(grid: str = FULL) -> Plan:
@@ -244,14 +280,23 @@ def paper_plan(grid: str = FULL) -> Plan:
     readings stay.
     """
     folder = files("vipetsc.paper")
-    steps = []
+    steps: list[PaperStep] = []
     for name, row in tomllib.loads((folder / "plan.toml").read_text(encoding="utf-8")).items():
         file = Path(str(folder / "cases" / f"{row.get('case', name)}.toml"))
-        changes = [*row.get("changes", ()), *(row.get("quick", ()) if grid == QUICK else ())]
+        changes = [*row.get("changes", ())]
+        if grid == QUICK:
+            changes += row.get("quick", ())
         if row["kind"] == "sweep":  # the figures of the paper are drawn from all sweeps together
             changes.insert(0, "output.figures=false")
         steps.append(
-            PaperStep(name, KINDS[row["kind"]], file, tuple(changes), row["cost"], sample=row.get("sample", 0))
+            PaperStep(
+                name=name,
+                kind=KINDS[row["kind"]],
+                file=file,
+                changes=tuple(changes),
+                cost=row["cost"],
+                sample=row.get("sample", 0),
+            )
         )
     steps += [replace(s, name=f"{s.name}-ts", cost=TS_COST, checks=s.name) for s in steps if s.sample]
     return Plan(grid, tuple(steps), note=COARSE if grid == QUICK else "")
@@ -261,8 +306,10 @@ def _sweep_statistics(folder: Path) -> dict[str, Any]:
     """Members and how they ended, contact episodes, the largest error of the ledger, CPU time in s."""
     ensemble = open_ensemble(folder)
     status = ensemble["status"].values
-    counts = {name: int((status == code).sum()) for code, name in enumerate(("simulated", "scaled", "failed"))}
-    return counts | {
+    return {
+        "simulated": int((status == COMPLETE).sum()),
+        "scaled": int((status == SCALED).sum()),
+        "failed": int((status == FAILED).sum()),
         "members": status.size,
         "episodes": int(np.nansum(ensemble["contact_episodes"].values)),
         "ledger": float(np.nanmax(ensemble["ledger_error"].values, initial=0.0)),
@@ -272,13 +319,18 @@ def _sweep_statistics(folder: Path) -> dict[str, Any]:
 
 def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
     """Points, largest residual, endings with tongues and warnings of the branches, and how many of them failed."""
-    residuals, endings = [], []
+    residuals: list[float] = []
+    endings: list[str] = []
     for path in paths:
         with open_netcdf(path, "branch", ("kind", "residual", "ending")) as branch:
-            residuals.extend(branch["residual"].values[branch["kind"].values == 0].tolist())
-            passed = [f"{branch.attrs['tongues']} tongues"] if branch.attrs.get("tongues") else []
-            told = [branch.attrs["ending"], *passed, *json.loads(branch.attrs.get("warnings", "[]"))]
-            endings.append(f"{branch.attrs['name']}: {', '.join(told)}")
+            regular = branch["kind"].values == 0
+            residuals.extend(branch["residual"].values[regular].tolist())
+            remarks = [branch.attrs["ending"]]
+            if branch.attrs.get("tongues"):
+                remarks.append(f"{branch.attrs['tongues']} tongues")
+            remarks += json.loads(branch.attrs.get("warnings", "[]"))
+            endings.append(f"{branch.attrs['name']}: {', '.join(remarks)}")
+
     failed = sum("failed" in ending for ending in endings)
     return {"points": len(residuals), "residual": max(residuals, default=0.0), "endings": endings, "failed": failed}
 

@@ -1,4 +1,4 @@
-"""What is told of the paper: one page with everything in it, for any screen and for print, and a table of verdicts."""
+"""The report on the paper: one page with everything in it, for any screen and for print, and a table of verdicts."""
 
 import base64
 import hashlib
@@ -12,7 +12,7 @@ from importlib.resources import files
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
@@ -23,27 +23,32 @@ from vipetsc.paper.paper_figures import READINGS, PaperFigure, describe
 from vipetsc.studies.engines import COMPARED
 
 COLOURS = 256  # of a picture of lines in the page
-WIDTH, QUALITY = 1000, 50  # of a picture of maps, in pixels and of WebP
+WIDTH = 1000  # pixels of a picture of maps
+QUALITY = 50  # of a picture of maps in WebP
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
-VERDICTS = HOLDS, IN_PART, FAILS, UNMEASURED
+VERDICTS = (HOLDS, IN_PART, FAILS, UNMEASURED)
 
 
-def write_report(
-    path: Path,
-    note: str,
-    claims: Sequence[Mapping[str, Any]],
-    pictures: Sequence[tuple[PaperFigure, Sequence[Path]]],
-    statistics: Mapping[str, Mapping[str, Any]],
-    versions: Mapping[str, Any],
-    cpu: Mapping[str, Any],
-) -> None:
-    """Write the page to ``path``, whole or not at all.
+class ReportContents(NamedTuple):
+    """What the page shows: the rows of ``claims.json``, the pictures (PNG) of every figure, numbers and versions.
 
-    From the rows of ``claims.json``, the pictures (PNG) of every figure, numbers about the steps by name, versions, and
-    the ``cpu`` time in s of "steps" by name, "figures" and "claims"; ``note`` is not empty for coarse grids. Pictures
-    that the page at ``path`` shows already are taken from there.
+    ``note`` is not empty for coarse grids; ``statistics`` are about the steps by name; ``cpu`` is the time in s of
+    "steps" by name, "figures" and "claims".
     """
-    encoded = dict(ENCODED.findall(path.read_text(encoding="utf-8"))) if path.exists() else {}
+
+    note: str
+    claims: Sequence[Mapping[str, Any]]
+    pictures: Sequence[tuple[PaperFigure, Sequence[Path]]]
+    statistics: Mapping[str, Mapping[str, Any]]
+    versions: Mapping[str, Any]
+    cpu: Mapping[str, Any]
+
+
+def write_report(path: Path, contents: ReportContents) -> None:
+    """Write the page to ``path``, whole or not at all; pictures that the page there shows already are taken from it."""
+    encoded: dict[str, str] = {}
+    if path.exists():
+        encoded = dict(ENCODED.findall(path.read_text(encoding="utf-8")))
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.loader = PackageLoader("vipetsc.paper", ".")
     environment.filters |= {
@@ -52,21 +57,27 @@ def write_report(
         "picture": partial(picture, encoded),
         "describe": describe,
     }
-    verdicts = Counter((claim["reading"], claim["verdict"]) for claim in claims)
+
+    statistics = contents.statistics
+    verdicts = Counter((claim["reading"], claim["verdict"]) for claim in contents.claims)
     readings = [r for r in READINGS if any(reading == r for reading, _ in verdicts)]
+    figure_of: dict[str, PaperFigure] = {}
+    for figure, _ in contents.pictures:
+        for claim in figure.claims:
+            figure_of.setdefault(claim, figure)  # the first figure that bears on a claim
     page = environment.get_template("report.html").render(
-        note=note,
-        pictures=pictures,
-        versions=versions,
-        rows=by_reading(claims),
+        note=contents.note,
+        pictures=contents.pictures,
+        versions=contents.versions,
+        rows=by_reading(contents.claims),
         readings=readings,
         counts={r: [(v, verdicts[r, v]) for v in VERDICTS if verdicts[r, v]] for r in readings},
-        figure_of={claim: figure for figure, _ in reversed(pictures) for claim in figure.claims},
+        figure_of=figure_of,
         sweeps={name: row for name, row in statistics.items() if "members" in row},
         branches={name: row for name, row in statistics.items() if "points" in row},
         checks={name.removesuffix("-ts"): row["agreement"] for name, row in statistics.items() if "agreement" in row},
         bounds=COMPARED,
-        cpu=cpu,
+        cpu=contents.cpu,
         script=(files("vipetsc.paper") / "explore.js").read_text(encoding="utf-8"),
     )
     write_text(path, page)
@@ -77,7 +88,10 @@ def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str,
     data = path.read_bytes()
     key = hashlib.sha256(data).hexdigest()
     with Image.open(io.BytesIO(data)) as image:
-        uri = encoded.get(key) or "data:image/webp;base64," + base64.b64encode(small(image.convert("RGB"))).decode()
+        uri = encoded.get(key)
+        if not uri:
+            uri = "data:image/webp;base64," + base64.b64encode(small(image.convert("RGB"))).decode()
+
         shown = path.with_suffix(".json")
         axes = zlib.compress(shown.read_bytes() if shown.exists() else b"[]", 9)
         return image.width, image.height, key, uri, base64.b64encode(axes).decode()
@@ -85,11 +99,15 @@ def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str,
 
 def small(image: Image.Image) -> bytes:
     """The picture as WebP: with all pixels in few colours, or, where that is larger, narrower and with losses."""
-    lines, maps = io.BytesIO(), io.BytesIO()
+    lines = io.BytesIO()
     few = image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     few.convert("RGB").save(lines, "webp", lossless=True, quality=60, method=4)
-    narrow = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
-    (narrow if image.width > WIDTH else image).save(maps, "webp", quality=QUALITY, method=4)
+
+    maps = io.BytesIO()
+    narrow = image
+    if image.width > WIDTH:
+        narrow = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
+    narrow.save(maps, "webp", quality=QUALITY, method=4)
     return min(lines.getvalue(), maps.getvalue(), key=len)
 
 
@@ -109,8 +127,9 @@ def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
     readings = list(dict.fromkeys(claim["reading"] for claim in claims))
     lines = [f"{'':<5}" + "".join(f"{reading:<18}" for reading in readings) + "claim"]
     for key, row in by_reading(claims).items():
-        verdicts = "".join(f"{row[r]['verdict'] if r in row else '':<18}" for r in readings)
-        lines.append(f"{key:<5}{verdicts}{next(iter(row.values()))['claim']}")
+        verdicts = [row[reading]["verdict"] if reading in row else "" for reading in readings]
+        claim = next(iter(row.values()))["claim"]
+        lines.append(f"{key:<5}" + "".join(f"{verdict:<18}" for verdict in verdicts) + claim)
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""The steps of the paper made, as far as they are missing: parts that single ranks make shared out, then the sweeps."""
+"""Making the steps of the paper that are missing: first the parts that single ranks make, then the sweeps."""
 
 import sys
 import time
@@ -6,18 +6,19 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from mpi4py import MPI
 
 from vipetsc.paper.build_record import read_record, write_record
-from vipetsc.paper.plan import STALE, PaperStep, Plan
+from vipetsc.paper.plan import STALE, PaperStep, PartMaker, Plan
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.pool import DISK_FULL, TaskPool
 
 
 @contextmanager
 def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
-    """Note what is raised and go on; not where one rank failed alone, nor for a full disk."""
+    """Note what the block raises and go on; not where one rank failed alone, nor for a full disk."""
     try:
         yield
     except StoppedError:
@@ -36,22 +37,26 @@ def make_steps(
 
     First the parts that single ranks make, of all steps together, then the sweeps one by one.
     """
-    left, stale = on_root(comm, lambda: (plan.left(root), {s.name for s in plan.steps if s.state(root) == STALE}))
+    left = on_root(comm, lambda: plan.left(root))
+    stale = on_root(comm, lambda: {step.name for step in plan.steps if step.state(root) == STALE})
     missing = [step for step in plan.steps if step.name in left]
 
-    def say(*names: str) -> None:
+    def announce(*names: str) -> None:
         if comm.rank == 0:
             tell(f"{', '.join(names)}: about {duration(sum(left[name] for name in names) / comm.size)}")
 
     made: list[str] = []
     parted = [step for step in missing if step.parts]
     if parted and not stop.agreed(comm):
-        say(*(step.name for step in parted))
+        announce(*(step.name for step in parted))
         made += _make_parts(parted, stale, root, comm, stop, notes)
-    for step in (step for step in missing if not step.parts):
+
+    for step in missing:
+        if step.parts:
+            continue
         if stop.agreed(comm):
             break
-        say(step.name)
+        announce(step.name)
         with noted(comm, step.name, notes):
             sys.audit("vipetsc.member", step.name)
             begin = time.process_time()
@@ -59,36 +64,51 @@ def make_steps(
             notes += [f"warning: {step.name}: {warning}" for warning in warnings]
             made.append(step.name)
             _account(root, comm, {step.name: time.process_time() - begin}, step.name in stale)
+
     return tuple(step.name for step in missing if step.name in made)
+
+
+class PartJob(NamedTuple):
+    """A part of a step, by number, that one rank makes; jobs are sorted by their ``cost`` in s."""
+
+    cost: float
+    step: str
+    part: int
 
 
 def _make_parts(
     steps: Sequence[PaperStep], stale: Collection[str], root: Path, comm: MPI.Comm, stop: StopRequest, notes: list[str]
 ) -> list[str]:
-    """Share all parts of ``steps`` over the ranks, the longest first; returns the steps without failures."""
-    cpu = dict[str, float]()
+    """Make all parts of ``steps`` on single ranks, the longest first; returns the steps without failures."""
+    cpu: dict[str, float] = {}
+    reasons: dict[str, str] = {}
     with ExitStack() as claims:
-        begun = {}
+        makers: dict[str, PartMaker] = {}
+        jobs: list[PartJob] = []
         for step in steps:
             with noted(comm, step.name, notes):
-                begun[step.name] = claims.enter_context(step.claimed(root, comm, stop, step.name in stale))
-        jobs = [(cost, step.name, part) for step in steps if step.name in begun for part, cost in step.parts.items()]
+                makers[step.name] = claims.enter_context(step.claimed(root, comm, stop, step.name in stale))
+                jobs += [PartJob(cost, step.name, part) for part, cost in step.parts.items()]
 
-        def work(job: tuple[float, str, int]) -> None:
-            _, name, part = job
+        def work(job: PartJob) -> None:
             begin = time.process_time()
-            begun[name].make(part)
-            cpu[name] = cpu.get(name, 0.0) + time.process_time() - begin
+            makers[job.step].make(job.part)
+            cpu[job.step] = cpu.get(job.step, 0.0) + time.process_time() - begin
+
+        def fail(job: PartJob, reason: str) -> None:
+            reasons[job.step] = reason
 
         pool = TaskPool(comm, MPI.COMM_SELF, stop)
-        reasons: dict[str, str] = {}
-        pool.run(sorted(jobs, reverse=True), work, fail=lambda job, reason: reasons.update({job[1]: reason}))
-        failed = {name: reason for share in comm.allgather(reasons) for name, reason in share.items()}
+        pool.run(sorted(jobs, reverse=True), work, fail=fail)
+        failed: dict[str, str] = {}
+        for of_rank in comm.allgather(reasons):
+            failed |= of_rank
         notes += [f"failed: {name}: {reason}" for name, reason in failed.items()]
-        made = [name for name in begun if name not in failed]
+
+        made = [name for name in makers if name not in failed]
         if not (pool.stopped or stop.agreed(comm)):
             for name in made:
-                begun[name].publish()
+                makers[name].publish()
     _account(root, comm, cpu, afresh=False)
     return made
 
@@ -96,8 +116,8 @@ def _make_parts(
 def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: bool) -> None:
     """Add the CPU time in s that each rank spent on ``steps`` to the record; of steps made ``afresh`` only this."""
     spent = Counter[str]()
-    for share in comm.allgather(steps):
-        spent.update(share)
+    for of_rank in comm.allgather(steps):
+        spent.update(of_rank)
 
     def write() -> None:
         record = read_record(root)
@@ -112,4 +132,6 @@ def duration(seconds: float) -> str:
     """A time in words; a dash for none."""
     if seconds <= 0:
         return "-"
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min"

@@ -84,35 +84,30 @@ def analyse(
 ) -> xr.Dataset:
     """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
-    Of ``FULL`` those ``measures`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
+    Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
     estimated from the group velocity: half the burst and the way to the site. ``options`` are the case's where none
     are given. What the run cannot give (no sites, a single cell) is left out and named in the attribute ``left_out``;
     what the samples and cells that were kept do not resolve is named in the list ``warnings`` as well.
     """
     sys.audit("vipetsc.analyse")
-    about = {"format_version": FORMAT_VERSION, "vipetsc_version": vipetsc.__version__}
-    about |= {"case": run.attrs["case"], "status": run.attrs.get("status", "")}
     options = options or options_of(run)
-    about["analysis"] = describe_options(options)
+    about = {
+        "format_version": FORMAT_VERSION,
+        "vipetsc_version": vipetsc.__version__,
+        "case": run.attrs["case"],
+        "status": run.attrs.get("status", ""),
+        "analysis": describe_options(options),
+    }
     if "velocity" not in run:
         return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
+
     record = VelocityRecord(run, options)
-    nt, cells = record.velocity.shape[:2]
-    measures = set(measures) - record.unresolved()
-    values: dict[str, Any] = _maps(record, measures) if {"kinetic", "wavenumber"} & measures else {}
-    if nt < 2:
-        record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
-    else:
-        values |= _dispersions(record) if "dispersion" in measures else {}
-        values |= band_energies(record, measures) if "bands" in measures else {}
-        values |= _wavelets(record, measures, arrival) if cells > 1 else {}
-    values |= modal_energies(run, record, measures) if {"modal", "transfers"} & measures else {}
-    if cells == 1:
-        record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
-    left_out = "; ".join(record.left_out + record.warnings)
-    about |= {"left_out": left_out, "warnings": json.dumps(record.warnings)}
+    values = _measure(run, record, set(measures) - record.unresolved(), arrival)
+    about["left_out"] = "; ".join(record.left_out + record.warnings)
+    about["warnings"] = json.dumps(record.warnings)
     about |= record.attributes.pop("", {})
+
     dims = {dim for name in values for dim in LAYOUT[name][0].split()}
     axes = {"time": record.mean_time, "cell": record.mean_cells, "bands/sample": record.time}
     values = {name: axis for name, axis in axes.items() if name in dims} | values
@@ -123,28 +118,64 @@ def analyse(
 
 
 def describe_options(options: AnalysisTable) -> str:
-    """The ``options`` that results depend on, as the attribute ``analysis`` of a file tells them."""
+    """The ``options`` that results depend on, as they stand in the attribute ``analysis`` of a file."""
     return json.dumps(options.model_dump(exclude={"memory"}))
 
 
+def _measure(
+    run: xr.Dataset, record: VelocityRecord, measures: Collection[str], arrival: float | None
+) -> dict[str, Any]:
+    """The variables of all ``measures``; what cannot be taken is named in the ``record``."""
+    measures = set(measures)
+    samples, cells = record.velocity.shape[:2]
+    values: dict[str, Any] = {}
+    if {"kinetic", "wavenumber"} & measures:
+        values |= _maps(record, measures)
+    if samples < 2:
+        record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
+    else:
+        if "dispersion" in measures:
+            values |= _dispersions(record)
+        if "bands" in measures:
+            values |= band_energies(record, measures)
+        if cells > 1:
+            values |= _wavelets(record, measures, arrival)
+    if {"modal", "transfers"} & measures:
+        values |= modal_energies(run, record, measures)
+    if cells == 1:
+        record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
+    return values
+
+
 def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
-    """Kinetic energy of cells and of wavenumbers over time, from blocks of samples."""
-    (nt, cells, dofs), (samples, _) = record.velocity.shape, record.sizes
-    kinetic, contents, total, wavenumber = [], [], [], np.zeros(0)
+    """Kinetic energy of cells and of wavenumbers over time, from blocks of samples that fit into the memory."""
+    nt, cells, dofs = record.velocity.shape
+    samples = record.sizes[0]
+    pooled = -(-cells // (2 * record.options.pixels))  # wavenumbers in a bin of the map
+    kinetic = []
+    contents = []
+    total = []
+    wavenumber = np.zeros(0)
     for rows in spectra.blocks(-(-nt // samples), 8 * samples * cells * dofs, record.memory):
-        held = np.asarray(record.weighted[rows.start * samples : rows.stop * samples])
-        energy = spectra.kinetic_energy(held, record.masses)
+        velocity = np.asarray(record.weighted[rows.start * samples : rows.stop * samples])
+        energy = spectra.kinetic_energy(velocity, record.masses)
         total.append(energy.sum(axis=1))
         kinetic.append(record.mean(energy))
         if "wavenumber" in measures and cells > 1:
-            wavenumber, content = spectra.wavenumber_content(held, record.masses)
-            size = -(-cells // (2 * record.options.pixels))
-            wavenumber = spectra.block_means(wavenumber, size, 0)
-            contents.append(spectra.block_sums(spectra.block_means(content, samples, 0), size, 1).astype(np.float32))
-    values = {"kinetic_energy": np.concatenate(kinetic)} if "kinetic" in measures else {}
-    if "kinetic" in measures and "bands" in measures and nt > 1:
-        values["bands/total"] = np.concatenate(total)
-    return values | ({"wavenumber": wavenumber, "wavenumber_content": np.concatenate(contents)} if contents else {})
+            wavenumber, content = spectra.wavenumber_content(velocity, record.masses)
+            wavenumber = spectra.block_means(wavenumber, pooled, 0)
+            mean_content = spectra.block_means(content, samples, 0)
+            contents.append(spectra.block_sums(mean_content, pooled, 1).astype(np.float32))
+
+    values: dict[str, Any] = {}
+    if "kinetic" in measures:
+        values["kinetic_energy"] = np.concatenate(kinetic)
+        if "bands" in measures and nt > 1:
+            values["bands/total"] = np.concatenate(total)
+    if contents:
+        values["wavenumber"] = wavenumber
+        values["wavenumber_content"] = np.concatenate(contents)
+    return values
 
 
 def _dispersions(record: VelocityRecord) -> dict[str, Any]:
@@ -153,7 +184,40 @@ def _dispersions(record: VelocityRecord) -> dict[str, Any]:
     if cells < 2:
         record.left_out.append("dispersion: a single cell was recorded")
         return {}
+
+    length = fft.next_fast_len(nt, real=True)
+    highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
+    frequencies = np.count_nonzero(2 * np.pi * fft.rfftfreq(length, record.interval) <= highest)
+    sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, frequencies)]
     values: dict[str, Any] = {}
+    for name, window in _windows(record).items():
+        if len(range(cells)[window]) < 2:
+            record.left_out.append(f"{name}: fewer than two of its cells were recorded")
+            continue
+        # A wave that crosses the border of a window would smear over all wavenumbers.
+        across = spectra.TAPER if name == "dispersion" else 0.5
+        pieces = []
+        for block in spectra.blocks(-(-frequencies // sizes[1]), 16 * cells * sizes[1], record.memory):
+            spectrum = spectra.dispersion(
+                record.weighted,
+                record.masses,
+                record.interval,
+                lengths=(length, cells),
+                highest=highest,
+                memory=record.memory,
+                cells=window,
+                tapers=(spectra.TAPER, across),
+                rows=slice(block.start * sizes[1], block.stop * sizes[1]),
+            )
+            pieces.append(spectrum.folded().pooled(*sizes))
+        values["wavenumber"] = pieces[0].wavenumber
+        values["frequency"] = np.concatenate([piece.frequency for piece in pieces])
+        values[name] = np.concatenate([piece.energy for piece in pieces], axis=1).astype(np.float32)
+    return values
+
+
+def _windows(record: VelocityRecord) -> dict[str, slice]:
+    """The recorded cells of which a dispersion is taken, by its name."""
     windows = {"dispersion": slice(None)}
     if record.site is None:
         record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
@@ -161,29 +225,12 @@ def _dispersions(record: VelocityRecord) -> dict[str, Any]:
         record.left_out.append("dispersion_before, dispersion_after: on a ring the wave goes both ways")
     else:
         low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
-        sides = slice(0, low), slice(high, cells)
-        before, after = sides if record.model.drive_cell < record.site else sides[::-1]
-        windows |= {"dispersion_before": before, "dispersion_after": after}
-    lengths = fft.next_fast_len(nt, real=True), cells
-    highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
-    count = np.count_nonzero(2 * np.pi * fft.rfftfreq(lengths[0], record.interval) <= highest)
-    sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, count)]
-    measured = record.weighted, record.masses, record.interval
-    given: dict[str, Any] = {"lengths": lengths, "highest": highest, "memory": record.memory}
-    for name, window in windows.items():
-        if len(range(cells)[window]) < 2:
-            record.left_out.append(f"{name}: fewer than two of its cells were recorded")
-            continue
-        # A wave that crosses the border of a window would smear over all wavenumbers.
-        given |= {"cells": window, "tapers": (spectra.TAPER, spectra.TAPER if name == "dispersion" else 0.5)}
-        pieces = []
-        for some in spectra.blocks(-(-count // sizes[1]), 16 * cells * sizes[1], record.memory):
-            rows = slice(some.start * sizes[1], some.stop * sizes[1])
-            pieces.append(spectra.dispersion(*measured, **given, rows=rows).folded().pooled(*sizes))
-        energy = np.concatenate([part.energy for part in pieces], axis=1).astype(np.float32)
-        frequency = np.concatenate([part.frequency for part in pieces])
-        values |= {"wavenumber": pieces[0].wavenumber, "frequency": frequency, name: energy}
-    return values
+        lower = slice(0, low)
+        upper = slice(high, len(record.cells))
+        drive_below = record.model.drive_cell < record.site
+        windows["dispersion_before"] = lower if drive_below else upper
+        windows["dispersion_after"] = upper if drive_below else lower
+    return windows
 
 
 def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float | None) -> dict[str, Any]:
@@ -192,53 +239,78 @@ def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float 
     if cells > MOST_CELLS and {"partition", "entropy"} & set(measures):
         record.left_out.append(f"partition, entropy: more than {MOST_CELLS} cells were recorded")
         return {}
-    stride, maps = -(-nt // (SNAPSHOTS + 1)), "maps" in measures
-    values = _partition(record, stride * record.options.snapshot_stride, maps) if "partition" in measures else {}
-    return values | (_entropies(record, stride, arrival, maps) if "entropy" in measures else {})
+
+    stride = -(-nt // (SNAPSHOTS + 1))
+    maps = "maps" in measures
+    values: dict[str, Any] = {}
+    if "partition" in measures:
+        values |= _partition(record, stride * record.options.snapshot_stride, maps)
+    if "entropy" in measures:
+        values |= _entropies(record, stride, arrival, maps)
+    return values
 
 
 def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps: bool) -> dict[str, Any]:
     """Entropy of the host velocity at every ``stride``-th sample, with its ``maps``."""
-    options, time = record.options, record.time[:: stride * record.options.snapshot_stride]
+    options = record.options
+    time = record.time[:: stride * options.snapshot_stride]
     reason = "the largest host velocity at the first site in the linear run"
     if arrival is None:
-        chain, start = record.model.chain, record.model.drive_cell
-        distance = 0 if record.site is None else cells_between(record.site - 1, start, chain.cells, chain.ends)
-        arrival = float(0.5 * record.model.drive.duration + distance / (record.model.speed or np.inf))
+        arrival = _estimated_arrival(record)
         reason = "half the burst and the way to the first site at the group velocity"
     # A record that ends before keeps its last snapshot.
     start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
+
     host = np.ascontiguousarray(record.velocity[::stride, :, record.model.chain.cell.host])
     entropy = spectra.entropy(host, start * options.snapshot_stride, options.cell_stride, options.snapshot_stride)
-    local, weight = entropy.local[start:], entropy.weight[start:]
-    doubled = spectra.averages(local[::2, ::2], weight[::2, ::2], 0, 2 * options.cell_stride, weight.max())
+    # What half of the snapshots and cells would give shows the error of those that were taken.
+    local = entropy.local[start:][::2, ::2]
+    weight = entropy.weight[start:]
+    coarse = spectra.averages(local, weight[::2, ::2], 0, 2 * options.cell_stride, weight.max())
+
     values: dict[str, Any] = {"entropy/snapshot": time, "entropy/history": entropy.snapshot}
+    strides = options.model_dump(include={"snapshot_stride", "cell_stride"})
     for name in ("energy_weighted", "masked", "joint", "error"):
-        values[f"entropy/{name}"] = getattr(entropy, name)
-        about = options.model_dump(include={"snapshot_stride", "cell_stride"})
-        about |= {"sampling_error": abs(getattr(doubled, name) - getattr(entropy, name))}
-        record.attributes[f"entropy/{name}"] = about
+        value = getattr(entropy, name)
+        values[f"entropy/{name}"] = value
+        record.attributes[f"entropy/{name}"] = strides | {"sampling_error": abs(getattr(coarse, name) - value)}
     record.attributes[""] = {"entropy/start": time[start], "entropy/starts_when": reason}
+
     if maps:
         size = -(-entropy.local.shape[1] // options.pixels)
         values["entropy/cell"] = spectra.block_means(record.cells[:: options.cell_stride], size, 0)
-        for name in ("local", "weight"):
-            values[f"entropy/{name}"] = spectra.block_means(getattr(entropy, name), size, 1).astype(np.float32)
+        values["entropy/local"] = spectra.block_means(entropy.local, size, 1).astype(np.float32)
+        values["entropy/weight"] = spectra.block_means(entropy.weight, size, 1).astype(np.float32)
     return values
+
+
+def _estimated_arrival(record: VelocityRecord) -> float:
+    """Time in s at which the middle of the burst reaches the first site at the group velocity."""
+    chain = record.model.chain
+    distance = 0
+    if record.site is not None:
+        distance = int(cells_between(record.site - 1, record.model.drive_cell, chain.cells, chain.ends))
+    return float(0.5 * record.model.drive.duration + distance / (record.model.speed or np.inf))
 
 
 def _partition(record: VelocityRecord, every: int, maps: bool) -> dict[str, Any]:
     """Kinetic energies of the wavenumber bins at every ``every``-th sample, with their ``maps``."""
     time = record.time[::every]
-    blocks = spectra.blocks(len(time), 8 * np.prod(record.velocity.shape[1:]), record.memory)
-    windows = (record.weighted[some.start * every : some.stop * every : every] for some in blocks)
     mean_over = record.sizes[1] if maps else 0
-    parts = [spectra.partition(window, record.masses, mean_over=mean_over) for window in windows]
+    parts = []
+    for block in spectra.blocks(len(time), 8 * np.prod(record.velocity.shape[1:]), record.memory):
+        snapshots = record.weighted[block.start * every : block.stop * every : every]
+        parts.append(spectra.partition(snapshots, record.masses, mean_over=mean_over))
+
     bins = len(parts[0].energy)
-    names = "energy", "kinetic", "reconstructed", "error", "cross_share"
-    values: dict[str, Any] = {"partition/snapshot": time, "partition/bin": np.arange(1, bins + 1)}
-    values |= {"partition/bound": np.arange(bins + 1), "partition/bounds": np.arange(bins + 1) * np.pi / bins}
-    values |= {f"partition/{name}": np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in names}
+    values: dict[str, Any] = {
+        "partition/snapshot": time,
+        "partition/bin": np.arange(1, bins + 1),
+        "partition/bound": np.arange(bins + 1),
+        "partition/bounds": np.arange(bins + 1) * np.pi / bins,
+    }
+    for name in ("energy", "kinetic", "reconstructed", "error", "cross_share"):
+        values[f"partition/{name}"] = np.concatenate([getattr(part, name) for part in parts], axis=-1)
     if maps:
-        values["partition/kinetic_energy"] = np.concatenate([p.field for p in parts], axis=1).astype(np.float32)
+        values["partition/kinetic_energy"] = np.concatenate([part.field for part in parts], axis=1).astype(np.float32)
     return values

@@ -1,4 +1,4 @@
-"""Inter-band transfer beside the slope of frequency-energy branches: ``backbone.h5`` (paper, section IV.C)."""
+"""Inter-band transfer laid over the slope of frequency-energy branches: ``backbone.h5`` (paper, section IV.C)."""
 
 import hashlib
 import json
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -44,31 +45,44 @@ def read_slope(path: Path) -> xr.Dataset:
     Attributes: ``law``, ``reading``, and ``grazing``, the energy in J of the last point without contact, where region I
     passes into II. Raises OSError, or ValueError if the branch does not reach a contact.
     """
-    names = "energy", "slope", "region", "contacts", "kind"
-    with open_netcdf(path, "branch", (*names, "case")) as file:
-        energy, slope, region, contacts, kind = (file[name].values for name in names)
+    with open_netcdf(path, "branch", ("energy", "slope", "region", "contacts", "kind", "case")) as file:
+        energy = file["energy"].values
+        slope = file["slope"].values
+        region = file["region"].values
+        contacts = file["contacts"].values
+        regular = file["kind"].values == 0
         case = tomllib.loads(file.attrs["case"])
+
     touching = np.nonzero(contacts > 0)[0]
     if not touching.size or touching[0] == 0:
         raise ValueError(f"{path}: the branch does not pass from region I to II; follow it to higher energy")
-    regular, about = kind == 0, {"grazing": float(energy[touching[0] - 1])}
-    about |= {key: case.get(section, {}).get(key, "") for section, key in (("contacts", "law"), ("lattice", "reading"))}
-    values = {"point": np.arange(regular.sum()), "branch/energy": energy[regular]}
-    values |= {"branch/slope": slope[regular], "branch/region": region[regular]}
+    values = {
+        "point": np.arange(regular.sum()),
+        "branch/energy": energy[regular],
+        "branch/slope": slope[regular],
+        "branch/region": region[regular],
+    }
+    about = {
+        "grazing": float(energy[touching[0] - 1]),
+        "law": case.get("contacts", {}).get("law", ""),
+        "reading": case.get("lattice", {}).get("reading", ""),
+    }
     return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
 
 
-def log_slope(energy: np.ndarray, known: np.ndarray, slope: np.ndarray, region: np.ndarray) -> np.ndarray:
-    """ln(df/dE) at ``energy`` (point) in J of a branch with the ``slope`` in Hz/J at ``known`` energies and regions.
+def log_slope(energy: np.ndarray, branch_energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """ln(df/dE) at ``energy`` (point) in J of a branch with the ``slope`` in Hz/J at its energies and regions.
 
-    Interpolated in logarithms between its points of region III, NaN beyond them. Raises ValueError if it has none.
+    It is interpolated in logarithms between the branch's points of region III, NaN beyond them. Raises ValueError if
+    there are none.
     """
     inside = (region == VIBRO_IMPACT) & np.isfinite(slope) & (slope > 0)
     if not inside.any():
         raise ValueError("the branch has no region III; follow it to higher energy")
-    order = np.argsort(known[inside])
-    at, steep = np.log(known[inside][order]), np.log(slope[inside][order])
-    return np.asarray(np.interp(np.log(energy), at, steep, left=np.nan, right=np.nan))
+    order = np.argsort(branch_energy[inside])
+    x = np.log(branch_energy[inside][order])
+    y = np.log(slope[inside][order])
+    return np.asarray(np.interp(np.log(energy), x, y, left=np.nan, right=np.nan))
 
 
 @dataclass(frozen=True)
@@ -92,11 +106,12 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
     """
     linear = read_linear(folder, case)
     if linear is None:
-        raise OSError(f"{folder}: its records tell of no linear run of this lattice and drive")
+        raise OSError(f"{folder}: its records hold no linear run of this lattice and drive")
     sites = np.asarray(case.contacts.sites)
-    touching, work = np.asarray(case.contacts.clearance) / linear.envelope[sites - 1], linear.statistics["work"]
+    touching = np.asarray(case.contacts.clearance) / linear.envelope[sites - 1]
     amplitude = float(touching[np.argmax(sites == leading_cell(case))])
-    return Initiation(amplitude, work * amplitude**2, float(touching.min()))
+    energy = linear.statistics["work"] * amplitude**2
+    return Initiation(amplitude, energy, onset=float(touching.min()))
 
 
 def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, branch: xr.Dataset) -> xr.Dataset:
@@ -112,73 +127,102 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     """
     valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
     order = np.argsort(work[valid], kind="stable")
-    energy, ibtet = work[valid][order] * (branch.attrs["grazing"] / initiation), ibtet[valid][order]
-    at = log_slope(energy, *(branch[f"branch/{name}"].values for name in ("energy", "slope", "region")))
-    fitted = np.isfinite(at) & (np.arange(len(energy)) >= np.argmax(ibtet))
+    energy = work[valid][order] * (branch.attrs["grazing"] / initiation)
+    ibtet = ibtet[valid][order]
+    slope = log_slope(energy, *(branch[f"branch/{name}"].values for name in ("energy", "slope", "region")))
+    fitted = np.isfinite(slope) & (np.arange(len(energy)) >= np.argmax(ibtet))
     values = {"energy": energy, "ibtet": ibtet, "fitted": fitted.astype(np.int8)}
     aligned = xr.merge([xr.Dataset(tabulated(LAYOUT, values)), branch], combine_attrs="override")
     if fitted.sum() < FEWEST:
         return aligned
-    at, measured = at[fitted], np.log(ibtet[fitted])
 
-    def misfit(logarithm: float) -> float:
-        return float(np.sum((np.log(np.exp(at - logarithm) + floor) - measured) ** 2))
+    log_transfer = np.log(ibtet[fitted])
+    slope = slope[fitted]
+
+    def misfit(log_divisor: float) -> float:
+        return float(np.sum((np.log(np.exp(slope - log_divisor) + floor) - log_transfer) ** 2))
 
     # Without a floor the mean of the differences is the answer; the floor only asks for a larger divisor.
-    start = float(np.mean(at - measured))
+    start = float(np.mean(slope - log_transfer))
     best = minimize_scalar(misfit, bracket=(start, start + 0.5), options={"xtol": 1e-10})
-    law, steepness = (power_law(energy[fitted], y) for y in (ibtet[fitted], np.exp(at)))
+    law = power_law(energy[fitted], ibtet[fitted])
+    slope_law = power_law(energy[fitted], np.exp(slope))
     low, high = law.exponent_interval
-    about = {"divisor": float(np.exp(best.x)), "factor": law.factor, "exponent": law.exponent, "exponent_low": low}
-    about |= {"exponent_high": high, "r2_adjusted": law.r2_adjusted, "slope_exponent": steepness.exponent}
-    return aligned.assign_attrs(about)
+    return aligned.assign_attrs(
+        divisor=float(np.exp(best.x)),
+        factor=law.factor,
+        exponent=law.exponent,
+        exponent_low=low,
+        exponent_high=high,
+        r2_adjusted=law.r2_adjusted,
+        slope_exponent=slope_law.exponent,
+    )
 
 
 def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
     """Write ``backbone.h5`` beside the ensemble: a group a curve; returns its path, None if there is no such curve."""
     if "ibtet" not in ensemble or bool(ensemble["ibtet"].isnull().all()):
         return None
-    slopes, folder = [read_slope(branch / BRANCH) for branch in branches], Path(ensemble.attrs["folder"])
+
+    folder = Path(ensemble.attrs["folder"])
+    slopes = [read_slope(branch / BRANCH) for branch in branches]
+    sweep = Sweep.of(ensemble)
     related: dict[str, xr.Dataset] = {}
     left_out: list[str] = []
-    sweep = Sweep.of(ensemble)
     for curve, number in curves(ensemble):
         case = sweep.case(number)
         sites = len(np.asarray(case.contacts.sites))
         if not sites:
             continue
         name = f"{case.lattice.reading}-{case.contacts.law}-{sites}-sites-{case.drive.cycles:g}-cycles"
-        relation: xr.Dataset | str = "another curve has the same law, reading, sites and cycles"
-        if name not in related:
-            relation = _relate_curve(curve, case, slopes, folder)
+        if name in related:
+            left_out.append(f"{name}: another curve has the same law, reading, sites and cycles")
+            continue
+        relation = _relate_curve(curve, case, slopes, folder)
         if isinstance(relation, str):
             left_out.append(f"{name}: {relation}")
         else:
             related[name] = relation
-    about = origin() | {"format_version": FORMAT_VERSION, "case": ensemble.attrs["case"]}
-    about |= {"left_out": left_out, "sources": _sources(folder, branches)}
-    about |= {f"{name}/{key}": value for name, data in related.items() for key, value in data.attrs.items()}
-    groups = [data.rename({key: f"{name}/{key}" for key in data.variables}) for name, data in related.items()]
-    write_netcdf(folder / "backbone.h5", xr.merge([xr.Dataset(attrs=about), *groups], combine_attrs="override"))
-    return folder / "backbone.h5" if related else None
+
+    about: dict[str, Any] = origin() | {
+        "format_version": FORMAT_VERSION,
+        "case": ensemble.attrs["case"],
+        "left_out": left_out,
+        "sources": _sources(folder, branches),
+    }
+    groups = []
+    for name, data in related.items():
+        about |= {f"{name}/{key}": value for key, value in data.attrs.items()}
+        groups.append(data.rename({key: f"{name}/{key}" for key in data.variables}))
+    path = folder / "backbone.h5"
+    write_netcdf(path, xr.merge([xr.Dataset(attrs=about), *groups], combine_attrs="override"))
+    return path if related else None
 
 
 def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], folder: Path) -> xr.Dataset | str:
-    """One curve beside the branch that suits it best, or why there is none."""
-    of_law = [slope for slope in slopes if slope.attrs["law"] == case.contacts.law]
-    untouched = curve["ibtet"].values[curve["contact_episodes"].values == 0]
-    if not of_law:
+    """One curve aligned with the branch that suits it best, or why there is none."""
+    same_law = [slope for slope in slopes if slope.attrs["law"] == case.contacts.law]
+    if not same_law:
         return f"no branch of the law {case.contacts.law}"
+    untouched = curve["ibtet"].values[curve["contact_episodes"].values == 0]
     if not untouched.size:
         return "no member without contact"
-    slope = min(of_law, key=lambda slope: slope.attrs["reading"] != case.lattice.reading)
-    initiation, floor = initiation_of(folder, case), float(untouched.mean())
+
+    slope = min(same_law, key=lambda slope: slope.attrs["reading"] != case.lattice.reading)
+    initiation = initiation_of(folder, case)
+    floor = float(untouched.mean())
     aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
     if "exponent" not in aligned.attrs:
         return f"{int(aligned['fitted'].sum())} points in region III behind the peak"
-    about = {"case": case.to_toml(), "branch_reading": slope.attrs["reading"]}
-    about |= {"grazing_energy": slope.attrs["grazing"], "floor": floor, "initiation_amplitude": initiation.amplitude}
-    return aligned.assign_attrs(about, initiation_energy=initiation.energy, onset_amplitude=initiation.onset)
+    return aligned.assign_attrs(
+        case=case.to_toml(),
+        branch_reading=slope.attrs["reading"],
+        grazing_energy=slope.attrs["grazing"],
+        floor=floor,
+        initiation_amplitude=initiation.amplitude,
+        initiation_energy=initiation.energy,
+        onset_amplitude=initiation.onset,
+    )
 
 
 def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
@@ -189,10 +233,10 @@ def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
 
 def is_related(folder: Path, branches: Sequence[Path]) -> bool:
     """Whether ``folder/backbone.h5`` is what this version makes of the sweep and the ``branches`` as they are now."""
-    made, version = "{}", None
     with suppress(OSError), open_netcdf(folder / "backbone.h5", "relation") as file:  # none, or one that was cut off
-        made, version = file.attrs.get("sources", "{}"), file.attrs.get("vipetsc_version")
-    return version == vipetsc.__version__ and json.loads(made) == _sources(folder, branches)
+        if file.attrs.get("vipetsc_version") == vipetsc.__version__:
+            return bool(json.loads(file.attrs.get("sources", "{}")) == _sources(folder, branches))
+    return False
 
 
 def relate_folders(folders: Sequence[Path]) -> list[Path]:
@@ -202,16 +246,21 @@ def relate_folders(folders: Sequence[Path]) -> list[Path]:
     its reading; what could not be related is named in the attribute ``left_out``. Raises FolderError if one of the
     other folders holds no out-of-phase branch, or a file cannot be used.
     """
-    sweeps = [f for f in folders if (f / "ensemble.h5").exists()]
-    branches = [f for f in folders if f not in sweeps]
+    sweeps = [folder for folder in folders if (folder / "ensemble.h5").exists()]
+    branches = [folder for folder in folders if folder not in sweeps]
     for folder in branches:
         if not (folder / BRANCH).exists():
             raise FolderError(f"{folder}: holds no {BRANCH}; the verb nnm makes it, with [nnm] modes = [2]")
+    if not branches:
+        return []
+
     written = []
-    for folder in sweeps if branches else ():
+    for folder in sweeps:
         sys.audit("vipetsc.relate", str(folder))
         try:
-            written.append(_relate(open_ensemble(folder), branches))
+            path = _relate(open_ensemble(folder), branches)
         except (KeyError, OSError, ValueError) as error:
             raise FolderError(f"{folder} beside {', '.join(map(str, branches))}: {error}") from None
-    return [path for path in written if path]
+        if path:
+            written.append(path)
+    return written

@@ -1,7 +1,7 @@
 """Energies of the pass bands and gaps of one run, by frequency filters, and the inter-band transfer."""
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,9 +9,9 @@ from vipetsc import spectra
 from vipetsc.lattice import pass_bands
 from vipetsc.studies.velocity_record import VelocityRecord
 
-ENDS = 0.02  # share of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
+ENDS = 0.02  # part of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 
-# As ``studies.analysis.LAYOUT``.
+# Rows of ``studies.analysis.LAYOUT``.
 BANDS = {
     "ibtet": ("", "1", "inter-band energy transfer"),
     "ibtet_whole": ("", "1", "inter-band energy transfer as the paper's: the record's last samples are in the mean"),
@@ -28,47 +28,92 @@ BANDS = {
 }
 
 
+class Span(NamedTuple):
+    """The samples over which means of the energies are taken, from ``first`` to before ``last``; when they begin."""
+
+    first: int
+    last: int
+    starts_when: str
+
+
 def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     """Energies of the pass bands and gaps, and the inter-band transfer from the wave's arrival on."""
-    parts, stride = spectra.Parts.of(pass_bands(record.model.chain.cell)), record.options.band_stride
-    measured = record.weighted, record.masses, record.interval, parts.edges
-    energy = spectra.part_energies(*measured, stride, record.memory)
+    parts = spectra.Parts.of(pass_bands(record.model.chain.cell))
     above = parts.above(record.model.drive.frequency)
-    if record.site is None:
-        after = int(np.searchsorted(record.time, record.model.drive.duration))
-        first, reason = min(after, len(record.time) - 1), "the drive ends (the lattice has no sites)"
-    else:
-        at = int(np.argmin(np.abs(record.cells - record.site)))
-        first = spectra.front_arrival(spectra.kinetic_energy(record.weighted[:, at], record.masses))
-        reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
-    # The filters see less than the waves' length at the record's ends.
-    nt, ends = len(record.time), int(np.ceil(ENDS * len(record.time)))
-    first = min(max(first, ends), nt - 1)
-    last = max(nt - ends, first + 1)
-    total = energy[:, first:last].sum(axis=0)
+    stride = record.options.band_stride
+    energy = spectra.part_energies(record.weighted, record.masses, record.interval, parts.edges, stride, record.memory)
+    span = _span(record)
+    total = energy[:, span.first : span.last].sum(axis=0)
     moving = total > 0
-    about = {"start": record.time[first], "starts_when": f"{reason}, or after the first {ENDS:.0%} of the record"}
-    about |= {"end": record.time[last - 1], "ends_when": f"before the last {ENDS:.0%} of the record"}
+
+    times = {
+        "start": record.time[span.first],
+        "starts_when": span.starts_when,
+        "end": record.time[span.last - 1],
+        "ends_when": f"before the last {ENDS:.0%} of the record",
+    }
     names = {"parts": list(parts.names)}
-    record.attributes |= {"bands/energy": names, "bands/share": about | names}
-    coarse, some = energy.copy(), np.arange(0, nt, 2 * stride)
-    coarse[-1] = np.interp(np.arange(nt), some, energy[-1, some])
-    values: dict[str, Any] = {}
-    whole = {"start": about["start"], "end": record.time[-1]}
-    for name, stop, times in (("ibtet", last, about), ("ibtet_whole", nt, whole)):
-        values[name], doubled = (spectra.ibtet(e[:, :stop], above, first) for e in (energy, coarse))
-        error = abs(doubled - values[name]) if stride > 1 else 0.0
-        record.attributes[name] = times | {"band_stride": stride, "sampling_error": error}
+    record.attributes["bands/energy"] = names
+    record.attributes["bands/share"] = times | names
+
+    values = _transfers(record, energy, above, span, times)
     if "maps" in measures:
         bands = np.flatnonzero([bool(inside) for inside in parts.bands])
-        values["bands/band"] = bands + 1
         ranges = np.column_stack([parts.edges[bands], parts.edges[bands + 1]])
-        values["bands/kinetic_energy"] = spectra.part_maps(*measured[:3], ranges, record.sizes, record.memory)
+        values["bands/band"] = bands + 1
+        values["bands/kinetic_energy"] = spectra.part_maps(
+            record.weighted, record.masses, record.interval, ranges, record.sizes, record.memory
+        )
     return values | {
         "bands/edge": np.arange(len(parts.edges)),
         "bands/part": np.arange(1, len(parts.names) + 1),
         "bands/edges": parts.edges,
         "bands/energy": energy,
         "bands/above": above.astype(np.int8),
-        "bands/share": (energy[:, first:last][:, moving] / total[moving]).mean(axis=1),
+        "bands/share": (energy[:, span.first : span.last][:, moving] / total[moving]).mean(axis=1),
     }
+
+
+def _span(record: VelocityRecord) -> Span:
+    """From the wave's arrival at the first site to the record's end, without the ends of the record."""
+    samples = len(record.time)
+    if record.site is None:
+        after = int(np.searchsorted(record.time, record.model.drive.duration))
+        first = min(after, samples - 1)
+        reason = "the drive ends (the lattice has no sites)"
+    else:
+        at = int(np.argmin(np.abs(record.cells - record.site)))
+        first = spectra.front_arrival(spectra.kinetic_energy(record.weighted[:, at], record.masses))
+        reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
+
+    # The filters see less than the waves' length at the record's ends.
+    ends = int(np.ceil(ENDS * samples))
+    first = min(max(first, ends), samples - 1)
+    last = max(samples - ends, first + 1)
+    return Span(first, last, f"{reason}, or after the first {ENDS:.0%} of the record")
+
+
+def _transfers(
+    record: VelocityRecord, energy: np.ndarray, above: np.ndarray, span: Span, times: dict[str, Any]
+) -> dict[str, Any]:
+    """The transfer to the bands ``above`` over the ``span``, and as the paper's, to the record's end."""
+    stride = record.options.band_stride
+    samples = len(record.time)
+    # Energies at twice the stride, interpolated, show the error that the stride makes.
+    coarse = energy.copy()
+    taken = np.arange(0, samples, 2 * stride)
+    coarse[-1] = np.interp(np.arange(samples), taken, energy[-1, taken])
+
+    def transfer(end: int) -> tuple[float, float]:
+        """The transfer up to the sample ``end``, and its error."""
+        value = spectra.ibtet(energy[:, :end], above, span.first)
+        if stride == 1:
+            return value, 0.0
+        return value, abs(spectra.ibtet(coarse[:, :end], above, span.first) - value)
+
+    inner, inner_error = transfer(span.last)
+    whole, whole_error = transfer(samples)
+    to_the_end = {"start": times["start"], "end": record.time[-1]}
+    record.attributes["ibtet"] = times | {"band_stride": stride, "sampling_error": inner_error}
+    record.attributes["ibtet_whole"] = to_the_end | {"band_stride": stride, "sampling_error": whole_error}
+    return {"ibtet": inner, "ibtet_whole": whole}

@@ -1,9 +1,10 @@
-"""Whether both engines give a sweep the same: a sample of its members by ``ts``, beside what the sweep measured."""
+"""Whether both engines give the same: a sample of a sweep's members by ``ts``, beside those of the sweep."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from vipetsc.case import Sweep
 from vipetsc.case.case_file import put
@@ -21,38 +22,55 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
     Curves are drawn from ``seed``, and of the amplitudes, cut into ``count`` equal parts, one in each: few members go
     from no contact to hard contact. They stand on one axis. Raises StopIteration if the amplitude does not vary.
     """
-    random, number = np.random.default_rng(seed), np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
+    random = np.random.default_rng(seed)
+    number = np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
     along = next(i for i, axis in enumerate(sweep.axes) if AMPLITUDE in axis)
     curves = np.moveaxis(number, along, -1).reshape(-1, sweep.shape[along])
     count = min(count, len(curves))
-    at = ((np.arange(count) + random.random(count)) * curves.shape[1] / count).astype(int)
-    chosen = np.sort(random.permutation(curves)[np.arange(count), at])
+    amplitude = ((np.arange(count) + random.random(count)) * curves.shape[1] / count).astype(int)
+    chosen = np.sort(random.permutation(curves)[np.arange(count), amplitude])
+
+    # Every key in one group of ``zip``: the members stand on one axis.
     section = sweep.options.model_dump() | {"fields": False, "zip": [[key for axis in sweep.axes for key in axis]]}
-    for axis, places in zip(sweep.axes, np.unravel_index(chosen, sweep.shape), strict=True):
+    for axis, indices in zip(sweep.axes, np.unravel_index(chosen, sweep.shape), strict=True):
         for key, values in axis.items():
-            put(section, key, [values[i] for i in places])
+            put(section, key, [values[i] for i in indices])
     return Sweep.from_table(sweep.table | {"name": f"{sweep.name}-ts", "sweep": section}, ["time.engine=ts"])
 
 
 def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
-    """What the members of the ``sample`` differ by from those of the ``sweep`` (folders), the loudest last.
+    """By how much the members of the ``sample`` differ from those of the ``sweep`` (folders), the loudest last.
 
     A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample) and whether they are the ``same`` number,
     ``differences`` by measure and the ``largest``, and whether the member ``agrees``: none above that of ``COMPARED``.
     Raises OSError, or ValueError.
     """
-    all_members, members = open_ensemble(sweep), open_ensemble(sample)
+    all_members = open_ensemble(sweep)
+    members = open_ensemble(sample)
     (axis,) = axes(members)
     keys = [str(name) for name, item in members.coords.items() if item.dims == (axis,) and name in all_members.coords]
     rows: list[dict[str, Any]] = []
     for i in range(members.sizes[axis]):
-        one = members.isel({axis: i})
-        pair = select(all_members, **{key: one[key].item() for key in keys}), one
-        episodes = [int(np.nan_to_num(member["contact_episodes"].item(), nan=-1)) for member in pair]
-        values = {name: [member[name].item() for member in pair] for name in COMPARED if name in one}
-        differences = {name: abs(b - a) for name, (a, b) in values.items() if np.isfinite([a, b]).all()}
-        agrees = all(difference <= COMPARED[name] for name, difference in differences.items())
-        row = {"amplitude": one["amplitude"].item(), "episodes": episodes, "same": episodes[0] == episodes[1]}
-        row |= {"differences": differences, "largest": max(differences.values(), default=0.0), "agrees": agrees}
-        rows.append(row)
+        member = members.isel({axis: i})
+        same = select(all_members, **{key: member[key].item() for key in keys})
+        rows.append(_compared(same, member))
     return sorted(rows, key=lambda row: row["amplitude"])
+
+
+def _compared(first: xr.Dataset, second: xr.Dataset) -> dict[str, Any]:
+    """A row of ``agreement``: one member by both engines."""
+    episodes = [int(np.nan_to_num(member["contact_episodes"].item(), nan=-1)) for member in (first, second)]
+    differences: dict[str, float] = {}
+    for name in COMPARED:
+        if name in second:
+            difference = abs(second[name].item() - first[name].item())
+            if np.isfinite(difference):
+                differences[name] = difference
+    return {
+        "amplitude": second["amplitude"].item(),
+        "episodes": episodes,
+        "same": episodes[0] == episodes[1],
+        "differences": differences,
+        "largest": max(differences.values(), default=0.0),
+        "agrees": all(difference <= COMPARED[name] for name, difference in differences.items()),
+    }

@@ -1,5 +1,6 @@
-"""Linear modes of a finite lattice near a frequency: where each is, of which band, and its shape, into ``modes.h5``."""
+"""Linear modes of a finite lattice near a frequency: the place, band and shape of each, into ``modes.h5``."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ from vipetsc.dynamics.matrices import LatticeMatrices
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.store import GATHER_LIMIT
-from vipetsc.lattice import Chain, pass_bands
+from vipetsc.lattice import Band, Chain, pass_bands
 from vipetsc.parallel import on_root
 from vipetsc.spectra.modal_energies import EDGE
 
-END = 0.1  # share of the cells that count as one end
+END = 0.1  # part of the cells that counts as one end
 LAYOUT = {
     "mode": ("mode", "1", "mode, lowest first"),
     "cell": ("cell", "1", "cell"),
@@ -41,53 +42,67 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
 
     All ranks must call it. Raises CaseError if there are not so many, or SLEPc is missing.
     """
-    chain, stops = case.model().chain, case.model().gaps
+    chain = case.model().chain
+    _check(case, count, near)
+    matrices = LatticeMatrices(chain, comm)
+    modes = modes_near(matrices, count, near)
+    matrices.destroy()
+    parts = comm.gather(modes.shapes)
+    written: list[xr.Dataset] = []
+
+    def write() -> None:
+        shape = np.concatenate(parts or [], axis=1)
+        # The sign of a mode is arbitrary: its largest displacement is positive.
+        flat = shape.reshape(count, -1)
+        flat *= np.sign(flat[np.arange(count), np.abs(flat).argmax(axis=1)])[:, None]
+        values = {
+            "mode": np.arange(1, count + 1),
+            "cell": np.arange(1, chain.cells + 1),
+            "dof": np.arange(1, chain.cell.dofs + 1),
+            "frequency": modes.frequency,
+            "residual": modes.residual,
+            "shape": shape,
+        }
+        values |= classify(chain, modes.frequency, shape)
+        data = xr.Dataset(tabulated(LAYOUT, values), attrs={"case": case.to_toml(), "near": near} | provenance(comm))
+        write_netcdf(folder / "modes.h5", data)
+        written.append(data)
+
+    # The shapes may be large: they stay on rank 0.
+    on_root(comm, write)
+    return written[0] if written else None
+
+
+def _check(case: Case, count: int, near: float) -> None:
+    """Raise CaseError if ``count`` modes near ``near`` cannot be found."""
+    chain = case.model().chain
+    gaps = case.model().gaps
     masses = chain.cells * chain.cell.dofs
     if not 1 <= count <= masses:
         raise CaseError([Problem("--modes", count, f"the lattice has {masses} modes")])
-    if stops and np.min(stops) <= 0:
+    if gaps and np.min(gaps) <= 0:
         raise CaseError([Problem("contacts.clearance", None, "contacts that touch at rest are in no linear mode")])
     if not 0 <= near < 1e50:
         raise CaseError([Problem("--near", near, "give a frequency in rad/s, from 0 on")])
     if 8 * count * masses > GATHER_LIMIT:
         raise CaseError([Problem("--modes", count, "their shapes are more than one rank gathers; ask for fewer")])
-    matrices = LatticeMatrices(chain, comm)
-    modes = modes_near(matrices, count, near)
-    matrices.destroy()
-    parts = comm.gather(modes.shapes)
-
-    def write() -> xr.Dataset:
-        shape = np.concatenate(parts or [], axis=1)
-        flat = shape.reshape(count, -1)
-        flat *= np.sign(flat[np.arange(count), np.abs(flat).argmax(axis=1)])[:, None]
-        numbers = {"mode": np.arange(1, count + 1), "cell": np.arange(1, chain.cells + 1)}
-        numbers |= {"dof": np.arange(1, chain.cell.dofs + 1), "frequency": modes.frequency, "residual": modes.residual}
-        values = numbers | {"shape": shape} | places(chain, modes.frequency, shape)
-        data = xr.Dataset(tabulated(LAYOUT, values), attrs={"case": case.to_toml(), "near": near} | provenance(comm))
-        write_netcdf(folder / "modes.h5", data)
-        return data
-
-    made: list[xr.Dataset] = []
-    on_root(comm, lambda: made.append(write()))
-    return made[0] if made else None
 
 
-def places(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:
+def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:
     """In which band modes (mode, cell, dof) are, and in which cells."""
     energy = np.sum(shape**2 * chain.masses().reshape(shape.shape[1:]), axis=2)
-    bands = pass_bands(chain.cell)
-    reach, end = EDGE * bands[-1].high, max(int(END * chain.cells), 1)
-    inside = [[b.number for b in bands if b.low - reach <= f <= b.high + reach] for f in frequency]
-    left, right = energy[:, :end].sum(axis=1), energy[:, -end:].sum(axis=1)
-    peak, sites = energy.argmax(axis=1), np.array(chain.sites, int)
+    end = max(int(END * chain.cells), 1)
+    left = energy[:, :end].sum(axis=1)
+    right = energy[:, -end:].sum(axis=1)
+    peak = energy.argmax(axis=1)
+
+    all_bands = pass_bands(chain.cell)
+    bands = [_band_of(all_bands, f) for f in frequency]
     kinds = []
-    for number, at, share in zip(inside, peak, left + right, strict=True):
-        near_site = sites[np.abs(sites - at) <= 1]
-        at_end = chain.ends != "periodic" and share > 0.5
-        place = f"at site {near_site[0] + 1}" if near_site.size else f"in cell {at + 1}"
-        kinds.append("bulk" if number else "edge" if at_end else place)
+    for band, cell, at_ends in zip(bands, peak, left + right, strict=True):
+        kinds.append("bulk" if band else _place(chain, int(cell), float(at_ends)))
     return {
-        "band": np.array([number[0] if number else 0 for number in inside]),
+        "band": np.array(bands),
         "participation": 1 / (energy**2).sum(axis=1),
         "left": left,
         "right": right,
@@ -96,14 +111,32 @@ def places(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, 
     }
 
 
+def _band_of(bands: Sequence[Band], frequency: float) -> int:
+    """The number of the first of ``bands`` that ``frequency`` in rad/s lies in; 0 in a gap."""
+    tolerance = EDGE * bands[-1].high
+    for band in bands:
+        if band.low - tolerance <= frequency <= band.high + tolerance:
+            return band.number
+    return 0
+
+
+def _place(chain: Chain, cell: int, at_ends: float) -> str:
+    """Where a mode in a gap is: its energy is largest in ``cell`` (from 0), the part ``at_ends`` of it at the ends."""
+    if chain.ends != "periodic" and at_ends > 0.5:
+        return "edge"
+    sites = np.array(chain.sites, int)
+    near = sites[np.abs(sites - cell) <= 1]
+    return f"at site {near[0] + 1}" if near.size else f"in cell {cell + 1}"
+
+
 def modes_report(data: xr.Dataset) -> str:
     """The modes as a table."""
     lines = ["mode  frequency (rad/s)  band  cells taking part  left   right  kind"]
-    for i in range(data.sizes["mode"]):
-        row = {name: data[name].values[i] for name in ("frequency", "band", "participation", "left", "right", "kind")}
-        band = str(row["band"]) if row["band"] else "gap"
+    for number in range(data.sizes["mode"]):
+        mode = data.isel(mode=number)
+        band = mode["band"].item()
         lines.append(
-            f"{i + 1:4d} {row['frequency']:18.6f} {band:>5} {row['participation']:18.2f}"
-            f"  {row['left']:.3f}  {row['right']:.3f}  {row['kind']}"
+            f"{number + 1:4d} {mode['frequency'].item():18.6f} {band or 'gap':>5} {mode['participation'].item():18.2f}"
+            f"  {mode['left'].item():.3f}  {mode['right'].item():.3f}  {mode['kind'].item()}"
         )
     return "\n".join([*lines, f"largest residual {float(data['residual'].max()):.1e}"])

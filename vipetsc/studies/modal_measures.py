@@ -5,7 +5,7 @@ between these samples, less what the drive would have changed in the lattice wit
 """
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -13,9 +13,9 @@ import xarray as xr
 from vipetsc.spectra.modal_energies import ModalParts, cluster_samples
 from vipetsc.studies.velocity_record import VelocityRecord
 
-MOST_BRACKETS = 1000  # samples around contacts; where there were more, clusters begin and end at every n-th alone
+MOST_BRACKETS = 1000  # samples at bounds of clusters; where there were more, these lie at every n-th sample alone
 
-# As ``studies.analysis.LAYOUT``.
+# Rows of ``studies.analysis.LAYOUT``.
 MODAL = {
     "upper_share_at_end": ("", "1", "energy of the bands above the driven one at the end, over the drive's work"),
     "bands/instant": ("bands/instant", "s", "time of an energy of the linear modes"),
@@ -34,67 +34,108 @@ MODAL = {
 
 def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     """The variables of ``MODAL``: at the last sample alone, or with "transfers" among the ``measures`` over time."""
-    chain, time = record.model.chain, record.time
-    recorded = [name for name in ("displacement", "end/displacement") if name in run]
-    if len(record.cells) < chain.cells or not recorded:
-        missing = f"{chain.cells - len(record.cells)} cells were" if recorded else "the displacement was"
-        record.left_out.append(f"upper_share_at_end, bands/modal_energy: {missing} not recorded")
+    time = record.time
+    parts = _modal_parts(run, record)
+    if parts is None:
         return {}
-    try:
-        if not chain.cell.springs:
-            raise ValueError("a lattice without springs has no modes")
-        parts = ModalParts.of(chain)
-    except ValueError as error:
-        record.left_out.append(f"upper_share_at_end, bands/modal_energy: {error}")
-        return {}
+
     names = parts.parts.names
     kind = "of the lattice" if parts.modes.exact else f"of a ring of {parts.modes.cells} cells"
     record.attributes["bands/modal_energy"] = {"parts": list(names), "modes": kind}
     values: dict[str, Any] = {"bands/part": np.arange(1, len(names) + 1)}
-    if recorded[0] == "displacement" and "transfers" in measures:
+    if "displacement" in run and "transfers" in measures:
         values |= _history(run, record, parts)
     else:
-        last = run[recorded[0]][-1:] if recorded[0] == "displacement" else run[recorded[0]].expand_dims("time")
+        # Runs that keep no displacement keep the last one.
+        last = run["displacement"][-1:] if "displacement" in run else run["end/displacement"].expand_dims("time")
         energy = parts.energies(last.values, np.asarray(record.velocity[-1:]), np.zeros(1, int))
-        values |= {"bands/instant": time[-1:], "bands/modal_energy": energy.sum(axis=1)}
+        values["bands/instant"] = time[-1:]
+        values["bands/modal_energy"] = energy.sum(axis=1)
+
     work = float(run["energy/work"].values[np.searchsorted(run["time"].values, time[-1])])
     above = parts.parts.above(record.model.drive.frequency)
-    upper = values["bands/modal_energy"][above, -1].sum() / work if above.any() and work else np.nan
+    upper = np.nan
+    if above.any() and work:
+        upper = values["bands/modal_energy"][above, -1].sum() / work
     return values | {"upper_share_at_end": upper}
 
 
+def _modal_parts(run: xr.Dataset, record: VelocityRecord) -> ModalParts | None:
+    """The modes by part of the frequency axis; None, and why in the ``record``, where they cannot be measured."""
+    chain = record.model.chain
+    reason = ""
+    if "displacement" not in run and "end/displacement" not in run:
+        reason = "the displacement was not recorded"
+    elif len(record.cells) < chain.cells:
+        reason = f"{chain.cells - len(record.cells)} cells were not recorded"
+    elif not chain.cell.springs:
+        reason = "a lattice without springs has no modes"
+    else:
+        try:
+            return ModalParts.of(chain)
+        except ValueError as error:
+            reason = str(error)
+    record.left_out.append(f"upper_share_at_end, bands/modal_energy: {reason}")
+    return None
+
+
 def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict[str, Any]:
-    """Energies at every ``modal_stride``-th sample and around contacts, and the transfers of these."""
-    time, model, fields = record.time, record.model, (record.field(run["displacement"]), record.velocity)
-    last, stride, onset, separation = len(time) - 1, 0, run["impacts/onset"].values, run["impacts/separation"].values
-    brackets = np.zeros(MOST_BRACKETS + 1)
-    while len(brackets) > MOST_BRACKETS:
-        stride += 1
-        bounds, cluster = cluster_samples(onset, separation, time, stride)
-        brackets = np.unique(bounds)
-    rows = np.unique([*range(0, last, record.options.modal_stride), *brackets, last])
-    energy = parts.energies(*fields, rows, record.memory)
+    """Energies at every ``modal_stride``-th sample and at the bounds of clusters, and the transfers of these."""
+    time = record.time
+    displacement = record.field(run["displacement"])
+    clusters = _clusters(run, time)
+    last = len(time) - 1
+    rows = np.unique([*range(0, last, record.options.modal_stride), *np.unique(clusters.bounds), last])
+    energy = parts.energies(displacement, record.velocity, rows, record.memory)
     by_part = energy.sum(axis=1)
-    transfer = np.diff(by_part.T[np.searchsorted(rows, bounds)], axis=1)[:, 0]
-    for c in np.flatnonzero(time[bounds[:, 0]] < max(drive.waveform.duration for drive in model.drives)):
-        u, v = (np.asarray(field[bounds[c, :1]]) for field in fields)
-        state = parts.modes.amplitudes(u, v)[0]
-        transfer[c] -= parts.driven_change(state, model.drives, time[bounds[c]])
-    expected = (run["energy/kinetic"] + run["energy/spring"]).values[np.searchsorted(run["time"].values, time[rows])]
-    error = np.abs(by_part.sum(axis=0) - expected).max() / max(expected.max(), 1e-300)
+
+    at_bounds = by_part.T[np.searchsorted(rows, clusters.bounds)]
+    transfer = np.diff(at_bounds, axis=1)[:, 0]
+    # While a drive acts, what it gives between the bounds is none of the contacts' transfer.
+    drives_end = max(drive.waveform.duration for drive in record.model.drives)
+    for c in np.flatnonzero(time[clusters.bounds[:, 0]] < drives_end):
+        begin = clusters.bounds[c, :1]
+        state = parts.modes.amplitudes(np.asarray(displacement[begin]), np.asarray(record.velocity[begin]))[0]
+        transfer[c] -= parts.driven_change(state, record.model.drives, time[clusters.bounds[c]])
+
+    stored = (run["energy/kinetic"] + run["energy/spring"]).values[np.searchsorted(run["time"].values, time[rows])]
+    error = np.abs(by_part.sum(axis=0) - stored).max() / max(stored.max(), 1e-300)
     record.attributes["bands/modal_energy"] |= {"modal_stride": record.options.modal_stride, "error": error}
     names = list(parts.parts.names)
-    record.attributes["bands/transfer"] = {"parts": names, "cluster_stride": stride}
+    record.attributes["bands/transfer"] = {"parts": names, "cluster_stride": clusters.stride}
     return {
         "bands/instant": time[rows],
         "bands/modal_energy": by_part,
         "bands/bin": np.arange(1, energy.shape[1] + 1),
         "bands/bin_energy": energy.sum(axis=0),
         "bands/drive_work": by_part[:, -1] - by_part[:, 0] - transfer.sum(axis=0),
-        "bands/cluster": np.arange(1, len(bounds) + 1),
+        "bands/cluster": np.arange(1, len(clusters.bounds) + 1),
         "bands/transfer": transfer,
-        "bands/cluster_begin": time[bounds[:, 0]],
-        "bands/cluster_end": time[bounds[:, 1]],
-        "bands/episode": np.arange(1, len(cluster) + 1),
-        "bands/cluster_of_episode": cluster + 1,
+        "bands/cluster_begin": time[clusters.bounds[:, 0]],
+        "bands/cluster_end": time[clusters.bounds[:, 1]],
+        "bands/episode": np.arange(1, len(clusters.of_episode) + 1),
+        "bands/cluster_of_episode": clusters.of_episode + 1,
     }
+
+
+class Clusters(NamedTuple):
+    """Samples (cluster, begin and end) that bound the contacts, which lie at multiples of ``stride``.
+
+    ``of_episode`` is the cluster of every contact episode.
+    """
+
+    bounds: np.ndarray
+    of_episode: np.ndarray
+    stride: int
+
+
+def _clusters(run: xr.Dataset, time: np.ndarray) -> Clusters:
+    """The clusters of contacts of a ``run`` by so large a stride that at most ``MOST_BRACKETS`` samples bound them."""
+    onset = run["impacts/onset"].values
+    separation = run["impacts/separation"].values
+    stride = 1
+    while True:
+        clusters = Clusters(*cluster_samples(onset, separation, time, stride), stride=stride)
+        if len(np.unique(clusters.bounds)) <= MOST_BRACKETS:
+            return clusters
+        stride += 1

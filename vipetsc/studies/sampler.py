@@ -1,7 +1,7 @@
-"""Which designs a search tries next: CMA-ES for one objective, NSGA-II for two; the same ones from the same seed.
+"""Samplers of designs: CMA-ES for one objective, NSGA-II for two; the same designs from the same seed.
 
-Either is asked for points (design, variable) of the unit cube and told the losses (design, objective), which are to
-become small, of all of them in that order. Neither draws from numpy's global state.
+Either is asked for points (design, variable) of the unit cube and then given the losses (design, objective), which are
+to become small, of all of them in that order. Neither draws from numpy's global state.
 """
 
 from typing import Any
@@ -30,7 +30,10 @@ class CmaEs:
         seed: int,
         population: int | None,
     ) -> None:
-        self._random, self._step, self._steps, self._directions = np.random.default_rng(seed), step, steps, directions
+        self._random = np.random.default_rng(seed)
+        self._step = step
+        self._steps = steps
+        self._directions = directions
         self._best: tuple[float, np.ndarray] = np.inf, start
         self._begin({"popsize": population} if population else {})
         self._first = int(self._search.popsize)
@@ -38,20 +41,25 @@ class CmaEs:
     def _begin(self, options: dict[str, Any]) -> None:
         from cma.evolution_strategy import CMAEvolutionStrategy
 
-        options |= {"minstd": (WHOLE * self._steps).tolist(), "tolx": RESOLVED}
-        options |= {"randn": lambda *shape: self._random.standard_normal(shape), "seed": np.nan}
-        options |= {"verbose": -10}  # nor does it read options from a file cma_signals.in
+        options |= {
+            "minstd": (WHOLE * self._steps).tolist(),
+            "tolx": RESOLVED,
+            "randn": lambda *shape: self._random.standard_normal(shape),
+            "seed": np.nan,  # cma would seed numpy's global state
+            "verbose": -10,  # nor does it read options from a file cma_signals.in
+        }
         self._centre = self._best[1]
         self._search = CMAEvolutionStrategy([0.0] * len(self._centre), self._step, options)
 
     def ask(self) -> np.ndarray:
         """The next generation."""
         self._asked = self._search.ask()
-        self._points = 1 - np.abs(1 - (self._centre + np.array(self._asked) @ self._directions.T) % 2)
+        unbounded = self._centre + np.array(self._asked) @ self._directions.T
+        self._points = 1 - np.abs(1 - unbounded % 2)  # mirrored at 0 and 1
         return self._points
 
     def tell(self, losses: np.ndarray) -> None:
-        """Its losses (design, 1)."""
+        """Report the losses (design, 1) of the generation that was asked for."""
         least = int(np.argmin(losses[:, 0]))
         if losses[least, 0] < self._best[0]:
             self._best = float(losses[least, 0]), self._points[least]
@@ -63,7 +71,7 @@ class CmaEs:
 class Nsga2:
     """Nondominated sorting genetic algorithm (Deb et al. 2002, IEEE Trans. Evol. Comput. 6, 182), by ``pymoo``.
 
-    The first generation is normal around the ``start``, with the standard deviation ``step``.
+    The first generation is normal about the ``start``, with the standard deviation ``step``.
     """
 
     def __init__(self, start: np.ndarray, step: float, seed: int, population: int, objectives: int = 2) -> None:
@@ -83,7 +91,7 @@ class Nsga2:
         return np.array(self._asked.get("X"), float)
 
     def tell(self, losses: np.ndarray) -> None:
-        """Its losses."""
+        """Report the losses (design, objective) of the generation that was asked for."""
         from pymoo.core.evaluator import Evaluator
         from pymoo.problems.static import StaticProblem
 
@@ -100,14 +108,15 @@ def smooth(count: int) -> np.ndarray:
     Cosines over the row: the mean by 1, the slope by 1/2, the bend by 1/3 (root mean square over the row), and so on.
     """
     order = np.arange(count)
-    cosines = np.cos(np.pi * np.outer(order + 0.5, order) / count) * np.where(order, np.sqrt(2), 1)
+    normalisation = np.where(order, np.sqrt(2), 1)
+    cosines = np.cos(np.pi * np.outer(order + 0.5, order) / count) * normalisation
     return np.asarray(cosines / (1 + order))
 
 
 def front(losses: np.ndarray) -> np.ndarray:
-    """Which of ``losses`` (design, objective) no other is better than: all finite, sorted by the first objective.
+    """The designs whose ``losses`` (design, objective) no other betters: all finite, sorted by the first objective.
 
-    Of equal ones the first; for one objective the best.
+    Of equal ones the first is taken; for one objective it is the best.
     """
     finite = np.flatnonzero(np.isfinite(losses).all(axis=1))
     order = finite[np.lexsort(losses[finite].T[::-1])]
@@ -119,6 +128,7 @@ def front(losses: np.ndarray) -> np.ndarray:
 
 
 def knee(losses: np.ndarray) -> int:
-    """Which of a front's ``losses`` (design, objective) is farthest below the line between its ends."""
+    """The design of a front whose ``losses`` (design, objective) are farthest below the line between its ends."""
     span = np.ptp(losses, axis=0)
-    return int(np.argmin(((losses - losses.min(axis=0)) / np.where(span > 0, span, 1.0)).sum(axis=1)))
+    scaled = (losses - losses.min(axis=0)) / np.where(span > 0, span, 1.0)
+    return int(np.argmin(scaled.sum(axis=1)))
