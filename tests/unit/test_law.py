@@ -23,7 +23,7 @@ from vipetsc.parallel import StopRequest
 from vipetsc.spectra import by_direction, upper_share, wave_energies
 from vipetsc.studies.one_site import ScatteringRuns, make_law
 from vipetsc.studies.pair_motion import largest_between
-from vipetsc.studies.scattering_law import POINT_LAYOUT, Outcome, ScatteringLaw, matched_clearances
+from vipetsc.studies.scattering_law import POINT_LAYOUT, ScatteringLaw, ScatteringOutcome, matched_clearances
 
 THREE = {
     "masses": [0.010, 0.004, 0.002],
@@ -191,14 +191,23 @@ def by_hand() -> ScatteringLaw:
     share[:, 1, 0], share[:, 2] = transmitted, upper[:, None] / 2
     rest = 1 - transmitted - upper
     times = np.array([np.nan, 0.1, 0.1, 0.1, 0.1])
-    mean = Outcome(share=share, transmitted=transmitted, reflected=0 * z, upper=upper, dissipated=rest, contact=0 * z,
-                   onset=times, separation=times, release=times)  # fmt: skip
+    mean = ScatteringOutcome(
+        share=share,
+        transmitted=transmitted,
+        reflected=0 * z,
+        upper=upper,
+        dissipated=rest,
+        contact=0 * z,
+        onset=times,
+        separation=times,
+        release=times,
+    )
     return ScatteringLaw(z, mean, mean, 1, 1e-3, 1e-4, np.zeros(1), np.zeros(1), {})
 
 
 def test_between_points_the_law_is_linear_in_log_z():
     law = by_hand()
-    assert [*Outcome._fields] == [*Outcome(*(law.mean))._asdict()] and set(Outcome._fields) == set(POINT_LAYOUT)
+    assert set(ScatteringOutcome._fields) == set(POINT_LAYOUT)
     middle = law.at([[np.sqrt(1.2 * 1.5), 1.02], [0.1, 9.0]])
     np.testing.assert_allclose(middle.upper, [[0.12, 0.08], [0, 0.01]], atol=1e-15)
     assert middle.share.shape == (2, 2, 3, 2) and middle.onset[0, 1] == 0.1 and np.isnan(middle.onset[1, 0])

@@ -28,7 +28,7 @@ BANDS = {
 }
 
 
-class Span(NamedTuple):
+class AveragingSpan(NamedTuple):
     """The samples over which means of the energies are taken, from ``first`` to before ``last``; when they begin."""
 
     first: int
@@ -74,7 +74,7 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
     }
 
 
-def _span(record: VelocityRecord) -> Span:
+def _span(record: VelocityRecord) -> AveragingSpan:
     """From the wave's arrival at the first site to the record's end, without the ends of the record."""
     samples = len(record.time)
     if record.site is None:
@@ -90,11 +90,11 @@ def _span(record: VelocityRecord) -> Span:
     ends = int(np.ceil(ENDS * samples))
     first = min(max(first, ends), samples - 1)
     last = max(samples - ends, first + 1)
-    return Span(first, last, f"{reason}, or after the first {ENDS:.0%} of the record")
+    return AveragingSpan(first, last, f"{reason}, or after the first {ENDS:.0%} of the record")
 
 
 def _transfers(
-    record: VelocityRecord, energy: np.ndarray, above: np.ndarray, span: Span, times: dict[str, Any]
+    record: VelocityRecord, energy: np.ndarray, above: np.ndarray, span: AveragingSpan, times: dict[str, Any]
 ) -> dict[str, Any]:
     """The transfer to the bands ``above`` over the ``span``, and as the paper's, to the record's end."""
     stride = record.options.band_stride

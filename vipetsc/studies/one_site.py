@@ -180,7 +180,7 @@ class ScatteringRuns:
         return mean, deviation
 
     def _outcome(self, record: Record) -> dict[str, Any]:
-        """What one run makes of the wave, as ``scattering_law.Outcome`` names it, with "near" and "episodes"."""
+        """What one run makes of the wave by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
         band = self.setting.band
         share = (np.array(record["energy"]) - self.reference) / self.arrived
         share[band, FORWARD] += 1

@@ -46,7 +46,7 @@ LAYOUT = {
 }
 
 
-class Outcome(NamedTuple):
+class ScatteringOutcome(NamedTuple):
     """What one site makes of a wave, arrays over z; shares of the energy that arrives in the drive's band.
 
     ``share`` (..., band, direction) is what leaves by band, forward (0) and backward (1): in the drive's band these are
@@ -77,8 +77,8 @@ class ScatteringLaw:
     """
 
     z: np.ndarray
-    mean: Outcome
-    scatter: Outcome
+    mean: ScatteringOutcome
+    scatter: ScatteringOutcome
     drive_band: int
     clearance: float
     peak: float
@@ -97,8 +97,8 @@ class ScatteringLaw:
         """The law in the content of ``law.h5``."""
         return cls(
             z=data["z"].values,
-            mean=Outcome(**{name: data[name].values for name in Outcome._fields}),
-            scatter=Outcome(**{name: data[f"{name}_scatter"].values for name in Outcome._fields}),
+            mean=ScatteringOutcome(**{name: data[name].values for name in ScatteringOutcome._fields}),
+            scatter=ScatteringOutcome(**{name: data[f"{name}_scatter"].values for name in ScatteringOutcome._fields}),
             drive_band=int(data.attrs["drive_band"]) - 1,
             clearance=float(data.attrs["clearance"]),
             peak=float(data.attrs["peak"]),
@@ -107,18 +107,18 @@ class ScatteringLaw:
             about=data.attrs,
         )
 
-    def at(self, z: ArrayLike) -> Outcome:
+    def at(self, z: ArrayLike) -> ScatteringOutcome:
         """What becomes of a wave at ``z`` (any shape): linear in log z between the points, T = 1 below the first.
 
         Above the last point the last one holds.
         """
         return self._interpolated(self.mean, z)
 
-    def deviation(self, z: ArrayLike) -> Outcome:
+    def deviation(self, z: ArrayLike) -> ScatteringOutcome:
         """The scatter at ``z`` (any shape), interpolated as ``at`` interpolates the mean."""
         return self._interpolated(self.scatter, z)
 
-    def _interpolated(self, values: Outcome, z: ArrayLike) -> Outcome:
+    def _interpolated(self, values: ScatteringOutcome, z: ArrayLike) -> ScatteringOutcome:
         x = np.log(np.clip(np.asarray(z, float), self.z[0], self.z[-1]))
         grid = np.log(self.z)
         right = np.clip(np.searchsorted(grid, x), 1, len(grid) - 1)
@@ -130,7 +130,7 @@ class ScatteringLaw:
             # Exactly the point's value at a point, and no NaN of its neighbour.
             return np.where(w == 0, array[right - 1], np.where(w == 1, array[right], mixed))
 
-        return Outcome(*map(between, values))
+        return ScatteringOutcome(*map(between, values))
 
     def efficiency(self) -> np.ndarray:
         """U/(1-T) (point), both averaged over 5 % of z either way; 0 where 1-T is below 2 % somewhere there."""

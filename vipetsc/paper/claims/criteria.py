@@ -1,4 +1,4 @@
-"""What decides on a claim: the criteria in ``claims.toml``, and the constants inside of the quantities they compare.
+"""Criteria that decide on the claims (``claims.toml``), and the constants inside of the quantities they compare.
 
 Every number that decides stands in one of the two. Sections (sec., App., Suppl.) are the paper's; SPEC is the
 specification that fixes what the paper leaves open.
@@ -13,22 +13,24 @@ from typing import Any, SupportsFloat
 
 HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
 ROUNDING = 1e-9  # of a measured number beside its threshold
-LAWS = "hertz", "bilinear"
+LAWS = ("hertz", "bilinear")
 
 # Constants of quantities: what is counted or measured, rather than what decides.
 STRAIGHT, STRAIGHT_EVERYWHERE = 0.95, 0.9  # adjusted R^2 of a power law (SPEC 11, C7 and C8)
 QUIET = 0.1  # normalised entropy that is still "nearly zero" (sec. II.C)
 ABRUPT = 10**0.5  # ratio of amplitudes, half a decade, in which an abrupt rise leads from QUIET to half the peak
-PEAK = 0.9, 1.8  # N (sec. II.C; SPEC 4: 1.1-1.4 N)
+PEAK = (0.9, 1.8)  # N (sec. II.C; SPEC 4: 1.1-1.4 N)
 HIGH, SEVERAL = 10.0, 3  # N, the paper's high amplitude; sites that are several
 BESIDE = 0.02  # half-width of the band about a Bloch branch over the top edge of the pass bands
-NATIVE = 7, 8  # wavenumber bins that the packet starts in (SPEC 11, C5)
-PAPER_CELL, GRID = (0.1, 0.5), 0.1  # (lambda, eta) of the paper, spacing of its grid (SPEC 11, C10; Suppl. 3)
+NATIVE = (7, 8)  # wavenumber bins that the packet starts in (SPEC 11, C5)
+PAPER_CELL = (0.1, 0.5)  # (lambda, eta) of the paper (SPEC 11, C10; Suppl. 3)
+GRID = 0.1  # spacing of its grid
 LOW = 10  # times the floor: up to there the transfer has not set in
-COUNTED = "band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2"  # the parts that the paper filters (App. A3)
+COUNTED = ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")  # the parts that the paper filters (App. A3)
 FEWEST_FOLDS = 2  # back in energy and forth again (SPEC 9)
 HERTZ_LIMIT = 0.1  # d ln f / d ln E of a resonator on a spring of force w^n, n = 3/2: (n - 1)/(2 (n + 1))
-SAME_MOTION, SAME_EXPONENT = 0.9, 0.2
+SAME_MOTION = 0.9  # correlation of motions that are the same
+SAME_EXPONENT = 0.2  # difference of exponents that are the same
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Criterion:
     "<="      bound          at most
     ">="      bound          at least
     "within"  (low, high)    in the closed interval
-    "of"      (count, all)   the quantity is a share: at least ``count`` out of ``all``
+    "of"      (count, all)   the quantity is a fraction: at least ``count`` out of ``all``
     ========  =============  ========================================================
 
     ``source`` is where SPEC.md or the paper gives the threshold. A claim that fails a ``decisive`` criterion does not
@@ -55,16 +57,21 @@ class Criterion:
 
     def met(self, value: SupportsFloat | None) -> bool:
         """Whether ``value`` keeps to the threshold; a number that is not there or not finite does not."""
+        if value is None or not isfinite(value):
+            return False
+
         low, high = self.interval
         scale = high if self.comparison == "of" else 1
-        return value is not None and isfinite(value) and low - ROUNDING <= float(value) * scale <= high + ROUNDING
+        return low - ROUNDING <= float(value) * scale <= high + ROUNDING
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Lowest and highest number that meets the criterion; counts for shares."""
+        """Lowest and highest number that meets the criterion; counts for fractions."""
         if isinstance(self.threshold, tuple):
             return self.threshold
-        return (-inf, self.threshold) if self.comparison == "<=" else (self.threshold, inf)
+        if self.comparison == "<=":
+            return -inf, self.threshold
+        return self.threshold, inf
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -106,7 +113,9 @@ def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | N
         return HOLDS, names
     if len(missed) == len(criteria):
         return FAILS if failed else UNMEASURED, names
-    return FAILS if any(c.decisive for c in failed) else IN_PART, names
+    if any(c.decisive for c in failed):
+        return FAILS, names
+    return IN_PART, names
 
 
 def _criteria(rows: Sequence[Sequence[Any]]) -> tuple[Criterion, ...]:
@@ -114,10 +123,18 @@ def _criteria(rows: Sequence[Sequence[Any]]) -> tuple[Criterion, ...]:
     criteria = []
     for law in (*LAWS, ""):
         for quantity, comparison, threshold, unit, source, *decisive in rows:
-            if quantity.endswith("*") == bool(law):
-                name = quantity.replace("*", f", {law}")
-                bounds = tuple(threshold) if isinstance(threshold, list) else threshold
-                criteria.append(Criterion(name, comparison, bounds, unit, source, bool(decisive)))
+            if quantity.endswith("*") != bool(law):
+                continue
+            criteria.append(
+                Criterion(
+                    quantity=quantity.replace("*", f", {law}"),
+                    comparison=comparison,
+                    threshold=tuple(threshold) if isinstance(threshold, list) else threshold,
+                    unit=unit,
+                    source=source,
+                    decisive=bool(decisive),
+                )
+            )
     return tuple(criteria)
 
 

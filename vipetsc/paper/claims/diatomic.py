@@ -1,5 +1,7 @@
 """C1-C6: what the diatomic lattice does at low, medium and high amplitude (the paper's section II.B)."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
@@ -10,6 +12,13 @@ from vipetsc.spectra import Dispersion, ridge
 BRANCHES = f"share within {100 * BESIDE:g} % of the top edge from the Bloch branches"
 STEP = "scattering-amplitudes"
 OPTICAL = 2  # the band that the paper drives
+
+
+class Fraction(NamedTuple):
+    """A part of the energy, and its standard deviation over time."""
+
+    value: float
+    deviation: float
 
 
 class AmplitudeTriple:
@@ -23,33 +32,37 @@ class AmplitudeTriple:
         runs = evidence.runs(STEP, reading, *needs)
         if len(runs) < 3:
             raise MissingEvidence(f"{STEP} has {len(runs)} amplitudes; low, medium and high are needed")
-        self.low, self.medium, self.high = runs[0], runs[len(runs) // 2], runs[-1]
+        self.low = runs[0]
+        self.medium = runs[len(runs) // 2]
+        self.high = runs[-1]
         self.runs = {"low": self.low, "medium": self.medium, "high": self.high}
+
         model = self.low.case.model()
-        drive, sites = model.drive, np.asarray(model.chain.sites)
+        drive = model.drive
+        sites = np.asarray(model.chain.sites)
         waves = [wave for wave in waves_at(model.chain.cell, drive.frequency) if wave[0] == OPTICAL]
         if not waves or not sites.size:
             raise MissingEvidence(f"{STEP}: the drive excites no wave of band {OPTICAL}, or the lattice has no sites")
         _, self.wavenumber, self.speed = waves[0]
         self.lobe = 2 * drive.frequency / (drive.cycles * self.speed)
-        self.duration, self.distance = drive.duration, int(np.min(np.abs(sites - model.drive_cell)))
+        self.duration = drive.duration
+        self.distance = int(np.min(np.abs(sites - model.drive_cell)))
 
-    def new_share(self, run: AnalysedMember) -> tuple[float, float]:
-        """Share of the kinetic energy outside the main lobe, and its deviation over time.
-
-        From when the middle of the burst passes the first site.
-        """
+    def new_fraction(self, run: AnalysedMember) -> Fraction:
+        """Part of the kinetic energy outside the main lobe, from when the middle of the burst passes the first site."""
         time, wavenumber, content = run.arrays("time", "wavenumber", "wavenumber_content")
         content = content[time >= self.duration / 2 + self.distance / self.speed]
         new = np.abs(wavenumber - self.wavenumber) > self.lobe
-        outside, whole = content[:, new].sum(axis=1), content.sum(axis=1)
-        return outside.sum() / whole.sum(), np.std(outside / whole)
+        outside = content[:, new].sum(axis=1)
+        whole = content.sum(axis=1)
+        return Fraction(outside.sum() / whole.sum(), np.std(outside / whole))
 
     def explain_medium(self, result: Measurement) -> None:
         """Add a reason if the medium amplitude makes no contact: from where on there is one."""
         if self.medium.episodes:
             return
-        onset, because = self.medium.onset, "makes no contact"
+        onset = self.medium.onset
+        because = "makes no contact"
         if np.isfinite(onset):
             result.value["first contact (N)"] = onset
             because = f"is below first contact at {onset:.3g} N"
@@ -63,8 +76,10 @@ def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None
         raise MissingEvidence(f"the run at {triple.low.amplitude:g} N is not linear: {triple.low.episodes} contacts")
     spectrum = Dispersion(*triple.low.arrays("wavenumber", "frequency", "dispersion"))
     wavenumber, frequency = ridge(spectrum)
+
     branch = bloch(triple.low.case.lattice.unit_cell(), wavenumber).frequency[:, OPTICAL - 1]
-    frequency_bin, wavenumber_bin = (axis[1] - axis[0] for axis in (spectrum.frequency, spectrum.wavenumber))
+    frequency_bin = spectrum.frequency[1] - spectrum.frequency[0]
+    wavenumber_bin = spectrum.wavenumber[1] - spectrum.wavenumber[0]
     distance = np.abs(frequency - branch) / frequency_bin
     strongest = spectrum.wavenumber[np.argmax(spectrum.energy.sum(axis=1))]
     result.value |= {
@@ -78,7 +93,7 @@ def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None
 
 
 def linear_content(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C2: share of the energy that changes its wavenumber between drive and far end at low amplitude (Fig. 2)."""
+    """C2: part of the energy that changes its wavenumber between drive and far end at low amplitude (Fig. 2)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content")
     model = triple.low.case.model()
     time, content = triple.low.arrays("time", "wavenumber_content")
@@ -86,103 +101,117 @@ def linear_content(evidence: Evidence, reading: str, result: Measurement) -> Non
     free = (time >= triple.duration) & (time <= model.chain.cells / fastest)
     if free.sum() < 2:
         raise MissingEvidence("the packet reaches the far end before the drive ends, or the record is too short")
-    share = content[free] / content[free].sum(axis=1, keepdims=True)
-    moved = 0.5 * np.abs(share - share[0]).sum(axis=1)
+
+    distribution = content[free] / content[free].sum(axis=1, keepdims=True)
+    moved = 0.5 * np.abs(distribution - distribution[0]).sum(axis=1)
     result.value["contact episodes at low amplitude"] = triple.low.episodes
     result.value["largest share of the energy that changes its wavenumber"] = moved.max()
     result.uncertainty |= {"mean over time of that share": moved.mean(), "samples": free.sum()}
 
 
 def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C3: shares at new wavenumbers and beside the Bloch branches at medium amplitude (Figs. 2, 3)."""
+    """C3: energy at new wavenumbers and off the Bloch branches at medium amplitude (Figs. 2, 3)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "dispersion")
-    (low, _), (medium, deviation) = triple.new_share(triple.low), triple.new_share(triple.medium)
+    low = triple.new_fraction(triple.low)
+    medium = triple.new_fraction(triple.medium)
     result.value |= {
-        "share at new wavenumbers, medium amplitude": medium,
-        "share at new wavenumbers, medium over low amplitude": medium / low,
-        BRANCHES: _branch_share(triple.medium),
-        "share at new wavenumbers, low amplitude": low,
-        f"{BRANCHES}, low amplitude": _branch_share(triple.low),
+        "share at new wavenumbers, medium amplitude": medium.value,
+        "share at new wavenumbers, medium over low amplitude": medium.value / low.value,
+        BRANCHES: _on_branches(triple.medium),
+        "share at new wavenumbers, low amplitude": low.value,
+        f"{BRANCHES}, low amplitude": _on_branches(triple.low),
         "main lobe's half-width (rad/cell)": triple.lobe,
     }
-    result.uncertainty["deviation over time of the share at new wavenumbers"] = deviation
+    result.uncertainty["deviation over time of the share at new wavenumbers"] = medium.deviation
     triple.explain_medium(result)
 
 
-def _branch_share(run: AnalysedMember) -> float:
-    """Share of the 2-D spectrum's energy within ``BESIDE`` times the top edge of a branch."""
+def _on_branches(run: AnalysedMember) -> float:
+    """Part of the 2-D spectrum's energy that lies within ``BESIDE`` times the top edge from a branch."""
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
     cell = run.case.lattice.unit_cell()
-    distance = np.abs(frequency[None, :, None] - bloch(cell, wavenumber).frequency[:, None, :]).min(axis=2)
+    branches = bloch(cell, wavenumber).frequency
+    distance = np.abs(frequency[None, :, None] - branches[:, None, :]).min(axis=2)
     return energy[distance <= BESIDE * pass_bands(cell)[-1].high].sum() / energy.sum()
 
 
 def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C4: new wavenumbers at high over medium amplitude, and the share reflected (Figs. 2, 3)."""
+    """C4: new wavenumbers at high over medium amplitude, and the part reflected (Figs. 2, 3)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "kinetic_energy")
-    new = {}
+    new: dict[str, float] = {}
     for name, run in triple.runs.items():
-        new[name], deviation = triple.new_share(run)
-        share, spread = _reflected_share(triple, run)
-        result.value[f"share at new wavenumbers, {name} amplitude"] = new[name]
-        result.value[f"share of the incident energy reflected, {name} amplitude"] = share
-        result.uncertainty[f"deviation over time of the share at new wavenumbers, {name} amplitude"] = deviation
-        result.uncertainty[f"deviation over time of the share reflected, {name} amplitude"] = spread
+        fraction = triple.new_fraction(run)
+        back = _reflected_fraction(triple, run)
+        new[name] = fraction.value
+        result.value[f"share at new wavenumbers, {name} amplitude"] = fraction.value
+        result.value[f"share of the incident energy reflected, {name} amplitude"] = back.value
+        deviations = "deviation over time of the share"
+        result.uncertainty[f"{deviations} at new wavenumbers, {name} amplitude"] = fraction.deviation
+        result.uncertainty[f"{deviations} reflected, {name} amplitude"] = back.deviation
     result.value["new wavenumbers, high over medium amplitude"] = new["high"] / new["medium"]
+
     triple.explain_medium(result)
     if "first contact (N)" in result.value:
         ratio = triple.high.amplitude / triple.medium.onset
         result.reasons.append(f"{triple.high.amplitude:g} N is {ratio:.3g} times first contact")
 
 
-def _reflected_share(triple: AmplitudeTriple, run: AnalysedMember) -> tuple[float, float]:
+def _reflected_fraction(triple: AmplitudeTriple, run: AnalysedMember) -> Fraction:
     """Kinetic energy before the first site over the incident, when the reflected packet is half-way back to the drive.
 
-    The mean and the deviation over half a burst's length about that time: the incident packet has passed then, and the
-    reflected one does not stand against the end yet. What is incident is the energy of the linear run, scaled by the
-    amplitudes' squares.
+    The mean and the deviation are over half a burst's length about that time: the incident packet has passed then, and
+    the reflected one does not stand against the end yet. What is incident is the energy of the linear run, scaled by
+    the amplitudes' squares.
     """
     time, cell, energy = run.arrays("time", "cell", "kinetic_energy")
     returning = np.abs(time - triple.duration / 2 - 1.5 * triple.distance / triple.speed) <= triple.duration / 4
     before = np.abs(cell - 1 - run.case.model().drive_cell) < triple.distance
     incident = triple.low.analysis["kinetic_energy"].values[returning].sum(axis=1).mean()
     incident *= (run.amplitude / triple.low.amplitude) ** 2
-    share = energy[returning][:, before].sum(axis=1) / incident
-    return share.mean(), share.std()
+    reflected_energy = energy[returning][:, before].sum(axis=1) / incident
+    return Fraction(reflected_energy.mean(), reflected_energy.std())
 
 
 def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C5: share of the packet in its own wavenumber bins before it meets a site (Fig. 4)."""
+    """C5: part of the packet in its own wavenumber bins before it meets a site (Fig. 4)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "partition")
     arrival = triple.distance / max_group_velocity(triple.low.case.lattice.unit_cell(), OPTICAL)[2]
-    first, last = NATIVE[0] - 1, NATIVE[-1]
-    shares = []
+    first = NATIVE[0] - 1
+    last = NATIVE[-1]
+    by_method: dict[str, list[float]] = {"Fourier": [], "wavelet": []}
     for run in triple.runs.values():
         time, wavenumber, content = run.arrays("time", "wavenumber", "wavenumber_content")
         snapshot, bounds, energy = run.arrays("partition/snapshot", "partition/bounds", "partition/energy")
-        sampled, transformed = ((t >= triple.duration) & (t <= arrival) for t in (time, snapshot))
+        sampled = (time >= triple.duration) & (time <= arrival)
+        transformed = (snapshot >= triple.duration) & (snapshot <= arrival)
         if not (sampled.any() and transformed.any()):
             raise MissingEvidence("no sample lies between the drive's end and the arrival at the first site")
-        content, energy = content[sampled].sum(axis=0), energy.compress(transformed, axis=1).sum(axis=1)
+
+        content = content[sampled].sum(axis=0)
         inside = (wavenumber >= bounds[first]) & (wavenumber <= bounds[last])
-        shares.append((content[inside].sum() / content.sum(), energy[first:last].sum() / energy.sum()))
-    for method, share in zip(("Fourier", "wavelet"), np.transpose(shares), strict=True):
+        by_method["Fourier"].append(content[inside].sum() / content.sum())
+        energy = energy.compress(transformed, axis=1).sum(axis=1)
+        by_method["wavelet"].append(energy[first:last].sum() / energy.sum())
+
+    for method, fractions in by_method.items():
         quantity = f"smallest share in bins {NATIVE[0]} and {NATIVE[1]}, {method}"
-        result.value[quantity] = share.min()
-        result.uncertainty[f"spread over the amplitudes: {quantity}"] = np.ptp(share)
+        result.value[quantity] = min(fractions)
+        result.uncertainty[f"spread over the amplitudes: {quantity}"] = np.ptp(fractions)
 
 
 def reconstruction(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C6: error of the kinetic energy of the bins' summed velocities (App. A, Fig. A1)."""
     triple = AmplitudeTriple(evidence, reading, "partition")
-    largest, cross = [], []
+    largest = []
+    cross = []
     for name, run in triple.runs.items():
-        snapshot, error, share = run.arrays("partition/snapshot", "partition/error", "partition/cross_share")
+        snapshot, error, between_bins = run.arrays("partition/snapshot", "partition/error", "partition/cross_share")
         after = snapshot >= triple.duration
         largest.append(error[after].max())
-        cross.append(share[after].mean())
+        cross.append(between_bins[after].mean())
         result.value[f"largest error, {name} amplitude"] = largest[-1]
         result.value[f"mean share between the bins, {name} amplitude"] = cross[-1]
+
     result.value["largest error of the reconstructed kinetic energy after the drive"] = max(largest)
     result.uncertainty["snapshots"] = after.sum()
     result.reasons.append(

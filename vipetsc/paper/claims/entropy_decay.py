@@ -7,9 +7,9 @@ from vipetsc.paper.claims.criteria import ABRUPT, HIGH, PEAK, QUIET, SEVERAL, ST
 from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence, Measurement, MissingEvidence
 from vipetsc.spectra import FEWEST, doubt, normalised
 
+# Steps with sites that are spread, and with sites in neighbouring cells.
 SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
-AVERAGES = "energy_weighted", "masked", "joint"
-FIT = "points", "r2_log_log", "r2_nonlinear", "exponent", "exponent_low", "exponent_high"
+AVERAGES = ("energy_weighted", "masked", "joint")
 
 
 class EntropyDecay(AmplitudeCurve):
@@ -22,12 +22,21 @@ class EntropyDecay(AmplitudeCurve):
 
     def __init__(self, members: xr.Dataset, average: str) -> None:
         super().__init__(members, f"entropy/{average}")
-        self.members, self.sites = members, int(members["sites"])
-        self.value = normalised(self.value) if np.ptp(self.value) > 0 else np.full_like(self.value, np.nan)
-        fit = (members[f"fits/entropy/{average}/{name}"].item() for name in FIT)
-        points, self.r2, nonlinear, self.exponent, low, high = fit
-        self.points, self.best = int(np.nan_to_num(points)), float(np.fmax(self.r2, nonlinear))
-        self.half_width = (high - low) / 2
+        self.members = members
+        self.sites = int(members["sites"])
+        if np.ptp(self.value) > 0:
+            self.value = normalised(self.value)
+        else:
+            self.value = np.full_like(self.value, np.nan)
+
+        def fitted(name: str) -> float:
+            return float(members[f"fits/entropy/{average}/{name}"].item())
+
+        self.points = int(np.nan_to_num(fitted("points")))
+        self.r2 = fitted("r2_log_log")
+        self.best = float(np.fmax(self.r2, fitted("r2_nonlinear")))
+        self.exponent = fitted("exponent")
+        self.half_width = (fitted("exponent_high") - fitted("exponent_low")) / 2
 
     def reaches(self, r2: float, bound: float) -> bool:
         """Whether ``r2``, one of the fits', reaches ``bound`` over enough points."""
@@ -52,10 +61,12 @@ def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: 
 def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C7: floor, abrupt rise, peak and power-law decay at 5 pi/9 (Fig. 5)."""
     spread = decays(evidence, SPREAD, reading, "energy_weighted", wavenumber=EXCITED)
+
     quiet = np.concatenate([c.value[c.untouched] for c in spread])
     abrupt = np.mean([c.growth_ratio(QUIET, 0.5) <= ABRUPT for c in spread])
     in_place = np.mean([PEAK[0] <= c.peak_amplitude <= PEAK[1] for c in spread])
-    behind = [c.interpolate(HIGH) if c.peak_amplitude < HIGH else np.nan for c in spread if c.sites >= SEVERAL]
+    several = [c for c in spread if c.sites >= SEVERAL]
+    behind = [c.interpolate(HIGH) if c.peak_amplitude < HIGH else np.nan for c in several]
     highest = np.max(behind) if behind else None
     result.value |= {
         "floor of the normalised entropy": quiet.max() if quiet.size else None,
@@ -68,12 +79,14 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
         _list_fits(result, decays(evidence, NEIGHBOURS, reading, "masked"), "neighbouring", "neighbours, masked")
     except (MissingEvidence, OSError, ValueError) as missing:
         result.reasons.append(str(missing).replace(f"{evidence.root}/", ""))
+
     result.uncertainty["amplitudes"] = len(spread[0].amplitude)
     onsets = (c.amplitude[~c.untouched].min() for c in spread if not c.untouched.all())
     result.value["smallest amplitude with contact (N)"] = min(onsets, default=None)
     late = [c for c in spread if c.peak_amplitude > PEAK[1]]
     if late:
-        first, fewest = min(c.peak_amplitude for c in late), min(c.points for c in spread)
+        first = min(c.peak_amplitude for c in late)
+        fewest = min(c.points for c in spread)
         result.reasons.append(
             f"{len(late)} of {len(spread)} configurations peak only from {first:.3g} N on, so that as few as {fewest}"
             f" of {len(late[0].amplitude)} amplitudes are left for a power law"
@@ -84,7 +97,7 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: str, kind: str) -> None:
-    """The share of configurations with a power law, and the fit of each of them."""
+    """Add the fraction of configurations with a power law, and the fit of each of them."""
     straight = np.mean([c.reaches(c.r2, STRAIGHT) for c in configurations])
     fit = f"adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
     result.value[f"share of configurations of {sites} sites with {fit}"] = straight
@@ -96,32 +109,38 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: s
         result.value[f"peak (N), {name}"] = c.peak_amplitude
         result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = None if doubts else c.half_width
         result.uncertainty[f"points of the fit, {name}"] = c.points
-        result.reasons += [f"no power law with {name}: {doubts}"] if doubts else []
+        if doubts:
+            result.reasons.append(f"no power law with {name}: {doubts}")
 
 
 def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C8: the same at every wavenumber from 2 pi/9 to 7 pi/9 (Suppl., Fig. S2)."""
+    """C8: rise, peak and decay at every wavenumber from 2 pi/9 to 7 pi/9 (Suppl., Fig. S2)."""
     ensemble = evidence.ensemble(SPREAD)
     if "wavenumber" not in ensemble.coords:
         raise MissingEvidence(f"{SPREAD} does not vary the wavenumber")
     wavenumbers = ensemble["wavenumber"].values.tolist()
-    by_average = {
-        average: [c for k in wavenumbers for c in decays(evidence, SPREAD, reading, average, wavenumber=k)]
-        for average in AVERAGES
-    }
+    by_average: dict[str, list[EntropyDecay]] = {}
+    straight: dict[str, np.floating] = {}
+    for average in AVERAGES:
+        curves: list[EntropyDecay] = []
+        for wavenumber in wavenumbers:
+            curves += decays(evidence, SPREAD, reading, average, wavenumber=wavenumber)
+        by_average[average] = curves
+        straight[average] = np.mean([c.reaches(c.best, STRAIGHT_EVERYWHERE) for c in curves])
     primary = by_average["energy_weighted"]
-    shares = {a: np.mean([c.reaches(c.best, STRAIGHT_EVERYWHERE) for c in cs]) for a, cs in by_average.items()}
+
     fit = f"share of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g} over {FEWEST} points or more"
     finite = [c.r2 for c in primary if np.isfinite(c.r2) and c.points >= FEWEST]
     result.value |= {
         "share of curves that rise, peak and fall by half": np.mean([c.falls for c in primary]),
-        fit: shares["energy_weighted"],
+        fit: straight["energy_weighted"],
         f"{fit}, log-log line alone": np.mean([c.reaches(c.r2, STRAIGHT_EVERYWHERE) for c in primary]),
         "median adjusted R^2 (log-log)": np.median(finite) if finite else None,
         "curves": len(primary),
     }
-    result.uncertainty |= {f"{fit}, {average} mean": shares[average] for average in AVERAGES[1:]}
+    result.uncertainty |= {f"{fit}, {average} mean": straight[average] for average in AVERAGES[1:]}
     result.uncertainty["fewest points of a fit"] = min(c.points for c in primary)
+
     late = sum(c.peak >= len(c.amplitude) - 3 for c in primary)
     if late:
         text = f"{late} of {len(primary)} curves have their peak among the three largest amplitudes"
@@ -134,7 +153,8 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
 def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C9: error bars at high amplitude over those at the peak and without contact (Fig. 5)."""
     configurations = decays(evidence, SPREAD, reading, "energy_weighted", wavenumber=EXCITED)
-    over_peak, over_quiet = [], []
+    over_peak = []
+    over_quiet = []
     for c in configurations:
         error = AmplitudeCurve(c.members, "entropy/error")
         high = error.value[error.amplitude >= HIGH]
@@ -145,6 +165,7 @@ def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
         over_peak.append(high.mean() / at_peak[0] if at_peak.size else np.nan)
         if error.untouched.any():
             over_quiet.append(high.mean() / error.value[error.untouched].mean())
+
     growth = f"share of configurations with larger error bars from {HIGH:g} N on than"
     result.value[f"{growth} at the peak"] = np.mean(np.greater(over_peak, 1))
     if over_quiet:

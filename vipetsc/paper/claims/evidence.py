@@ -1,4 +1,4 @@
-"""What claims are measured from, the steps of the paper in one folder, and what a measurement gathers."""
+"""The evidence that claims are measured from: the steps of the paper in one folder; and what a measurement gathers."""
 
 import tomllib
 from contextlib import ExitStack, suppress
@@ -44,7 +44,9 @@ class AnalysedMember:
     """
 
     def __init__(self, folder: Path, analysis: xr.Dataset, episodes: int) -> None:
-        self.folder, self.analysis, self.episodes = folder, analysis, episodes
+        self.folder = folder
+        self.analysis = analysis
+        self.episodes = episodes
         self.case = Case.of(analysis)
         self.amplitude = self.case.drive.amplitude
 
@@ -74,8 +76,10 @@ class AmplitudeCurve:
         valid = members.isel(amplitude=np.isfinite(members[name].values))
         if not valid.sizes["amplitude"]:
             raise MissingEvidence(f"{step}: every member of a curve of {name} failed")
-        self.amplitude, self.value = valid["amplitude"].values, valid[name].values
-        self.untouched, self.peak = valid["contact_episodes"].values == 0, int(np.argmax(self.value))
+        self.amplitude = valid["amplitude"].values
+        self.value = valid[name].values
+        self.untouched = valid["contact_episodes"].values == 0
+        self.peak = int(np.argmax(self.value))
         self.peak_amplitude = float(self.amplitude[self.peak])
 
     def growth_ratio(self, low: float, high: float) -> float:
@@ -84,7 +88,8 @@ class AmplitudeCurve:
         Up to the peak; NaN if none is so low before it.
         """
         value = self.value[: self.peak + 1]
-        before, above = np.nonzero(value <= low)[0], np.nonzero(value >= high)[0]
+        before = np.nonzero(value <= low)[0]
+        above = np.nonzero(value >= high)[0]
         if not before.size or not above.size:
             return float("nan")
         return float(self.amplitude[above[above > before[-1]][0]] / self.amplitude[before[-1]])
@@ -118,7 +123,7 @@ class Evidence(ExitStack):
         return self.root / name
 
     def open(self, *parts: str, needs: tuple[str, ...] = ()) -> xr.Dataset:
-        """An HDF5 file below ``root`` with the variables and groups ``needs``."""
+        """Open an HDF5 file below ``root`` that holds the variables and groups ``needs``."""
         return self._open(self.path(*parts), needs)
 
     def ensemble(self, step: str) -> xr.Dataset:
@@ -130,13 +135,16 @@ class Evidence(ExitStack):
 
         Of an axis that is not named the first value is taken.
         """
-        ensemble, wanted = self.ensemble(step), {"reading": reading} | wanted
+        ensemble = self.ensemble(step)
+        wanted = {"reading": reading} | wanted
         only = tomllib.loads(ensemble.attrs["case"]).get("lattice", {}).get("reading", "calibrated")
         swept = "reading" in ensemble.coords
         if not swept and only != reading:
             raise MissingEvidence(f"{step} has the reading {only!r} alone")
+
+        coordinates = {key: value for key, value in wanted.items() if swept or key != "reading"}
         try:
-            members = select(ensemble, **{k: v for k, v in wanted.items() if swept or k != "reading"})
+            members = select(ensemble, **coordinates)
         except KeyError:
             values = (f"{k} = {v:.6g}" if isinstance(v, float) else f"{k} = {v}" for k, v in wanted.items())
             raise MissingEvidence(f"{step} has no members with {', '.join(values)}") from None

@@ -10,37 +10,48 @@ from vipetsc.lattice.modes import linear_modes
 from vipetsc.paper.claims.criteria import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
 from vipetsc.paper.claims.evidence import AmplitudeCurve, AnalysedMember, Evidence, Measurement, MissingEvidence
 
-STEP, AMPLITUDES, DESIGN, SCATTER = "interband", "interband-amplitudes", "design", "interband-scatter"
+# Steps of the paper's plan.
+STEP = "interband"
+AMPLITUDES = "interband-amplitudes"
+DESIGN = "design"
+SCATTER = "interband-scatter"
 FIELDS = 16  # random ones, for norms
 
 
 def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C10: the best (lambda, eta) of the search, on the paper's grid and on all of it (Suppl. 3, Fig. S3)."""
     search = evidence.open(DESIGN, "design.h5")
-    readings, costs = (list(map(str, search[name].values)) for name in ("reading", "cost"))
+    readings = list(map(str, search["reading"].values))
+    costs = list(map(str, search["cost"].values))
     if reading not in readings:
         raise MissingEvidence(f"design has no reading {reading}")
-    row, weighted = readings.index(reading), costs.index("weighted")
-    lam, eta = search["lambda"].values, search["eta"].values
-    phase, cost, best, paper = (
-        search[name].values[row] for name in ("out_of_phase", "weighted", "optimum_value", "paper_value")
-    )
+
+    row = readings.index(reading)
+    weighted = costs.index("weighted")
+    lam = search["lambda"].values
+    eta = search["eta"].values
+    out_of_phase = search["out_of_phase"].values[row]
+    cost = search["weighted"].values[row]
+    best = search["optimum_value"].values[row]
+    paper = search["paper_value"].values[row]
     for i, name in enumerate(costs):
         for symbol in ("lambda", "eta"):
             result.value[f"{symbol} at the optimum, {name}"] = search[f"optimum_{symbol}"].values[row, i]
-    # The paper searched a coarse grid; a finer one has its optimum beside.
-    rows, columns = _on_grid(lam), _on_grid(eta)
-    coarse = np.where(phase, cost, -np.inf)[np.ix_(rows, columns)]
+
+    # The paper searched a coarse grid; a finer one has its optimum between that one's points.
+    rows = _on_grid(lam)
+    columns = _on_grid(eta)
+    coarse = np.where(out_of_phase, cost, -np.inf)[np.ix_(rows, columns)]
     at_lam, at_eta = np.unravel_index(np.argmax(coarse), coarse.shape)
-    cell = int(np.argmin(abs(lam - PAPER_CELL[0]))), int(np.argmin(abs(eta - PAPER_CELL[1])))
+    cell = (int(np.argmin(abs(lam - PAPER_CELL[0]))), int(np.argmin(abs(eta - PAPER_CELL[1]))))
     result.value |= {
         f"lambda at the optimum of a grid of {GRID:g}": lam[rows][at_lam],
         f"eta at the optimum of a grid of {GRID:g}": eta[columns][at_eta],
-        "u2 and u3 out of phase on band 2 at the paper's cell (1 = yes)": phase[cell],
+        "u2 and u3 out of phase on band 2 at the paper's cell (1 = yes)": out_of_phase[cell],
         "weighted cost of the paper's cell over the optimum's": paper[weighted] / best[weighted],
     }
-    for name, values in (("lambda", lam), ("eta", eta)):
-        result.uncertainty[f"spacing of {name}"] = np.diff(values).max(initial=0.0)
+    result.uncertainty["spacing of lambda"] = np.diff(lam).max(initial=0.0)
+    result.uncertainty["spacing of eta"] = np.diff(eta).max(initial=0.0)
 
 
 def _on_grid(values: np.ndarray) -> np.ndarray:
@@ -52,6 +63,7 @@ def _on_grid(values: np.ndarray) -> np.ndarray:
 def _transfer(
     evidence: Evidence, reading: str, law: str, sites: int, cycles: int, mean: str = "ibtet"
 ) -> AmplitudeCurve:
+    """The transfer over the amplitude with so many ``sites`` and ``cycles`` of the burst."""
     return AmplitudeCurve(evidence.select(STEP, reading, law=law, sites=sites, cycles=cycles), mean)
 
 
@@ -60,59 +72,71 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
 
     The floor is that of the paper's mean, in which the record's last samples are.
     """
-    maxima, inner = [], []
+    maxima = []
+    inner_floors = []
     for law in LAWS:
-        curve, whole = (_transfer(evidence, reading, law, 5, 30, mean) for mean in ("ibtet", "ibtet_whole"))
-        floors = [c.value[c.untouched].mean() if c.untouched.any() else np.nan for c in (whole, curve)]
-        floor = floors[0]
-        inner.append(floors[1])
+        curve = _transfer(evidence, reading, law, sites=5, cycles=30)
+        whole = _transfer(evidence, reading, law, sites=5, cycles=30, mean="ibtet_whole")
+        floor = _floor(whole)
+        inner_floor = _floor(curve)
         highest = curve.value.max()
         growth = curve.growth_ratio(LOW * floor, highest / 2)
         maxima.append(highest)
+        inner_floors.append(inner_floor)
         result.value |= {
             f"floor, {law}": floor,
-            f"floor without the record's ends, {law}": inner[-1],
+            f"floor without the record's ends, {law}": inner_floor,
             f"ratio of amplitudes from the floor to half the maximum, {law}": growth,
             f"maximum, {law}": highest,
             f"amplitude of the maximum (N), {law}": curve.peak_amplitude,
             f"transfer at the largest amplitude, {law}": curve.value[-1],
         }
         # The larger of its two neighbours shows how well the grid of amplitudes resolves the maximum.
-        beside = np.sort(curve.value[max(curve.peak - 1, 0) : curve.peak + 2])[-2:][0]
-        result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - beside
+        neighbour = np.sort(curve.value[max(curve.peak - 1, 0) : curve.peak + 2])[-2:][0]
+        result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - neighbour
         result.uncertainty[f"amplitudes, {law}"] = len(curve.amplitude)
         _add_scatter(evidence, reading, law, 5, result)
+
     result.uncertainty["spread of the maxima between the laws"] = np.ptp(maxima)
-    text = "the floor is what the filters make of the record's end, not transfer: without the ends it is"
-    result.reasons += [f"{text} {np.nanmax(inner):.1g}"] if np.isfinite(inner).any() else []
+    if np.isfinite(inner_floors).any():
+        text = "the floor is what the filters make of the record's end, not transfer: without the ends it is"
+        result.reasons.append(f"{text} {np.nanmax(inner_floors):.1g}")
     lowest = next(c.interval[0] for c in CLAIMS["C11"].criteria if c.quantity.startswith("maximum"))
     if max(maxima) < lowest and reading == "printed":
         result.reasons.append("the resonator's spring lambda k of the printed equations gives less transfer")
 
 
+def _floor(curve: AmplitudeCurve) -> float:
+    """The mean transfer without contact; NaN where there is contact at every amplitude."""
+    if not curve.untouched.any():
+        return float("nan")
+    return float(curve.value[curve.untouched].mean())
+
+
 def _add_scatter(evidence: Evidence, reading: str, law: str, sites: int, result: Measurement) -> None:
-    """Mean and deviation near the maximum with clearances that scatter, where these samples were made; no criterion."""
+    """Add mean and deviation near the maximum with clearances that scatter, if these were made; no criterion."""
     with suppress(MissingEvidence, KeyError):
         ensemble = evidence.ensemble(SCATTER)
         member = select(ensemble, reading=reading, law=law, sites=sites)
-        share = tomllib.loads(ensemble.attrs["case"])["disorder"]["clearance"]["relative"]
-        samples = f"{member['statistics/samples'].item()} samples of {100 * share:g} % clearance scatter"
+        relative = tomllib.loads(ensemble.attrs["case"])["disorder"]["clearance"]["relative"]
+        samples = f"{member['statistics/samples'].item()} samples of {100 * relative:g} % clearance scatter"
         at = f"at {member['amplitude'].item():.4g} N, {law}"
         result.value[f"mean of {samples} {at}"] = member["statistics/ibtet/mean"].item()
         result.uncertainty[f"deviation of the {samples} {at}"] = member["statistics/ibtet/deviation"].item()
 
 
 def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C12: share of the upper bands at medium over low and high amplitude (Figs. 7, 8, S6)."""
+    """C12: energy of the upper bands at medium over low and high amplitude (Figs. 7, 8, S6)."""
     for law in LAWS:
         curve = AmplitudeCurve(evidence.select(AMPLITUDES, reading, law=law), "ibtet")
         if len(curve.amplitude) < 3:
             raise MissingEvidence(f"{AMPLITUDES} has {len(curve.amplitude)} amplitudes; low, medium, high are needed")
+
         index = {"low": 0, "medium": len(curve.value) // 2, "high": -1}
-        share = {name: curve.value[i] for name, i in index.items()}
-        result.value[f"medium over low amplitude, {law}"] = share["medium"] / share["low"]
-        result.value[f"medium over high amplitude, {law}"] = share["medium"] / share["high"]
-        result.value |= {f"share of the upper bands, {name}, {law}": value for name, value in share.items()}
+        upper = {name: curve.value[i] for name, i in index.items()}
+        result.value[f"medium over low amplitude, {law}"] = upper["medium"] / upper["low"]
+        result.value[f"medium over high amplitude, {law}"] = upper["medium"] / upper["high"]
+        result.value |= {f"share of the upper bands, {name}, {law}": value for name, value in upper.items()}
         result.uncertainty |= {f"{name} amplitude (N)": curve.amplitude[i] for name, i in index.items()}
 
 
@@ -140,13 +164,17 @@ def modal_error(run: AnalysedMember) -> float:
     and of Om^-1 V^T (V Om^2 V^T - A) V Om^-1: the Frobenius norms, which are not smaller, from random fields.
     """
     chain = run.case.model().chain
-    modes, root = linear_modes(chain), 1 / np.sqrt(chain.masses())[:, None]
-    v, frequency = modes.vectors, modes.frequency[:, None]
+    modes = linear_modes(chain)
+    v = modes.vectors
+    frequency = modes.frequency[:, None]
+    root = 1 / np.sqrt(chain.masses())[:, None]
+
     x = np.random.default_rng(0).standard_normal((len(v), FIELDS))
     y = v @ (x / frequency)
     spring = v @ (frequency**2 * (v.T @ y)) - root * (chain.stiffness_matrix() @ (root * y))
-    errors = v.T @ (v @ x) - x, v.T @ spring / frequency
-    return float(max(np.sqrt(np.sum(error**2) / FIELDS) for error in errors))
+    kinetic_error = v.T @ (v @ x) - x
+    spring_error = v.T @ spring / frequency
+    return float(max(np.sqrt(np.sum(error**2) / FIELDS) for error in (kinetic_error, spring_error)))
 
 
 def split_errors(run: AnalysedMember) -> dict[str, float]:
@@ -154,43 +182,53 @@ def split_errors(run: AnalysedMember) -> dict[str, float]:
 
     The means over the record agree for any complete split without overlap (Parseval). Over a period of the drive they
     agree where no motion straddles an edge; judged in the inner part of the record, a burst away from its ends, where
-    the filters see less than a period. The shares must be those of an independent spectrum, the space-time one, and
-    lie in the parts that the paper counts.
+    the filters see less than a period. The energy must be divided between the parts as in an independent spectrum, the
+    space-time one, and lie in those that the paper counts.
     """
     names = ("bands/sample", "bands/edges", "bands/energy", "bands/total", "frequency", "dispersion")
     time, edges, energy, total, frequency, dispersion = run.arrays(*names)
-    drive, parts = run.case.model().drive, energy.sum(axis=0)
+    drive = run.case.model().drive
+    parts = energy.sum(axis=0)
+
+    # Means over a period of the drive.
     samples = min(max(round(2 * np.pi / drive.frequency / (time[1] - time[0])), 1), len(time))
     window = np.full(samples, 1 / samples)
-    middle, mean_parts, mean_total = (np.convolve(x, window, "valid") for x in (time, parts, total))
+    middle = np.convolve(time, window, "valid")
+    mean_parts = np.convolve(parts, window, "valid")
+    mean_total = np.convolve(total, window, "valid")
     inner = (middle >= drive.duration) & (middle <= time[-1] - drive.duration)
-    after = time >= drive.duration
     if not inner.any():
         raise MissingEvidence(f"{run.folder.name}: the record is no longer than two bursts")
-    share = energy.mean(axis=1) / energy.mean(axis=1).sum()
-    part = np.searchsorted(edges, frequency, side="right") - 1
-    spectrum = np.bincount(part, dispersion.sum(axis=0), len(share))
-    counted = np.isin(np.atleast_1d(run.analysis["bands/energy"].attrs["parts"]), COUNTED)
     over_period = np.abs(mean_parts[inner] / mean_total[inner] - 1)
+    after = time >= drive.duration
     at_instants = np.abs(parts[after] - total[after]) / total[after]
-    beside_spectrum = np.abs(share - spectrum / spectrum.sum())
+
+    # How the energy is divided between the parts, by the filters and by the space-time spectrum.
+    fraction = energy.mean(axis=1) / energy.mean(axis=1).sum()
+    part = np.searchsorted(edges, frequency, side="right") - 1
+    spectrum = np.bincount(part, dispersion.sum(axis=0), len(fraction))
+    from_spectrum = np.abs(fraction - spectrum / spectrum.sum())
+    counted = np.isin(np.atleast_1d(run.analysis["bands/energy"].attrs["parts"]), COUNTED)
     return {
         "largest error of the mean over the record": abs(parts.mean() / total.mean() - 1),
         "mean error over a period of the drive, largest of the runs": over_period.mean(),
-        "largest share outside the paper's bands and gaps": share[~counted].sum(),
-        "largest difference of a part's share from that in the space-time spectrum": beside_spectrum.max(),
+        "largest share outside the paper's bands and gaps": fraction[~counted].sum(),
+        "largest difference of a part's share from that in the space-time spectrum": from_spectrum.max(),
         "mean error at an instant after the drive, largest of the runs": at_instants.mean(),
     }
 
 
 def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C14: maximum with one site; 15 beside 30 cycles (Fig. 9, Suppl.)."""
+    """C14: maximum with one site; 15 cycles compared with 30 (Fig. 9, Suppl.)."""
     for law in LAWS:
-        many, short, single = (_transfer(evidence, reading, law, *kind) for kind in ((5, 30), (5, 15), (1, 30)))
-        shared, i, j = np.intersect1d(many.amplitude, short.amplitude, return_indices=True)
-        logarithms = np.log(many.value[i]), np.log(short.value[j])
-        correlation = np.corrcoef(*logarithms)[0, 1] if len(shared) > 2 else np.nan
-        peaks = many.peak_amplitude, short.peak_amplitude
+        many = _transfer(evidence, reading, law, sites=5, cycles=30)
+        short = _transfer(evidence, reading, law, sites=5, cycles=15)
+        single = _transfer(evidence, reading, law, sites=1, cycles=30)
+        common, i, j = np.intersect1d(many.amplitude, short.amplitude, return_indices=True)
+        correlation = np.nan
+        if len(common) > 2:
+            correlation = np.corrcoef(np.log(many.value[i]), np.log(short.value[j]))[0, 1]
+        peaks = (many.peak_amplitude, short.peak_amplitude)
         result.value |= {
             f"maximum with one site, {law}": single.value.max(),
             f"maximum with one site over that with five, {law}": single.value.max() / many.value.max(),
@@ -198,22 +236,20 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
             f"ratio of the peaks' amplitudes, 15 and 30 cycles, {law}": max(peaks) / min(peaks),
             f"maximum with 15 cycles, {law}": short.value.max(),
         }
-        result.uncertainty[f"amplitudes, {law}"] = len(shared)
+        result.uncertainty[f"amplitudes, {law}"] = len(common)
         _add_scatter(evidence, reading, law, 1, result)
 
 
 def prediction(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C18: what five sites transfer, composed from the answer of one site, beside simulations."""
+    """C18: transfer of five sites, composed from the response of one, compared with simulations."""
     for law in LAWS:
         data = evidence.open(f"prediction-{law}", "prediction.h5", needs=("predicted", "simulated"))
-        touched = (
-            data["simulated/contact_episodes"].values > 0,
-            data["amplitude"].values > data.attrs["onset_amplitude"],
-        )
+        simulated_contact = data["simulated/contact_episodes"].values > 0
+        predicted_contact = data["amplitude"].values > data.attrs["onset_amplitude"]
         result.value |= {
             f"rms of the upper bands' energy at the end, in decades, {law}": data.attrs["rms_upper"],
             f"largest error of the dissipated share, {law}": data.attrs["worst_dissipated"],
-            f"amplitudes with contact on one side alone, {law}": int(np.sum(touched[0] != touched[1])),
+            f"amplitudes with contact on one side alone, {law}": int(np.sum(simulated_contact != predicted_contact)),
             f"largest error of the upper bands' energy, in decades, {law}": data.attrs["worst_upper"],
         }
         result.uncertainty[f"amplitudes, {law}"] = data.sizes["amplitude"]

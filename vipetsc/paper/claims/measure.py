@@ -24,15 +24,20 @@ def measure_claims(root: str | Path) -> list[dict[str, Any]]:
     are missing has the verdict "not measured", and ``reason`` says what is missing.
     """
     with Evidence(root) as evidence:
-        return [measure_claim(claim, reading, evidence) for claim, spec in CLAIMS.items() for reading in spec.readings]
+        rows = []
+        for claim, spec in CLAIMS.items():
+            rows += [measure_claim(claim, reading, evidence) for reading in spec.readings]
+        return rows
 
 
 def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any]:
     """One claim, by its id, in one reading."""
-    result, spec = Measurement(), CLAIMS[claim]
-    judgement, missed = UNMEASURED, list[str]()
+    spec = CLAIMS[claim]
     measure = resolve_name(f"vipetsc.paper.claims.{spec.measure}")
-    evidence.files = []
+    result = Measurement()
+    judgement = UNMEASURED
+    missed: list[str] = []
+    evidence.files = []  # those of this claim alone are named in its row
     try:
         measure(evidence, reading, result)
     except MissingEvidence as missing:
@@ -43,7 +48,10 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
         result.reasons.append(f"{file} cannot be used: {message}")
     else:
         judgement, missed = verdict(spec.criteria, result.value)
-    reasons = [f"not met: {' / '.join(missed)}"] if 0 < len(missed) < len(spec.criteria) else []
+
+    reasons = result.reasons
+    if 0 < len(missed) < len(spec.criteria):
+        reasons = [f"not met: {' / '.join(missed)}", *reasons]
     return {
         "id": claim,
         "reading": reading,
@@ -52,7 +60,7 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
         "uncertainty": rounded(result.uncertainty),
         "threshold": "; ".join(map(str, spec.criteria)),
         "verdict": judgement,
-        "reason": "; ".join([*reasons, *result.reasons]),
+        "reason": "; ".join(reasons),
         "figure": result.figure or spec.figure.format(reading=reading),
         "files": evidence.files,
     }
@@ -60,7 +68,12 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
 
 def rounded(numbers: Numbers) -> dict[str, float | None]:
     """``numbers`` with ``DIGITS`` significant digits; None for what is not finite."""
-    return {k: float(f"{v:.{DIGITS}g}") if v is not None and isfinite(v) else None for k, v in numbers.items()}
+    short: dict[str, float | None] = {}
+    for name, number in numbers.items():
+        short[name] = None
+        if number is not None and isfinite(number):
+            short[name] = float(f"{number:.{DIGITS}g}")
+    return short
 
 
 def write_claims(claims: Sequence[Mapping[str, Any]], path: Path) -> None:

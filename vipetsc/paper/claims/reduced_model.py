@@ -1,4 +1,4 @@
-"""C15-C17: the reduced model's frequency-energy branches beside the lattice (the paper's section IV and supplement)."""
+"""C15-C17: the reduced model's frequency-energy branches and the lattice (the paper's section IV and supplement)."""
 
 import json
 
@@ -14,9 +14,11 @@ from vipetsc.paper.claims.criteria import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_
 from vipetsc.paper.claims.evidence import AnalysedMember, Evidence, Measurement, MissingEvidence
 from vipetsc.studies.backbone import BRANCH, log_slope
 
-INTERBAND, ONE_SITE = "interband", "interband-one-site"
+# Steps of the paper's plan.
+INTERBAND = "interband"
+ONE_SITE = "interband-one-site"
 MAIN = "5-sites-30-cycles"
-BESIDE = "branch-in-phase.h5"
+IN_PHASE = "branch-in-phase.h5"
 # What the in-phase branch passes at 100 MPa up to ``HIGHEST`` in J; steps of a third of the usual ones find no more.
 HIGHEST = 6e9
 TRUE = {
@@ -28,47 +30,55 @@ TRUE = {
 def branches(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C15: slope, folds and stability over regions I-IV of the out-of-phase branch (Fig. 11)."""
     for law in LAWS:
-        step = f"nnm-{law}" + ("" if reading == "printed" else f"-{reading}")
+        step = f"nnm-{law}" if reading == "printed" else f"nnm-{law}-{reading}"
         branch = evidence.open(step, BRANCH)
         case = NnmCase.from_toml(branch.attrs["case"])
         if case.lattice.reading != reading or case.contacts.law != law:
             raise MissingEvidence(f"{step} holds a branch of the law {case.contacts.law}, {case.lattice.reading}")
-        names = ("energy", "frequency", "slope", "region", "multiplier_max", "kind")
-        energy, frequency, slope, region, multiplier, kind = (branch[name].values for name in names)
-        regular = kind == 0
-        steepness = np.abs(slope * energy / frequency)
-        first, last = np.nonzero((region == 1) & regular)[0], np.nonzero(regular)[0][-1]
-        folds = int(np.sum((kind == KINDS.index("fold-energy")) & (region == 2)))
-        fit = json.loads(branch.attrs["fits"]).get("III", {})
-        result.value |= {
-            f"regions, {law}": len(set(region[region > 0].tolist())),
-            f"largest |d ln f / d ln E| in region I, {law}": _largest(steepness[first]),
-            f"energy folds in region II, {law}": folds,
-            f"largest |multiplier| in region II, {law}": _largest(multiplier[region == 2]),
-            f"adjusted R^2 of the slope in region III, {law}": fit.get("adjusted_r2"),
-            f"exponent of the slope in region III, {law}": fit.get("exponent"),
-            f"last frequency (Hz), {law}": frequency[last],
-            f"energy at the end of region I (J), {law}": energy[first[-1]] if first.size else None,
-        }
-        result.uncertainty[f"points in region III, {law}"] = fit.get("points", 0)
-        result.uncertainty[f"energy of the last point (J), {law}"] = energy[last]
-        if law == "bilinear":
-            limit = System.from_case(case).closed_frequencies()[-1] / (2 * np.pi)
-            result.value["high-energy limit (Hz), bilinear"] = limit
-            distance = abs(frequency[last] / limit - 1)
-            result.value["last frequency's relative distance from the limit, bilinear"] = distance
-        else:
-            distance = abs(steepness[last] - HERTZ_LIMIT)
-            result.value["last d ln f / d ln E's distance from the 3/2 law's .1, hertz"] = distance
-        if folds < FEWEST_FOLDS:
-            modulus = f" at {case.contacts.modulus / 1e6:g} MPa" if case.contacts.modulus else ""
-            result.reasons.append(f"the {law} branch{modulus} has {folds} energy folds at grazing")
-        if reading == "printed" and (evidence.root / step / BESIDE).exists():
-            _beside(evidence.open(step, BESIDE, needs=("kind", "energy", "frequency", "resonance")), law, result)
+        _add_out_of_phase(branch, case, law, result)
+        if reading == "printed" and (evidence.root / step / IN_PHASE).exists():
+            in_phase = evidence.open(step, IN_PHASE, needs=("kind", "energy", "frequency", "resonance"))
+            _add_in_phase(in_phase, law, result)
 
 
-def _beside(branch: xr.Dataset, law: str, result: Measurement) -> None:
-    """The in-phase branch: its tongues, special points and largest frequency, and where they are not the true ones."""
+def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measurement) -> None:
+    """Add slope, folds and stability of the out-of-phase branch, region by region."""
+    names = ("energy", "frequency", "slope", "region", "multiplier_max", "kind")
+    energy, frequency, slope, region, multiplier, kind = (branch[name].values for name in names)
+    regular = kind == 0
+    steepness = np.abs(slope * energy / frequency)
+    first = np.nonzero((region == 1) & regular)[0]
+    last = np.nonzero(regular)[0][-1]
+    folds = int(np.sum((kind == KINDS.index("fold-energy")) & (region == 2)))
+    fit = json.loads(branch.attrs["fits"]).get("III", {})
+    result.value |= {
+        f"regions, {law}": len(set(region[region > 0].tolist())),
+        f"largest |d ln f / d ln E| in region I, {law}": _largest(steepness[first]),
+        f"energy folds in region II, {law}": folds,
+        f"largest |multiplier| in region II, {law}": _largest(multiplier[region == 2]),
+        f"adjusted R^2 of the slope in region III, {law}": fit.get("adjusted_r2"),
+        f"exponent of the slope in region III, {law}": fit.get("exponent"),
+        f"last frequency (Hz), {law}": frequency[last],
+        f"energy at the end of region I (J), {law}": energy[first[-1]] if first.size else None,
+    }
+    result.uncertainty[f"points in region III, {law}"] = fit.get("points", 0)
+    result.uncertainty[f"energy of the last point (J), {law}"] = energy[last]
+
+    if law == "bilinear":
+        limit = System.from_case(case).closed_frequencies()[-1] / (2 * np.pi)
+        result.value["high-energy limit (Hz), bilinear"] = limit
+        distance = abs(frequency[last] / limit - 1)
+        result.value["last frequency's relative distance from the limit, bilinear"] = distance
+    else:
+        distance = abs(steepness[last] - HERTZ_LIMIT)
+        result.value["last d ln f / d ln E's distance from the 3/2 law's .1, hertz"] = distance
+    if folds < FEWEST_FOLDS:
+        modulus = f" at {case.contacts.modulus / 1e6:g} MPa" if case.contacts.modulus else ""
+        result.reasons.append(f"the {law} branch{modulus} has {folds} energy folds at grazing")
+
+
+def _add_in_phase(branch: xr.Dataset, law: str, result: Measurement) -> None:
+    """Add tongues, special points and largest frequency of the in-phase branch; say where they differ from ``TRUE``."""
     passed = branch["energy"].values <= HIGHEST
     kind, tongue, frequency = (branch[name].values[passed] for name in ("kind", "resonance", "frequency"))
     counts = {name: int(np.sum(kind == KINDS.index(name))) for name in TRUE[law] if name != "tongues"}
@@ -81,25 +91,32 @@ def _beside(branch: xr.Dataset, law: str, result: Measurement) -> None:
 
 
 def _largest(values: np.ndarray) -> float | None:
-    return float(np.nanmax(values)) if np.isfinite(values).any() else None
+    """The largest of ``values`` that are numbers; None if there is none."""
+    if not np.isfinite(values).any():
+        return None
+    return float(np.nanmax(values))
 
 
 def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C16: power law of the transfer in region III beside that of the branch's slope (Figs. 12, S7, S8)."""
+    """C16: power law of the transfer in region III compared with that of the branch's slope (Figs. 12, S7, S8)."""
     relation = evidence.open(INTERBAND, "backbone.h5")
     left_out = [str(text) for text in np.atleast_1d(relation.attrs.get("left_out", []))]
     curves = sorted({str(name).partition("/")[0] for name in relation.variables if str(name).startswith(f"{reading}-")})
     if not any(name.startswith(f"{reading}-{law}-{MAIN}") for name in curves for law in LAWS):
         raise MissingEvidence("; ".join([f"backbone.h5 holds no curve of the reading {reading}", *left_out]))
+
     for name in curves:
         _, law, sites, _, cycles, _ = name.split("-")
         main = name.endswith(MAIN)
-        label = law if main else f"{law}, {sites} site{'s' if sites != '1' else ''}, {cycles} cycles"
+        label = law
+        if not main:
+            label = f"{law}, {sites} {'site' if sites == '1' else 'sites'}, {cycles} cycles"
         about = {k.removeprefix(f"{name}/"): v for k, v in relation.attrs.items() if k.startswith(f"{name}/")}
         difference = abs(about["exponent"] - about["slope_exponent"])
         fitted = relation[f"{name}/fitted"].values.astype(bool)
         energy, ibtet = (relation[f"{name}/{key}"].values[fitted] for key in ("energy", "ibtet"))
         branch = (relation[f"{name}/branch/{key}"].values for key in ("energy", "slope", "region"))
+
         # Transfer over (slope / divisor + floor); the mean factor is exp of the rms logarithm.
         ratio = np.log(ibtet / (np.exp(log_slope(energy, *branch)) / about["divisor"] + about["floor"]))
         result.value |= {
@@ -131,7 +148,9 @@ def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
         touching = [i for i, run in enumerate(runs) if run.episodes]
         if len(touching) < 2 or runs[0].episodes:
             raise MissingEvidence(f"{ONE_SITE}, {law}: one amplitude without contact and two with are needed")
-        first, last = touching[0], touching[-1]
+
+        first = touching[0]
+        last = touching[-1]
         grazing = np.corrcoef(resonator[first], resonator[0])[0, 1]
         result.value |= {
             f"I: correlation of host and resonator, {law}": correlation[0],
@@ -153,7 +172,7 @@ def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
 def pair_motion(evidence: Evidence, run: AnalysedMember) -> tuple[np.ndarray, np.ndarray, float]:
     """Velocities (t) in m/s of host and resonator at the only site of a run, and how much of their motion is fast.
 
-    That is the share of the pair's kinetic energy at frequencies above the driven band, of the whole record under a
+    That is the part of the pair's kinetic energy at frequencies above the driven band, of the whole record under a
     Hann window. Raises MissingEvidence if the cell was not recorded.
     """
     model = run.case.model()
@@ -161,13 +180,17 @@ def pair_motion(evidence: Evidence, run: AnalysedMember) -> tuple[np.ndarray, np
     pair = [cell.host, cell.resonator]
     with open_run(evidence.path(ONE_SITE, run.folder.name, "run.h5")) as fields:
         site = int(fields["sites/cell"].values[0])
-        index, interval = nearest_cell(fields, site), field_interval(fields)
+        index = nearest_cell(fields, site)
+        interval = field_interval(fields)
         if "velocity" not in fields or fields["cell"].values[index] != site:
             raise MissingEvidence(f"the velocity of cell {site} was not recorded")
         velocity = fields["velocity"][:, index].values[:, pair]
+
     spectrum = np.abs(np.fft.rfft(velocity * np.hanning(len(velocity))[:, None], axis=0)) ** 2
     energy = spectrum @ np.asarray(cell.masses)[pair]
     frequency = 2 * np.pi * np.fft.rfftfreq(len(velocity), interval)
     waves = waves_at(cell, model.drive.frequency)
-    edge = pass_bands(cell)[waves[0][0] - 1].high if waves else model.drive.frequency
+    edge = model.drive.frequency
+    if waves:
+        edge = pass_bands(cell)[waves[0][0] - 1].high
     return *velocity.T, energy[frequency > edge].sum() / energy.sum()
