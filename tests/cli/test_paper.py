@@ -56,7 +56,7 @@ def made(tmp_path_factory) -> Path:
 @pytest.mark.mpirun
 def test_one_rank_makes_the_same_claims_as_two(made, tmp_path):
     done = make_paper(drawing(tiny_plan()), tmp_path / "out", only=["C8", "C11"])
-    assert set(done.made) == {"scattering", "interband", "interband-scatter"}
+    assert set(done.new_steps) == {"scattering", "interband", "interband-scatter"}
     claims = (made / "claims.json").read_bytes()
     assert (tmp_path / "out" / "claims.json").read_bytes() == claims
     assert {row["verdict"] for row in json.loads(claims)} == {"holds"}
@@ -66,7 +66,7 @@ def test_one_rank_makes_the_same_claims_as_two(made, tmp_path):
 def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(made):
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.is_file()}
     again = make_paper(drawing(tiny_plan()), made)
-    assert (again.made, again.drawn, again.complete) == ((), (), True)
+    assert (again.new_steps, again.drawn, again.complete) == ((), (), True)
     assert {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.is_file()} == before
     (made / "figures" / "fig10-reduced-model-printed.pdf").unlink()
     assert len(make_paper(drawing(tiny_plan()), made).drawn) == 3

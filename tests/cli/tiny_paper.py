@@ -92,7 +92,7 @@ def main() -> int:
     install_abort_hook()
     result = make_paper(drawing(tiny_plan()), sys.argv[1], only=sys.argv[2:])
     if MPI.COMM_WORLD.rank == 0:
-        print(json.dumps({"made": result.made, "drawn": len(result.drawn), "complete": result.complete}))
+        print(json.dumps({"made": result.new_steps, "drawn": len(result.drawn), "complete": result.complete}))
     return 0
 
 

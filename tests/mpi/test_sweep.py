@@ -117,7 +117,7 @@ def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
     stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
     stopped = run_sweep(plan, folder / "out", comm, stop=stop)
     assert stopped.resumable and not (folder / "out" / "ensemble.h5").exists()
-    assert stopped.made == stopped.count(0) + stopped.count(1)
+    assert stopped.newly_made == stopped.count(0) + stopped.count(1)
     comm.Barrier()
     assert run_sweep(plan, folder / "out", comm).complete
     assert_same_bits(datasets(folder / "out" / "ensemble.h5"), whole)

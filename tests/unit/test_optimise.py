@@ -308,7 +308,7 @@ class Scarce(ObjectiveRuns):
     """Without ranks and files: what is known is given."""
 
     def __init__(self, plan, known=()):
-        self.plan, self.recorded = plan, SimpleNamespace(known=dict(known))
+        self.plan, self.recorded = plan, SimpleNamespace(records=dict(known))
 
 
 def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
@@ -339,6 +339,6 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
         runs = RecordedRuns("small-runs", tmp_path, MPI.COMM_SELF, StopRequest()).read()
         with pytest.raises(OSError, match=r"Unable|full|0 problem"):
             runs.make(["stalls", "short"], work, failures=True)
-        known = RecordedRuns("small-runs", tmp_path, MPI.COMM_SELF, StopRequest()).read().known
+        known = RecordedRuns("small-runs", tmp_path, MPI.COMM_SELF, StopRequest()).read().records
         assert [*known] == ["stalls"] and known["stalls"]["reason"] == "stalled"
     assert asked == ["stalls", "short", "short"]

@@ -164,11 +164,11 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
     result = make.make_paper(plan, root)
     assert (
         result.notes == ["failed: other: InjectedError: a fault at member"]
-        and result.made == ("design",)
+        and result.new_steps == ("design",)
         and not result.complete
     )
     whole = make.make_paper(plan, root)
-    assert whole.made == ("other",) and whole.complete and not whole.drawn
+    assert whole.new_steps == ("other",) and whole.complete and not whole.drawn
     assert (
         set(read_record(root)["cpu"]["steps"]) == {"other", "design"}
         and "CPU time" in (root / "report.html").read_text()
@@ -184,7 +184,7 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
     ):
         os.truncate(path, path.stat().st_size // 2 if path.suffix == ".h5" else 0)
     again = make.make_paper(plan, root)
-    assert again.made == ("design",) and again.complete and picture in again.drawn
+    assert again.new_steps == ("design",) and again.complete and picture in again.drawn
     assert_same_bits(datasets(root / "design" / "design.h5"), found)
     assert (root / "claims.json").read_bytes() == claims and picture.read_bytes()[-8:-4] == b"IEND"
     (root / "plan.json").write_text("")

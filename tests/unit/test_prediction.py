@@ -142,7 +142,7 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(made):
     site = answer(made)
     assert all(0 < record["release"] < 1 for record in answers[4:])
     z = [record["z"] for record in answers]
-    np.testing.assert_allclose(site.of_bursts(np.array(z)).release, [record["release"] for record in answers])
+    np.testing.assert_allclose(site.over_bursts(np.array(z)).release, [record["release"] for record in answers])
 
 
 def test_runs_that_are_there_are_not_made_again(made, tmp_path, monkeypatch):

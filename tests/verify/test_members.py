@@ -83,7 +83,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
         damaged = [line.replace(b"2", b"3", 1) if i == number else line for i, line in enumerate(lines)]
         (out / "members.jsonl").write_bytes(b"".join(damaged))
         again = run_sweep(plan, out)
-        assert again.complete and again.made == made
+        assert again.complete and again.newly_made == made
         said = f"{out}/members.jsonl, line {number + 1}: cut off or damaged; what it told is made again"
         assert [told for told in again.warnings if "meets the right end" not in told] == [said]
         assert_same_bits(before, datasets(out / "ensemble.h5"))
@@ -91,7 +91,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
     for name in ("ensemble.h5", "index.json"):
         os.truncate(out / name, 20)
         again = run_sweep(plan, out)
-        assert again.complete and again.made == 0
+        assert again.complete and again.newly_made == 0
         assert_same_bits(before, datasets(out / "ensemble.h5"))
         assert json.loads((out / "index.json").read_text())["members"]["missing"] == 0
 
@@ -115,7 +115,7 @@ def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     assert (kept / "analysis.h5").read_bytes() == written
     os.truncate(kept / "run.h5", 300)
     again = run_sweep(Sweep.from_table(table | {"output": thin}), tmp_path / "thin")
-    assert again.made == 1 and "run.h5 cannot be read" in again.warnings[0]
+    assert again.newly_made == 1 and "run.h5 cannot be read" in again.warnings[0]
     assert_same_bits(found, datasets(kept / "run.h5"))
 
 

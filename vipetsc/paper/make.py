@@ -31,12 +31,12 @@ Announce = Callable[[str], None]
 
 @dataclass(frozen=True)
 class PaperResult:
-    """How the paper ended: steps ``made`` now, files ``drawn`` now, the rows of ``claims.json``.
+    """How the paper ended: ``new_steps`` made now, files ``drawn`` now, the rows of ``claims.json``.
 
     ``complete``: every step asked for is there, without failures; ``notes`` are warnings, and say what failed and why.
     """
 
-    made: tuple[str, ...]
+    new_steps: tuple[str, ...]
     drawn: tuple[Path, ...]
     claims: list[dict[str, Any]]
     complete: bool
@@ -73,7 +73,7 @@ def make_paper(
 def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Announce) -> PaperResult:
     """Make the steps and figures of ``part``, and from all of ``plan`` that is there the claims and the report."""
     notes: list[str] = []
-    made = make_steps(part, root, comm, stop, tell, notes)
+    new_steps = make_steps(part, root, comm, stop, tell, notes)
     stop.check(comm)
 
     # What is made from results begins when all of them are there: inputs are hashes of their contents.
@@ -88,7 +88,7 @@ def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRe
 
     left = on_root(comm, lambda: part.left(root))
     failed = any(note.startswith("failed") for note in notes)
-    return PaperResult(made=made, drawn=drawn, claims=claims, complete=not (left or failed), notes=notes)
+    return PaperResult(new_steps=new_steps, drawn=drawn, claims=claims, complete=not (left or failed), notes=notes)
 
 
 def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:

@@ -237,8 +237,8 @@ class Plan:
         names = {figure.id.lower() for figure in self.figures}
         unknown = [i for i in ids if i.lower() not in names and i.upper() not in CLAIMS]
         if unknown:
-            known = f"figures are {', '.join(f.id for f in self.figures)}; claims are C1 to C{len(CLAIMS)}"
-            raise FolderError(f"--only {' '.join(unknown)}: {known}")
+            choices = f"figures are {', '.join(f.id for f in self.figures)}; claims are C1 to C{len(CLAIMS)}"
+            raise FolderError(f"--only {' '.join(unknown)}: {choices}")
 
         wanted = {i.lower() for i in ids}
         claims = {i.upper() for i in ids}

@@ -45,11 +45,11 @@ def make_steps(
         if comm.rank == 0:
             tell(f"{', '.join(names)}: about {duration(sum(left[name] for name in names) / comm.size)}")
 
-    made: list[str] = []
+    finished: list[str] = []
     parted = [step for step in missing if step.parts]
     if parted and not stop.agreed(comm):
         announce(*(step.name for step in parted))
-        made += _make_parts(parted, stale, root, comm, stop, notes)
+        finished += _make_parts(parted, stale, root, comm, stop, notes)
 
     for step in missing:
         if step.parts:
@@ -62,10 +62,10 @@ def make_steps(
             begin = time.process_time()
             warnings = step.sweep(root, comm, stop, step.name in stale)
             notes += [f"warning: {step.name}: {warning}" for warning in warnings]
-            made.append(step.name)
+            finished.append(step.name)
             _account(root, comm, {step.name: time.process_time() - begin}, step.name in stale)
 
-    return tuple(step.name for step in missing if step.name in made)
+    return tuple(step.name for step in missing if step.name in finished)
 
 
 class PartJob(NamedTuple):
@@ -101,23 +101,23 @@ def _make_parts(
         pool = TaskPool(comm, MPI.COMM_SELF, stop)
         pool.run(sorted(jobs, reverse=True), work, fail=fail)
         failed: dict[str, str] = {}
-        for of_rank in comm.allgather(reasons):
-            failed |= of_rank
+        for from_rank in comm.allgather(reasons):
+            failed |= from_rank
         notes += [f"failed: {name}: {reason}" for name, reason in failed.items()]
 
-        made = [name for name in makers if name not in failed]
+        finished = [name for name in makers if name not in failed]
         if not (pool.stopped or stop.agreed(comm)):
-            for name in made:
+            for name in finished:
                 makers[name].publish()
     _account(root, comm, cpu, afresh=False)
-    return made
+    return finished
 
 
 def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: bool) -> None:
     """Add the CPU time in s that each rank spent on ``steps`` to the record; of steps made ``afresh`` only this."""
     spent = Counter[str]()
-    for of_rank in comm.allgather(steps):
-        spent.update(of_rank)
+    for from_rank in comm.allgather(steps):
+        spent.update(from_rank)
 
     def write() -> None:
         record = read_record(root)

@@ -111,7 +111,7 @@ class Network:
         for i in range(MOST):
             z = self._over_clearance(c, c3)
             if i < HELD:
-                on = in_contact(z, site.of_bursts(z.max(axis=1)).release) & self.during
+                on = in_contact(z, site.over_bursts(z.max(axis=1)).release) & self.during
             if not on.any():
                 break
 
@@ -185,7 +185,7 @@ class Network:
         assert wave is not None
 
         state = site.at(z)
-        burst = site.of_bursts(z.max(axis=1))
+        burst = site.over_bursts(z.max(axis=1))
         lost = state.lost * burst.lost[:, None]
         into = state.into * burst.into[:, :, None]
         power = wave.power_per_area * np.abs(c) ** 2 * waves.on

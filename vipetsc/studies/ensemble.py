@@ -123,7 +123,7 @@ class Results:
 
     def _enter_linear(self, record: Record, line: Line) -> None:
         """Take the ``record`` of a linear run, which may be measured for other sites than an earlier one."""
-        run = LinearRun.of_record(record)
+        run = LinearRun.from_record(record)
         name = record["linear"]
         self.linear[name] = run.joined(self.linear.get(name))
         self.lines[f"{name} {[*run.measures]}"] = line

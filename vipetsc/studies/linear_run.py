@@ -109,7 +109,7 @@ class LinearRun(NamedTuple):
         }
 
     @classmethod
-    def of_record(cls, record: Record) -> Self:
+    def from_record(cls, record: Record) -> Self:
         """The run that a ``record`` holds."""
         return cls(
             envelope=np.array(record["envelope"], float),
@@ -204,5 +204,5 @@ def read_linear(sweep: Path, case: Case) -> LinearRun | None:
     for path in RecordPaths(sweep, MEMBERS).existing():
         for record, _ in read_records(path, damaged=lambda text: None):
             if record.get("linear") == name and "envelope" in record:
-                run = LinearRun.of_record(record)
+                run = LinearRun.from_record(record)
     return run

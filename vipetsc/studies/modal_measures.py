@@ -113,19 +113,19 @@ def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict
         "bands/transfer": transfer,
         "bands/cluster_begin": time[clusters.bounds[:, 0]],
         "bands/cluster_end": time[clusters.bounds[:, 1]],
-        "bands/episode": np.arange(1, len(clusters.of_episode) + 1),
-        "bands/cluster_of_episode": clusters.of_episode + 1,
+        "bands/episode": np.arange(1, len(clusters.by_episode) + 1),
+        "bands/cluster_of_episode": clusters.by_episode + 1,
     }
 
 
 class Clusters(NamedTuple):
     """Samples (cluster, begin and end) that bound the contacts, which lie at multiples of ``stride``.
 
-    ``of_episode`` is the cluster of every contact episode.
+    ``by_episode`` is the cluster of every contact episode.
     """
 
     bounds: np.ndarray
-    of_episode: np.ndarray
+    by_episode: np.ndarray
     stride: int
 
 

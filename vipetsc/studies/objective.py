@@ -71,7 +71,7 @@ class ObjectiveRuns:
     def losses(self, design: Case) -> tuple[list[float], str]:
         """How far a ``design`` whose runs were made is from each goal, small is good; NaN if one failed, and why."""
         objectives = self.plan.options.objective
-        records = {key: self.recorded.known[case_id(run)] for key, run in self.runs(design).items()}
+        records = {key: self.recorded.records[case_id(run)] for key, run in self.runs(design).items()}
         for (amplitude, _), record in records.items():
             if "reason" in record:
                 return [np.nan] * len(objectives), f"{amplitude:g} N: {record['reason']}"
@@ -89,7 +89,7 @@ class ObjectiveRuns:
 
     def values(self, run: Case) -> dict[str, Any]:
         """What was measured of a ``run`` that has a record; nothing of one that failed."""
-        return dict(self.recorded.known[case_id(run)].get("values", {}))
+        return dict(self.recorded.records[case_id(run)].get("values", {}))
 
 
 def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[ObjectiveTable]) -> dict[str, Any]:

@@ -96,7 +96,7 @@ class ScatteringRuns:
     @property
     def records(self) -> dict[Any, Record]:
         """What was recorded of the runs, by z."""
-        return self.recorded.known
+        return self.recorded.records
 
     def make(self, points: Iterable[float], progress: bool = False) -> None:
         """Make the runs with a site at ``points`` that are missing; raises RuntimeError if one fails. Collective."""

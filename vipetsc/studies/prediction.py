@@ -159,7 +159,7 @@ class PredictionRuns:
             return {"kind": job.kind, "at": job.at} | record
 
         self.recorded.make(jobs, work, what=f"{jobs[0].kind} runs", progress=self.progress)
-        return [self.recorded.known[job] for job in jobs]
+        return [self.recorded.records[job] for job in jobs]
 
     def _linear(self, amplitude: float) -> Record:
         """The lattice without contacts: the largest w at the sites over the clearances, work, energies."""

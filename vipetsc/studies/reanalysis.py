@@ -51,11 +51,11 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str
     runs, sweeps = on_root(comm, look)
 
     def measure_own() -> list[Path]:
-        of_this_rank = runs[comm.rank :: comm.size]
-        return [measure_run(run.folder, run.sweep, run.measures, overrides) for run in of_this_rank]
+        runs_here = runs[comm.rank :: comm.size]
+        return [measure_run(run.folder, run.sweep, run.measures, overrides) for run in runs_here]
 
     measured_here = on_every_rank(comm, measure_own)
-    written = sorted(path for of_rank in comm.allgather(measured_here) for path in of_rank)
+    written = sorted(path for from_rank in comm.allgather(measured_here) for path in from_rank)
     return written + on_root(comm, lambda: [_reassemble(folder) for folder in sweeps])
 
 
@@ -66,7 +66,7 @@ def _reassemble(folder: Path) -> Path:
         raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
 
     # New records behind the old ones: the latest of a member counts.
-    file = RecordFile(results.paths.of_rank(0))
+    file = RecordFile(results.paths.for_rank(0))
     for name in results.ids:
         path = folder / name / "analysis.h5"
         if path.exists():

@@ -39,7 +39,7 @@ class RecordPaths:
         """The file of all records."""
         return self.folder / f"{self.name}.jsonl"
 
-    def of_rank(self, rank: int) -> Path:
+    def for_rank(self, rank: int) -> Path:
         """The file that ``rank`` appends to."""
         return self.folder / f"{self.name}-{rank}.jsonl"
 
@@ -56,7 +56,7 @@ class RecordPaths:
 class RecordedRuns:
     """Runs made by teams of ``ranks`` of ``comm``, and their records called ``name`` in ``folder``.
 
-    ``team`` are the ranks that work on a run together with this one; the first of them appends its record. ``known``
+    ``team`` are the ranks that work on a run together with this one; the first of them appends its record. ``records``
     are the records by key, on all ranks: those that are there, once they are ``read``, and those that are made after
     that. ``failures`` are the exceptions that a single run may end in.
     """
@@ -75,12 +75,12 @@ class RecordedRuns:
         self.team = comm.Split(comm.rank // ranks, comm.rank)
         self.pool = TaskPool(comm, self.team, stop, failures)
         self.paths = RecordPaths(folder, name)
-        self.file = RecordFile(self.paths.of_rank(comm.rank))
-        self.known: dict[Key, Record] = {}
+        self.file = RecordFile(self.paths.for_rank(comm.rank))
+        self.records: dict[Key, Record] = {}
 
     def read(self) -> "RecordedRuns":
-        """Take the records that are there as ``known``, on all ranks; returns itself. Collective."""
-        self.known = on_root(self.comm, lambda: {key: record for key, (record, _) in self._read().items()})
+        """Take the records that are there as ``records``, on all ranks; returns itself. Collective."""
+        self.records = on_root(self.comm, lambda: {key: record for key, (record, _) in self._read().items()})
         return self
 
     def make(
@@ -92,13 +92,13 @@ class RecordedRuns:
         progress: bool = False,
         failures: bool = False,
     ) -> None:
-        """Make the records of unknown ``keys`` by ``work``, which all ranks of a team call. Collective.
+        """Make the records of those ``keys`` that have none by ``work``, which all ranks of a team call. Collective.
 
         The record of a run that fails is its ``reason`` if ``failures`` may be; else RuntimeError is raised on all
         ranks. Raises OSError on all, and there is no record, if memory or disk is short or if it was no failure
         of the run itself: it may succeed the next time. Raises StoppedError on all if some rank got a request to stop.
         """
-        missing = [key for key in dict.fromkeys(keys) if key not in self.known]
+        missing = [key for key in dict.fromkeys(keys) if key not in self.records]
         recorded: dict[Key, Record] = {}
         failed: list[str] = []
 
@@ -121,11 +121,11 @@ class RecordedRuns:
         self.pool.run(missing, make_one, Progress(self.comm, len(missing), what, show=progress and bool(missing)), fail)
         self.file.close()
         for records in self.comm.allgather(recorded):
-            self.known |= records
+            self.records |= records
         if self.pool.stopped:
-            raise StoppedError(f"stopped on request with {len(self.known)} runs; the same command goes on")
+            raise StoppedError(f"stopped on request with {len(self.records)} runs; the same command goes on")
 
-        reasons = [reason for of_rank in self.comm.allgather(failed) for reason in of_rank]
+        reasons = [reason for from_rank in self.comm.allgather(failed) for reason in from_rank]
 
         def check() -> None:
             if reasons:

@@ -276,7 +276,7 @@ class SiteResponse(NamedTuple):
         """Complex ``values`` at ``x``."""
         return np.asarray(np.interp(x, self.x, values.real) + 1j * np.interp(x, self.x, values.imag))
 
-    def of_bursts(self, largest: np.ndarray) -> BurstState:
+    def over_bursts(self, largest: np.ndarray) -> BurstState:
         """What holds over bursts with these ``largest`` z (site)."""
         x = np.log(np.maximum(largest, 1e-9))
         factors = np.array([np.interp(x, self.peaks, row) for row in self.factor])

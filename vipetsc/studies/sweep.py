@@ -32,12 +32,12 @@ MOST_SURVEYED = 10_000  # members whose cases are made beforehand, for their lin
 class SweepResult:
     """How a sweep ended: ``status`` (member), an index of ``studies.ensemble.STATUS``.
 
-    ``made`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
+    ``newly_made`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
     rank worked on members. ``warnings`` are sentences about records made again and about the members' results.
     """
 
     status: np.ndarray
-    made: int
+    newly_made: int
     seconds: float
     busy: tuple[float, ...]
     folder: Path
@@ -111,7 +111,7 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
 
     order = on_root(comm, lambda: surveys[0].order(runs.linear))
     bar = Progress(comm, len(order), "runs", show=progress)
-    made = pool.run(order, runs.make, bar, runs.fail)
+    newly_made = pool.run(order, runs.make, bar, runs.fail)
     runs.recorded.file.close()
 
     seconds = time.perf_counter() - begin
@@ -125,13 +125,13 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
 
     status, warnings = on_root(comm, put_together)
     runs.recorded.team.Free()
-    return SweepResult(status, made, seconds, busy, folder, warnings)
+    return SweepResult(status, newly_made, seconds, busy, folder, warnings)
 
 
 def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:
     """Give every rank the linear runs of all, each with all measures that any rank took of it."""
-    for of_rank in comm.allgather(runs.linear):
-        for name, run in of_rank.items():
+    for from_rank in comm.allgather(runs.linear):
+        for name, run in from_rank.items():
             runs.linear[name] = run if isinstance(run, str) else run.joined(runs.linear.get(name))
 
 
