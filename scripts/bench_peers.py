@@ -212,6 +212,7 @@ def compiled_right_hand_side(model: Model) -> RightHandSide:
 
 @cache
 def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> RightHandSide:
+    """The compiled right-hand side; ``driven`` is the number of the driven mass."""
     # Arrays and numbers of this function are constants in the kernel: it is compiled for one lattice.
     stiffness = chain.stiffness_matrix().tocsr()
     first = stiffness.indptr

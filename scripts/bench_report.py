@@ -87,6 +87,7 @@ def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
 
 
 def _whole_sentence(found: dict[str, Any]) -> str:
+    """CPU time of whole runs, and of a right-hand side."""
     runs = ", ".join(f"{engine} {seconds:.2f} s" for engine, seconds in found["whole"].items())
     return (
         f"Built-in case, from start to `run.h5`: {runs} of CPU. One right-hand side at"
@@ -95,12 +96,14 @@ def _whole_sentence(found: dict[str, Any]) -> str:
 
 
 def _paper_sentence(found: dict[str, Any]) -> str:
+    """CPU time of the paper, by stage."""
     budget = found["paper"]
     stages = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in sorted(budget.items(), key=lambda s: -s[1]))
     return f"The paper: {sum(budget.values()):.0f} s of CPU over all ranks. By stage: {stages}."
 
 
 def _builds_table(found: dict[str, Any]) -> str:
+    """Set-up and files of large lattices."""
     lines = [
         "| cells | sites | ranks | set-up (s) | velocities written (GB) | in (s) | peak GiB a rank |",
         "|---" * 7 + "|",
@@ -116,6 +119,7 @@ def _builds_table(found: dict[str, Any]) -> str:
 
 
 def _scaling_table(found: dict[str, Any]) -> str:
+    """Wall time and memory over cells and ranks."""
     lines = [
         "| engine | cells | ranks | ms per 2e-4 s | two ranks gain (bare memory gains) | peak GiB a rank"
         " | share of bandwidth limit |",
@@ -135,6 +139,7 @@ def _scaling_table(found: dict[str, Any]) -> str:
 
 
 def _power(value: float) -> str:
+    """A power of ten as ``1e-8``, not ``1e-08``."""
     return f"{value:.0e}".replace("e-0", "e-")
 
 

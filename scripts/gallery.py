@@ -62,8 +62,9 @@ def make_small(source: Path, target: Path) -> None:
 def make(page: Path, folder: Path) -> None:
     """Run the commands of a page in ``folder``, and renew its pictures."""
     for words in commands(page):
-        here = [sys.executable if word == "python" else word for word in words]
-        subprocess.run(here, cwd=folder, check=True)
+        # This interpreter, whatever `python` is on the path.
+        command = [sys.executable if word == "python" else word for word in words]
+        subprocess.run(command, cwd=folder, check=True)
     for target in pictures(page):
         run, figure = target.name.split(".", 1)
         make_small(folder / "runs" / run / "figures" / figure, target)

@@ -32,6 +32,7 @@ def branch_kind(branch: xr.Dataset) -> str:
 
 
 def _kind_by_variables(branch: xr.Dataset) -> str:
+    """Return the kind of a file without the attribute, by variables that only that kind has."""
     if "share" in branch:
         return RESPONSES
     if "harmonics" in branch:

@@ -94,6 +94,7 @@ class Chunks(Protocol):
 
 def ranges(numbers: np.ndarray) -> np.ndarray:
     """Half-open ranges (range, 2) of consecutive ``numbers``."""
+    # -2 is no cell's number, nor next to one: there is a break at both ends.
     breaks = np.diff(numbers, prepend=-2, append=-2) != 1
     return np.stack([numbers[breaks[:-1]], numbers[breaks[1:]] + 1], axis=1)
 

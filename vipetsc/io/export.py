@@ -44,7 +44,7 @@ def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> 
     _child(grid, "Time", Value="{time!r}")
     _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=mesh)
     geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
-    # Cells along the slow axis.
+    # Cells along the slow axis, as the datasets have them; a single cell has no spacing of its own.
     spacing = cells[1] - cells[0] if len(cells) > 1 else 1
     _child(geometry, "DataItem", _words((cells[0], 1)), Dimensions="2", Format="XML")
     _child(geometry, "DataItem", _words((spacing, 1)), Dimensions="2", Format="XML")

@@ -91,7 +91,7 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
     if reason:
         raise ValueError(reason)
     with open_netcdf(folder / "ensemble.h5", "sweep's ensemble", ("status", "case")) as file:
-        data = file.assign_attrs(folder=str(folder)).load()
+        data = file.assign_attrs(folder=str(folder)).load()  # before the file is closed
 
     zipped = [key for group in tomllib.loads(data.attrs["case"])["sweep"]["zip"] for key in group]
     further = [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in zipped]

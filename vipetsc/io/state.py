@@ -82,6 +82,7 @@ class State(NamedTuple):
         """Largest displacement, or velocity over ``frequency`` in rad/s, in m, and the cell (1-based) that has it."""
         if not self.cell.size:
             return 0.0, 1
+        # A velocity over the frequency is the displacement that the motion swings to.
         sizes = np.maximum(np.abs(self.displacement), np.abs(self.velocity) / frequency).max(axis=1, initial=0.0)
         return float(sizes.max()), int(self.cell[np.argmax(sizes)])
 

@@ -103,6 +103,7 @@ def linear_modes(chain: Chain) -> Modes:
 
 @lru_cache(maxsize=4)
 def _modes(chain: Chain) -> Modes:
+    """The modes of a chain without sites, as ``linear_modes``."""
     ring = chain.ends == "periodic"
     many = chain.cells * chain.cell.dofs > MOST_DOFS
     if chain.is_uniform() and (ring or many):

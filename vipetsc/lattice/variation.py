@@ -46,6 +46,7 @@ class Variation:
 
     @cached_property
     def _digest(self) -> bytes:
+        """Digest of all arrays: chains are keys of caches, which compare them at each look-up."""
         return hashlib.sha256(b"".join(name.encode() + array.tobytes() for name, array in self.items())).digest()
 
     def __eq__(self, other: object) -> bool:
