@@ -55,6 +55,8 @@ def parameters(model: Model) -> str:
     drive = model.drive
     if contact.restitution != 1 or chain.ends == "periodic":
         raise ValueError("the peers know conservative lattices with fixed or free ends only")
+    if contact.law not in ("hertz", "bilinear"):
+        raise ValueError(f"the peers know the laws hertz and bilinear, not {contact.law}")
 
     couplings = chain.cell.couplings()
     lines = [
@@ -221,8 +223,12 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
     inverse_mass = 1 / chain.masses()
     n = inverse_mass.size
     host, resonator, clearance = _pairs(chain)
-    contact, exponent, n = law.stiffness, law.exponent, inverse_mass.size
-    amplitude, frequency, cycles, end = drive.window_amplitude, drive.frequency, drive.cycles, drive.duration
+    contact = law.stiffness
+    exponent = law.onset_exponent  # hertz and bilinear are powers throughout
+    amplitude = drive.window_amplitude
+    frequency = drive.frequency
+    cycles = drive.cycles
+    end = drive.duration
 
     @numba.njit
     def slope(t: float, y: np.ndarray) -> np.ndarray:
