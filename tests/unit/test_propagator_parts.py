@@ -1,4 +1,4 @@
-"""The propagator's parts alone: stencil against the matrix exponential; collocation; grouping."""
+"""The propagator's parts alone: stencil against the matrix exponential; grouping; series; collocation; kinks; tape."""
 
 import re
 from math import factorial
@@ -12,10 +12,11 @@ from scipy.integrate import trapezoid
 from tests.conftest import small_case
 from tests.unit.test_exact_lattices import exponential
 from vipetsc.case import Case
-from vipetsc.contact.law import CLOSED, create_contacts
+from vipetsc.contact.law import CLOSED, PERMANENT, create_contacts
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.advance import DONE, advance_cluster, first_kink
 from vipetsc.dynamics.propagator.clusters import (
     Groups,
     create_dof_tables,
@@ -33,7 +34,7 @@ from vipetsc.dynamics.propagator.collocation import (
 )
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
-from vipetsc.dynamics.propagator.series import StepSeries, evaluate, shift
+from vipetsc.dynamics.propagator.series import StepSeries, copy, evaluate, first_onset, shift
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.substeps import (
     HISTORY,
@@ -43,6 +44,7 @@ from vipetsc.dynamics.propagator.substeps import (
     Trial,
     create_tape,
     create_trial,
+    write_on_tape,
 )
 from vipetsc.dynamics.propagator.tangent import no_samples
 from vipetsc.dynamics.vectors import LANES
@@ -177,6 +179,58 @@ def test_a_shifted_series_is_the_same_function():
         np.testing.assert_allclose(evaluate(series, 0.8), evaluate(other, 0.43), rtol=1e-12)
 
 
+def test_a_series_is_shifted_in_place_and_its_rows_are_copied_in_part():
+    taylor = np.random.default_rng(4).normal(size=(3, 7))
+    expected = np.empty_like(taylor)
+    shift(taylor, -0.6, expected)
+    in_place = taylor.copy()
+    shift(in_place, -0.6, in_place)
+    assert in_place.tobytes() == expected.tobytes()
+    rows = np.zeros((2, 7))
+    copy(taylor, rows)
+    np.testing.assert_array_equal(rows, taylor[:2])
+    # A workspace for more DoFs keeps what it had of the others.
+    room = np.full((5, 7), 9.0)
+    shift(taylor, -0.6, room)
+    np.testing.assert_array_equal(room[:3], expected)
+    assert (room[3:] == 9.0).all()
+
+
+@pytest.mark.parametrize(
+    ("series", "clearances", "length", "onset"),
+    [
+        ([0.0, 1.0], (0.4, 0.4), 1.0, 0.4),
+        ([0.0, -1.0], (0.4, 0.4), 1.0, 0.4),
+        ([0.0, -1.0], (0.4, 0.3), 1.0, 0.3),
+        ([0.0, -1.0], (0.4, 0.3), 0.35, 0.3),
+        ([0.0, -1.0], (0.4, np.inf), 1.0, 2.0),
+        ([0.0, 1.0], (np.inf, 0.4), 1.0, 2.0),
+        ([0.0, 1.0], (0.4, 0.4), 0.39, 2.0),
+        ([0.0, 0.0, 1.0], (0.2, 0.2), 0.5, 0.2**0.5),
+        ([0.0, 0.0, 1.0], (0.3, 0.3), 0.5, 2.0),
+        # Both sides within the length: the first of the two.
+        ([0.0, 2.0, -6.0], (0.1, 0.1), 1.0, (1 - 0.4**0.5) / 6),
+        ([0.0, -2.0, 6.0], (0.1, 0.1), 1.0, (1 - 0.4**0.5) / 6),
+        # Away from a clearance on which it begins, and back; towards it; a little beyond it.
+        ([0.3, -1.0, 1.0], (0.3, 0.3), 1.2, 1.0),
+        ([0.3, 1.0, 0.0], (0.3, 0.3), 1.2, 0.0),
+        ([0.3 * (1 + 1e-12), 1.0, 0.0], (0.3, 0.3), 1.2, 0.0),
+        # At rest on a clearance, then away to the other side; almost at rest just before it.
+        ([0.3, 0.0, -1.0], (0.3, 0.3), 1.0, 0.6**0.5),
+        ([0.3 - 1e-11, 1e-9, 1.0], (0.3, 0.3), 1.0, 0.0),
+        # Away at first, and back faster and faster: w = 4 s^3 - s.
+        ([0.0, -1.0, 0.0, 4.0], (0.3, 0.3), 1.0, np.roots([4.0, 0.0, -1.0, -0.3]).real.max()),
+        # A short approach with much curvature; one that turns just short of the clearance, or just beyond.
+        ([0.0, 0.0, 0.0, 40.0], (0.3, 0.3), 1.0, (0.3 / 40) ** (1 / 3)),
+        ([0.0, 1.0, -1.0], (0.25 + 1e-7, 0.25 + 1e-7), 1.0, 2.0),
+        ([0.0, 1.0, -1.0], (0.25 - 1e-7, 0.25 - 1e-7), 1.0, 0.5 - 1e-7**0.5),
+    ],
+)
+def test_the_first_onset_is_met_to_rounding(series, clearances, length, onset):
+    site = create_contacts(small_case().model().contact, [clearances])[0]
+    assert first_onset(np.array(series), site, length) == pytest.approx(onset, rel=2e-10, abs=1e-14)
+
+
 def test_nodes_have_the_order_of_gauss_and_follow_roots():
     table = collocation(4)
     position, weight = table.position, table.weight
@@ -276,6 +330,134 @@ def test_responses_are_added_up_over_all_terms():
     phase, h = turn * 0.9 * nodes.position[PLAIN], cluster.interval
     np.testing.assert_allclose(to_w.sum(axis=0), (1 - np.cos(phase)) * h**2 / (mass * turn**2), rtol=1e-11)
     np.testing.assert_allclose(to_v.sum(axis=0), np.sin(phase) * h / (mass * turn), rtol=1e-11)
+
+
+def pressed(gap: float, side: int = 1) -> Cluster:
+    """The mass of ``oscillator`` on a stop without modes at ``gap`` on one side."""
+    cluster, _ = oscillator()
+    cluster.contacts["mode"] = side * PERMANENT
+    cluster.contacts["clearance"] = cluster.contacts["clearance_minus"] = gap
+    cluster.contacts["scale"] = 0.5
+    # Accelerations need a second term, which is zero: the mass is free between its contacts.
+    response = np.append(cluster.response, np.zeros((1, 1, 1)), axis=2)
+    zeros = np.zeros((2, 1, 4))
+    return cluster._replace(
+        response=response, taylor=zeros[0], moments=zeros[1], nodes=collocation(4), trial=create_trial(1, 2)
+    )
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("gap", [0.0, -0.3])
+@pytest.mark.parametrize(
+    ("motion", "kink"),
+    [
+        ([0.2, -1.0], 0.2),
+        ([-0.2, 1.0], 0.2),
+        ([-0.2, -1.0], 2.0),
+        ([0.2, 1.0], 2.0),
+        ([1.2, -1.0], 2.0),
+        # On the kink at the beginning: the direction decides, and it may come back.
+        ([0.0, 1.0, -2.0], 0.5),
+        ([0.0, -1.0, 2.0], 0.5),
+        ([0.0, 1.0, 0.0], 2.0),
+        ([0.0, -1.0, 0.0], 2.0),
+        ([2e-11, -1.0, 2.0], 0.5),
+        ([-2e-11, 1.0, -2.0], 0.5),
+        ([1e-10, -1.0, 2.0], 1e-10),
+        ([-1e-10, 1.0, -2.0], 1e-10),
+        # The substep ends on it; it opens and closes inside; it touches from either side.
+        ([1.0, -1.0], 2.0),
+        ([-1.0, 1.0], 2.0),
+        ([1.0 - 2e-11, -1.0], 2.0),
+        ([1.0 - 1e-10, -1.0], 1.0 - 1e-10),
+        ([0.16, -1.0, 1.0], 0.2),
+        ([-0.16, 1.0, -1.0], 0.2),
+        ([0.26, -1.0, 1.0], 2.0),
+    ],
+)
+def test_a_kink_is_found_where_a_pressed_contact_opens_or_closes(side, gap, motion, kink):
+    """``motion`` is the depth as a polynomial in the position within the substep."""
+    cluster = pressed(gap, side)
+    length = 0.5
+    seconds = length * cluster.interval
+    for out, s in ((cluster.site_motion, 0.0), (cluster.trial.site_motion, 1.0)):
+        depth = np.polynomial.Polynomial(motion)
+        out[0] = side * (depth(s) + gap), side * depth.deriv()(s) / seconds, side * depth.deriv(2)(s) / seconds**2
+    assert first_kink(cluster, cluster.trial, length) == pytest.approx(kink, rel=1e-9)
+    # Other contacts have modes, which are searched for elsewhere.
+    cluster.contacts["mode"] = side * CLOSED
+    assert first_kink(cluster, cluster.trial, length) == 2.0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_substeps_end_where_a_pressed_contact_opens_and_closes(side):
+    """A mass pressed on a bilinear stop by a load P = k p: w'' = -omega^2 w while w > -p, then w'' = P/m, and back."""
+    speed, depth, mass, rate = 0.13, 4e-6, 0.02, 3e4
+    cluster = pressed(-depth, side)
+    h = cluster.interval
+    cluster.contacts["preload"] = side * mass * rate**2 * depth
+    cluster.taylor[0, 1] = -side * speed * h
+    cluster.state["length"] = 1.0
+    assert advance_cluster(cluster) == DONE
+
+    # The phase at which it opens, the time in the air, and the rest of the step on the stop again.
+    opening = np.arcsin(depth * rate / speed) / rate
+    rebound = np.sqrt(speed**2 - (depth * rate) ** 2)
+    flight = 2 * rebound / (rate**2 * depth)
+    remaining = h - opening - flight
+    assert remaining > 0
+    w = -depth * np.cos(rate * remaining) + rebound / rate * np.sin(rate * remaining)
+    v = rate * depth * np.sin(rate * remaining) + rebound * np.cos(rate * remaining)
+    assert cluster.taylor[0, 0] == pytest.approx(side * w, abs=1e-10 * depth)
+    assert cluster.taylor[0, 1] / h == pytest.approx(side * v, abs=1e-10 * speed)
+    assert cluster.state["position"] == 1.0
+
+
+def test_a_tape_knows_the_substep_in_which_a_contact_begins():
+    """The onset, and the position at which the substep begins, were summed in another order."""
+    cluster, _ = oscillator()
+    h = cluster.interval
+    cases = [(0.0, 3e-3, (3e-3 - 1e-9) * h, 0), (0.0, 3e-3, (3e-3 + 1e-9) * h, 0)]
+    for begin, position in ((0.0, 3e-3), (0.7, 0.25), (40.0, 0.999)):
+        time = begin + position * h
+        # Two roundings of the time, or of the step, either way; and a substep of the shortest length after the onset.
+        slip = 2.0 * max(np.spacing(time), np.spacing(h))
+        cases += [(begin, position, time, 1), (begin, position, time - slip, 1), (begin, position, time + slip, 1)]
+    tape = create_tape(1, len(cases), NODES)
+    cluster = cluster._replace(tape=tape)
+    for begin, position, onset, _ in cases:
+        cluster.state["begin"], cluster.state["position"] = begin, position
+        cluster.history["onset"] = onset
+        write_on_tape(cluster, cluster.trial, Substep(PLAIN, 1e-3))
+    assert tape.rows["onset"][0].tolist() == [expected for *_, expected in cases]
+
+
+def test_a_tape_holds_the_closed_sites_of_a_substep_and_counts_rows_beyond_its_end():
+    cluster, _ = oscillator()
+    tape = create_tape(1, 2, NODES)
+    # Two sites, of which the second one is closed.
+    cluster = cluster._replace(
+        contacts=cluster.contacts.repeat(2),
+        site_motion=np.array([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0]]),
+        history=cluster.history.repeat(2),
+        tape=tape,
+    )
+    cluster.state["begin"], cluster.state["position"] = 0.3, 0.25
+    cluster.contacts["approach"] = 9.0, 0.75
+    trial = create_trial(2, 1)._replace(closed=np.array([1]))
+    trial.w[1], trial.v[1] = np.arange(NODES), -np.arange(NODES)
+    for kind in (ONSET, EXIT, PLAIN):
+        write_on_tape(cluster, trial, Substep(kind, 0.125))
+    assert tape.used[0] == 3
+    assert tape.rows["kind"].tolist() == [[ONSET, EXIT]]
+    expected = {"begin": 0.3, "position": 0.25, "length": 0.125, "approach": 0.75, "rate": 2.0, "acceleration": 3.0}
+    for name, value in (expected | {"site": 1, "mode": CLOSED}).items():
+        assert (tape.rows[name] == value).all(), name
+    np.testing.assert_array_equal(tape.motion[0, 1], [np.arange(NODES), -np.arange(NODES)])
+    # Without rows nothing is written, and nothing counted.
+    cluster = cluster._replace(tape=create_tape(1, 0))
+    write_on_tape(cluster, trial, Substep(PLAIN, 0.125))
+    assert cluster.tape.used[0] == 0
 
 
 def test_ten_thousand_sites_are_set_up_and_gone_on_with():

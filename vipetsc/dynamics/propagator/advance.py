@@ -129,7 +129,7 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
 
 
 @kernel
-def _first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
+def first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
     """Position, as a fraction of a substep tried, at which the first contact without modes opens or closes.
 
     2 if none does inside.
@@ -167,7 +167,7 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
     """
     state = cluster.state[0]
     for _ in range(MOST_ATTEMPTS):
-        fraction = _first_kink(cluster, trial, substep.length)
+        fraction = first_kink(cluster, trial, substep.length)
         if fraction > 1.0 or fraction * substep.length < SHORTEST:
             break
         substep = Substep(substep.kind, fraction * substep.length)
