@@ -23,7 +23,7 @@ beforehand: a site with sum |a_k| < D cannot touch. Otherwise |w''| <= B = sum k
 on the side sigma one may go from s by the d with D - sigma w - sigma w' d - B d^2/2 = 0 without passing an onset, and
 such steps converge to the first one.
 
-**3. Forces** (``collocation``). An impulse on DoF l moves DoF i by G_il(s) = sum_m g_ilm s^(2m+1), odd
+**3. Forces** (``collocation``, ``nodes``). An impulse on DoF l moves DoF i by G_il(s) = sum_m g_ilm s^(2m+1), odd
 coefficients as in 1. While forces act,
 
     x_i(s) = a_i(s) + H sum_l integral_0^s G_il(s - z) F_l(z, x_l, x'_l) dz,
@@ -37,9 +37,10 @@ which h is controlled. After the substep the a_i are shifted to its end, and the
 
 **4. Changes** (``advance``). Substeps are searched for changes of a site's mode on the quintic Hermite interpolant of w
 and repeated so that they end on the first one: see ``vipetsc.contact``. Contacts that touch or are pressed at rest act
-always, F being what they have beyond their load, and are never searched.
+always, F being what they have beyond their load. They change no mode, but F has a kink where they open or close, and
+substeps end there, too.
 
-**5. What forces leave in the lattice** (``series``). K and M are symmetric, and so is (-A)^m M^-1: the motion
+**5. What forces leave in the lattice** (``clusters``). K and M are symmetric, and so is (-A)^m M^-1: the motion
 after an impulse on a DoF, (-A)^m M^-1 c^T = M^-1 (c (-A)^m)^T, has the rows of 2 again (Maxwell's reciprocity). With
 the moments mu_k = integral of F (1 - s)^k dt over the step,
 
@@ -67,7 +68,13 @@ what those beyond would change took a way out there and back, and counts as entr
 ones around them share their rows. omega_max and gamma are the largest of all cells; r and the truncation are those of a
 lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude that any cell's has.
 
-**9. Variations** of the state beside an orbit move by P and by one small matrix a step in contact: ``tangent_kernels``.
+**9. Variations** of an orbit move by P and by one small matrix a step in contact: ``tangent``, ``tangent_kernels``.
+
+**Modules**, from the lattice to the engine. ``rows``: powers of the lattice's matrix, row by row. ``series``: how many
+of them count, and how far. ``stencil``: P on a rank's cells. ``clusters``: contact DoFs, their groups and tables.
+``nodes``: tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
+``advance``: substeps up to a change of modes. ``forces``: changes up to the step's end. ``engine``: steps up to the
+sample. ``tangent`` and ``tangent_kernels``: variations.
 
 References
 ----------

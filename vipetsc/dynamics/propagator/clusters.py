@@ -180,8 +180,8 @@ def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.n
 
     band = 2 * series.reach + 1
     for end in range(joined):
-        for row, form, around in zip(rows, forms[:, end], series.rows(cells[:, end]), strict=True):
-            part = series.cut(around, -series.reach, band).astype(float)
+        for row, form, mass_rows in zip(rows, forms[:, end], series.rows(cells[:, end]), strict=True):
+            part = series.cut(mass_rows, -series.reach, band).astype(float)
             # The rows of a mass in the next cell lie one cell further on.
             row[:, end : end + band] += np.einsum("i,imjc->jcm", form, part)
     return rows

@@ -313,7 +313,7 @@ def first_onset(series: np.ndarray, site: Any, length: float) -> float:
                 first = min(first, s)
                 break
             # The root of curvature/2 d^2 + closing d = gap, without cancellation. The gap is taken larger by the
-            # tolerance, since steps that shrink with it would never reach the clearance.
+            # tolerance: so far beyond the clearance an onset is still met.
             gap += tolerance
             root = np.sqrt(max(closing * closing + 2.0 * curvature * gap, 0.0))
             step = 2.0 * gap / (closing + root) if closing > 0.0 else (root - closing) / curvature
