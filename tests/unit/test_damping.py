@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import small_case
-from tests.unit.test_variation import CELLS, ENDS, varied
+from tests.unit.test_inhomogeneity import CELLS, ENDS, varied
 from vipetsc.case import Case
 from vipetsc.contact.law import CLOSED
 from vipetsc.dynamics import simulate

@@ -140,7 +140,7 @@ class Halves(Observer):
         self.sums = []
 
     def observe(self, block):
-        fields = block.share.fields[:, : block.share.rows(len(block))]
+        fields = block.samples.fields[:, : block.samples.rows(len(block))]
         self.sums += fields.sum(axis=(0, 2, 3)).tolist()
         if 100 in range(block.first, block.first + len(block)):
             raise RunawayError("far enough", 100 - block.first)

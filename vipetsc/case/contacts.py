@@ -44,10 +44,13 @@ def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid
     if each.keys() & {*MATERIAL} and (lacking := [k for k in MATERIAL if None in values_of_sites(contacts, k, count)]):
         yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
     laws = values_of_sites(contacts, "law", count) if count else [contacts.law]
-    exponents = values_of_sites(contacts, "exponent", max(count, 1))
-    if ("power" in laws) != (exponents != [None] * len(exponents)):
-        remedy = 'is for law = "power"' if "power" not in laws else 'missing; the law "power" needs it'
-        yield Problem(where("exponent"), each.get("exponent", contacts.exponent), remedy)
+    for key, parameter in PARAMETERS.items():
+        values = values_of_sites(contacts, key, max(count, 1))
+        is_given = any(value is not None for value in values)
+        if is_given and parameter.law not in laws:
+            yield Problem(where(key), each.get(key, getattr(contacts, key)), f'is for law = "{parameter.law}"')
+        if parameter.law in laws and not is_given:
+            yield Problem(where(key), None, f'missing; the law "{parameter.law}" needs it')
     names, restitutions = (values_of_sites(contacts, key, count) for key in ("damping", "restitution"))
     for name, asked in sorted(set(zip(names, restitutions, strict=True)), key=str) or [
         (contacts.damping, contacts.restitution)

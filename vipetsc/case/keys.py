@@ -15,6 +15,7 @@ from pydantic.json_schema import models_json_schema
 from vipetsc.case.case import Case
 from vipetsc.case.schema import MULTIPLE_OF_PI
 from vipetsc.case.verb_cases import SECTIONS
+from vipetsc.lattice.contact import PARAMETERS
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Schema = dict[str, Any]
@@ -23,8 +24,13 @@ Schema = dict[str, Any]
 @cache
 def texts() -> dict[str, dict[str, list[str]]]:
     """Unit and text of every key, by the name of its class."""
-    told = tomllib.loads((files("vipetsc.case") / "keys.toml").read_text(encoding="utf-8"))
-    return told | {"OneDrive": {key: text for key, text in told["DriveTable"].items() if key != "more"}}
+    described = tomllib.loads((files("vipetsc.case") / "keys.toml").read_text(encoding="utf-8"))
+    # Parameters of elastic laws are described where the laws are.
+    for key, parameter in PARAMETERS.items():
+        described["ContactsTable"][key] = [parameter.unit, parameter.text]
+        described["PerSiteTable"][key] = [parameter.unit, f"{key} of each site"]
+    described["OneDrive"] = {key: text for key, text in described["DriveTable"].items() if key != "more"}
+    return described
 
 
 def unit_and_text(name: str, key: str) -> tuple[str, str]:

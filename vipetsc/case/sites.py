@@ -1,17 +1,16 @@
 """The section of a case about its contact sites: where they are, their laws and their stops."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, create_model
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.schema import MOST_SITES, NotNegative, Positive
-from vipetsc.lattice.contact import Damping, Law
+from vipetsc.lattice.contact import PARAMETERS, Damping, Law, Parameter
 
 Ends = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 Side = Literal["both", "plus", "minus"]
 Restitution = Annotated[float, Field(ge=0, le=1)]
-Exponent = Annotated[float, Field(ge=1, le=10)]
 Poisson = Annotated[float, Field(gt=-1, le=0.5)]
 
 
@@ -31,11 +30,42 @@ class ClearanceSpan(Section):
     last: Positive
 
 
-class PerSiteTable(Section):
+def bounded(parameter: Parameter) -> Any:
+    """The type of a value of a law's ``parameter``."""
+    return Annotated[float, Field(ge=parameter.least, le=parameter.most)]
+
+
+if TYPE_CHECKING:
+
+    class ElasticLaw(Section):
+        """The law of all sites, and its parameters."""
+
+        law: Law = "hertz"
+
+    class ElasticLaws(Section):
+        """The law of each site, and their parameters."""
+
+        law: list[Law] | None = None
+
+else:
+    # The parameters of elastic laws are declared where the laws are: a key of each follows the law's name.
+    ElasticLaw = create_model(
+        "ElasticLaw",
+        __base__=Section,
+        law=(Law, "hertz"),
+        **{key: (bounded(parameter) | None, None) for key, parameter in PARAMETERS.items()},
+    )
+    ElasticLaws = create_model(
+        "ElasticLaws",
+        __base__=Section,
+        law=(list[Law] | None, None),
+        **{key: (list[bounded(parameter)] | None, None) for key, parameter in PARAMETERS.items()},
+    )
+
+
+class PerSiteTable(ElasticLaws):
     """What differs from site to site: lists, one value a site, in place of the values of ``[contacts]``."""
 
-    law: list[Law] | None = None
-    exponent: list[Exponent] | None = None
     modulus: list[Positive] | None = None
     radius: list[Positive] | None = None
     poisson: list[Poisson] | None = None
@@ -49,7 +79,7 @@ class PerSiteTable(Section):
     clearance_minus: list[NotNegative] | None = None
 
 
-class ContactsTable(Section):
+class ContactsTable(ElasticLaw):
     """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances.
 
     ``damping``: ``paper`` (if left out), which is ``hunt-crossley``, ``exact`` or another by name: see
@@ -58,8 +88,6 @@ class ContactsTable(Section):
     ``precompression``: static indentation in m, from which displacements count. ``each`` has lists over the sites.
     """
 
-    law: Law = "hertz"
-    exponent: Exponent | None = None
     modulus: Positive | None = None
     radius: Positive | None = None
     poisson: Poisson | None = None

@@ -45,9 +45,14 @@ the smallest |w'_minus| in m/s, whether g is kept from becoming negative; the re
 
 def elastic_records(laws: Sequence[Contact]) -> np.ndarray:
     """Parameters (law,) of dtype ``ELASTIC`` of the elastic laws of ``laws``."""
-    # Sites share few laws, and a factor costs gamma functions: each distinct law is asked once.
-    rows = {law: (law.stiffness, law.onset_exponent, law.duration_factor) for law in dict.fromkeys(laws)}
+    # Sites have few different laws, and a factor costs gamma functions: each law is asked once.
+    rows = {law: _elastic_row(law) for law in dict.fromkeys(laws)}
     return np.array([rows[law] for law in laws], ELASTIC)
+
+
+def _elastic_row(law: Contact) -> tuple[float, ...]:
+    """The values of a record of dtype ``ELASTIC``."""
+    return law.stiffness, law.onset_exponent, law.duration_factor
 
 
 def create_contacts(

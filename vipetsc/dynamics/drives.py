@@ -12,7 +12,7 @@ import numpy as np
 from vipetsc.compiled import kernel
 from vipetsc.lattice.drive import PIECE, Drive, Pieces
 
-# Shares of a time, and of a step, to which the beginning of a piece is met.
+# Fraction of a time, and of a step, within which a piece that begins has begun.
 ROUNDED = 1e-14
 
 DRIVE = np.dtype(
@@ -33,22 +33,28 @@ class Drives(NamedTuple):
 
 def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
     """The record of those of ``drives`` with the ``numbers``, -1 of one that there is not; all are off."""
-    tables, rows = [np.zeros(0, PIECE)], np.zeros(len(numbers), DRIVE)
+    tables = [np.zeros(0, PIECE)]
+    rows = np.zeros(len(numbers), DRIVE)
     for row, number in zip(rows, numbers, strict=True):
-        row["number"], row["piece"], row["first"], row["last"] = number, -1, sum(map(len, tables)), 0
+        row["number"] = number
+        row["piece"] = -1
+        row["first"] = sum(map(len, tables))
+        row["last"] = 0
         if number < 0:
             continue
-        wave, factor = drives[number].waveform, drives[number].stiffness or 1.0
-        row["duration"], row["highest"], row["stiffness"] = wave.duration, wave.highest, drives[number].stiffness
+
+        drive = drives[number]
+        wave, factor = drive.waveform, drive.stiffness or 1.0
+        row["duration"] = wave.duration
+        row["highest"] = wave.highest
+        row["stiffness"] = drive.stiffness
         if isinstance(wave, Pieces):
             tables.append(Pieces.of(factor, 1.0, np.inf, wave.table).table)
             row["last"] = row["first"] + len(wave.table)
         else:
-            row["amplitude"], row["frequency"], row["cycles"] = (
-                wave.window_amplitude * factor,
-                wave.frequency,
-                wave.cycles,
-            )
+            row["amplitude"] = wave.window_amplitude * factor
+            row["frequency"] = wave.frequency
+            row["cycles"] = wave.cycles
     return Drives(rows, np.concatenate(tables))
 
 
@@ -76,6 +82,8 @@ def select_piece(drives: Drives, i: int, t: float) -> float:
     if drive.first >= drive.last or t >= drive.duration:
         drive.piece = -1
         return drive.duration if t < drive.duration else np.inf
+
+    # The first piece that begins after t, by bisection: a measured drive has as many pieces as samples.
     low, high = drive.first, drive.last
     while low < high:
         middle = (low + high) // 2
@@ -89,9 +97,9 @@ def select_piece(drives: Drives, i: int, t: float) -> float:
 
 @kernel
 def drive_end(drives: Drives, i: int, begin: float, interval: float, position: float) -> float:
-    """Share of the step of ``interval`` s from ``begin`` on to which drive ``i`` is smooth; -1 if it is over.
+    """Position in the step of ``interval`` s from ``begin`` on up to which drive ``i`` is smooth; -1 if it is over.
 
-    The piece that begins at the ``position``, a share to rounding, is turned on. A burst's end stays its end.
+    The piece that begins at the ``position``, to rounding, is turned on. A burst's end stays its end.
     """
     drive = drives.rows[i]
     if drive.first >= drive.last:
@@ -105,7 +113,7 @@ def drive_end(drives: Drives, i: int, begin: float, interval: float, position: f
 def wall_energy(drives: Drives, i: int, t: float, u: float) -> float:
     """Energy in J of a wall's spring at time t in s, its mass at u in m, beyond that of one to a wall at rest.
 
-    It is the work of the wall beyond that of the force k U on the mass, too; 0 of a force.
+    The wall's work is that of the force k U on the mass and this energy. It is 0 where drive ``i`` is a force.
     """
     stiffness = drives.rows[i].stiffness
     if stiffness == 0.0:

@@ -70,11 +70,11 @@ class Engine(ABC):
 
     @abstractmethod
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """All that a resumed run needs to go on with the same bits: this rank's cells and sites, and what all share."""
+        """All that a resumed run needs to go on with the same bits: this rank's cells and sites, and common values."""
 
     @abstractmethod
-    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go back to a checkpoint, given the shares of all ranks that wrote it, in their order, however many."""
+    def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go back to a checkpoint, given what each rank that wrote it kept, in their order, however many."""
 
     @abstractmethod
     def destroy(self) -> None:

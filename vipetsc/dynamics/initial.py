@@ -24,37 +24,47 @@ def set_in_motion(setup: Setup) -> None:
     """
     layout, meter = setup.layout, setup.meter
     state = layout.create_vector()
-    layout.place(np.hstack(_fields(setup.model, layout)), 0.0, state.array)
+    layout.place(np.hstack(_fields(setup.model, layout)), work=0.0, y=state.array)
     state.ghostUpdate()
     with state.localForm() as local:
-        y, lattice = local.array, meter.lattice
-        sums = measure(y, lattice, meter.unit)
-        rows = [relative_motion(y, lattice.site_dofs, i) for i in range(len(layout.contacts))]
+        y, site_dofs = local.array, meter.lattice.site_dofs
+        sums = measure(y, meter.lattice, meter.unit)
+        relative = [relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))]
+
     motion = np.zeros((len(setup.model.chain.sites), 2))
-    for numbers, theirs in layout.comm.allgather((layout.contacts, rows)):
-        motion[list(numbers)] = np.reshape(theirs, (-1, 2))
-    energy = float(meter.total(sums[None], np.zeros((1, 1))).total[0])
+    for numbers, rows in layout.comm.allgather((layout.contacts, relative)):
+        motion[list(numbers)] = np.reshape(rows, (-1, 2))
+    no_work = np.zeros((1, 1))
+    energy = float(meter.total(sums[None], no_work).total[0])
     setup.engine.begin(layout.motion(state.array_r), motion, energy)
     state.destroy()
 
 
 def _fields(model: Model, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Displacement and velocity (cell, dof) of the rank's cells, the same to the last bit on any partition."""
-    initial, chain, cells = model.initial, model.chain, (layout.start, layout.stop)
+    initial, chain = model.initial, model.chain
     assert initial is not None
     if initial.kind == "file":
-        return _of_file(str(initial.path), initial, layout)
+        return _read_fields(initial, layout)
+
     assert initial.amplitude
     if initial.kind == "packet":
-        u, v = initial.packet(chain.cell).on(chain, *cells)
+        u, v = initial.packet(chain.cell).on(chain, layout.start, layout.stop)
         return initial.amplitude * u, initial.amplitude * v
-    assert initial.number
-    bare = Chain(chain.cell, chain.cells, chain.ends)
-    u = initial.amplitude * on_root(layout.comm, lambda: mode_shape(bare, initial.number or 0))[slice(*cells)]
+
+    number = initial.number
+    assert number
+    # A mode is that of the linear lattice: neither contacts nor cells that differ. It is computed whole, on one rank.
+    linear = Chain(chain.cell, chain.cells, chain.ends)
+    shape = on_root(layout.comm, lambda: mode_shape(linear, number))
+    u = initial.amplitude * shape[layout.start : layout.stop]
     return u, np.zeros_like(u)
 
 
-def _of_file(path: str, initial: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+def _read_fields(initial: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """The fields of the file that ``initial`` names, which must still be the one that the case was resolved with."""
+    path = str(initial.path)
+
     def check() -> None:
         try:
             digest = file_hash(path)

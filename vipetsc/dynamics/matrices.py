@@ -28,25 +28,39 @@ class LatticeMatrices:
     """
 
     def __init__(self, chain: Chain, comm: MPI.Comm) -> None:
-        self.chain, self.comm = chain, comm
+        self.chain = chain
+        self.comm = comm
+        self.rows = chain.cells * chain.cell.dofs
         self.start, self.stop = cell_cuts(chain.cells, comm.size)[comm.rank : comm.rank + 2]
-        coefficients, count = chain.coefficients(self.start - 1, self.stop), self.stop - self.start
-        masses, rows = coefficients.masses[1:], chain.cells * chain.cell.dofs
-        most, entries = int(np.iinfo(PETSc.IntType).max), len(chain.cell.couplings()) * 2 * count
-        if comm.allreduce(max(rows, entries), MPI.MAX) > most:
-            remedy = "more rows or entries than the indices of this PETSc count; it needs one --with-64-bit-indices"
-            raise CaseError([Problem("lattice.cells", chain.cells, f"makes matrices of {remedy}")])
+        self._check_indices()
         self.stiffness = self._matrix(on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop)))
-        self.rows, circles, shift = rows, np.zeros_like(masses), self.start * chain.cell.dofs
-        for mass, offset, _, _, _, spring in chain.cell.couplings():
-            circles[:, mass] += 2 * coefficients.stiffness[1 + min(offset, 0) :][:count, spring]
-        self.largest = comm.allreduce(float(np.max(circles / masses, initial=0.0)), MPI.MAX)
-        self.mass = self._matrix(diags([masses.ravel()], [shift], (masses.size, rows), format="csr"))
+
+        coefficients = chain.coefficients(self.start - 1, self.stop)
+        masses = coefficients.masses[1:]
+        first_row = self.start * chain.cell.dofs
+        self.mass = self._matrix(diags([masses.ravel()], [first_row], (masses.size, self.rows), format="csr"))
+
+        # A row's circle reaches from 0 to twice the sum of the springs at its mass.
+        owned = self.stop - self.start
+        reaches = np.zeros_like(masses)
+        for coupling in chain.cell.couplings():
+            springs = coefficients.stiffness[1 + min(coupling.offset, 0) :][:owned, coupling.spring]
+            reaches[:, coupling.mass] += 2 * springs
+        self.largest = comm.allreduce(float(np.max(reaches / masses, initial=0.0)), MPI.MAX)
+
+    def _check_indices(self) -> None:
+        """Raise CaseError on all ranks where PETSc's indices count neither all rows nor a rank's entries."""
+        cell = self.chain.cell
+        entries = len(cell.couplings()) * 2 * (self.stop - self.start)
+        if self.comm.allreduce(max(self.rows, entries), MPI.MAX) > int(np.iinfo(PETSc.IntType).max):
+            remedy = "more rows or entries than the indices of this PETSc count; it needs one --with-64-bit-indices"
+            raise CaseError([Problem("lattice.cells", self.chain.cells, f"makes matrices of {remedy}")])
 
     def _matrix(self, rows: csr_matrix) -> PETSc.Mat:
         """The matrix of which this rank has the ``rows``, allocated for exactly their entries."""
-        indices = (part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices))
-        return PETSc.Mat().createAIJ((rows.shape, rows.shape), csr=(*indices, rows.data), comm=self.comm)
+        first_entries = rows.indptr.astype(PETSc.IntType)
+        columns = rows.indices.astype(PETSc.IntType)
+        return PETSc.Mat().createAIJ((rows.shape, rows.shape), csr=(first_entries, columns, rows.data), comm=self.comm)
 
     def vector(self, cells: np.ndarray | None = None) -> PETSc.Vec:
         """A vector of this rank's ``cells`` (cell, dof), zero if none are given."""

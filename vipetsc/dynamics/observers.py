@@ -20,8 +20,10 @@ from vipetsc.dynamics.samples import Block
 from vipetsc.io.store import RunOutput
 from vipetsc.parallel import Progress
 
-# A ledger that misses by this share of the largest work is no longer a solution but an instability.
+# A ledger that misses by this fraction of the largest work is no longer a solution but an instability.
 RUNAWAY = 0.1
+# ... where the lattice has more energy than rounding of the sums, as a fraction of the largest that they hold.
+NEGLIGIBLE = 1e-12
 # Errors of the ledger over the largest work that are as expected: in tolerances, and bounds of that.
 LEDGER_PER_RTOL, LEAST_LEDGER, MOST_LEDGER = 100.0, 1e-8, 1e-4
 
@@ -86,14 +88,14 @@ class Observer:
             setattr(self, key, state[key].item())
 
     def finish(self, stopped: bool) -> None:
-        """Come to an end; ``stopped`` on request, to be gone on with from the checkpoint just made."""
+        """Come to an end; a run ``stopped`` on request is gone on with from the checkpoint just made."""
 
     def statistics(self) -> dict[str, Any]:
         """Numbers for ``summary.json`` and the attributes of ``run.h5``; those of rank 0 count."""
         return {}
 
     def warnings(self) -> list[str]:
-        """Sentences about a result that is not what it seems, beside the statistics; those of rank 0 count."""
+        """Sentences about a result that is not what it seems; those of rank 0 count."""
         return []
 
 
@@ -108,11 +110,16 @@ class Guard(Observer):
         energies, largest = block.energies, self.setup.meter.largest
         most_work = np.maximum.accumulate(np.append(self.most_work, np.abs(energies.work)))[1:]
         finite = np.isfinite(energies.work) & (energies.total < largest)
-        runs_away = (np.abs(energies.residual) > RUNAWAY * most_work) & (energies.total > 1e-12 * largest)
-        for k in np.flatnonzero(~finite | runs_away).tolist():
-            total, work = energies.total[k], energies.work[k]
-            reason = f"the energy runs away: {total:.4g} J in the lattice, {work:.4g} J of work done"
-            raise RunawayError(reason if finite[k] else "the state is not finite", k)
+        runs_away = (np.abs(energies.residual) > RUNAWAY * most_work) & (energies.total > NEGLIGIBLE * largest)
+
+        refused = np.flatnonzero(~finite | runs_away)
+        if refused.size:
+            k = int(refused[0])
+            reason = "the state is not finite"
+            if finite[k]:
+                total, work = energies.total[k], energies.work[k]
+                reason = f"the energy runs away: {total:.4g} J in the lattice, {work:.4g} J of work done"
+            raise RunawayError(reason, k)
         self.most_work = float(most_work[-1])
 
 
@@ -126,7 +133,8 @@ class Ledger(Observer):
 
     def observe(self, block: Block) -> None:
         energies = block.energies
-        self.work, self.dissipated = float(energies.work[-1]), float(energies.dissipated[-1])
+        self.work = float(energies.work[-1])
+        self.dissipated = float(energies.dissipated[-1])
         self.dissipated_by_damping = float(energies.dissipated_by_damping[-1])
         self.worst = float(np.maximum(self.worst, np.abs(energies.residual).max()))
         self.most_work = max(self.most_work, float(np.abs(energies.work).max()))
@@ -138,11 +146,12 @@ class Ledger(Observer):
         if np.isnan(self.work):
             return numbers
         numbers |= {"work": self.work, "dissipated": self.dissipated}
-        damped = self.setup.model.chain.is_damped
-        return numbers | ({"dissipated_by_damping": self.dissipated_by_damping} if damped else {})
+        if self.setup.model.chain.is_damped:
+            numbers["dissipated_by_damping"] = self.dissipated_by_damping
+        return numbers
 
     def warnings(self) -> list[str]:
-        """An error of the balance that is larger than that of the trajectory should make it."""
+        """A sentence where the balance has a larger error than a trajectory of the tolerance asked explains."""
         error, rtol = self.statistics()["ledger_error"], self.setup.model.rtol
         bound = min(max(LEDGER_PER_RTOL * rtol, LEAST_LEDGER), MOST_LEDGER)
         if error is None or error <= bound:

@@ -44,26 +44,38 @@ def petsc_options(options: Mapping[str, str]) -> Iterator[None]:
 def check_options(case: CaseFile | None) -> None:
     """Raise CaseError for options of ``case`` that Runge-Kutta stepping does not know, or whose value PETSc refuses."""
     options = options_of(case)
-    problems = _problems(options) if options else []
-    if problems is None:
-        problems = [(name, "PETSc refuses it") for name, value in options.items() if _problems({name: value}) is None]
+    if not options:
+        return
+
+    try:
+        problems = _problems(options)
+    except PETSc.Error:
+        # PETSc does not say which option it refused: each is tried alone.
+        problems = [(name, "PETSc refuses it") for name in options if _is_refused({name: options[name]})]
     if problems:
         raise CaseError([Problem(f"petsc.{name}", options[name], remedy) for name, remedy in problems])
 
 
-def _problems(options: Mapping[str, str]) -> list[tuple[str, str]] | None:
-    """What is wrong with ``options`` once a time stepper has read them; None if it cannot."""
-    ts, used = PETSc.TS().create(PETSc.COMM_SELF), ctypes.c_int()
+def _is_refused(options: Mapping[str, str]) -> bool:
+    try:
+        _problems(options)
+    except PETSc.Error:
+        return True
+    return False
+
+
+def _problems(options: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What is wrong with ``options`` once a time stepper has read them; raises PETSc.Error if it cannot."""
+    ts = PETSc.TS().create(PETSc.COMM_SELF)
     ts.setType(PETSc.TS.Type.RK)
     problems = []
     with petsc_options(options):
-        try:
-            ts.setFromOptions()
-        except PETSc.Error:
-            return None
+        ts.setFromOptions()
+        used = ctypes.c_int()
         for name in options:  # petsc4py 3.18 cannot say which were read
             petsc_library().PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
-            problems += [] if used.value else [(name, "PETSc's time stepping has no such option")]
+            if not used.value:
+                problems.append((name, "PETSc's time stepping has no such option"))
     if ts.getType() != PETSc.TS.Type.RK:
         problems.append(("ts_type", 'the lattice is stepped by "rk" alone; ts_rk_type names the method'))
     if not 0 < ts.getTimeStep() < float("inf"):

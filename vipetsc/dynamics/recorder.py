@@ -19,7 +19,7 @@ from vipetsc.io.store import GATHER_LIMIT
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
 CHUNK_SAMPLES = 256
 CHUNK_BYTES = 64 * 2**20
-ENERGIES = {part.name: f"energy/{part.name}" for part in fields(Energies) if part.name != "balanced"}
+ENERGIES = {field.name: f"energy/{field.name}" for field in fields(Energies) if field.name != "balanced"}
 
 
 def recorded_cells(output: OutputTable, cells: int) -> range:
@@ -41,7 +41,7 @@ def chunk_samples(sample_bytes: int) -> int:
 
 
 class Recorder(Observer):
-    """Keeps the case's share of the fields, the energies and the contact episodes, and writes them in chunks."""
+    """Keeps the fields that the case asks for, the energies and the contact episodes, and writes them in chunks."""
 
     name = "recorder"
     saved = ("episodes", "deepest")
@@ -51,30 +51,26 @@ class Recorder(Observer):
 
     def begin(self, setup: Setup) -> None:
         super().begin(setup)
-        layout, output, chain = setup.layout, setup.case.output, setup.model.chain
-        recorded = np.array(recorded_cells(output, chain.cells))
+        layout, output = setup.layout, setup.case.output
+        recorded = np.array(recorded_cells(output, setup.model.chain.cells))
         first, stop = np.searchsorted(recorded, [layout.start, layout.stop]).tolist()
         local = recorded[first:stop] - layout.start
         together = bool(setup.output.folder) and written_together(setup.model, output, layout.comm.size)
-        given = {
-            "cell": recorded + 1,
-            "dof": np.arange(1, layout.dofs + 1),
-            "site": np.arange(1, len(chain.sites) + 1),
-            "sites/cell": np.array(chain.sites, np.int64) + 1,
-            "sites/clearance": np.array(chain.clearances, float),
-        }
-        if setup.model.gaps:
-            given["sites/clearance"], given["sites/clearance_minus"] = np.array(setup.model.gaps).T
-        if chain.variation:
-            given |= {f"lattice/{name}": array[recorded] for name, array in chain.variation.items()}
-            given["spring"] = np.arange(1, len(chain.cell.springs) + 1)
-        rows = -(-setup.model.samples // output.stride)
-        self._energies = [part for part, name in ENERGIES.items() if name != DAMPED or chain.is_damped]
-        sampled = ("time", "field_time", *(ENERGIES[part] for part in self._energies))
-        setup.output.recording = Recording(given, tuple(output.fields), together, rows, sampled)
+
+        self._energies = [energy for energy, name in ENERGIES.items() if name != DAMPED or setup.model.chain.is_damped]
+        setup.output.recording = Recording(
+            given=_coordinates(setup.model, recorded),
+            fields=tuple(output.fields),
+            together=together,
+            rows=-(-setup.model.samples // output.stride),
+            sampled=("time", "field_time", *(ENERGIES[energy] for energy in self._energies)),
+        )
         self._columns = np.array([[first, stop] if together else [0, len(recorded)]])
+
         numbers = len(output.fields) * layout.dofs * local.size + len(layout.sites)
-        self._length = chunk_samples(8 * layout.comm.allreduce(numbers, MPI.MAX if together else MPI.SUM))
+        # Gathered chunks lie on rank 0 together.
+        most = layout.comm.allreduce(numbers, MPI.MAX if together else MPI.SUM)
+        self._length = chunk_samples(8 * most)
         self._stride = output.stride
         self._shape = len(output.fields), self._length, layout.dofs, local.size
         self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
@@ -82,34 +78,52 @@ class Recorder(Observer):
         self._begin_chunk()
 
     def _begin_chunk(self) -> None:
-        n, self._held, self._rows, self._number = self._length, 0, 0, 0
-        self._sums, self._work = np.zeros((n, ENERGY_SUMS, 2), np.int64), np.zeros((n, len(self.setup.model.drives)))
+        """Make room for a chunk of samples."""
+        n = self._length
+        self._held = self._rows = self._number = 0
+        self._sums = np.zeros((n, ENERGY_SUMS, 2), np.int64)
+        self._work = np.zeros((n, len(self.setup.model.drives)))
         self._losses = np.zeros((n, len(self.setup.layout.sites)))
-        self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[part] for part in self._energies))}
+        self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[energy] for energy in self._energies))}
         self._fields = self.setup.output.room(self._shape)
 
     def room(self, number: int, most: int) -> Samples:
         """Room for the samples from ``number`` on: for as many as the chunk still takes, and at ``most`` so many."""
         meter, output = self.setup.meter, self.setup.case.output
         here = slice(self._held, self._held + most)
-        fields = np.ascontiguousarray(self._fields[:, self._rows :][:, :most])  # engines are compiled for such alone
-        arrays = self._sums[here], self._work[here], self._losses[here], fields, self._moving
-        of_lattice = meter.lattice, meter.unit, self.setup.model.sample_interval
-        return Samples(number, *arrays, self._first, output.every, output.stride, *of_lattice)
+        fields = self._fields[:, self._rows :][:, :most]
+        return Samples(
+            number=number,
+            sums=self._sums[here],
+            work=self._work[here],
+            losses=self._losses[here],
+            fields=np.ascontiguousarray(fields),  # engines are compiled for such alone
+            moving=self._moving,
+            first_cell=self._first,
+            every=output.every,
+            stride=output.stride,
+            lattice=meter.lattice,
+            unit=meter.unit,
+            interval=self.setup.model.sample_interval,
+        )
 
     def observe(self, block: Block) -> None:
         here = slice(self._held, self._held + len(block))
         self._kept["time"][here] = block.times
-        for part in self._energies:
-            self._kept[ENERGIES[part]][here] = getattr(block.energies, part)
-        rows = self._rows + block.share.rows(len(block))
-        if not np.may_share_memory(self._fields, block.share.fields):
-            self._fields[:, self._rows : rows] = block.share.fields[:, : rows - self._rows]
-        self._number, self._held, self._rows = block.first - self._held, here.stop, rows
+        for energy in self._energies:
+            self._kept[ENERGIES[energy]][here] = getattr(block.energies, energy)
+
+        rows = self._rows + block.samples.rows(len(block))
+        # Where the room was not contiguous in the chunk, the engine has filled a copy.
+        if not np.may_share_memory(self._fields, block.samples.fields):
+            self._fields[:, self._rows : rows] = block.samples.fields[:, : rows - self._rows]
+        self._number = block.first - self._held
+        self._held = here.stop
+        self._rows = rows
 
     @property
     def due(self) -> bool:
-        """A chunk is full."""
+        """Whether the chunk is full."""
         return self._held == self._length
 
     def flush(self, last: bool = False) -> None:
@@ -119,28 +133,43 @@ class Recorder(Observer):
         says; of episodes that are still open, in the ``last`` one. Rank 0's has times and energies besides.
         """
         sys.audit("vipetsc.flush")
+        comm, output = self.setup.layout.comm, self.setup.output
         episodes = self.setup.engine.take_episodes(unfinished=last)
         episodes = episodes[episodes["onset"] <= self.end]
-        layout, comm, output = self.setup.layout, self.setup.layout.comm, self.setup.output
-        together, part = output.recording.together, self._fields[:, : self._rows]
-        share = np.array(layout.sites, np.int64), self._losses[: self._held], episodes, part
-        shares = [share] if together or comm.size == 1 else comm.gather(share)
-        chunk: dict[str, np.ndarray] = {}
-        if shares is not None:
-            sites, losses, logs, parts = zip(*shares, strict=True)
-            numbers, log = np.concatenate(sites), np.concatenate(logs)
-            log["site"] += 1  # counted from 1
-            order = np.argsort(numbers)
-            chunk |= {LOSSES: np.concatenate(losses, axis=1)[:, order], "sites": ranges(numbers[order]), "impacts": log}
-            part = np.concatenate(parts, axis=3) if len(parts) > 1 else part
-            chunk |= dict(zip(output.recording.fields, part, strict=True)) | {"columns": self._columns}
+
+        chunk = self._gather(episodes)
         if comm.rank == 0:
             chunk |= {name: values[: self._held] for name, values in self._kept.items()}
             chunk["field_time"] = chunk["time"][-self._number % self._stride :: self._stride]
         output.append(chunk or None)
+
         self.episodes += comm.allreduce(len(episodes))
         self.deepest = comm.allreduce(max([self.deepest, *episodes["indentation"].tolist()]), MPI.MAX)
         self._begin_chunk()
+
+    def _gather(self, episodes: np.ndarray) -> dict[str, np.ndarray]:
+        """Fields, losses and ``episodes`` of the chunk: this rank's, or those of all on rank 0 and none elsewhere."""
+        comm, recording = self.setup.layout.comm, self.setup.output.recording
+        sites = np.array(self.setup.layout.sites, np.int64)
+        own = sites, self._losses[: self._held], episodes, self._fields[:, : self._rows]
+        gathered = [own] if recording.together or comm.size == 1 else comm.gather(own)
+        if gathered is None:
+            return {}
+
+        all_sites, all_losses, all_episodes, all_fields = zip(*gathered, strict=True)
+        numbers = np.concatenate(all_sites)
+        order = np.argsort(numbers)
+        log = np.concatenate(all_episodes)
+        log["site"] += 1  # counted from 1
+        # One rank's fields may be large: they are not copied.
+        kept = all_fields[0] if len(all_fields) == 1 else np.concatenate(all_fields, axis=3)
+        chunk = {
+            LOSSES: np.concatenate(all_losses, axis=1)[:, order],
+            "sites": ranges(numbers[order]),
+            "impacts": log,
+            "columns": self._columns,
+        }
+        return chunk | dict(zip(recording.fields, kept, strict=True))
 
     def finish(self, stopped: bool) -> None:
         if not stopped:
@@ -155,7 +184,26 @@ class Recorder(Observer):
         sites, radius = len(self.setup.model.chain.sites), self.setup.case.contact_radius
         if sites and not self.episodes:
             return [f"no contact: nothing reached {'the site' if sites == 1 else f'one of the {sites} sites'}"]
+
         if radius is None or self.setup.model.contact.law != "hertz" or self.deepest <= radius:
             return []
         beyond = f"the deepest indentation, {self.deepest:.3g} m, is beyond the contacts' radius of {radius:g} m"
         return [f"{beyond}: Hertz's law holds for indentations far below it"]
+
+
+def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:
+    """What is known before a run: the numbers of ``recorded`` cells, masses and sites, and where cells differ."""
+    chain = model.chain
+    given = {
+        "cell": recorded + 1,
+        "dof": np.arange(1, chain.cell.dofs + 1),
+        "site": np.arange(1, len(chain.sites) + 1),
+        "sites/cell": np.array(chain.sites, np.int64) + 1,
+        "sites/clearance": np.array(chain.clearances, float),
+    }
+    if model.gaps:
+        given["sites/clearance"], given["sites/clearance_minus"] = np.array(model.gaps).T
+    if chain.variation:
+        given |= {f"lattice/{name}": array[recorded] for name, array in chain.variation.items()}
+        given["spring"] = np.arange(1, len(chain.cell.springs) + 1)
+    return given

@@ -5,9 +5,8 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -16,7 +15,7 @@ import numpy as np
 from vipetsc.case import Case, Model
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
-from vipetsc.dynamics.engine import Engine
+from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.initial import set_in_motion
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
@@ -35,6 +34,13 @@ ENGINES = (Propagator, Integrator)
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
+
+
+class Failure(NamedTuple):
+    """Why a run ends before its end, and the ``time`` in s at which it does."""
+
+    reason: str
+    time: float
 
 
 @dataclass(frozen=True)
@@ -104,52 +110,67 @@ def simulate(
     model = case.model()
     kind, refusal = select_engine(case, model)
     check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
-    watching: list[type[Observer]] = [Guard, *observers, Ledger, *([ProgressReport] if progress else [])]
-    make = partial(_simulate, case, model, kind, stop, refusal, watching)
+
+    watching: list[type[Observer]] = [Guard, *observers, Ledger]
+    if progress:
+        watching.append(ProgressReport)
+    simulation = Simulation(case, model, kind, refusal, stop, watching)
     if isinstance(folder, RunOutput):
-        return make(folder)
+        return simulation.make(folder)
+
     with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
         output = RunFolder(claim.folder, comm)
-        told = output.ending()
-        result = result_of(told, False, output.folder) if told else make(output)
+        ended = output.ending()
+        result = result_of(ended, False, output.folder) if ended else simulation.make(output)
         if not result.resumable:
             claim.publish()
     return replace(result, folder=claim.path)
 
 
-def result_of(told: Mapping[str, Any], resumable: bool, folder: Path | None) -> Result:
-    """The result that the attributes of a run tell."""
-    about = told["status"], told["statistics"], told.get("warnings", [])
-    return Result(told["complete"], resumable, *about, folder)
+def result_of(attributes: Mapping[str, Any], resumable: bool, folder: Path | None) -> Result:
+    """The result that the ``attributes`` of a run state."""
+    return Result(
+        complete=attributes["complete"],
+        resumable=resumable,
+        sentence=attributes["status"],
+        statistics=attributes["statistics"],
+        warnings=attributes.get("warnings", []),
+        folder=folder,
+    )
 
 
-def _simulate(
-    case: Case,
-    model: Model,
-    kind: type[Engine],
-    stop: StopRequest | None,
-    refusal: str | None,
-    watching: Sequence[type[Observer]],
-    output: RunOutput,
-) -> Result:
-    """Simulate ``case`` into ``output``, from its last checkpoint on if it has one."""
-    begin = time.perf_counter(), time.process_time()
-    output.begin(case.to_toml())
-    sys.audit("vipetsc.set-up", case.name)
-    with log.SET_UP, petsc_options(options_of(case)):
-        layout = Layout(model, output.comm, kind.dashpots)
-        engine = kind(model, layout, stop)
-    with released(engine, output.comm):
-        run = Run(Setup(case, model, layout, EnergyMeter(model, layout), engine, output), watching)
-        shares = output.last_state()
-        if shares is not None:
-            run.restore(shares)
-        elif model.initial is not None:
-            set_in_motion(run.setup)
-        with log.SAMPLES:
-            ending, sentence = run.advance()
-        with log.ENDING:
-            return run.finish(ending, sentence, begin, {"engine_note": refusal} if refusal else {})
+@dataclass(frozen=True)
+class Simulation:
+    """What is to be simulated: the case and its model, the engine and why it is not the one asked for, who looks on."""
+
+    case: Case
+    model: Model
+    kind: type[Engine]
+    refusal: str | None
+    stop: StopRequest | None
+    watching: Sequence[type[Observer]]
+
+    def make(self, output: RunOutput) -> Result:
+        """Simulate into ``output``, from its last checkpoint on if it has one; all ranks must call it."""
+        begin = time.perf_counter(), time.process_time()
+        output.begin(self.case.to_toml())
+        sys.audit("vipetsc.set-up", self.case.name)
+        with log.SET_UP, petsc_options(options_of(self.case)):
+            layout = Layout(self.model, output.comm, self.kind.dashpots)
+            engine = self.kind(self.model, layout, self.stop)
+        with released(engine, output.comm):
+            meter = EnergyMeter(self.model, layout)
+            run = Run(Setup(self.case, self.model, layout, meter, engine, output), self.watching)
+            checkpoints = output.last_state()
+            if checkpoints is not None:
+                run.restore(checkpoints)
+            elif self.model.initial is not None:
+                set_in_motion(run.setup)
+            with log.SAMPLES:
+                ending, sentence = run.advance()
+            with log.ENDING:
+                note = {"engine_note": self.refusal} if self.refusal else {}
+                return run.finish(ending, sentence, begin, note)
 
 
 @contextmanager
@@ -190,41 +211,55 @@ class Run:
         for observer in self.observers:
             observer.begin(setup)
 
-    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go on after a checkpoint, given the shares of all ranks that wrote it, however many."""
-        self.setup.engine.restore(shares)
-        state = shares[0]
-        self.samples, self.last = int(state["samples"]), self.setup.engine.time
+    def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go on after a checkpoint, given what each rank that wrote it kept, however many."""
+        self.setup.engine.restore(checkpoints)
+        state = checkpoints[0]
+        self.samples = int(state["samples"])
+        self.last = self.setup.engine.time
         for observer in self.observers:
             prefix = f"{observer.name}/"
             observer.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
     def advance(self) -> tuple[str, str]:
         """Go to the end, or to where the run stops or fails: how it ended, and a sentence about it."""
-        setup, total = self.setup, self.setup.model.samples
-        engine = setup.engine
+        setup, engine = self.setup, self.setup.engine
+        total = setup.model.samples
         while self.samples < total:
             samples = self.recorder.room(self.samples, min(self.longest, total - self.samples))
-            result = engine.fill(samples)
-            failure, when = result.stalled and f"stalled: {result.stalled}", engine.time
-            block = self.block(samples, result.samples)
-            for observer in self.observers:
-                try:
-                    if len(block):
-                        observer.observe(block)
-                except RunawayError as error:
-                    failure, when, block = str(error), block.times[error.sample], self.block(samples, error.sample)
+            filled = engine.fill(samples)
+            block, failure = self._observe(samples, filled)
             if len(block):
-                self.samples, self.last = block.first + len(block), float(block.times[-1])
+                self.samples = block.first + len(block)
+                self.last = float(block.times[-1])
+
             if failure:
-                self.recorder.end = when + setup.model.sample_interval
+                self.recorder.end = failure.time + setup.model.sample_interval
                 good = "none" if self.last is None else f"t = {self.last:.6g} s"
-                return FAILED, f"{failure}, at t = {when:.6g} s ({fastest_cell(setup)}); last good sample: {good}"
-            if result.stopped and self.samples < total:
+                where = f"at t = {failure.time:.6g} s ({fastest_cell(setup)})"
+                return FAILED, f"{failure.reason}, {where}; last good sample: {good}"
+            if filled.stopped and self.samples < total:
                 return STOPPED, f"stopped on request at t = {engine.time:.6g} s"
             if any(observer.due for observer in self.observers):
                 self.checkpoint()
         return COMPLETE, f"complete: {total} samples to t = {self.last:.6g} s"
+
+    def _observe(self, samples: Samples, filled: FillResult) -> tuple[Block, Failure | None]:
+        """Let the observers look at what the engine has filled: the block of good samples, and what ends the run."""
+        failure = None
+        if filled.stalled:
+            failure = Failure(f"stalled: {filled.stalled}", self.setup.engine.time)
+        block = self.block(samples, filled.samples)
+        for observer in self.observers:
+            if not len(block):
+                break
+            try:
+                observer.observe(block)
+            except RunawayError as error:
+                # The samples before are good, and all that the observers behind see. They end before a stall does.
+                failure = Failure(str(error), block.times[error.sample])
+                block = self.block(samples, error.sample)
+        return block, failure
 
     def block(self, samples: Samples, count: int) -> Block:
         """The first ``count`` of ``samples`` as observers see them; all ranks must call it."""
@@ -252,26 +287,37 @@ class Run:
             self.checkpoint()
             sentence += "; the same command goes on from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
-        model = self.setup.model
-        rebounds = {law: law.effective_restitution for law in {*model.laws, model.contact}}
-        statistics["effective_restitution"] = [rebounds[law] for law in model.laws] or rebounds[model.contact]
+        statistics["effective_restitution"] = _effective_restitution(self.setup.model)
+
         warnings = self.setup.case.warnings()
         for observer in self.observers:
             observer.finish(ending == STOPPED)
             statistics |= observer.statistics()
-            warnings += observer.warnings() if ending != STOPPED else []
+            if ending != STOPPED:
+                warnings += observer.warnings()
         if ending == FAILED:
             warnings.append(f"the record ends at sample {self.samples} of {self.setup.model.samples}: {sentence}")
-        wall, cpu = time.perf_counter() - begin[0], comm.allreduce(time.process_time() - begin[1])
+
+        wall = time.perf_counter() - begin[0]
+        cpu = comm.allreduce(time.process_time() - begin[1])
         statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
         about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
-        attributes = comm.bcast(provenance(comm) | about)  # what rank 0 tells counts
+        attributes = comm.bcast(provenance(comm) | about)  # what rank 0 states counts
         if ending == COMPLETE and isinstance(output, RunMemory):
-            shares = comm.gather(self.setup.layout.motion(engine.state.array_r))
-            output.end = np.concatenate(shares) if shares else None
+            motions = comm.gather(self.setup.layout.motion(engine.state.array_r))
+            output.end = np.concatenate(motions) if motions else None
         if ending != STOPPED:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
         return result_of(attributes, ending == STOPPED, output.folder)
+
+
+def _effective_restitution(model: Model) -> float | list[float]:
+    """The effective restitution of each site's law, or of all where they are alike."""
+    if not model.laws:
+        return model.contact.effective_restitution
+    # A root search each: sites have few laws.
+    values = {law: law.effective_restitution for law in set(model.laws)}
+    return [values[law] for law in model.laws]
 
 
 def fastest_cell(setup: Setup) -> str:
@@ -283,7 +329,10 @@ def fastest_cell(setup: Setup) -> str:
     if layout.owned:
         local = float(speed.max()), layout.start + int(speed.max(axis=0).argmax())
     _, fastest = max(layout.comm.allgather(local))
+
+    cell = f"cell {fastest + 1}"
     sites = setup.model.chain.sites
-    nearest = min(range(len(sites)), key=lambda i: abs(sites[i] - fastest), default=None)
-    near = "" if nearest is None else f", nearest site {nearest + 1} in cell {sites[nearest] + 1}"
-    return f"cell {fastest + 1}{near}"
+    if not sites:
+        return cell
+    nearest = min(range(len(sites)), key=lambda i: abs(sites[i] - fastest))
+    return f"{cell}, nearest site {nearest + 1} in cell {sites[nearest] + 1}"

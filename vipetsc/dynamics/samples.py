@@ -7,7 +7,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.dynamics.drives import wall_energy
 from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, measure
 from vipetsc.dynamics.lattice_record import LatticeRecord
@@ -16,7 +16,7 @@ from vipetsc.dynamics.lattice_record import LatticeRecord
 class Samples(NamedTuple):
     """Room for consecutive samples of a rank, the first of which has the ``number``; empty arrays take nothing.
 
-    Energies: ``sums`` (sample, part, 2) as ``measure`` gives them, ``work`` (sample, drive) of all drives and
+    Energies: ``sums`` (sample, energy, 2) as ``measure`` gives them, ``work`` (sample, drive) of all drives and
     ``losses`` (sample, owned site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose
     numbers ``stride`` divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from
     ``first_cell`` on, n = ``every``. ``interval`` in s is that of all samples.
@@ -43,40 +43,50 @@ class Samples(NamedTuple):
 @njit(error_model="numpy")
 def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
     """Put the rank's part ``y`` of the state, ghosts up to date, in as sample ``k``; False if it is not finite."""
-    shape, number = samples.lattice.shape, samples.number + k
+    shape, drives = samples.lattice.shape, samples.lattice.drives
+    number = samples.number + k
     samples.sums[k] = measure(y, samples.lattice, samples.unit)
-    drives, time = samples.lattice.drives, number * samples.interval
+
     for i in range(drives.rows.size):
         drive = drives.rows[i]
         samples.work[k, drive.number] = y[shape.work + i]
         if drive.stiffness > 0.0:
-            energy = wall_energy(drives, i, time, y[drive.target - shape.dofs * shape.cells])
+            energy = wall_energy(drives, i, number * samples.interval, y[drive.target - shape.dofs * shape.cells])
             samples.work[k, drive.number] += energy
             add_energy(samples.sums[k], energy, samples.unit)
     samples.losses[k] = y[shape.dissipated : shape.owned]
+
     if number % samples.stride == 0:
-        row, n = number // samples.stride - (samples.number + samples.stride - 1) // samples.stride, shape.cells
-        for i in range(samples.fields.shape[0]):
-            for j in range(shape.dofs):
-                out, first = samples.fields[i, row, j], (j + shape.dofs * samples.moving[i]) * n + samples.first_cell
-                for c in range(out.size):
-                    out[c] = y[first + c * samples.every]
+        _record_fields(y, number, samples)
     return samples.sums[k, :, 0].max() < LARGEST and np.abs(samples.work[k]).max() < np.inf
+
+
+@kernel
+def _record_fields(y: np.ndarray, number: int, samples: Samples) -> None:
+    """Keep the fields of the sample with the ``number``, which the stride divides."""
+    shape = samples.lattice.shape
+    row = number // samples.stride - (samples.number + samples.stride - 1) // samples.stride
+    for i in range(samples.fields.shape[0]):
+        for mass in range(shape.dofs):
+            out = samples.fields[i, row, mass]
+            first = (mass + shape.dofs * samples.moving[i]) * shape.cells + samples.first_cell
+            for c in range(out.size):
+                out[c] = y[first + c * samples.every]
 
 
 @dataclass(frozen=True)
 class Block:
     """Consecutive samples of a run: ``times`` (sample,) in s, the number ``first`` of the first one, from 0.
 
-    ``energies`` are those of the whole lattice, arrays (sample,). ``share``: this rank's share, where ``losses`` and
-    ``fields`` begin with these samples. ``state`` is the last one that the engine came to, ordered as ``Layout`` says,
-    ghosts up to date; it changes with the next block.
+    ``energies`` are those of the whole lattice, arrays (sample,). ``samples`` are what this rank took, where ``losses``
+    and ``fields`` begin with these samples. ``state`` is the last one that the engine came to, ordered as ``Layout``
+    says, ghosts up to date; it changes with the next block.
     """
 
     first: int
     times: np.ndarray
     energies: Energies
-    share: Samples
+    samples: Samples
     state: PETSc.Vec
 
     def __len__(self) -> int:

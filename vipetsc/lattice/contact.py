@@ -21,8 +21,10 @@ Adhesion = Literal["allow", "clip"]
 Damping = Literal["paper", "exact", "hunt-crossley", "lankarani-nikravesh", "flores"]
 LEAST_RESTITUTION = 0.05  # where the damping grows without bound towards 0
 
-# Laws whose force is a power of the indentation; that of "power" is a parameter.
-EXPONENTS: Mapping[Law, float] = {"hertz": 1.5, "bilinear": 1.0}
+# The power of the indentation with which the force of a law begins; that of "power" is its parameter.
+ONSET_EXPONENTS: Mapping[Law, float] = {"hertz": 1.5, "bilinear": 1.0}
+# Laws whose force is that power all along.
+POWER_LAWS = ("hertz", "bilinear", "power")
 # Phases at which the duration of an impact is summed; relative errors are below 1e-5 where f begins as x^1.5.
 PHASES = 32
 
@@ -90,7 +92,7 @@ class Contact:
     def onset_exponent(self) -> float:
         """The power of the indentation with which the force begins; raises KeyError for a law that there is not."""
         if self.law != "power":
-            return EXPONENTS[self.law]
+            return ONSET_EXPONENTS[self.law]
         if self.exponent is None:
             raise ValueError("the law power needs an exponent")
         return self.exponent
@@ -113,7 +115,7 @@ class Contact:
     @property
     def duration_factor(self) -> float:
         """Duration of an impact without loss over depth/speed (Johnson 1985, sec. 11.4); 0 if f is no power of x."""
-        if self.law not in (*EXPONENTS, "power"):
+        if self.law not in POWER_LAWS:
             return 0.0
         n = self.onset_exponent
         # Integral of dx / sqrt(1 - x^(n+1)) over [0, 1]: pi/2 for n = 1, 1.4716 for n = 3/2.

@@ -30,6 +30,19 @@ STRETCH = 1.08
 MOST_TRIALS = 10_000
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
+# Steps in periods of the first drive's radian: the first one, and the one that the controller begins with.
+FIRST_STEP = 0.002
+FREE_STEP = 0.05
+# A burst rises as t^3: steps that grow with t keep even the first samples' ledger small compared with the work.
+STEP_PER_TIME = 0.25
+# The step after an onset, as a fraction of the contact's duration, and the order of its error, both at a tolerance of
+# 1e-10: where all forces begin linearly, and else. Hertz's force begins as (t - onset)^(3/2), which no step of high
+# order likes: the velocity's error goes as h^(5/2). The fractions are those that the controller settles at.
+LINEAR_ONSET = 1 / 20, 8
+OTHER_ONSET = 1 / 200, 2.5
+LONGEST_ONSET = 0.1
+# Work and losses do not decide the step.
+NO_TOLERANCE = 1e30
 
 
 class Integrator(Engine):
@@ -40,7 +53,7 @@ class Integrator(Engine):
     model, layout
         The lattice and its distribution.
     stop
-        Looked at after every step; a request on any rank is told by ``advance`` on all, at the time it goes to.
+        Looked at after every step; a request on any rank ends ``advance`` on all, at the time it goes to.
 
     PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor, first step; with
     ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
@@ -49,36 +62,42 @@ class Integrator(Engine):
     name, dashpots = "ts", True
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
-        self.comm, self.layout = layout.comm, layout
+        self.comm = layout.comm
+        self.layout = layout
         self.lattice = create_record(model, layout)
         self.tracker = ImpactTracker(self.lattice.contacts, layout.contacts)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
+        self._logged = np.isin(layout.contacts, layout.sites)  # other ranks log the others
+        self._stop = stop or StopRequest()
+        self._any_open = False
+
         self.time = 0.0
         self.state = layout.create_vector()
+        register_sums(self.state)  # before it is duplicated
         self.rates = layout.create_vector() if model.chain.pairs else self.state
-        self._mine = np.isin(layout.contacts, layout.sites)  # others log the rest
-        register_sums(self.state)
         self.saved = self.state.duplicate()
-        self.ts, self._first_step = self._create_ts(model, layout), 0.002 / model.drive.frequency
+        self.ts = self._create_ts(model, layout)
+
         options = PETSc.Options()
-        self.step = self.free_step = options.getReal("ts_dt", 0.05 / model.drive.frequency)
+        self._first_step = FIRST_STEP / model.drive.frequency
+        self.step = options.getReal("ts_dt", FREE_STEP / model.drive.frequency)
+        self.free_step = self.step
         self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
         self._interval = model.sample_interval
         self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
-        self._stop, self._any_open = stop or StopRequest(), False
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
-        # Hertz's force begins as (t - onset)^(3/2), which no step of high order likes: the velocity's error goes
-        # as h^(5/2). The shares are those that the controller settles at.
-        exponents = {law.onset_exponent for law in model.laws or (model.contact,)}
-        share, order = (1 / 20, 8) if exponents == {1} else (1 / 200, 2.5)
-        self._first_share = min(share * (model.rtol / 1e-10) ** (1 / order), 0.1)
+        laws = model.laws or (model.contact,)
+        fraction, order = LINEAR_ONSET if all(law.onset_exponent == 1 for law in laws) else OTHER_ONSET
+        self._onset_fraction = min(fraction * (model.rtol / 1e-10) ** (1 / order), LONGEST_ONSET)
         self.observe(self.tracker.start)
 
     def _create_ts(self, model: Model, layout: Layout) -> PETSc.TS:
-        options = PETSc.Options()
-        tolerances, half = self.state.duplicate(), layout.dofs * layout.owned
+        """PETSc's time stepper for this lattice, with the options that the user gave."""
+        tolerances = self.state.duplicate()
+        half = layout.dofs * layout.owned
         tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol
-        tolerances.array[2 * half :] = 1e30  # work and losses do not decide the step
+        tolerances.array[2 * half :] = NO_TOLERANCE
+
         ts = PETSc.TS().create(layout.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
         ts.setType(PETSc.TS.Type.RK)
@@ -91,14 +110,16 @@ class Integrator(Engine):
         ts.setErrorIfStepFails(False)
         ts.setSolution(self.state)
         register(ts, self.lattice)
+
         # The step must depend neither on the lattice's length nor on the ranks: the largest error decides.
-        default = "ts_adapt_wnormtype"
-        if options.hasName(default):
+        options = PETSc.Options()
+        norm = "ts_adapt_wnormtype"
+        if options.hasName(norm):
             ts.setFromOptions()
         else:
-            options[default] = "infinity"
+            options[norm] = "infinity"
             ts.setFromOptions()
-            options.delValue(default)
+            options.delValue(norm)
         return ts
 
     def observe(self, motion: np.ndarray, time: float | None = None) -> None:
@@ -120,14 +141,15 @@ class Integrator(Engine):
         self._restart(True)
 
     def fill(self, samples: Samples) -> FillResult:
-        """A sample at which it stops is not taken."""
+        """Go on through ``samples`` and take them; a sample at which it stops is not taken."""
         for k in range(len(samples.work)):
             sys.audit("vipetsc.step")
             try:
-                if not self.advance((samples.number + k) * self._interval):
-                    return FillResult(k, stopped=True)
+                goes_on = self.advance((samples.number + k) * self._interval)
             except StalledError as error:
                 return FillResult(k, stalled=str(error))
+            if not goes_on:
+                return FillResult(k, stopped=True)
             with self.state.localForm() as local:
                 take_sample(local.array, k, samples)
         return FillResult(len(samples.work))
@@ -138,32 +160,39 @@ class Integrator(Engine):
         Raises StalledError, on all ranks, where no step can be taken.
         """
         # The end of a drive or of a piece of one is a kink: a step ends there.
-        first, last = self._breaks.searchsorted(self.time, "right"), self._breaks.searchsorted(target)
-        return all(self._reach(time) for time in (*self._breaks[first:last].tolist(), target))
+        first = self._breaks.searchsorted(self.time, "right")
+        last = self._breaks.searchsorted(target)
+        times = [*self._breaks[first:last].tolist(), target]
+        return all(self._advance_smoothly(time) for time in times)
 
-    def _reach(self, target: float) -> bool:
-        """As ``advance``, without a kink on the way."""
+    def _advance_smoothly(self, target: float) -> bool:
+        """Go on as ``advance`` does, to a time before which no drive has a kink."""
         drives = self.lattice.drives
-        for i in range(len(drives.rows) if len(drives.pieces) else 0):
-            select_piece(drives, i, self.time)
-        trials, stopped = 0, False
+        if len(drives.pieces):
+            for i in range(len(drives.rows)):
+                select_piece(drives, i, self.time)
+
+        stopped = False
+        trials = 0
         while self.time < target:
             if trials > self._most_trials:
                 raise StalledError(f"{trials} steps did not reach t = {target:.6g} s")
-            stopped |= not self._step(target)
+            if not self._step(target):
+                stopped = True
             trials += 1
         self.ts.restartStep()  # as a run does that goes on from here
         return not stopped
 
     def _step(self, target: float) -> bool:
+        """Try a step towards ``target`` in s and land on a change within it; False if a stop was requested."""
         remaining = target - self.time
         shortest = SHORTEST_STEP * max(self.time, self.free_step)
         if remaining <= shortest:
             self.time = target
             return True
-        # A burst rises as t^3: steps that grow with t keep even the first samples' ledger small beside the work.
-        step = min(STRETCH * self.step, self._first_step + 0.25 * self.time)
-        count = np.ceil(remaining / step)
+
+        # Equal steps to the target: none of them is short because the others were long.
+        count = np.ceil(remaining / min(STRETCH * self.step, self._first_step + STEP_PER_TIME * self.time))
         h = remaining / count
         if h < shortest:
             raise StalledError(f"the step fell to {h:.3g} s")
@@ -176,20 +205,27 @@ class Integrator(Engine):
         if not self._fixed_step and (suggestion < 4 * h or suggestion > self.step):
             self.step = suggestion
         self.counts["steps"] += 1
+
         end = target if count == 1 else self.time + h
         self.observe(self.tracker.end, end)
         with log.SEARCH:
-            change = first_change(self.tracker.contacts, self.tracker.start, self.tracker.end, h, np.empty((2, 6)))
+            change = self._first_change(h)
+        # One reduction for both: the earliest change, and whether a stop was requested anywhere.
         earliest = np.array([change.position, -float(self._stop.requested)])
         self.comm.Allreduce(MPI.IN_PLACE, earliest, MPI.MIN)
-        share, stop = earliest.tolist()
-        if share <= 1.0:
+        position, stop = earliest.tolist()
+        if position <= 1.0:
             with log.LANDING:
-                self._land(h, share, change)
+                self._land(h, position, change)
         else:
             self.tracker.accept_step(h)
             self.time = end
         return stop == 0.0
+
+    def _first_change(self, h: float) -> ModeChange:
+        """The first change of this rank's sites in the step of ``h`` s that was just tried."""
+        tracker = self.tracker
+        return first_change(tracker.contacts, tracker.start, tracker.end, h, np.empty((2, 6)))
 
     def _trial(self, h: float) -> float | None:
         """Try one step of ``h`` s from ``saved``: PETSc's next step size; None if it was rejected, and is undone."""
@@ -200,19 +236,21 @@ class Integrator(Engine):
         suggestion = ts.getTimeStep()
         if np.isfinite(suggestion) and ts.getConvergedReason() >= 0:
             return suggestion
+
         self.step = suggestion if np.isfinite(suggestion) else 0.1 * h
         self.saved.copy(self.state)
         ts.restartStep()
         return None
 
-    def _land(self, h: float, share: float, change: ModeChange) -> None:
-        """Step from the saved state onto the change at ``share`` of the step just tried, and switch there.
+    def _land(self, h: float, position: float, change: ModeChange) -> None:
+        """Step from the saved state onto the change at ``position`` in the step just tried, and switch there.
 
-        ``change`` is this rank's first one; the rank whose share is the smallest judges the landing for all.
+        ``change`` is this rank's first one; the rank whose position is the smallest judges the landing for all.
         """
         comm, tracker = self.comm, self.tracker
-        owner = comm.allreduce(comm.rank if change.position == share else comm.size, MPI.MIN)
-        attempt, outcome = Landing(share * h, h, np.inf, 0), RETRY
+        owner = comm.allreduce(comm.rank if change.position == position else comm.size, MPI.MIN)
+        attempt = Landing(length=position * h, longest=h, residual=np.inf, attempts=0)
+        outcome = RETRY
         self.counts["landings"] += 1
         sys.audit("vipetsc.landing")
         while outcome == RETRY:
@@ -225,7 +263,9 @@ class Integrator(Engine):
             if self._trial(length) is None:
                 return
             self.observe(tracker.end, self.time + length)
-            attempt, outcome = comm.bcast(self._judge(attempt, change) if comm.rank == owner else None, owner)
+            judged = self._judge(attempt, change) if comm.rank == owner else None
+            attempt, outcome = comm.bcast(judged, owner)
+
         tracker.accept_step(length)
         self.time += length
         if outcome == LANDED:
@@ -235,18 +275,23 @@ class Integrator(Engine):
         """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it."""
         tracker, site = self.tracker, change.site
         value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, tracker.end[site])
-        attempt, outcome = correct(attempt, value, rate, tolerance, tolerance)
+        attempt, outcome = correct(attempt, value, rate, tolerance, goal=tolerance)
         if outcome != SEARCH:
             return attempt, outcome
+
         # A graze: short of it, go on from here; beyond it, search again on the shorter step.
-        share = first_change(tracker.contacts, tracker.start, tracker.end, attempt.length, np.empty((2, 6))).position
-        return (shorten(attempt, share), RETRY) if share <= 1.0 else (attempt, MISSED)
+        position = self._first_change(attempt.length).position
+        if position > 1.0:
+            return attempt, MISSED
+        return shorten(attempt, position), RETRY
 
     def _switch(self) -> None:
         """Switch modes of all landed sites and set the step with which to go on."""
-        was_free, sites, modes = not self._any_open, self.tracker.contacts, self.tracker.contacts["mode"].copy()
+        was_free = not self._any_open
+        before = self.tracker.contacts["mode"].copy()
         self.tracker.switch(self.time, self.layout.losses(self.state.array_r))
-        self.counts["switches"] += int((modes != sites["mode"])[self._mine].sum())
+        switched = before != self.tracker.contacts["mode"]
+        self.counts["switches"] += int(switched[self._logged].sum())
         self._restart(was_free)
 
     def _restart(self, was_free: bool) -> None:
@@ -256,36 +301,39 @@ class Integrator(Engine):
         if self._any_open and not self._fixed_step:
             if was_free:
                 self.free_step = self.step
-            self.step = min(self.step, self._first_share * shortest)
+            self.step = min(self.step, self._onset_fraction * shortest)
         elif not was_free:
             self.step = self.free_step
         self.observe(self.tracker.start)
         self.ts.restartStep()
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
-        """Those of the owned sites."""
+        """Episodes of the owned sites closed since the last call, ``unfinished`` ones too."""
         episodes = self.tracker.take_episodes(self.layout.losses(self.state.array_r), unfinished)
-        return episodes[np.isin(episodes["site"], self.layout.sites)] if episodes.size else episodes
+        if not episodes.size:
+            return episodes
+        return episodes[np.isin(episodes["site"], self.layout.sites)]
 
     def statistics(self) -> dict[str, Any]:
         """Steps, and what landings and limits of the contact law there were."""
-        limits = self.tracker.counts[self._mine]
-        of_sites = np.array([self.counts["switches"], *(limits[name].sum() for name in LIMITS)])
-        self.comm.Allreduce(MPI.IN_PLACE, of_sites, MPI.SUM)
-        sums = dict(zip(("switches", *LIMITS), of_sites.tolist(), strict=True))
-        return self.counts | sums | {"method": self.ts.getRKType()}
+        limits = self.tracker.counts[self._logged]
+        totals = np.array([self.counts["switches"], *(limits[name].sum() for name in LIMITS)])
+        self.comm.Allreduce(MPI.IN_PLACE, totals, MPI.SUM)
+        per_site = dict(zip(("switches", *LIMITS), totals.tolist(), strict=True))
+        return self.counts | per_site | {"method": self.ts.getRKType()}
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         return self.layout.checkpoint(self.state.array_r) | {
-            "sites": self.tracker.checkpoint()[self._mine],
+            "sites": self.tracker.checkpoint()[self._logged],
             "time": np.array(self.time),
             "steps": np.array([self.step, self.free_step, float(self._any_open)]),
             "counts": np.array([list(self.counts.values())]),
         }
 
-    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        tables, common = join(shares, {"sites": "number", "counts": None}), shares[0]
-        self.layout.restore(shares, self.state.array)
+    def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        common = checkpoints[0]
+        tables = join(checkpoints, {"sites": "number", "counts": None})
+        self.layout.restore(checkpoints, self.state.array)
         self.tracker.restore(tables["sites"])
         self.time = float(common["time"])
         self.step, self.free_step, any_open = common["steps"].tolist()

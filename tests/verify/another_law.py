@@ -1,0 +1,237 @@
+"""What each room makes of hardening stops, against formulas written out here: a script of ``test_another_law``."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.linalg import eigh
+from scipy.optimize import brentq, root
+
+from vipetsc import Case, open, simulate
+from vipetsc.cli.main import main
+from vipetsc.contact.law import (
+    create_contacts,
+    elastic_energy,
+    elastic_force,
+    elastic_force_and_slope,
+    elastic_records,
+    impact_time,
+)
+from vipetsc.io.store import RunMemory
+from vipetsc.lattice import Contact
+
+K, B = 2e5, 4e5
+# Of the stop in a steady state far below all modes, where nothing is large but its own force.
+SOFT, STEADY_B = 2e3, 2e6
+D = 1e-3
+
+
+def force(x, k=K, b=B):
+    return k * x * (1 + b * x**2)
+
+
+def slope(x):
+    return K * (1 + 3 * B * x**2)
+
+
+def energy(x):
+    return K * x**2 / 2 + K * B * x**4 / 4
+
+
+def relative(a, b):
+    return float(np.abs(np.subtract(a, b)).max() / np.abs(b).max())
+
+
+def twins() -> dict:
+    law, x = Contact("hardening", K, hardening=B), np.linspace(1e-4, 2e-3, 7)
+    (record,) = elastic_records([law])
+    compiled = np.array(
+        [(*elastic_force_and_slope(record, s), elastic_force(record, s), elastic_energy(record, s)) for s in x]
+    )
+    differences = [
+        relative(law.elastic_force(x), force(x)),
+        relative(law.elastic_slope(x), slope(x)),
+        relative(law.elastic_energy(x), energy(x)),
+        relative(compiled.T, [force(x), slope(x), force(x), energy(x)]),
+    ]
+
+    mass, speed = 0.01, 2.0
+    fall = solve_ivp(lambda t, y: [y[1], -force(y[0]) / mass], (0, 1), [0.0, speed], rtol=1e-11, atol=1e-14,
+                     events=turning)  # fmt: skip
+    site = create_contacts(law, [D], mass)[0]
+    durations = [law.impact_time(speed, mass), impact_time(site, speed)]
+    return {"twins": max(differences), "duration": relative(durations, [2 * fall.t[-1]] * 2)}
+
+
+def turning(t, y):
+    return y[1]
+
+
+turning.terminal = True
+
+LATTICE = {"preset": "four-band", "cells": 12}
+STOPS = {"law": "hardening", "hardening": B, "stiffness": K, "sites": [4, 6], "clearance": D}
+
+
+def engines() -> dict:
+    velocity, results = {}, {}
+    for law, engine in (("hardening", "ts"), ("hardening", "propagator"), ("bilinear", "propagator")):
+        stops = STOPS | {"law": law, "restitution": 0.6}
+        if law != "hardening":
+            del stops["hardening"]
+        table = {
+            "lattice": LATTICE,
+            "contacts": stops,
+            "drive": {"amplitude": 300.0, "cycles": 5, "cell": 5},
+            "time": {"end": 0.03, "engine": engine, "rtol": 1e-10},
+        }
+        memory = RunMemory()
+        results[law, engine] = simulate(Case.from_table(table), memory).statistics
+        velocity[law, engine] = memory.dataset["velocity"].values
+    ours, exact, linear = velocity.values()
+    pair = list(results.values())[:2]
+    return {
+        "engines": relative(ours, exact),
+        "hardens": relative(linear, exact),
+        "episodes": [statistics["episodes"] for statistics in pair],
+        "ledgers": [statistics["ledger_error"] for statistics in pair],
+    }
+
+
+MASS, SPRING = 1.3, 4e4
+
+
+def period(total: float) -> float:
+    """Four times the way from rest to the farthest point of a mass on a spring between two stops."""
+
+    def potential(x):
+        return SPRING * x**2 / 2 + energy(max(x - D, 0.0))
+
+    farthest = brentq(lambda x: potential(x) - total, 0, 1, xtol=1e-16)
+
+    def slowness(s):
+        x = farthest * np.sin(s)
+        return farthest * np.cos(s) / np.sqrt(2 * (total - potential(x)) / MASS)
+
+    touch = np.arcsin(min(D / farthest, 1.0))
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    total_time = 0.0
+    for low, high in ((0.0, touch), (touch, np.pi / 2)):
+        if low == high:
+            continue
+        phases = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+        total_time += 0.5 * (high - low) * sum(w * slowness(s) for s, w in zip(phases, weights, strict=True))
+    return 4 * total_time
+
+
+def normal_modes() -> dict:
+    touching = SPRING * D**2 / 2
+    highest = 20 * touching
+    case = f"""
+[contacts]
+law = "hardening"
+hardening = {B}
+stiffness = {K}
+
+[nnm]
+system = "own"
+modes = [1]
+method = "METHOD"
+energy = [0.0, {highest}]
+start_energy = {0.9 * touching}
+points = 60
+truncation = 1e-4
+
+[nnm.own]
+masses = [{MASS}]
+springs = [{{ start = 0, end = 1, stiffness = {SPRING} }}]
+contacts = [{{ host = 0, resonator = 1, clearance = {D} }}]
+"""
+    found: dict = {"periods": {}, "reached": {}}
+    for method in ("shooting", "condensed"):
+        Path(f"{method}.toml").write_text(case.replace("METHOD", method))
+        assert main(["nnm", f"{method}.toml", "--out", method, "--force"], {}) == 0
+        (path,) = Path(method).glob("branch-*.csv")
+        table = np.genfromtxt(path, delimiter=",", names=True, comments=None)
+        expected = np.array([period(total) for total in table["energy"]])
+        found["periods"][method] = relative(1 / table["frequency"], expected)
+        found["reached"][method] = float(table["energy"].max() / highest)
+    return found
+
+
+def periodic(omega: float, amplitude: float, chain) -> float:
+    """Largest |w| in m of the symmetric periodic orbit under amplitude cos(omega t) on the first mass."""
+    stiffness, masses = chain.stiffness_matrix().toarray(), chain.masses()
+    pair = np.zeros(len(masses))
+    pair[[chain.cell.host, chain.cell.resonator]] = -1, 1
+
+    def rate(t, y, strength):
+        u, v = np.split(y, 2)
+        w = pair @ u
+        push = np.sign(w) * force(max(abs(w) - D, 0.0), SOFT, STEADY_B)
+        pull = stiffness @ u + push * pair
+        pull[0] -= strength * np.cos(omega * t)
+        return np.concatenate([v, -pull / masses])
+
+    def orbit(u, strength):
+        # Nothing dissipates: the orbit is even in time, and so about half a period.
+        times = np.linspace(0, np.pi / omega, 201)
+        start = np.concatenate([u, 0 * u])
+        return solve_ivp(rate, times[[0, -1]], start, "DOP853", times, args=(strength,), rtol=1e-10, atol=1e-14).y
+
+    n = len(masses)
+    linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(n)[0])
+    touching = D / abs(pair @ linear)
+    u = linear * touching
+    for strength in np.linspace(touching, amplitude, 4)[1:]:
+        solved = root(
+            lambda u, strength=strength: orbit(u, strength)[n:, -1] / (omega * D), u * strength / touching, tol=1e-9
+        )
+        assert solved.success, solved.message
+        u, touching = solved.x, strength
+    return float(np.abs(pair @ orbit(u, amplitude)[:n]).max())
+
+
+def steady() -> dict:
+    lattice = {"preset": "four-band", "cells": 2}
+    chain = Case.from_table({"lattice": lattice, "contacts": STOPS | {"sites": [1]}}).model().chain
+    stiffness, masses = chain.stiffness_matrix().toarray(), chain.masses()
+    omega = round(0.7 * float(np.sqrt(eigh(stiffness, np.diag(masses), eigvals_only=True)[0])), 3)
+    linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(len(masses))[0])
+    touching = D / abs(linear[chain.cell.resonator] - linear[chain.cell.host])
+    case = f"""
+[lattice]
+preset = "four-band"
+cells = 2
+
+[contacts]
+law = "hardening"
+hardening = {STEADY_B}
+stiffness = {SOFT}
+sites = [1]
+clearance = {D}
+restitution = 1.0
+
+[drive]
+cell = 1
+mass = 1
+
+[nfrc]
+source = "force"
+infinite = false
+fixed = [{omega}]
+range = [{0.9 * touching}, {3 * touching}]
+harmonics = 31
+"""
+    Path("nfrc.toml").write_text(case)
+    assert main(["nfrc", "nfrc.toml", "--out", "nfrc", "--force"], {}) == 0
+    (path,) = Path("nfrc").glob("branch-*.h5")
+    with open(path) as curve:
+        amplitude, largest = curve["amplitude"].values, curve["largest"].values
+    expected = periodic(omega, amplitude[-1], chain)
+    return {"steady": abs(float(largest[-1, 0]) / expected - 1), "steady_hardens": STEADY_B * (expected - D) ** 2}
+
+
+found = twins() | engines() | normal_modes() | steady()
+Path("found.json").write_text(json.dumps(found))
