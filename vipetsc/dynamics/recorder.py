@@ -151,8 +151,8 @@ class Recorder(Observer):
         """Fields, losses and ``episodes`` of the chunk: this rank's, or those of all on rank 0 and none elsewhere."""
         comm, recording = self.setup.layout.comm, self.setup.output.recording
         sites = np.array(self.setup.layout.sites, np.int64)
-        own = sites, self._losses[: self._held], episodes, self._fields[:, : self._rows]
-        gathered = [own] if recording.together or comm.size == 1 else comm.gather(own)
+        rank_part = sites, self._losses[: self._held], episodes, self._fields[:, : self._rows]
+        gathered = [rank_part] if recording.together or comm.size == 1 else comm.gather(rank_part)
         if gathered is None:
             return {}
 
@@ -162,14 +162,14 @@ class Recorder(Observer):
         log = np.concatenate(all_episodes)
         log["site"] += 1  # counted from 1
         # One rank's fields may be large: they are not copied.
-        kept = all_fields[0] if len(all_fields) == 1 else np.concatenate(all_fields, axis=3)
+        all_cells = all_fields[0] if len(all_fields) == 1 else np.concatenate(all_fields, axis=3)
         chunk = {
             LOSSES: np.concatenate(all_losses, axis=1)[:, order],
             "sites": ranges(numbers[order]),
             "impacts": log,
             "columns": self._columns,
         }
-        return chunk | dict(zip(recording.fields, kept, strict=True))
+        return chunk | dict(zip(recording.fields, all_cells, strict=True))
 
     def finish(self, stopped: bool) -> None:
         if not stopped:
