@@ -15,12 +15,15 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault(name, "1")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("vipetsc").setLevel(logging.INFO)
+
+    # Looked for rather than imported: PETSc takes its options from the first import that starts it.
     if missing := [name for name in BUILT_FOR_MPI if find_spec(name) is None]:
         remedy = (
             "on Debian: apt install python3-petsc4py python3-h5py-mpi, and an environment with --system-site-packages"
         )
         logging.getLogger("vipetsc").critical("vipetsc: %s not installed; %s", " and ".join(missing), remedy)
         return 1
+
     arguments = sys.argv[1:] if arguments is None else arguments
     end = arguments.index("--") if "--" in arguments else len(arguments)
 
@@ -33,12 +36,15 @@ def main(arguments: list[str] | None = None) -> int:
     from vipetsc.case.schema import only_looks
     from vipetsc.parallel import install_abort_hook
 
+    # Before a rank can fail: one that raises alone would leave the others waiting for ever.
     install_abort_hook()
+
     # Options that a result may depend on become part of the case.
     database = PETSc.Options()
     options = {name: value or "true" for name, value in database.getAll().items() if not only_looks(name)}
     for name in options:
         database.delValue(name)
+
     from vipetsc.cli.main import main as run_verb
 
     return run_verb(arguments[:end], options)

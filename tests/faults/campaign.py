@@ -20,22 +20,28 @@ from tests.faults.scenarios import SCENARIOS
 from tests.faults.trials import Crew, judge, last_words, matrix, references
 from vipetsc.case import Case
 
+Row = dict[str, Any]  # of the report: a task, and how it went
 # Of verbs that leave results of their own, which the same command goes on with.
 KILLED = [scenario.name for scenario in SCENARIOS.values() if scenario.verb.results]
 
 
 def faults(options: argparse.Namespace) -> dict[str, Any]:
     """Every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
-    rows, reached = [], set()
+    rows: list[Row] = []
+    reached: set[str] = set()
     with tempfile.TemporaryDirectory(prefix="faults-") as work:
         for ranks in options.ranks:
             crew = Crew(Path(work) / str(ranks), ranks, options.patience)
             unbroken = references(crew, options.only or list(SCENARIOS))
-            tasks = [t for t in matrix(unbroken, options.kinds) if not options.phases or t["phase"] in options.phases]
+            tasks = list(matrix(unbroken, options.kinds))
+            if options.phases:
+                tasks = [task for task in tasks if task["phase"] in options.phases]
             reached |= {task["phase"] for task in tasks}
-            share = tasks[:: options.every]
-            rows += [judged(task | {"ranks": ranks}, stages, options) for task, stages in crew.do(share)]
-    missed = sorted(phases() - reached) if not options.only else []
+            for task, stages in crew.do(tasks[:: options.every]):
+                rows.append(judged(task | {"ranks": ranks}, stages, options))
+
+    # Some scenarios need not come to all phases.
+    missed = [] if options.only else sorted(phases() - reached)
     print(fault_table(rows, options.kinds, options.ranks))
     if missed:
         print(f"phases that no case comes to: {', '.join(missed)}")
@@ -46,7 +52,7 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
 
 def kills(options: argparse.Namespace) -> dict[str, Any]:
     """Signals at random times to whole calls and to single ranks; then the same command, and its bits."""
-    rows = []
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="kills-") as work:
         crews = {ranks: Crew(Path(work) / str(ranks), ranks, options.patience) for ranks in options.ranks}
         for _ in range(2):  # kernels are compiled in the first
@@ -54,20 +60,23 @@ def kills(options: argparse.Namespace) -> dict[str, Any]:
         seconds = {(name, ranks): unbroken[ranks][name]["seconds"] for ranks in crews for name in options.only}
         tasks = list(trials.kills(seconds, options.seed, options.count))
         for ranks, crew in crews.items():
-            share = [task for task in tasks if task["ranks"] == ranks]
-            rows += [judged(task, stages, options) for task, stages in crew.do(share)]
+            of_crew = [task for task in tasks if task["ranks"] == ranks]
+            rows += [judged(task, stages, options) for task, stages in crew.do(of_crew)]
+
     bad = sum(bool(row["wrong"]) for row in rows)
     for name in options.only:
         of_name = [row for row in rows if row["scenario"] == name]
-        in_time, lost = (sum(bool(row[key]) for row in of_name) for key in ("came", "wrong"))
+        in_time = sum(bool(row["came"]) for row in of_name)
+        lost = sum(bool(row["wrong"]) for row in of_name)
         print(f"{name:<13}{len(of_name):>5} kills, {in_time:>4} before the end, {lost} not as they should be")
     print(f"seed {options.seed}: {len(rows)} kills, {bad} of them not as they should be")
     return {"seed": options.seed, "rows": rows, "bad": bad}
 
 
-def judged(task: dict[str, Any], stages: dict[str, dict[str, Any]], options: argparse.Namespace) -> dict[str, Any]:
+def judged(task: Row, stages: dict[str, Row], options: argparse.Namespace) -> Row:
     """A row of the report; what is wrong is printed at once."""
-    wrong, ended = judge(task, stages, options.allowed), stages.get("ended", {})
+    wrong = judge(task, stages, options.allowed)
+    ended = stages.get("ended", {})
     if wrong:
         print(f"{task['id']}: {'; '.join(wrong)}\n    {last_words(stages)}", flush=True)
     return task | {"came": ended.get("fired"), "code": ended.get("code"), "since": ended.get("since"), "wrong": wrong}
@@ -77,17 +86,20 @@ def cases(options: argparse.Namespace) -> dict[str, Any]:
     """Random changes of case files, read as every verb reads them: a sentence, never a traceback or a long wait."""
     from tests.faults import mutations
 
-    rows, endings = [], Counter()
+    rows: list[Row] = []
+    endings: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="cases-") as work:
         for mutation in itertools.islice(mutations.mutations(options.seed), options.count):
             verdict = mutations.judge(mutation, Path(work) / "case.toml", options.seconds)
-            defect, runs = verdict.defect, [case for case in verdict.cases if isinstance(case, Case)]
+            defect = verdict.defect
+            runs = [case for case in verdict.cases if isinstance(case, Case)]
             if runs and endings["valid"] % options.every == 0:
                 defect = mutations.run_shortly(runs[0], options.seconds)
             endings["valid" if verdict.cases else "refused"] += 1
             if defect:
                 rows.append({"parent": mutation.parent, "changes": mutation.changes, "defect": defect})
                 print(f"{mutation.parent}, {'; '.join(mutation.changes)}: {defect}", flush=True)
+
     counts = f"{endings['valid']} of them valid, {len(rows)} with a traceback or longer than {options.seconds} s"
     print(f"seed {options.seed}: {options.count} cases, {counts}")
     return {"seed": options.seed, "count": options.count, **endings, "rows": rows, "bad": len(rows)}
@@ -95,16 +107,19 @@ def cases(options: argparse.Namespace) -> dict[str, Any]:
 
 def fault_table(rows: Sequence[dict[str, Any]], kinds: Sequence[str], ranks: Sequence[int]) -> str:
     """Phases of every verb against kinds of faults and ranks: "." as it should be, "x" not, "-" it did not come."""
-    marks = {False: "-", True: "."}
-    cells = {
-        (row["scenario"], row["phase"], row["kind"], row["ranks"]): "x" if row["wrong"] else marks[bool(row["came"])]
-        for row in rows
-    }
-    columns = [(kind, n) for kind in kinds for n in ranks]
-    lines = [f"{'verb':<13}{'phase':<12}" + "".join(f"{kind + ' ' + str(n):>13}" for kind, n in columns)]
+    marks = {}
+    for row in rows:
+        mark = "." if row["came"] else "-"
+        if row["wrong"]:
+            mark = "x"
+        marks[row["scenario"], row["phase"], row["kind"], row["ranks"]] = mark
+
+    columns = [(kind, count) for kind in kinds for count in ranks]
+    titles = [f"{kind} {count}" for kind, count in columns]
+    lines = [f"{'verb':<13}{'phase':<12}" + "".join(f"{title:>13}" for title in titles)]
     for name, phase in dict.fromkeys((row["scenario"], row["phase"]) for row in rows):
-        row = (cells.get((name, phase, kind, n), "") for kind, n in columns)
-        lines.append(f"{name:<13}{phase:<12}" + "".join(f"{mark:>13}" for mark in row))
+        shown = [marks.get((name, phase, kind, count), "") for kind, count in columns]
+        lines.append(f"{name:<13}{phase:<12}" + "".join(f"{mark:>13}" for mark in shown))
     return "\n".join(lines)
 
 
@@ -116,6 +131,7 @@ def main() -> int:
     common.add_argument("--allowed", type=float, default=10.0, metavar="S", help="time from a fault to the end of all")
     common.add_argument("--report", type=Path, metavar="FILE", help="leave all results there as JSON")
     kinds = parser.add_subparsers(required=True, metavar="KIND")
+
     part = kinds.add_parser("faults", parents=[common], help=faults.__doc__, description=faults.__doc__)
     part.add_argument("--only", nargs="+", choices=SCENARIOS, help="scenarios; all if left out")
     part.add_argument("--phases", nargs="+", help="phases; all if left out")
@@ -123,18 +139,21 @@ def main() -> int:
     part.add_argument("--every", type=int, default=1, metavar="N", help="every N-th fault only")
     part.add_argument("--ranks", nargs="+", type=int, default=[2, 3])
     part.set_defaults(function=faults)
+
     part = kinds.add_parser("kills", parents=[common], help=kills.__doc__, description=kills.__doc__)
     part.add_argument("--seed", type=int, default=1)
     part.add_argument("--count", type=int, default=200)
     part.add_argument("--only", nargs="+", choices=SCENARIOS, default=KILLED)
     part.add_argument("--ranks", nargs="+", type=int, default=[1, 2, 3])
     part.set_defaults(function=kills)
+
     part = kinds.add_parser("cases", parents=[common], help=cases.__doc__, description=cases.__doc__)
     part.add_argument("--seed", type=int, default=1)
     part.add_argument("--count", type=int, default=2000)
     part.add_argument("--seconds", type=int, default=20, metavar="S", help="time that a case may take")
     part.add_argument("--every", type=int, default=10, metavar="N", help="simulate every N-th valid case for a while")
     part.set_defaults(function=cases)
+
     options = parser.parse_args()
     begin = time.monotonic()
     report = options.function(options)

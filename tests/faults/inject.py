@@ -36,11 +36,14 @@ class Injector:
     def arm(self, phase: str, number: int, kind: str, mark: Path | None = None) -> None:
         """Strike with ``kind`` at the ``number``-th time from now on; the time is then written to ``mark``."""
         self.counts.clear()
-        self.armed, self.mark = (phase, number, kind), mark
+        self.armed = (phase, number, kind)
+        self.mark = mark
 
     def disarm(self) -> Counter[str]:
         """Do nothing any more; returns how often every phase has come since the last call or ``arm``."""
-        counts, self.counts, self.armed = self.counts, Counter(), None
+        counts = self.counts
+        self.counts = Counter()
+        self.armed = None
         return counts
 
     def _hook(self, event: str, arguments: tuple) -> None:
@@ -49,7 +52,8 @@ class Injector:
         phase = event.removeprefix(PREFIX)
         self.counts[phase] += 1
         if self.armed and self.armed[:2] == (phase, self.counts[phase]):
-            kind, self.armed = self.armed[2], None
+            kind = self.armed[2]
+            self.armed = None  # before it strikes, as what cleans up comes to phases too
             if self.mark:
                 self.mark.write_text(str(time.time()))
             strike(kind, phase)

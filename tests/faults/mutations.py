@@ -10,7 +10,7 @@ import random
 import signal
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,15 +113,21 @@ def mutations(seed: int, without: tuple[str, ...] = (), mild: bool = False) -> I
 
     ``mild``: few changes, of the kinds that often leave a valid case.
     """
-    rng, keys = random.Random(seed), known_keys()
+    rng = random.Random(seed)
+    keys = known_keys()
     sources = {name: table for name, table in parents().items() if name not in without}
     names = sorted(sources)
+    # What is there twice is done twice as often.
+    counts = (1, 1, 2) if mild else (1, 1, 1, 2, 2, 3, 5)
+    kinds = (_scale, _put) if mild else (_replace, _replace, _scale, _remove, _misspell, _lists, _put, _put)
+
     while True:
         parent = rng.choice(names)
-        table, changes = copy.deepcopy(sources[parent]), []
-        for _ in range(rng.choice((1, 1, 2) if mild else (1, 1, 1, 2, 2, 3, 5))):
-            every = (_replace, _replace, _scale, _remove, _misspell, _lists, _put, _put)
-            changes.append(rng.choice((_scale, _put) if mild else every)(rng, table, keys))
+        table = copy.deepcopy(sources[parent])
+        changes = []
+        for _ in range(rng.choice(counts)):
+            change = rng.choice(kinds)
+            changes.append(change(rng, table, keys))
         try:
             text = tomli_w.dumps(table).encode("utf-8", "surrogatepass")
         except (ValueError, TypeError):  # tomli_w refuses some numbers and keys
@@ -134,7 +140,11 @@ def mutations(seed: int, without: tuple[str, ...] = (), mild: bool = False) -> I
 
 def _places(node: Any, path: Path_ = ()) -> Iterator[Path_]:
     """The path of every value, sections and elements of lists included."""
-    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    items: Iterable[tuple[Any, Any]] = ()
+    if isinstance(node, dict):
+        items = node.items()
+    elif isinstance(node, list):
+        items = enumerate(node)
     for key, value in items:
         yield (*path, key)
         yield from _places(value, (*path, key))
@@ -197,6 +207,7 @@ def _lists(rng: random.Random, table: Any, keys: Any) -> str:
         return "no list"
     values = _at(table, path)
     what = rng.choice(("double", "cut", "empty", "mix", "nest"))
+
     if what == "double":
         values += copy.deepcopy(values)
     elif what == "cut" and values:
@@ -214,7 +225,8 @@ def _put(rng: random.Random, table: Any, keys: dict[Path_, list[Any]]) -> str:
     """A key that some section has, with one of its choices, a plausible number or nonsense; sometimes elsewhere."""
     path = rng.choice(sorted(keys))
     numbers = (1, 2, 3, 5, 40, 0.3, 0.9, 1e-3, 1e4, [1], [1, 2], [2, 1], [1.0, 2.0], True)
-    value = rng.choice(keys[path] or numbers) if rng.random() < 0.6 else copy.deepcopy(rng.choice(HOSTILE))
+    plausible = rng.random() < 0.6
+    value = rng.choice(keys[path] or numbers if plausible else HOSTILE)
     if rng.random() < 0.15:
         path = ("sweep", *path)
         value = value if isinstance(value, list) else [value, value]
@@ -222,7 +234,7 @@ def _put(rng: random.Random, table: Any, keys: dict[Path_, list[Any]]) -> str:
     for key in path[:-1]:
         section = section.setdefault(key, {}) if isinstance(section, dict) else section
     if isinstance(section, dict):
-        section[path[-1]] = value
+        section[path[-1]] = copy.deepcopy(value)
     return f"{path} := {value!r:.60}"
 
 
@@ -230,6 +242,7 @@ def _spoil_text(rng: random.Random, text: bytes) -> tuple[bytes, str]:
     lines = text.splitlines(keepends=True) or [b"\n"]
     i = rng.randrange(len(lines))
     what = rng.choice(("BOM", "twice", "cut", "bytes", "brackets", "digits", "crlf"))
+
     if what == "BOM":
         return b"\xef\xbb\xbf" + text, what
     if what == "twice":

@@ -226,13 +226,16 @@ def difference(wanted: Path, found: Path) -> str:
 
     The files that are there; every bit of the datasets, tables and claims; the numbers of the summaries but for times.
     """
-    names = [{str(path.relative_to(folder)) for path in folder.rglob("*")} for folder in (wanted, found)]
-    if names[0] != names[1]:
-        return f"files {sorted(names[0] ^ names[1])[:5]}"
-    for name in sorted(names[0]):
-        contents = [_content(folder / name) for folder in (wanted, found)]
-        if contents[0] != contents[1]:
-            return f"{name}: {[key for key in contents[0] if contents[0][key] != contents[1].get(key)][:5]}"
+    names_wanted = {str(path.relative_to(wanted)) for path in wanted.rglob("*")}
+    names_found = {str(path.relative_to(found)) for path in found.rglob("*")}
+    if names_wanted != names_found:
+        return f"files {sorted(names_wanted ^ names_found)[:5]}"
+
+    for name in sorted(names_wanted):
+        before = _content(wanted / name)
+        after = _content(found / name)
+        if before != after:
+            return f"{name}: {[key for key in before if before[key] != after.get(key)][:5]}"
     return ""
 
 

@@ -45,26 +45,35 @@ class Crew:
         After a task that ended its worker a new worker goes on.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        left, told = list(tasks), dict[str, dict[str, Record]]()
+        left = list(tasks)
+        stages_of: dict[str, dict[str, Record]] = {}
         while left:
             (self.folder / "results.jsonl").write_text("")
             code, messages = self._launch(left[:AT_ONCE])
             for line in (self.folder / "results.jsonl").read_text().splitlines():
                 record = json.loads(line)
-                told.setdefault(record["id"], {})[record["stage"]] = record
-            while left and "finished" in told.get(left[0]["id"], {}):
-                yield left[0], told.pop(left.pop(0)["id"])
-            stages = told.setdefault(left[0]["id"], {}) if left else {}
-            if left and (code != 0 or "ended" in stages):
-                end = self._end(code, messages)
-                if "begun" in stages and left[0]["do"] == "trial":
-                    stages.setdefault("ended", end | {"broken": unreadable(self.folder / left[0]["scenario"])})
-                    left[0] = left[0] | {"do": "finish"}
-                else:
-                    yield left.pop(0), stages | {"finished": end | {"differs": "it did not end by itself"}}
+                stages_of.setdefault(record["id"], {})[record["stage"]] = record
+            while left and "finished" in stages_of.get(left[0]["id"], {}):
+                task = left.pop(0)
+                yield task, stages_of.pop(task["id"])
+            if not left:
+                return
+
+            # The next task is the one that ended its worker, unless the worker was done with all that it was given.
+            task = left[0]
+            stages = stages_of.setdefault(task["id"], {})
+            if code == 0 and "ended" not in stages:
+                continue
+            end = self._end(code, messages)
+            if "begun" in stages and task["do"] == "trial":
+                stages.setdefault("ended", end | {"broken": unreadable(self.folder / task["scenario"])})
+                left[0] = task | {"do": "finish"}
+            else:
+                left.pop(0)
+                yield task, stages | {"finished": end | {"differs": "it did not end by itself"}}
 
     def _end(self, code: int, messages: str) -> Record:
-        """What is known of a call that ended its worker."""
+        """What a call that ended its worker has left: exit code, messages, the time since its fault."""
         errors = "".join(path.read_text(errors="replace") for path in sorted(self.folder.glob("errors-*")))
         fired = self.folder / "fired"
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
@@ -87,16 +96,20 @@ class Crew:
         return code, log.read_text(errors="replace")
 
     def _await(self, process: subprocess.Popen, kills: dict[str, Task]) -> int:
-        """Its exit code; killed when nothing has been told for longer than any call may take.
+        """The exit code of a worker; it is killed when it reports nothing for longer than any call may take.
 
         ``kills`` are tasks by their ids that are to meet a signal from outside, a ``delay`` in s after they began.
         """
         results = self.folder / "results.jsonl"
-        told, last = -1, time.monotonic()
+        reported = -1
+        last = time.monotonic()
         while process.poll() is None:
-            if (size := results.stat().st_size) != told:
-                told, last = size, time.monotonic()
-                record = json.loads((results.read_text().splitlines() or ["{}"])[-1])
+            size = results.stat().st_size
+            if size != reported:
+                reported = size
+                last = time.monotonic()
+                lines = results.read_text().splitlines()
+                record = json.loads(lines[-1]) if lines else {}
                 kill = kills.get(record.get("id", "")) if record.get("stage") == "begun" else None
                 if kill and not self._changes(results, size, record["time"] + kill["delay"]):
                     (self.folder / "fired").write_text(str(time.time()))
@@ -107,7 +120,7 @@ class Crew:
         return process.returncode
 
     def _changes(self, results: Path, size: int, until: float) -> bool:
-        """Whether something was told before the time ``until``."""
+        """Whether the worker reports something before the time ``until``."""
         while (left := until - time.time()) > 0 and results.stat().st_size == size:
             time.sleep(min(left, 0.01))
         return results.stat().st_size != size
@@ -170,7 +183,8 @@ def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Itera
     random = Random(seed)
     for number in range(count):
         (name, ranks), duration = random.choice(sorted(seconds.items()))
-        kind, rank = random.choice(("sigkill", "sigterm")), random.randrange(-1, ranks)
+        kind = random.choice(("sigkill", "sigterm"))
+        rank = random.randrange(-1, ranks)
         delay = round(0.8 * random.random() * duration, 3)
         whom = "all" if rank < 0 else f"rank {rank}"
         yield {
@@ -181,25 +195,32 @@ def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Itera
 
 def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> list[str]:
     """What is wrong with how a trial ended, in words."""
-    ended, finished = stages.get("ended", {}), stages.get("finished", {})
-    kind, wrong, errors = task["kind"], [], ended.get("errors", "")
+    ended = stages.get("ended", {})
+    finished = stages.get("finished", {})
     if not ended.get("fired"):  # what ranks draw from a count may have gone to another
         return [] if ended.get("code") == finished.get("code") == 0 else ["it ends before the fault"]
+
+    kind = task["kind"]
+    errors = ended.get("errors", "")
+    wrong = []
     if "Timeout (" in errors:
         wrong.append("hangs")
     elif ended["since"] > allowed:
         wrong.append(f"all ranks ended after {ended['since']:.0f} s")
+
     # A file that cannot be read may be another's, or made again.
     codes = CODES.get(kind, {0, 1, 2} if task.get("phase") == "read" else {1})
     if "delay" in task:
         codes = codes | OF_MPIRUN[kind]
     if ended["code"] not in codes:
         wrong.append(f"exit code {ended['code']}")
+
     messages = re.findall(r"^vipetsc: (?!warning:)", errors, re.MULTILINE)
     if len(messages) > (kind != "sigkill"):
         wrong.append(f"{len(messages)} messages")
     if "Traceback" in errors and kind != "exception":
         wrong.append("traceback")
+
     wrong += ended["broken"]
     if finished.get("code") != 0:
         wrong.append(f"the same command then: exit code {finished.get('code')}")
@@ -210,5 +231,7 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
 
 def last_words(stages: dict[str, Record]) -> str:
     """The last line on stderr of the call after the fault, else of the one with it."""
-    lines = [line for stage in ("ended", "finished") for line in stages.get(stage, {}).get("errors", "").splitlines()]
+    lines: list[str] = []
+    for stage in ("ended", "finished"):
+        lines += stages.get(stage, {}).get("errors", "").splitlines()
     return lines[-1] if lines else ""

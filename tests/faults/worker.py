@@ -27,7 +27,7 @@ petsc4py.init(["faults", "-no_signal_handler"])
 from mpi4py import MPI
 
 from tests.faults.inject import Injector
-from tests.faults.scenarios import SCENARIOS, copy, difference, prepare, shrink, unreadable, words_of
+from tests.faults.scenarios import SCENARIOS, Scenario, copy, difference, prepare, shrink, unreadable, words_of
 from vipetsc.cli.main import main as vipetsc
 from vipetsc.parallel import install_abort_hook
 
@@ -60,34 +60,54 @@ class Worker:
     def do(self, task: Task) -> None:
         """Do one task; all ranks call it."""
         scenario = SCENARIOS[task["scenario"]]
-        case, out, before, wanted = (self.folder / f"{scenario.name}{end}" for end in (".toml", "", "-before", "-done"))
         if task["do"] == "reference":
-            self._reference(task, case, before, wanted)
+            self._reference(task, scenario)
             return
-        words = words_of(scenario.words, case, out)
+
+        out = self.folder / scenario.name
+        words = words_of(scenario.words, self._case(scenario), out)
         if task["do"] == "trial":
-            if self.comm.rank == 0:
-                copy(before, out)
-                (self.folder / "fired").unlink(missing_ok=True)
-            self.comm.Barrier()
-            if self.comm.rank == task["rank"] and "phase" in task:
-                self.injector.arm(task["phase"], task["number"], task["kind"], self.folder / "fired")
-            self._tell(task, "begun", processes=self.comm.allgather(os.getpid()))
-            ended = self._call(words)
-            self.injector.disarm()
-            self._tell(task, "ended", **ended, **self._left_behind(out))
+            self._meet_the_fault(task, words, out, self._before(scenario))
             if "delay" in task:
                 raise SystemExit(0)  # another worker calls again: this one may have a signal on its way
-        ended = self._call(words)
-        differs = difference(wanted, out) if self.comm.rank == 0 else ""
-        self._tell(task, "finished", **ended, differs=differs)
 
-    def _reference(self, task: Task, case: Path, before: Path, wanted: Path) -> None:
-        scenario = SCENARIOS[task["scenario"]]
+        ended = self._call(words)
+        differs = difference(self._wanted(scenario), out) if self.comm.rank == 0 else ""
+        self._report(task, "finished", **ended, differs=differs)
+
+    def _meet_the_fault(self, task: Task, words: list[str], out: Path, before: Path) -> None:
+        """Call the program on the folder ``out`` as it was ``before``, while a rank meets the fault of ``task``."""
+        if self.comm.rank == 0:
+            copy(before, out)
+            (self.folder / "fired").unlink(missing_ok=True)
+        self.comm.Barrier()
+
+        if self.comm.rank == task["rank"] and "phase" in task:
+            self.injector.arm(task["phase"], task["number"], task["kind"], self.folder / "fired")
+        self._report(task, "begun", processes=self.comm.allgather(os.getpid()))
+        ended = self._call(words)
+        self.injector.disarm()
+        self._report(task, "ended", **ended, **self._left_behind(out))
+
+    def _case(self, scenario: Scenario) -> Path:
+        return self.folder / f"{scenario.name}.toml"
+
+    def _before(self, scenario: Scenario) -> Path:
+        return self.folder / f"{scenario.name}-before"
+
+    def _wanted(self, scenario: Scenario) -> Path:
+        return self.folder / f"{scenario.name}-done"
+
+    def _reference(self, task: Task, scenario: Scenario) -> None:
+        """Call the program undisturbed, and keep what it leaves and how often every phase comes."""
+        case = self._case(scenario)
+        before = self._before(scenario)
+        wanted = self._wanted(scenario)
         if self.comm.rank == 0:
             prepare(scenario, self.folder)
             copy(self.folder / "nothing", before)
         self.comm.Barrier()
+
         if scenario.before:
             if scenario.stop and self.comm.rank == 0:
                 self.injector.arm("step", scenario.stop, "sigterm")
@@ -95,10 +115,11 @@ class Worker:
         if self.comm.rank == 0:
             copy(before, wanted)
         self.comm.Barrier()
+
         self.injector.disarm()
         ended = self._call(words_of(scenario.words, case, wanted), 10.0)  # kernels may have to be compiled
         counts = self.comm.gather(self.injector.disarm())
-        self._tell(task, "finished", **ended, counts=counts)
+        self._report(task, "finished", **ended, counts=counts)
 
     def _left_behind(self, out: Path) -> dict[str, Any]:
         fired = self.folder / "fired"
@@ -112,7 +133,9 @@ class Worker:
         """
         for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
-        begin, code, error = time.monotonic(), 1, None
+        begin = time.monotonic()
+        code: Any = 1
+        error: BaseException | None = None
         with self._redirected():
             faulthandler.dump_traceback_later(leave * self.patience, exit=True)
             try:
@@ -123,13 +146,14 @@ class Worker:
                 error = raised
             if not self._all_are_here(1.0 if error else 2 * leave * self.patience):
                 sys.excepthook(type(error), error, error.__traceback__)  # as at the end of a process: it ends all
-            self._report(error)
+            self._report_error(error)
             faulthandler.cancel_dump_traceback_later()
+
         errors = self.comm.allgather(self.errors.read_text(errors="replace"))
         codes = self.comm.allgather(code)
         return {"code": max(codes), "errors": "".join(errors), "seconds": time.monotonic() - begin}
 
-    def _report(self, error: BaseException | None) -> None:
+    def _report_error(self, error: BaseException | None) -> None:
         """Say what all ranks raised as the abort hook does, but go on."""
         agreed = getattr(error, "from_root", False)
         everywhere = all(self.comm.allgather(agreed))
@@ -145,7 +169,8 @@ class Worker:
             sys.excepthook = hook
 
     def _all_are_here(self, patience: float) -> bool:
-        request, deadline = self.comm.Ibarrier(), time.monotonic() + patience
+        request = self.comm.Ibarrier()
+        deadline = time.monotonic() + patience
         while not request.Test():
             if time.monotonic() > deadline:
                 return False
@@ -154,13 +179,15 @@ class Worker:
 
     @contextmanager
     def _redirected(self) -> Iterator[None]:
-        """Both streams into the file of this rank's errors."""
+        """Lead stderr into the file of this rank's errors, and stdout nowhere; by number, for PETSc and MPI too."""
         sys.stdout.flush()
         sys.stderr.flush()
         saved = [os.dup(number) for number in (1, 2)]
-        nothing, target = os.open(os.devnull, os.O_WRONLY), os.open(self.errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        target = os.open(self.errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(nothing, 1)
         os.dup2(target, 2)
+
         try:
             yield
         finally:
@@ -172,7 +199,7 @@ class Worker:
             os.close(nothing)
             os.close(target)
 
-    def _tell(self, task: Task, stage: str, **more: Any) -> None:
+    def _report(self, task: Task, stage: str, **more: Any) -> None:
         if self.comm.rank == 0:
             with (self.folder / "results.jsonl").open("a") as file:
                 file.write(json.dumps({"id": task["id"], "stage": stage, "time": time.time(), **more}) + "\n")
@@ -183,10 +210,9 @@ def main() -> int:
     logging.basicConfig(format="%(message)s")
     logging.getLogger("vipetsc").setLevel(logging.INFO)
     install_abort_hook()
-    folder, tasks, patience = Path(sys.argv[1]), json.loads(sys.argv[2]), float(sys.argv[3])
     shrink()
-    worker = Worker(folder, patience)
-    for task in tasks:
+    worker = Worker(folder=Path(sys.argv[1]), patience=float(sys.argv[3]))
+    for task in json.loads(sys.argv[2]):
         worker.do(task)
     return 0
 

@@ -45,6 +45,7 @@ def describe_ends(case: Case) -> str:
     if absorbing is None or not (absorbing.cells and absorbing.strength):
         return f"{lattice.ends} ends"
 
+    # Once for each pair of frequency and cycles: drives that share them send the same waves to the end.
     end = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength)
     reflections = []
     for omega, cycles in dict.fromkeys((drive.frequency or 0.0, drive.cycles) for _, drive in case.drive.every):

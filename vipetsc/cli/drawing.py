@@ -53,13 +53,15 @@ def draw_pictures(
         try:
             return draw(pictures.source, folders, names, formats, rank=comm.rank, ranks=comm.size, newest=newest)
         except (OSError, KeyError, ValueError) as error:
-            if pictures.prepare:  # which has checked the files, so that this is no matter of the folder
+            # What `prepare` has checked is no matter of the folder: an error then is one of the program.
+            if pictures.prepare:
                 raise
             article = "an" if pictures.noun[0] in "aeiou" else "a"
             path = folders[0] / pictures.file
             raise FolderError(f"{path}: is not {article} {pictures.noun} of vipetsc ({error})") from None
 
     on_root(comm, lambda: prepare(pictures, folders, names))
+    # Rank 0 looks, so that all ranks judge by one time, whatever their file systems show them.
     newest = None if afresh else on_root(comm, lambda: newest_result(folders))
     drawn = on_every_rank(comm, draw_part)
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)

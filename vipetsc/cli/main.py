@@ -32,12 +32,14 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
     has_verb = bool(arguments) and (arguments[0] in ABOUT_THE_PROGRAM or not arguments[0].startswith("-"))
     if not has_verb:
         arguments = ["run", *arguments]  # of the built-in case
+
     options = _parser().parse_args(arguments)
     is_answer = VERBS[options.verb].is_answer or getattr(options, "list", False)
     try:
         with reporting(MPI.COMM_WORLD, options, is_answer):
             return _call(options, petsc or {})
-    except FolderError as error:  # the file of --log
+    except FolderError as error:
+        # The file of --log cannot be written, so that nothing else is set up to report it.
         if MPI.COMM_WORLD.rank == 0:
             print(f"vipetsc: {error}", file=sys.stderr, flush=True)
         return BAD_INPUT
@@ -47,14 +49,17 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
     """Call the verb with a request to stop at hand, and report bad input; returns the exit code."""
     verb = VERBS[options.verb]
     try:
+        # Refused rather than ignored: a result is that of its case file, and these would not stand in it.
         if petsc and not verb.takes_petsc_options:
             raise CaseError([Problem(f"-{name}", None, f"{verb.name} takes no PETSc options") for name in petsc])
         if petsc:
             options.set = [*options.set, *(f"petsc.{name}={value}" for name, value in petsc.items())]
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
+
         with StopRequest().listening(at_once=not verb.is_stoppable) as stop:
             return int(verb.call(options, MPI.COMM_WORLD, stop))
+
     except (CaseError, FolderError) as error:
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT
@@ -72,6 +77,7 @@ def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
         epilog="PETSc options go after --, as in: vipetsc run CASE -- -ts_rk_type 5dp -log_view",
     )
     parser.add_argument("--version", action="version", version=f"vipetsc {vipetsc.__version__}")
+
     subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb in VERBS.values():
         of_verb = subparsers.add_parser(
@@ -81,6 +87,7 @@ def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
             epilog=f"example: vipetsc {verb.example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        # The verb `completion` describes the parser to a shell.
         of_verb.set_defaults(parser=_parser)
         for flag, keywords in (*verb.arguments, *OF_EVERY_VERB):
             added = of_verb.add_argument(flag, **keywords)

@@ -52,6 +52,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
         if comm.rank == 0:
             handlers.append(_file_handler(options.log))
 
+    # Without propagation: the front door's own handler would print everything again.
     is_verbose = options.verbose and comm.rank == 0
     level = logger.level
     logger.propagate = False

@@ -16,7 +16,9 @@ def first_few(items: Sequence[object]) -> str:
     if not items:
         return "none"
     shown = ", ".join(map(str, items[:MOST_SHOWN]))
-    return f"{shown}, ... ({len(items)})" if len(items) > MOST_SHOWN else shown
+    if len(items) > MOST_SHOWN:
+        shown += f", ... ({len(items)})"
+    return shown
 
 
 def duration(seconds: float) -> str:

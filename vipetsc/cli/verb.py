@@ -127,11 +127,13 @@ class StudyVerb(Verb):
 
     def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         """Compute, draw and report; returns the exit code."""
+        # Before anything is written: what is refused leaves no folder behind.
         case = on_root(comm, lambda: self.checked_case(options))
         folder = options.out or Path("runs") / f"{case.name}{self.suffix}"
         work = Work(options, folder, comm, stop)
         work.warn(on_root(comm, case.warnings))
 
+        # Studies lock their folder themselves, which the same process may do again; this lock spans the pictures too.
         with locked(comm, folder):
             outcome = self.study(case, work)
             # What was computed is saved; pictures are drawn by the command that goes on.
@@ -139,6 +141,7 @@ class StudyVerb(Verb):
             if outcome.drawable and case.wants_pictures:
                 echo_paths(comm, draw_pictures(self.pictures, [folder], comm, afresh=False))
 
+        # Last, where a user sees them; with --quiet they are all that is printed.
         for failure in outcome.failures:
             echo(comm, f"vipetsc: {failure}", sys.stderr)
         return DONE if outcome.complete and not outcome.failures else FAILED

@@ -55,6 +55,7 @@ def _lock(path: Path) -> Iterator[None]:
         descriptor = _acquire(path, created)
         yield
     finally:
+        # Removed while it is still locked: one that opens it from here on finds another file, and tries again.
         if descriptor is not None:
             (path / LOCK).unlink(missing_ok=True)
             os.close(descriptor)

@@ -35,10 +35,13 @@ def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     case = on_root(comm, lambda: Case.load(options.case, options.set))
     folder = options.out or Path("runs") / f"{case.name}-bands"
 
-    # All ranks find modes together; the rest is a second's work of one.
+    # All ranks find modes together; everything else is a second's work for one.
     modes = modes_report(case, options, folder, comm)
     text = on_root(comm, lambda: write_bands(case, folder, options.json))
-    echo(comm, text if options.json else text + modes)
+    # JSON is read by programs, for which modes are in their file.
+    if not options.json:
+        text += modes
+    echo(comm, text)
     return DONE
 
 
@@ -48,6 +51,7 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
 
     cell = case.lattice.unit_cell()
     numbers = bands_table(cell) | damping_table(cell, case.drive.frequency or 0.0)
+    # This rank alone is here, so that the lock must not wait for others.
     with locked(MPI.COMM_SELF, folder):
         for leftover in folder.glob(".*.part"):  # of a command that was killed
             leftover.unlink()

@@ -44,6 +44,7 @@ def follow_modes(case: NnmCase, work: Work) -> Outcome:
         work.stop.check(comm)
         claim.publish()
 
+    # Branches are known on rank 0 alone; all ranks must agree on how the verb ends.
     failures = [f"{branch.name}: {branch.ending}" for branch in branches if branch.ending.startswith("failed")]
     return Outcome(failures=comm.bcast(failures))
 
@@ -64,6 +65,7 @@ def follow_responses(case: NfrcCase, work: Work) -> Outcome:
         if has_curves:
             claim.publish()
 
+    # Curves are known on rank 0 alone; all ranks must agree on how the verb ends.
     failures = [f"{curve.name}: {curve.ending}" for curve in curves if curve.ending.startswith("failed")]
     return Outcome(drawable=has_curves, failures=comm.bcast(failures))
 
@@ -112,6 +114,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
 
 def branch_log() -> Callable[["Branch", "Point"], None]:
     """A live table of growing branches: a line a point, no more than two a second."""
+    # Of reduced models points come in milliseconds: a line for each would hide all else.
     title = "branch           point      T (s)        E (J)  Newton  contacts  max multiplier\n"
     last = -math.inf
 

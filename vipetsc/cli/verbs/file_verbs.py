@@ -47,6 +47,7 @@ def write_exports(path: Path) -> list[Path]:
             mesh = write_xdmf(folder)
             if mesh:
                 written.append(mesh)
+        # A folder of branches is the one kind with several files of curves.
         for source in branches or [path]:
             written += write_curves(source)
     except (OSError, ValueError) as error:

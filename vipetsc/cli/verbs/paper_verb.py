@@ -21,6 +21,7 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
     plan = paper_plan(QUICK if options.quick else FULL)
     folder = options.out or Path("runs") / ("paper-quick" if options.quick else "paper")
+    # A list looks at the folder, and neither locks nor makes it.
     if options.list:
         echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
         return DONE

@@ -86,6 +86,7 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     """
     from vipetsc.cli.verbs.verb_list import study_verbs
 
+    # Verbs that leave the same kind of folder share their pictures.
     known = {verb.pictures.source: verb.pictures for verb in study_verbs()}
     files = {pictures.file for pictures in known.values()}
     folders = [path.parent if path.name in files else path for path in paths]
@@ -120,6 +121,7 @@ def film(
             f"--rate {shot.rate:g} --width {shot.width}: at most {FASTEST:g} a second, {NARROWEST} to {WIDEST} pixels"
         )
 
+    # What was asked for by name is refused where it cannot be made; what is made by default is left out, and said.
     has_ffmpeg = movie.ffmpeg() is not None
     missing = ""
     if "mp4" in formats and not has_ffmpeg:
@@ -135,6 +137,7 @@ def film(
         except ValueError as error:
             raise FolderError(f"{folder}: {error}") from None
 
+        # After all options were checked: measuring writes a file, and bad input writes none.
         prepare(pictures, [folder])
         analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
         stage = movie.MovieFigure(run, movie_frames.movie_frames(run, analysis, shot), shot.width)

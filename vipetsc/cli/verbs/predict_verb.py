@@ -40,12 +40,15 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
     site = case.one_site()
     where = f"a clearance of {site.clearance:.5g} m {site.distance} cells from the drive"
     ring = f"ring of {site.cells} cells, {site.samples} samples"
+    comparison = "no simulation"
+    if options.simulate:
+        comparison = "a simulation at every amplitude"
 
     return [
         *lattice_rows(case),
         ("predict", amplitudes),
         ("composed of", f"{options.points} runs of one site with {where}; {ring}"),
-        ("compared with", "a simulation at every amplitude" if options.simulate else "no simulation"),
+        ("compared with", comparison),
     ]
 
 

@@ -80,6 +80,7 @@ def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -
     """Print a script by which the shell completes verbs, options and files."""
     import shtab
 
+    # By the names and flags of arguments, whichever verb takes them.
     kinds = {"case": shtab.FILE, "path": shtab.FILE, "--out": shtab.DIRECTORY}
     echo(comm, on_root(comm, lambda: shtab.complete(options.parser(kinds), options.shell)))
     return DONE

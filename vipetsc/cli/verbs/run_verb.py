@@ -54,8 +54,10 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     work.report(run_table(result, faster))
     if work.comm.rank == 0:
         logger.debug("statistics %s", json.dumps(result.statistics))
+    # The run is saved; its measures are made by the command that goes on.
     work.stop.check(work.comm)
 
+    # Measures of fields need a second sample: a run that fails in its first has none.
     has_fields = bool(case.output.fields) and result.statistics["samples"] > 1
     if has_fields:
         # The linear run of its sweep tells when the wave arrives at the sites of a member.
@@ -82,11 +84,13 @@ def run_rows(case: Case, ranks: int) -> Rows:
     ]
     burst = max(drive.waveform.duration for drive in model.drives)
 
+    # Doubles: fields at every stride-th sample, and what each site has dissipated at all samples. The rest is small.
     columns = len(recorded_cells(case.output, chain.cells)) * chain.cell.dofs * len(case.output.fields)
     size = 8 * (columns * -(-model.samples // case.output.stride) + len(chain.sites) * model.samples)
     writer = "parallel" if written_together(model, case.output, ranks) else "gather"
     free = shutil.disk_usage(".").free
 
+    # Ranks on one machine divide its memory among them.
     needed = sum(memory_needed(model, case.output, cost.engine, ranks).values())
     available = memory_available() / ranks
     memory = f"{needed / 1e9:.3g} GB on a rank"

@@ -32,6 +32,7 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
     """How many members a sweep has, and how many of those tried are no valid cases."""
+    # A sweep may have a million members, of which each takes milliseconds to resolve.
     tried = plan.members(MOST_TRIED)
     impossible = sum(member.case is None for member in tried)
     counts = " x ".join(map(str, plan.shape))

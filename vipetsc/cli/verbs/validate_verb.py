@@ -50,6 +50,7 @@ def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
     after = values_of(drawn.lattice, drawn.contacts)
     rows = []
     for name, deviation in disorder.quantities().items():
+        # Sites move by cells; all else is scattered about a value, so that the ratio tells how far.
         if name == "sites":
             values = f"cells {first_few([f'{cell:.5g}' for cell in after[name]])}"
         else:
