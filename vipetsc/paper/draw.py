@@ -33,6 +33,7 @@ def draw_paper(
     if comm.rank == 0:
         tell("figures")
     with Files() as files, style.rc_style():
+        # Every rank opens the files and knows all pictures; which of them it draws is decided one by one.
         offers = on_every_rank(comm, lambda: {f.id: [*f.offers(folders, files)] for f in missing})
         for key, pictures in offers.items():
             record["figures"][key]["pictures"] = [picture.stem for picture in pictures]

@@ -94,7 +94,7 @@ def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRe
 def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:
     """Claim ``root`` for this plan; a case that cannot be used raises before anything is written."""
     for step in plan.steps:
-        _ = step.text
+        _ = step.text  # resolves the case, which raises
 
     def difference(text: str) -> str | None:
         """Why ``plan.json`` with this ``text`` is of another plan; None if it is of this one."""
@@ -118,6 +118,7 @@ def _relate(folders: Mapping[str, Path]) -> None:
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: str) -> list[dict[str, Any]]:
     """Write ``claims.json`` and ``report.html`` as far as their ``inputs`` changed; returns the claims."""
+    # The record is written last: with a kill before, what it vouches for is made again.
     record = read_record(root)
     path = root / "claims.json"
     if read_json(path) is None or record.get("claims") != inputs:
@@ -131,6 +132,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: st
     claims = path.read_text(encoding="utf-8")
     about = provenance(comm)
     versions = {key: value for key, value in about.items() if key.endswith("_version")}
+    # The report's own time is none of its inputs: it would never be up to date.
     cpu = {key: seconds for key, seconds in record["cpu"].items() if key != "report"}
     report_inputs = fingerprint(claims, json.dumps([inputs, record["figures"], versions, cpu]))
     if not is_whole(root / "report.html") or record.get("report") != report_inputs:

@@ -175,6 +175,7 @@ class PaperStep:
 
     def identity(self, root: Path) -> str:
         """Hash of the case and of what the results hold."""
+        # What is related to a sweep is drawn with it.
         paths = [*self.results(root), self.folder(root) / RELATION]
         return fingerprint(self.text, *(path.read_bytes() for path in paths if path.exists()))
 
@@ -265,6 +266,7 @@ class Plan:
     def inputs(self, root: Path) -> dict[str, str]:
         """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
         steps = {step.name: step.name + step.identity(root) for step in self.steps if step.state(root) == DONE}
+        # The note stands on every picture, and another version may draw or measure otherwise.
         version = (vipetsc.__version__, self.note)
         inputs: dict[str, str] = {}
         for figure in self.figures:

@@ -46,6 +46,7 @@ class ReportContents(NamedTuple):
 
 def write_report(path: Path, contents: ReportContents) -> None:
     """Write the page to ``path``, whole or not at all; pictures that the page there shows already are taken from it."""
+    # By the hash of the picture: one that has not changed is not encoded again.
     encoded: dict[str, str] = {}
     if path.exists():
         encoded = dict(ENCODED.findall(path.read_text(encoding="utf-8")))

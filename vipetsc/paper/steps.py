@@ -51,6 +51,7 @@ def make_steps(
         announce(*(step.name for step in parted))
         finished += _make_parts(parted, stale, root, comm, stop, notes)
 
+    # Then the steps on which all ranks work, one by one: each is whole before the next begins.
     for step in missing:
         if step.parts:
             continue
@@ -98,6 +99,7 @@ def _make_parts(
         def fail(job: PartJob, reason: str) -> None:
             reasons[job.step] = reason
 
+        # Parts of all steps together, the longest first: no rank waits long for the last.
         pool = TaskPool(comm, MPI.COMM_SELF, stop)
         pool.run(sorted(jobs, reverse=True), work, fail=fail)
         failed: dict[str, str] = {}

@@ -108,6 +108,7 @@ def analyse(
     about["warnings"] = json.dumps(record.warnings)
     about |= record.attributes.pop("", {})
 
+    # Axes are written only where some variable needs them.
     dims = {dim for name in values for dim in LAYOUT[name][0].split()}
     axes = {"time": record.mean_time, "cell": record.mean_cells, "bands/sample": record.time}
     values = {name: axis for name, axis in axes.items() if name in dims} | values
@@ -185,6 +186,7 @@ def _dispersions(record: VelocityRecord) -> dict[str, Any]:
         record.left_out.append("dispersion: a single cell was recorded")
         return {}
 
+    # Time is padded to a length that transforms fast; a padded row of cells would have other wavenumbers.
     length = fft.next_fast_len(nt, real=True)
     highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
     frequencies = np.count_nonzero(2 * np.pi * fft.rfftfreq(length, record.interval) <= highest)

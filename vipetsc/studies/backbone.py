@@ -130,6 +130,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     energy = work[valid][order] * (branch.attrs["grazing"] / initiation)
     ibtet = ibtet[valid][order]
     slope = log_slope(energy, *(branch[f"branch/{name}"].values for name in ("energy", "slope", "region")))
+    # Before its peak the transfer still sets in.
     fitted = np.isfinite(slope) & (np.arange(len(energy)) >= np.argmax(ibtet))
     values = {"energy": energy, "ibtet": ibtet, "fitted": fitted.astype(np.int8)}
     aligned = xr.merge([xr.Dataset(tabulated(LAYOUT, values)), branch], combine_attrs="override")
@@ -208,6 +209,7 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
     if not untouched.size:
         return "no member without contact"
 
+    # A branch of the same reading if there is one, else any of the law.
     slope = min(same_law, key=lambda slope: slope.attrs["reading"] != case.lattice.reading)
     initiation = initiation_of(folder, case)
     floor = float(untouched.mean())

@@ -76,7 +76,7 @@ class Network:
         self.offset = 2 * np.pi * np.arange(-most, most + 1) / length
         self.time = np.arange(len(self.offset)) * length / len(self.offset)
         self.decay = DECAY / length
-        self.during = self.time <= model.end
+        self.during = self.time <= model.end  # the second half is padding for what the transform would fold back
 
         # The burst's envelope under 1 N: sin is -i exp(i Om t), under a Hann window.
         force = drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
@@ -116,6 +116,7 @@ class Network:
                 break
 
             state = site.at(z)
+            # The last c is near the next: GMRES begins with it.
             arriving = self._solve(self.between, self.radiated * state.fundamental * on, linear, c)
             change = float(np.abs(arriving - c).max()) / size
             step = 1.0 if i < FULL_STEPS else 0.5

@@ -26,6 +26,7 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
     number = np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
     along = next(i for i, axis in enumerate(sweep.axes) if AMPLITUDE in axis)
     curves = np.moveaxis(number, along, -1).reshape(-1, sweep.shape[along])
+    # One amplitude in each of equal parts, and each on another curve: few members go through all regimes.
     count = min(count, len(curves))
     amplitude = ((np.arange(count) + random.random(count)) * curves.shape[1] / count).astype(int)
     chosen = np.sort(random.permutation(curves)[np.arange(count), amplitude])

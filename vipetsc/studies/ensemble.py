@@ -148,6 +148,7 @@ class Results:
             "work": work,
             "dissipated_fraction": statistics["dissipated"] / work if work else np.nan,
         }
+        # Scaled members have no measures of their own: they get those of their linear run at the end.
         self._put(number, row | record.get("measures", {}))
         # An amplitude sweep goes below the onset on purpose.
         self.warnings[number] = [text for text in record["warnings"] if not text.startswith("no contact")]
@@ -213,6 +214,7 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     positions = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
     numbers = results.first[results.status == FAILED]
     about = origin() | {"format_version": FORMAT_VERSION}
+    # Sorted, since the file must not depend on the order in which members were made.
     about |= {name: sorted(values) for name, values in results.used.items()}
     about |= {
         "case": plan.to_toml(),
@@ -319,6 +321,7 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     order = np.argsort(np.abs(amplitude[valid]), kind="stable")
     x = np.abs(amplitude[valid])[order]
     y = curve[valid][order]
+    # Two points fit any line; a constant has no peak to begin at.
     if len(y) < 3 or np.ptp(y) == 0:
         return row
 

@@ -59,6 +59,7 @@ class LinearRun(NamedTuple):
         """
         model = Case.of(run).model()
         motion = PairMotion.of(run, model.chain.cell)
+        # With the rate in it, the envelope does not depend on where the samples fall.
         squares = motion.displacement**2 + (motion.velocity / model.drive.frequency) ** 2
         host_velocity = run["velocity"].values[..., model.chain.cell.host]
         wave = cls(

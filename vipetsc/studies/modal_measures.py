@@ -85,6 +85,7 @@ def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict
     displacement = record.field(run["displacement"])
     clusters = _clusters(run, time)
     last = len(time) - 1
+    # The bounds of clusters are among the instants, so that transfers are differences of energies that are kept.
     rows = np.unique([*range(0, last, record.options.modal_stride), *np.unique(clusters.bounds), last])
     energy = parts.energies(displacement, record.velocity, rows, record.memory)
     by_part = energy.sum(axis=1)

@@ -83,6 +83,7 @@ class ObjectiveRuns:
             for amplitude in self._amplitudes(objective):
                 samples = [row["values"][objective.name] for (at, _), row in records.items() if at == amplitude]
                 by_amplitude.append(sign * float(np.mean(samples)))
+            # Losses are small for good designs, so the worst is the largest.
             worst = objective.over == "worst"
             losses.append(max(by_amplitude) if worst else float(np.mean(by_amplitude)))
         return losses, ""
@@ -111,6 +112,7 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[O
     for band in pass_bands(model.chain.cell):
         holds_band = [band.number in bands for bands in modal.parts.bands]
         inside[band.number] = modal.part == holds_band.index(True)
+    # All of these are measured whatever is asked for: the pictures compare designs by them.
     values: dict[str, Any] = {
         "episodes": statistics["episodes"],
         "dissipated": statistics["dissipated"] / work,

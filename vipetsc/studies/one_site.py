@@ -134,6 +134,7 @@ class ScatteringRuns:
         run = self.ring.run_to_end(amplitude, with_site=True)
         u, v = _last_state(run)
         energy, speed = wave_energies(self.cell, u, v)
+        # What still moves near the site at the end is counted among what leaves: this shows how much it is.
         near = (np.arange(-NEAR, NEAR + 1) + setting.site) % setting.cells
 
         first_contact = np.nan
@@ -183,6 +184,7 @@ class ScatteringRuns:
         """What one run makes of the wave by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
         band = self.setting.band
         share = (np.array(record["energy"]) - self.reference) / self.arrived
+        # The reference holds the whole wave: against it nothing is left where nothing is touched, and T = 1 there.
         share[band, FORWARD] += 1
         return {
             "share": share,

@@ -169,6 +169,7 @@ def run_search(
     """
     with claimed(comm, folder, OPTIMUM, plan.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "optimum.h5"
+        # One that was cut off is made again, from the records of its runs.
         if not on_root(comm, lambda: is_whole(path, [])):
             _search(plan, claim.folder, comm, stop or StopRequest(), progress)
         claim.publish()
@@ -233,6 +234,7 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
         return Nsga2(point, options.step, options.seed, options.population or POPULATION)
 
     variables = plan.variables()
+    # Whole numbers need a least deviation, or the search would stand still on one of them.
     steps = np.array([1 / (v.high - v.low) if v.kind == "whole" else 0.0 for v in variables])
     # Of clearances, what the row of sites has in common is searched first.
     clearances = np.array([v.name.startswith("clearance") for v in variables])

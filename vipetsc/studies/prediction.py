@@ -93,7 +93,7 @@ def predict(
         if not on_root(comm, path.exists):
             runs = PredictionRuns(case, claim.folder, comm, stop or StopRequest(), progress)
             records = runs.make_all()
-            about = provenance(comm)
+            about = provenance(comm)  # collective, so not within the writing, which rank 0 does alone
             runs.recorded.finish()
             on_root(comm, lambda: write_netcdf(path, composed(case, records).assign_attrs(about)))
 
@@ -133,6 +133,7 @@ class PredictionRuns:
 
     def make_all(self) -> Records:
         """The records of all runs, those that are missing made now. Collective; raises RuntimeError if one fails."""
+        # The linear run comes first: it says which z the amplitudes reach, and so which runs of one site are needed.
         linear = self.make([Job(LINEAR, 1.0)])[0]
         amplitudes = amplitudes_of(self.case, linear)
         largest = max(float(amplitudes[-1] * max(linear["reached"])), HIGH) * BEYOND
@@ -221,6 +222,7 @@ class PredictionRuns:
         u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
         energy = np.abs(modes.amplitudes(u, v)[0]) ** 2 / 2
         lower_edges = [band.low for band in pass_bands(self.model.chain.cell)[1:]]
+        # A mode at a band's edge counts to that band, whatever its last digits are.
         band = np.searchsorted(lower_edges, modes.frequency * (1 + 1e-9))
         return [float(e) for e in np.bincount(band, energy, len(lower_edges) + 1)]
 

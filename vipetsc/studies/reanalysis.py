@@ -46,6 +46,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str
         for override in overrides:
             if sweeps or not override.startswith("analysis."):
                 raise FolderError(f"{override}: of a run that is there only [analysis] can change, of a sweep nothing")
+        # All are checked before any is measured: nothing is written if a path cannot be used.
         return [run for path in paths for run in _measurable(path)], sweeps
 
     runs, sweeps = on_root(comm, look)

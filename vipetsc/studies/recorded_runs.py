@@ -98,6 +98,7 @@ class RecordedRuns:
         ranks. Raises OSError on all, and there is no record, if memory or disk is short or if it was no failure
         of the run itself: it may succeed the next time. Raises StoppedError on all if some rank got a request to stop.
         """
+        # A key that is asked for twice is made once; the order stays, on all ranks the same.
         missing = [key for key in dict.fromkeys(keys) if key not in self.records]
         recorded: dict[Key, Record] = {}
         failed: list[str] = []
@@ -125,6 +126,7 @@ class RecordedRuns:
         if self.pool.stopped:
             raise StoppedError(f"stopped on request with {len(self.records)} runs; the same command goes on")
 
+        # Every rank has to raise: one that went on alone would wait for the others for ever.
         reasons = [reason for from_rank in self.comm.allgather(failed) for reason in from_rank]
 
         def check() -> None:

@@ -216,6 +216,7 @@ class SiteResponse(NamedTuple):
     @classmethod
     def of(cls, records: list[Record], cell: UnitCell, drive: float, largest: float) -> Self:
         """The response from the sums of all runs, in any order; zero if there was no contact."""
+        # Rising peaks, which interpolation needs; and the same sums whatever the order in which runs ended.
         records = sorted(records, key=lambda record: record["z"])
         x = np.linspace(np.log(LOWEST), np.log(largest), BINS)
         sums = np.array([record["sums"] for record in records])

@@ -40,6 +40,7 @@ class Ring:
         setting = self.setting
         contacts: dict[str, list[float]] = {"sites": [], "clearance": []}
         if with_site:
+            # Every run has the law's one clearance: z is changed by the amplitude alone.
             contacts = {"sites": [setting.site + 1], "clearance": [setting.clearance]}
         case = self.case.varied(
             without=("output",),

@@ -105,6 +105,7 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
         surveys.append(survey)
         return survey.needed, dict(survey.results.linear) if len(survey.missing) else {}
 
+    # Linear runs first: members that nothing touches are scaled from them, and they show what the others cost.
     needed, runs.linear = on_root(comm, look)
     pool.run(list(needed), lambda name: runs.make_linear(*needed[name]))
     _join_linear_runs(runs, comm)
@@ -175,6 +176,7 @@ class _Survey(NamedTuple):
                 costs.append(contacts + 1e-3 * float(member.case.time.end))
         # One that was not drawn costs what the last one before it does that was: its neighbour in the sweep.
         nearest = np.searchsorted(numbers, self.missing, "right") - 1
+        # Stable, so that equal ones stay in their order and every call makes them alike.
         dearest_first = np.argsort(-np.array(costs)[nearest], kind="stable")
         return list(self.missing[dearest_first].tolist())
 

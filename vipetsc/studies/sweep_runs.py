@@ -76,6 +76,7 @@ class SweepRuns:
 
             self.linear[name] = on_root(self.recorded.team, measure).joined(earlier)
         except Exception as error:
+            # Every member that needs it fails with this reason, without another try.
             self.linear[name] = str(error) or type(error).__name__
             raise
 
@@ -141,6 +142,7 @@ class SweepRuns:
         on_root(self.recorded.team, begin)
         memory = RunMemory(self.recorded.team)
         everything = _with_everything(case, [*FIELDS] if fields else ["velocity"])
+        # Measures need all samples and cells, also those that the member does not keep.
         simulated = case if fields and all_kept else everything
         output = RunFolder(folder, self.recorded.team) if fields else memory
         result = self.recorded.simulate(simulated, output)

@@ -110,6 +110,7 @@ class Evidence(ExitStack):
         super().__init__()
         self.root = Path(root)
         self.files: list[str] = []
+        # Claims ask for the same files again and again.
         self._open_ensemble = cache(open_ensemble)
         self._open = cache(lambda path, needs: self.enter_context(open_netcdf(path, "file of results", needs)))
 

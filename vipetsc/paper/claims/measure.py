@@ -47,6 +47,7 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
         file = evidence.files[-1] if evidence.files else "a file"
         result.reasons.append(f"{file} cannot be used: {message}")
     else:
+        # A claim whose measurement broke off has no verdict on the numbers that it has.
         judgement, missed = verdict(spec.criteria, result.value)
 
     reasons = result.reasons
