@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 
 from tests.unit.test_floquet import case
-from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.lattice_follow import LatticeFollower
 
 COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.parallel([2, 3])
 def test_the_same_branch_on_any_number_of_ranks(folder):
-    branches = follow_all(case(multipliers=2), folder, COMM, kind=LatticeFollower)
+    branches = follow_all(case(multipliers=2), folder, COMM)
     assert len(branches) == (COMM.rank == 0)
     if COMM.rank == 0:
-        together = Branch.read(folder / "branch-breather-1600.h5")
-        (alone,) = follow_all(case(multipliers=2), folder, MPI.COMM_SELF, kind=LatticeFollower)
+        together = read_branch(folder / "branch-breather-1600.h5")
+        (alone,) = follow_all(case(multipliers=2), folder, MPI.COMM_SELF)
         assert len(together.points) == len(alone.points) == 3
         for a, b in zip(together.points, alone.points, strict=True):
             assert a.period == pytest.approx(b.period, rel=1e-10)

@@ -30,9 +30,9 @@ def test_variations_have_the_same_bits(restitution):
     ends = []
     for comm in (COMM, MPI.COMM_SELF):
         flow = LatticeFlow(chain, contact, comm)
-        arc = flow.arc(flow.share(state.ravel()), 2 * np.pi / 1600)
+        arc = flow.arc(flow.scatter(state.ravel()), 2 * np.pi / 1600)
         assert arc.episodes >= len(sites)
-        ends.append((flow.whole(arc.end), flow.whole(arc.move(flow.share(changes.reshape(3, -1)))), arc.closed))
+        ends.append((flow.gather(arc.end), flow.gather(arc.move(flow.scatter(changes.reshape(3, -1)))), arc.closed))
         arc.engine.destroy()
     (together, moved, closed), (alone, moved_alone, closed_alone) = ends
     assert together.tobytes() == alone.tobytes()

@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case.nnm import NnmCase
-from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import StopRequest
 
@@ -74,7 +74,7 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
     if comm.rank == 0:
         first, second = stopped
         assert first.ending == "stopped on request after point 13; resume goes on"
-        assert len(Branch.read(folder / "branch-mode-1.h5").points) == 14
+        assert len(read_branch(folder / "branch-mode-1.h5").points) == 14
         assert second.ending.startswith("20 points reached")
         whole.mkdir()
     comm.Barrier()

@@ -16,16 +16,20 @@ from vipetsc.case.nnm import NnmCase, NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.figures.registry import branch as draw
 from vipetsc.io.state import State
-from vipetsc.lattice import Chain, Contact, DenseCompliance, WaveCompliance, contact_stiffness, four_band, pass_bands
+from vipetsc.lattice import Chain, Contact, WaveCompliance, contact_stiffness, four_band, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
-from vipetsc.modes.balance.breather import CondensedContinuation, CondensedProblem
+from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.branches.condensed_follow import CondensedBranch, CondensedFollower, state_of
+from vipetsc.modes.branches.condensed import condensed_system, state_of
+from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import claim_branches, follow_all
-from vipetsc.modes.point import Point, resonance
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.shooting import MAPS, Relative, Shooting
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.orbit import resonance
+from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
 
@@ -48,24 +52,20 @@ tolerance = 1e-11
 """
 
 
-def condensed(system: System, **options) -> CondensedProblem:
-    rows = np.vstack([system.contact_rows, system.spring_rows])
-    contacts = [(pair.law, pair.clearance) for pair in system.contacts]
-    forces = SiteForces(contacts, [(s.quadratic, s.cubic) for s in system.springs])
-    control = NnmTable(**{"tolerance": 1e-12, "first_step": 1e-2} | options)
-    return CondensedProblem(DenseCompliance(system.masses, system.stiffness, rows), forces, control)
+def condensed(system: System, **options) -> ConservativeMotions:
+    return condensed_system(system, NnmTable(**{"tolerance": 1e-12, "first_step": 1e-2} | options))
 
 
-def branch(system: System, mode: int, energy: float, **options) -> tuple[CondensedProblem, list]:
+def branch(system: System, mode: int, energy: float, **options) -> tuple[ConservativeMotions, list]:
     """Points of a branch that begins at a linear mode with an ``energy``."""
     problem, (omega, shapes) = condensed(system, **options), system.linear_modes()
     rows = np.vstack([system.contact_rows, system.spring_rows])
     z = rows @ shapes[:, mode] * np.sqrt(2 * energy) / omega[mode]
     start = problem.from_mode(z, float(omega[mode]))
-    return problem, [start, *CondensedContinuation(problem, start, problem.control)]
+    return problem, [start, *Continuation(problem, start, problem.control)]
 
 
-def displacement(problem: CondensedProblem, point: Point) -> np.ndarray:
+def displacement(problem: ConservativeMotions, point: Point) -> np.ndarray:
     (u,) = state_of(problem, point).values()
     return u
 
@@ -93,7 +93,7 @@ def test_a_mass_between_two_stops_has_its_period_in_closed_form():
 
 
 def test_a_cubic_spring_has_the_period_of_elliptic_functions():
-    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, cubic=1.0)])
+    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, cubic=1.0)])
     _, points = branch(system, 0, 1e-3, truncation=1e-10, points=25, largest_step=0.3)
     for point in points:
         a = float(point.elongations[0])
@@ -115,7 +115,7 @@ def reduced(law: str, power: float | None = None) -> System:
 
 
 KERSCHEN = System.assemble(
-    [1.0, 1.0], [(None, 0, 1.0), (0, 1, 1.0), (None, 1, 1.0)], smooth=[SmoothSpring(None, 0, cubic=0.5)]
+    [1.0, 1.0], [(None, 0, 1.0), (0, 1, 1.0), (None, 1, 1.0)], smooth=[SmoothSpring.between(None, 0, cubic=0.5)]
 )
 
 
@@ -135,27 +135,26 @@ def test_same_curves_as_by_shooting(system, mode, energy, truncation):
         problem, points = branch(system, mode, energy, truncation=truncation, points=12)
     else:
         problem = condensed(system, truncation=truncation, points=2)
-        points = list(CondensedContinuation(problem, problem.from_gap(mode, np.array([1.0])), problem.control))
+        points = list(Continuation(problem, problem.from_gap(mode, np.array([1.0])), problem.control))
     assert system.springs or points[-1].episodes
     shooting = Shooting(Dop853Flow(system), MAPS["quarter"], 1e-12)
     for point in points[:0:-4]:
         u = displacement(problem, point)
-        chart = Relative(system, u, point.period)
-        xi = chart.encode(u, point.period)
+        frame = shooting.relative_frame(u, point.period)
         row = np.append(u / np.linalg.norm(u), 0.0)
-        attempt = shooting.solve(chart, xi, row, row @ xi)
+        attempt = frame.solve(frame.xi, row, row @ frame.xi)
         assert attempt.converged
-        orbit = Point.of(shooting, attempt, chart)
+        orbit = frame.measures(attempt)
         nonlinear = bool(point.episodes or system.springs)
         here = point.frequency + (point.slope * (orbit.energy - point.energy) if nonlinear else 0.0)
         assert orbit.frequency == pytest.approx(here, rel=1e-6)
         assert point.energy == pytest.approx(system.energy(u, 0 * u), rel=1e-6)
 
 
-def breather(cells: int, site: int, omega: float, truncation=1e-8, **options) -> tuple[CondensedProblem, Point]:
+def breather(cells: int, site: int, omega: float, truncation=1e-8, **options) -> tuple[ConservativeMotions, Point]:
     chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (D,))
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
-    problem = CondensedProblem(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)]), control)
+    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)]), control)
     return problem, problem.from_gap(omega, np.array([1.0]))
 
 
@@ -195,7 +194,7 @@ def test_the_cost_does_not_grow_with_the_cells():
                 return super().at(omegas)
 
         control = NnmTable(truncation=1e-5, tolerance=1e-11)
-        problem = CondensedProblem(Counted(compliance), SiteForces([(HERTZ, D)]), control)
+        problem = ConservativeMotions(Counted(compliance), SiteForces([(HERTZ, D)]), control)
         problem.from_gap(4000.0, np.array([1.0]))
         return asked
 
@@ -216,7 +215,7 @@ def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
 def two_sites(signs: list[int]) -> Point:
     chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (D, D))
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
-    problem = CondensedProblem(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)] * 2), control)
+    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)] * 2), control)
     return problem.from_gap(4000.0, np.array(signs))
 
 
@@ -235,7 +234,7 @@ def case(omega: str = "4000.0", points: int = 3, cells: int = 60, site: int = 20
 
 def followed(given: NnmCase, folder, resume: bool = False, stop: StopRequest | None = None):
     with claim_branches(given, folder, MPI.COMM_SELF, resume=resume) as claim:
-        branches = follow_all(given, claim.folder, MPI.COMM_SELF, claim.going_on, None, stop, CondensedFollower)
+        branches = follow_all(given, claim.folder, MPI.COMM_SELF, claim.going_on, None, stop)
         claim.publish()
     return branches
 
@@ -245,12 +244,12 @@ def test_files_states_and_the_way_on(tmp_path):
     (part,) = followed(case(points=2), tmp_path / "part")
     assert "resume" in part.ending
     (rest,) = followed(case(), tmp_path / "part", resume=True)
-    read = CondensedBranch.read(tmp_path / "whole" / "branch-breather-4000.h5")
+    read = read_branch(tmp_path / "whole" / "branch-breather-4000.h5")
     for point, other, stored in zip(whole.points, rest.points, read.points, strict=True):
         assert np.array_equal(point.x, other.x)
         assert np.array_equal(point.x, stored.x)
         assert np.array_equal(point.tangent, stored.tangent)
-        assert (point.energy, point.truncation, point.last) == (stored.energy, stored.truncation, stored.last)
+        assert (point.energy, point.truncation, point.order) == (stored.energy, stored.truncation, stored.order)
     state = State.read(tmp_path / "whole" / "branch-breather-4000.h5", orbit=1)
     assert state.period == pytest.approx(2 * np.pi / 4000)
     u = state.on(0, 60)[0].ravel()
@@ -279,7 +278,7 @@ def test_a_branch_that_fails_keeps_its_points_and_names_the_knob(tmp_path):
     assert stuck.ending.startswith("failed: step below")
     assert "nnm.harmonics or nnm.truncation" in stuck.ending
     assert "E = " in stuck.ending
-    assert len(CondensedBranch.read(tmp_path / "branch-breather-3700.h5").points) == len(stuck.points) > 0
+    assert len(read_branch(tmp_path / "branch-breather-3700.h5").points) == len(stuck.points) > 0
 
 
 def test_where_no_breather_begins():
@@ -318,14 +317,13 @@ def test_the_tongues_of_the_in_phase_mode_are_followed():
     shooting, counts = Shooting(Dop853Flow(KERSCHEN), MAPS["quarter"], 1e-12), []
     for i in (*tips, *(tips + 4)):
         point, u, before = points[i], displacement(problem, points[i]), displacement(problem, points[i - 1])
-        chart = Relative(KERSCHEN, u, point.period)
-        xi = chart.encode(u, point.period)
-        row = xi - chart.encode(before, points[i - 1].period)  # at the same length along the branch
-        attempt = shooting.solve(chart, xi, row / np.linalg.norm(row), row @ xi / np.linalg.norm(row))
-        orbit = Point.of(shooting, attempt, chart)
+        frame = shooting.relative_frame(u, point.period)
+        row = frame.xi - frame.chart.encode(before, points[i - 1].period)  # at the same length along the branch
+        attempt = frame.solve(frame.xi, row / np.linalg.norm(row), row @ frame.xi / np.linalg.norm(row))
+        orbit = frame.measures(attempt)
         assert attempt.converged
         assert orbit.frequency == pytest.approx(point.frequency, rel=1e-8)
         assert orbit.energy == pytest.approx(point.energy, rel=1e-6)
         counts.append(resonance(shooting, orbit))
     assert counts[:3] == [3, 3, 5]
-    assert max(p.last for p in points) < 100
+    assert max(p.order for p in points) < 100

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from vipetsc.lattice import Contact
-from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.lattice import Contact, Spring
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces, arcs
 
 CONSERVATIVE = [Contact("bilinear", 3.0), Contact("hertz", 3.0)]
@@ -47,7 +47,7 @@ def balance_of(forces, last, kind):
     rng = np.random.default_rng(3)
     root = rng.normal(size=(5, 5))
     compliance = DenseCompliance(np.ones(5), root @ root.T + np.eye(5), rng.normal(size=(forces.pairs, 5)))
-    return Balance(compliance, forces, last, odd=kind != "any", cosines=kind == "at rest")
+    return HarmonicBalance(compliance, forces, last, odd=kind != "any", cosines=kind == "at rest")
 
 
 def series_of(samples, orders):
@@ -72,7 +72,7 @@ def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
 
 
 def test_smooth_springs_have_the_harmonics_of_powers_of_a_cosine():
-    series = SiteForces([], [(2.0, 0.5)]).series(np.array([[0.0, 3.0]]), OMEGA)
+    series = SiteForces([], [Spring(0, 1, 0.0, quadratic=2.0, cubic=0.5)]).series(np.array([[0.0, 3.0]]), OMEGA)
     assert series.forces[0] == pytest.approx([9.0, 0.5 * 27 * 0.75, 9.0], abs=1e-12)  # 2 cos^2 = 1 + cos 2
 
 
@@ -96,18 +96,20 @@ def test_a_dissipative_contact_loses_what_its_law_says(law):
     [*itertools.product(CONSERVATIVE, ("at rest", "odd", "any")), *itertools.product(DISSIPATIVE, ("odd", "any"))],
 )
 def test_derivatives_are_those_of_the_residual(law, kind):
-    forces = SiteForces([(law, 1.0), (law, 0.8)], [(0.3 if kind == "any" else 0.0, 0.2)])
+    spring = Spring(0, 1, 0.0, quadratic=0.3 if kind == "any" else 0.0, cubic=0.2)
+    forces = SiteForces([(law, 1.0), (law, 0.8)], [spring])
     balance = balance_of(forces, 7, kind)
     x = balance.pack(motion_of(forces, 7, 1, kind))
     step = 1e-6
-    jacobian, rate = balance.derivative(x, OMEGA)
+    shift = balance.shift(OMEGA)
+    jacobian, rate = balance.derivative(x, OMEGA, shift)
     differences = [
-        (balance.residual(x + step * e, OMEGA) - balance.residual(x - step * e, OMEGA)) / (2 * step)
+        (balance.residual(x + step * e, OMEGA, shift) - balance.residual(x - step * e, OMEGA, shift)) / (2 * step)
         for e in np.eye(balance.size)
     ]
     assert jacobian == pytest.approx(np.transpose(differences), abs=2e-8 * np.abs(jacobian).max())
     if not law.approach_floor:  # its small part of the derivative is left out
-        ahead, behind = (balance.residual(x, OMEGA + s) for s in (step, -step))
+        ahead, behind = (balance.residual(x, OMEGA + s, shift) for s in (step, -step))
         assert rate == pytest.approx((ahead - behind) / (2 * step), abs=2e-8 * np.abs(rate).max())
 
 
@@ -139,9 +141,10 @@ def test_a_contact_that_never_separates():
 
 
 def test_the_solution_does_not_depend_on_the_shift():
-    forces = SiteForces([(CONSERVATIVE[1], 1.0)], [(0.0, 0.2)])
+    forces = SiteForces([(CONSERVATIVE[1], 1.0)], [Spring(0, 1, 0.0, cubic=0.2)])
     balance = balance_of(forces, 5, "odd")
     x = balance.pack(motion_of(forces, 5, 2, "odd"))
     z, force = balance.unpack(x), balance.series(x, OMEGA).forces[:, :6]
     linear = z + np.einsum("kij,jk->ik", balance.compliance.at(np.arange(6) * OMEGA), force)
-    assert balance.residual(x, OMEGA, linear) == pytest.approx(np.zeros(balance.size), abs=1e-14)
+    for shift in (balance.shift(OMEGA), -balance.shift(OMEGA)):
+        assert balance.residual(x, OMEGA, shift, linear) == pytest.approx(np.zeros(balance.size), abs=1e-14)

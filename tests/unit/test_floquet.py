@@ -11,13 +11,13 @@ from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, contact_stiffness
 from vipetsc.lattice.cell import four_band
-from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.lattice_follow import LatticeFollower
 from vipetsc.modes.lattice.krylov import LatticeShooting
-from vipetsc.modes.point import linear_start
 from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.shooting import MAPS, Shooting
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System
 
 CELLS, SITE = 14, 5
@@ -44,8 +44,8 @@ def test_the_breather_is_the_one_of_the_specification(breather):
     assert point.energy == pytest.approx(0.0203, abs=5e-5)
     assert (point.residual < 1e-12, point.episodes) == (True, 1)
     start = np.append(point.x, 0 * point.x)
-    flow = problem.lattice_flow
-    end = flow.whole(flow.arc(flow.share(start), point.period).end)
+    flow = problem.flow
+    end = flow.gather(flow.arc(flow.scatter(start), point.period).end)
     assert np.abs((end - start)[: len(point.x)]).max() < 1e-8 * np.abs(point.x).max()
 
 
@@ -53,9 +53,9 @@ def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
     from vipetsc.modes.lattice.floquet import largest_multipliers
 
     problem, point = breather
-    flow, n = problem.lattice_flow, problem.system.dofs
-    half = flow.arc(flow.share(np.append(point.x, 0 * point.x)), point.period / 2)
-    map_ = flow.whole(half.move(flow.share(np.eye(2 * n)))).T
+    flow, n = problem.flow, problem.system.dofs
+    half = flow.arc(flow.scatter(np.append(point.x, 0 * point.x)), point.period / 2)
+    map_ = flow.gather(half.move(flow.scatter(np.eye(2 * n)))).T
     all_of_them = np.linalg.eigvals(map_) ** 2
     found = largest_multipliers(flow, problem.system, True, point.x, point.period, 4)
     assert len(found) >= 2
@@ -68,11 +68,10 @@ def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
 
 def test_the_product_is_the_derivative(breather):
     problem, point = breather
-    chart = problem.chart("relative", point.x, point.period)
-    problem._chart, problem._last = chart, None
-    xi, change = chart.encode(point.x, point.period), np.random.default_rng(4).standard_normal(len(point.x) + 1)
-    product = problem._derivative(xi, change)
-    later, earlier = (problem._function(xi + way * 1e-6 * change) for way in (1, -1))
+    frame = problem.frame(point)
+    change = np.random.default_rng(4).standard_normal(len(point.x) + 1)
+    product = frame.product(frame.xi, change)
+    later, earlier = (frame.residual(frame.xi + sign * 1e-6 * change) for sign in (1, -1))
     np.testing.assert_allclose(product, (later - earlier) / 2e-6, atol=1e-6 * np.abs(product).max())
 
 
@@ -98,21 +97,21 @@ def test_a_branch_is_stored_with_its_multipliers_and_gone_on_with(tmp_path):
     short, whole = tmp_path / "short", tmp_path / "whole"
     for folder in (short, whole):
         folder.mkdir()
-    (branch,) = follow_all(case(multipliers=2), short, MPI.COMM_SELF, kind=LatticeFollower)
+    (branch,) = follow_all(case(multipliers=2), short, MPI.COMM_SELF)
     assert branch.name == "breather-1600"
     assert branch.ending.startswith("2 points reached")
-    stored = Branch.read(short / "branch-breather-1600.h5")
+    stored = read_branch(short / "branch-breather-1600.h5")
     assert [p.multiplier for p in stored.points] == [p.multiplier for p in branch.points]
     np.testing.assert_array_equal(stored.points[0].multipliers, branch.points[0].multipliers)
     assert min(p.multiplier for p in stored.points) > 1.3
-    (resumed,) = follow_all(case(multipliers=2, points=3), short, MPI.COMM_SELF, resume=True, kind=LatticeFollower)
-    (once,) = follow_all(case(multipliers=2, points=3), whole, MPI.COMM_SELF, kind=LatticeFollower)
+    (resumed,) = follow_all(case(multipliers=2, points=3), short, MPI.COMM_SELF, resume=True)
+    (once,) = follow_all(case(multipliers=2, points=3), whole, MPI.COMM_SELF)
     assert [p.energy for p in resumed.points] == [p.energy for p in once.points]
     assert np.all(np.diff([p.energy for p in once.points]) > 0)
 
 
 def test_what_has_no_breather_says_so_and_keeps_what_there_is(tmp_path):
-    (branch,) = follow_all(case(start_frequency=[700.0], max_newton=2), tmp_path, MPI.COMM_SELF, kind=LatticeFollower)
+    (branch,) = follow_all(case(start_frequency=[700.0], max_newton=2), tmp_path, MPI.COMM_SELF)
     assert branch.ending.startswith("failed: no ")
     assert "nnm.start_frequency" in branch.ending
 

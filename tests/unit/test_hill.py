@@ -15,12 +15,11 @@ from tests.unit.test_floquet import case
 from tests.unit.test_nfrc import case as forced
 from tests.unit.test_nfrc import start_of
 from vipetsc.case import CaseError, NnmCase
-from vipetsc.modes.branches.condensed_follow import CondensedBranch, CondensedFollower
+from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.branches.lattice_follow import LatticeFollower
 from vipetsc.modes.lattice import floquet
-from vipetsc.modes.response.nfrc import _first
 from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
 
 CONDENSED = {"system": "condensed", "points": 1, "truncation": 1e-7}
 
@@ -30,8 +29,8 @@ def test_multipliers_of_a_breather_are_those_of_floquet(tmp_path):
 
     In the 14 cells other pairs of 1.05 and less lie near the circle, whose zeros and poles are .01 of a strip apart.
     """
-    (branch,) = follow_all(case(**CONDENSED, multipliers=2), tmp_path, MPI.COMM_SELF, kind=CondensedFollower)
-    stored = CondensedBranch.read(tmp_path / "branch-breather-1600.h5")
+    (branch,) = follow_all(case(**CONDENSED, multipliers=2), tmp_path, MPI.COMM_SELF)
+    stored = read_branch(tmp_path / "branch-breather-1600.h5")
     for point, other in zip(stored.points, branch.points, strict=True):
         assert np.array_equal(point.multipliers, other.multipliers)
         mu, largest = point.multipliers[0, 0], np.abs(point.multipliers[:, 0]).max()
@@ -74,7 +73,7 @@ def test_multipliers_of_a_dissipative_state_are_those_of_its_period_map():
     of = forced({"cells": 2}, {"sites": [1], "restitution": 0.7}, source="force", infinite=False, harmonics=61,
                 range=[force, 20.0], fixed=[omega], largest_step=0.5)  # fmt: skip
     states = SteadyStates(of, 0.7, omega)
-    xi = _first(states).xi
+    xi = first_state(states).xi
     measures, z = states.measured(xi), states.balance.unpack(xi[:-1] * states.clearance)[0]
     phases = np.linspace(0, np.pi, 2001)
     w = (z * np.exp(1j * np.arange(len(z)) * phases[:, None])).sum(axis=1).real
@@ -86,7 +85,7 @@ def test_multipliers_of_a_dissipative_state_are_those_of_its_period_map():
     derivative = np.array([(after - before) / 2 / step for (after, before), step in zip(ends, scale, strict=True)]).T
     largest = np.abs(np.linalg.eigvals(derivative)).max()
     assert largest > 1.2
-    assert np.exp(2 * np.pi * measures["growth"]) == pytest.approx(largest, rel=1e-4)
+    assert np.exp(2 * np.pi * measures.growth) == pytest.approx(largest, rel=1e-4)
 
 
 def test_where_slepc_fails_the_branch_goes_on_without_multipliers(tmp_path, monkeypatch, caplog):
@@ -98,13 +97,13 @@ def test_where_slepc_fails_the_branch_goes_on_without_multipliers(tmp_path, monk
 
     monkeypatch.setattr(floquet, "_krylov_basis", fails)
     with caplog.at_level(logging.WARNING):
-        (branch,) = follow_all(case(multipliers=2), tmp_path, MPI.COMM_SELF, kind=LatticeFollower)
+        (branch,) = follow_all(case(multipliers=2), tmp_path, MPI.COMM_SELF)
     assert branch.ending.startswith("2 points reached") and len(branch.points) == 3
     assert np.isnan([p.multiplier for p in branch.points]).all()
     assert caplog.text.count("has no multipliers: SLEPc") == 3
     monkeypatch.setattr(floquet, "_krylov_basis", runs_out)
     with pytest.raises(PETSc.Error):  # maybe of one rank alone, which others wait for
-        follow_all(case(multipliers=2), tmp_path, MPI.COMM_SELF, kind=LatticeFollower)
+        follow_all(case(multipliers=2), tmp_path, MPI.COMM_SELF)
 
 
 def test_multipliers_of_the_whole_of_a_long_lattice_are_refused():

@@ -44,7 +44,7 @@ def test_without_contact_the_multipliers_are_those_of_the_linear_modes(ends):
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]), ends)
     n = CELLS * DOFS
     arc = flow.arc(towards((5,), 0.0, 0.0), PERIOD)
-    map_ = flow.whole(arc.move(flow.share(np.eye(2 * n)))).T
+    map_ = flow.gather(arc.move(flow.scatter(np.eye(2 * n)))).T
     squared = eigh(flow.chain.stiffness_matrix().toarray(), np.diag(flow.chain.masses()), eigvals_only=True)
     phases = np.exp(1j * np.outer([1, -1], np.sqrt(np.maximum(squared, 0)) * PERIOD)).ravel()
     found = np.linalg.eigvals(map_)
@@ -52,7 +52,7 @@ def test_without_contact_the_multipliers_are_those_of_the_linear_modes(ends):
     near = 1e-6 if ends != "fixed" else 1e-12
     assert np.abs(found[:, None] - phases[None]).min(axis=0).max() < near
     assert (arc.episodes, arc.closed) == (0, 0.0)
-    np.testing.assert_allclose(flow.share(flow.whole(arc.end)), arc.end, rtol=0, atol=0)
+    np.testing.assert_allclose(flow.scatter(flow.gather(arc.end)), arc.end, rtol=0, atol=0)
 
 
 CONTACTS = {
@@ -127,13 +127,13 @@ def test_the_conservative_flow_is_symplectic_and_keeps_the_energy(law):
     masses, stiffness = flow.chain.masses(), flow.chain.stiffness_matrix()
 
     def energy(block):
-        u, v = np.split(flow.whole(block), 2)
+        u, v = np.split(flow.gather(block), 2)
         w = u[5 * DOFS + 2] - u[5 * DOFS + 1]
         return 0.5 * masses @ v**2 + 0.5 * u @ (stiffness @ u) + contact.potential(w, CLEARANCE)
 
     assert energy(arc.end) == pytest.approx(energy(start), rel=1e-13)
     scale = np.append(np.sqrt(masses) * 1600, np.sqrt(masses))  # momentum and displacement in one unit
-    map_ = scale[:, None] * flow.whole(arc.move(flow.share(np.eye(2 * n)))).T / scale
+    map_ = scale[:, None] * flow.gather(arc.move(flow.scatter(np.eye(2 * n)))).T / scale
     form = np.kron([[0, 1], [-1, 0]], np.eye(n))
     np.testing.assert_allclose(map_.T @ form @ map_, form, atol=1e-9)
 

@@ -19,17 +19,28 @@ from scipy.integrate import DOP853
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import Guards, NnmCase, NnmTable
 from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
-from vipetsc.modes.branches.branch import Branch, slope_laws, tell_regions
+from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, is_jump, sampled, suspects
+from vipetsc.modes.branches.files import LAYOUTS, read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.continuation.arclength import Continuation, half_trace_change, relative_turn, unit
-from vipetsc.modes.continuation.special import Segment, locate, switch
-from vipetsc.modes.point import Point, half_traces, linear_start, multipliers, repetitions, sample_orbit
+from vipetsc.modes.branches.regions import assign_regions, fit_slope, regions
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.guards import half_trace_change
+from vipetsc.modes.continuation.segment import Segment
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import unit
 from vipetsc.modes.shooting import dop853
+from vipetsc.modes.shooting.charts import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.landing import CROSSING, EXTREMUM, NONE, first_rise
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
 from vipetsc.modes.shooting.reference import Newmark
-from vipetsc.modes.shooting.shooting import MAPS, Chart, Grazing, Logarithmic, Relative, Shooting
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.stability import half_traces, multipliers
+from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
 
@@ -55,7 +66,7 @@ def test_reduced_model_of_another_cell():
 def test_forces_are_the_energy_gradient():
     law = Contact("hertz", 3e6)
     pairs = (ContactPair(None, 0, 0.1, law), ContactPair(0, 2, 0.05, law))
-    smooth = (SmoothSpring(1, 2, cubic=3.0, quadratic=-1.0), SmoothSpring(None, 1, cubic=2.0))
+    smooth = (SmoothSpring.between(1, 2, cubic=3.0, quadratic=-1.0), SmoothSpring.between(None, 1, cubic=2.0))
     system = System.assemble([1.0, 2.0, 3.0], [(None, 0, 5.0), (0, 1, 7.0), (1, 2, 11.0)], pairs, smooth)
     u, step, zero = np.array([0.3, -0.2, 0.5]), 1e-6, np.zeros(3)
     gradient = [(system.energy(u + step * e, zero) - system.energy(u - step * e, zero)) / (2 * step) for e in np.eye(3)]
@@ -79,7 +90,7 @@ def test_unsound_systems_are_refused(change, message):
 
 
 def test_quarter_map_needs_an_odd_system():
-    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, quadratic=0.1)])
+    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, quadratic=0.1)])
     with pytest.raises(ValueError, match="half"):
         Shooting(Dop853Flow(system), MAPS["quarter"])
 
@@ -87,7 +98,7 @@ def test_quarter_map_needs_an_odd_system():
 def test_half_map_of_an_asymmetric_system():
     """x'' + x + a x^2 = 0: the second-order frequency 1 - 5/12 a^2 A^2 (Nayfeh and Mook 1979)."""
     a, energy = 0.1, 1e-3
-    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring(None, 0, quadratic=a)])
+    system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, quadratic=a)])
     problem = Shooting(Dop853Flow(system), MAPS["half"])
     point = linear_start(problem, 0, energy)
     assert 2 * np.pi * point.frequency == pytest.approx(1 - 5 / 12 * a**2 * 2 * point.energy, abs=2e-9)
@@ -212,7 +223,7 @@ def test_a_gap_that_nearly_closes_is_left_to_the_flow(margins, expected):
 @pytest.mark.parametrize("cubic", [1e8, 1e12])
 def test_a_step_that_overflows_is_taken_again_shorter(cubic):
     """The longest step is a radian of the linear system, of which the spring makes thousands."""
-    system = System(np.ones(2), np.array([[2.0, -1.0], [-1.0, 2.0]]), (), (SmoothSpring(None, 0, cubic=cubic),))
+    system = System(np.ones(2), np.array([[2.0, -1.0], [-1.0, 2.0]]), (), (SmoothSpring.between(None, 0, cubic=cubic),))
     arc = Dop853Flow(system).arc(np.array([1.0, 1.0, 0.0, 0.0]), 2e-3, 8e-3)
     energies = [system.energy(z[:2], z[2:]) for z in (arc.start, arc.end)]
     assert energies[1] == pytest.approx(energies[0], rel=1e-9)
@@ -236,7 +247,7 @@ def test_multipliers_are_those_of_the_monodromy_matrix(name):
     system = reduced()
     problem = Shooting(Dop853Flow(system), MAPS[name])
     point = linear_start(problem, 1, 1e-3)
-    traces = half_traces(problem, problem.arc(point.x, point.period))
+    traces = half_traces(system, problem.map, problem.arc(point.x, point.period))
     omega = system.linear_modes()[0]
     expected = np.cos(2 * np.pi * omega[0] / omega[1])
     mu = multipliers(traces, problem.map.quarter)
@@ -249,12 +260,12 @@ def test_regions_and_power_law_of_a_made_up_branch():
     touched = energy > 1e-2
     slope = np.where(touched, 1e3 / energy + 1e4 * (energy / 1e-2) ** -6.0, 0.0)
     closed = np.where(touched, 1 - 0.5 / (1 + np.log10(np.maximum(energy / 1e-2, 1)) ** 2), 0.0)
-    region = tell_regions(energy, slope, touched.astype(int), closed)
+    region = assign_regions(energy, slope, touched.astype(int), closed)
     assert np.all(np.diff(region) >= 0)
     assert set(region) == {1, 2, 3, 4}
     assert np.all((region == 1) == ~touched)
     assert closed[region == 4].min() >= 0.95 > closed[region == 3].max()
-    law = slope_laws(energy, slope, region)["IV"]
+    law = fit_slope(energy, slope, region)["IV"]
     assert law["exponent"] == pytest.approx(-1, abs=1e-3)
     assert law["adjusted_r2"] > 0.9999
     assert law["points"] == np.sum(region == 4)
@@ -265,11 +276,11 @@ def test_region_three_begins_where_the_exponent_settles():
     energy = np.geomspace(1e-3, 1e6, 4000)
     touched = energy > 1e-2
     slope = np.where(touched, 1e3 / energy + 1e4 * (energy / 1e-2) ** -6.0, 0.0)
-    region = tell_regions(energy, slope, touched.astype(int), np.zeros(4000))
+    region = assign_regions(energy, slope, touched.astype(int), np.zeros(4000))
     share = 1e4 * (energy / 1e-2) ** -6.0 / np.where(touched, slope, 1.0)
     begin = np.nonzero(region == 3)[0][0]
     assert share[begin] == pytest.approx((1 - np.sqrt(0.92)) / 2, rel=0.05)
-    laws = slope_laws(energy, slope, region)
+    laws = fit_slope(energy, slope, region)
     assert set(laws) == {"II", "III"}
     assert laws["II"]["exponent"] < -1.2
     assert laws["III"]["exponent"] == pytest.approx(-1, abs=1e-3)
@@ -280,11 +291,11 @@ def test_the_law_of_region_two_is_that_of_its_falling_part():
     """Behind the last point where the branch goes backwards, and behind the peak."""
     energy = np.geomspace(1, 100, 60)
     slope = np.concatenate([np.full(5, 9.0), [-1.0], energy[6:20] ** 3, energy[20:] ** -2.5 * energy[20] ** 5.5])
-    laws = slope_laws(energy, slope, np.full(60, 2))
+    laws = fit_slope(energy, slope, np.full(60, 2))
     assert laws["II"]["exponent"] == pytest.approx(-2.5, abs=1e-12)
     assert laws["II"]["points"] == 40
-    assert slope_laws(energy[:3], slope[:3], np.full(3, 3)) == {}
-    assert slope_laws(energy, np.full(60, np.nan), np.full(60, 3)) == {}
+    assert fit_slope(energy[:3], slope[:3], np.full(3, 3)) == {}
+    assert fit_slope(energy, np.full(60, np.nan), np.full(60, 3)) == {}
 
 
 def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():
@@ -292,7 +303,7 @@ def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():
     energy = np.geomspace(1e-3, 1e6, 4000)
     touched = energy > 1e-2
     slope = np.where(touched, 1 / energy + 1e8 * (energy / 1e-2) ** -3.0, 0.0)
-    region = tell_regions(energy, slope, touched.astype(int), np.zeros(4000))
+    region = assign_regions(energy, slope, touched.astype(int), np.zeros(4000))
     share = 1e8 * (energy / 1e-2) ** -3.0 / np.where(touched, slope, 1.0)
     assert share[region == 3].max() == pytest.approx((1 - np.sqrt(0.5)) / 2, rel=0.02)
 
@@ -300,8 +311,8 @@ def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():
 def test_regions_without_contacts():
     energy = np.geomspace(1e-3, 1e3, 50)
     none, never = np.zeros(50, int), np.zeros(50)
-    assert set(tell_regions(energy, np.zeros(50), none, never)) == {1}  # linear
-    assert set(tell_regions(energy, 1 / energy, none, never)) == {0}  # smooth springs
+    assert set(assign_regions(energy, np.zeros(50), none, never)) == {1}  # linear
+    assert set(assign_regions(energy, 1 / energy, none, never)) == {0}  # smooth springs
 
 
 def test_portrait_is_the_orbit_itself():
@@ -358,7 +369,7 @@ def test_systems_of_every_kind_of_case():
     assert system.contacts[0].law.stiffness == 2.0
     assert system.stiffness == pytest.approx(np.array([[8.0, -5.0], [-5.0, 5.0]]))
     assert (system.contacts[0].host, system.contacts[0].resonator) == (None, 1)
-    assert system.springs == (SmoothSpring(None, 1, cubic=7.0),)
+    assert system.springs == (SmoothSpring.between(None, 1, cubic=7.0),)
     chain = {"lattice": {"cells": 3}, "contacts": {"sites": [1, 3]}, "nnm": {"system": "chain", "modes": [12]}}
     system = System.from_case(NnmCase.from_table(chain))
     assert system.dofs == 12
@@ -422,7 +433,21 @@ def short_branch() -> Branch:
     points = [growing.point, *growing]
     assert growing.finished
     orbits = sampled(problem, points[-1:])
-    return Branch("out-of-phase", "name = 'x'", 2, points, 0.1, True, "done", ["a", "b"], orbits)
+    return Branch(
+        name="out-of-phase",
+        case="name = 'x'",
+        dofs=2,
+        points=points,
+        next_step=0.1,
+        complete=True,
+        ending="done",
+        findings=["a", "b"],
+        extra=orbits,
+    )
+
+
+def csv_of(branch: Branch) -> str:
+    return str(LAYOUTS[branch.kind].table(branch))
 
 
 def test_steps_have_the_arclength_that_they_say(short_branch):
@@ -489,26 +514,26 @@ def test_energy_folds_are_where_the_energy_turns(short_branch, sign):
 
 
 def test_branch_file_round_trip(short_branch, tmp_path):
-    short_branch.write(tmp_path, {"ranks": 1})
-    again = Branch.read(tmp_path / "branch-out-of-phase.h5")
+    write_branch(short_branch, tmp_path, {"ranks": 1})
+    again = read_branch(tmp_path / "branch-out-of-phase.h5")
     for read, written in zip(again.points, short_branch.points, strict=True):
-        for name in (f.name for f in fields(written)):
+        for name in {f.name for f in fields(written)} - {"next_step"}:  # it stands with the branch
             assert np.array_equal(getattr(read, name), getattr(written, name), equal_nan=name != "kind"), name
     assert again.next_step == short_branch.next_step
-    assert again.to_csv() == short_branch.to_csv()
+    assert csv_of(again) == csv_of(short_branch)
     assert (again.ending, again.complete, again.findings) == ("done", True, ["a", "b"])
     rows = list(csv.DictReader(io.StringIO((tmp_path / "branch-out-of-phase.csv").read_text())))
     assert [float(r["energy"]) for r in rows] == [p.energy for p in short_branch.points]
     told = [(float(r["slope"]), int(r["contacts"]), r["kind"]) for r in rows[1:]]
     assert told == [(p.slope, p.episodes, p.kind) for p in short_branch.points[1:]]
-    assert [int(r["region"]) for r in rows] == short_branch.regions().tolist()
+    assert [int(r["region"]) for r in rows] == regions(short_branch).tolist()
     assert list(rows[0])[-6:] == ["half_trace", "multiplier_max", "slope", "contacts", "region", "kind"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["branch-out-of-phase.csv", "branch-out-of-phase.h5"]
 
 
 def test_xarray_opens_the_branch(short_branch, tmp_path):
     xarray = pytest.importorskip("xarray")
-    short_branch.write(tmp_path, {})
+    write_branch(short_branch, tmp_path, {})
     with xarray.open_dataset(tmp_path / "branch-out-of-phase.h5", engine="h5netcdf") as data:
         assert data.frequency.attrs["units"] == "Hz"
         assert data.initial.dims == ("point", "dof")
@@ -523,7 +548,7 @@ def test_xarray_opens_the_branch(short_branch, tmp_path):
 def test_picture_from_the_file(short_branch, tmp_path):
     from vipetsc.figures.registry import draw
 
-    short_branch.write(tmp_path, {})
+    write_branch(short_branch, tmp_path, {})
     (path,) = draw("branches", [tmp_path])
     assert path == tmp_path / "figures" / "branch-out-of-phase.png"
     assert path.stat().st_size > 20000
@@ -545,7 +570,7 @@ def test_the_in_phase_hertz_branch_crosses_the_out_of_phase_one_and_goes_on(guar
     The true branch comes back from the tip, with c = 1 passed there, and no orbit repeats itself.
     """
     problem, points = in_phase_hertz(**({} if guarded else {"guards": Guards(turn_relative=0), "points": 200}))
-    assert max(relative_turn(problem, a, b) for a, b in itertools.pairwise(points)) > 0.2
+    assert max(problem.turn(a, b) for a, b in itertools.pairwise(points)) > 0.2
     monitor = BranchMonitor(problem, Guards())
     said = [s for s in map(monitor.check, points) if s]
     assert [i for i, why in suspects(problem, points) if "turns by" in why] == ([] if guarded else [123])
@@ -569,12 +594,11 @@ def test_a_branch_that_stands_still_says_so():
 
 def on_branch(problem: Shooting, x: list[float], period: float, step: float) -> Point:
     """A point of a branch from rounded values, with falling period along its tangent."""
-    chart = Relative(problem.system, np.array(x), period)
-    xi = chart.encode(np.array(x), period)
-    row = np.linalg.svd(problem.jacobian(problem.arc(np.array(x), period)) @ chart.derivative(xi))[2][-1]
-    attempt = problem.solve(chart, xi, row, row @ xi)
+    frame = problem.relative_frame(np.array(x), period)
+    row = np.linalg.svd(frame.jacobian(frame.xi))[2][-1]
+    attempt = frame.solve(frame.xi, row, row @ frame.xi)
     assert attempt.converged
-    return replace(Point.of(problem, attempt, chart, -row * np.sign(row[-1])), step=step)
+    return replace(frame.measures(attempt, -row * np.sign(row[-1])), step=step)
 
 
 # Three points of the in-phase Hertz branch, x in m, period in s and step each; 1.0e6 J and 1.7e7 J.
@@ -679,7 +703,7 @@ def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(
     assert second.ending == "stopped on request after point 7; resume goes on"
     last = follow(tmp_path, "parts", resume=True, **nnm)
     whole = follow(tmp_path, "whole", **nnm)
-    assert last.to_csv() == whole.to_csv()
+    assert csv_of(last) == csv_of(whole)
     assert last.complete
     names = {path.name for path in (tmp_path / "whole").iterdir()}
     assert names == {path.name for path in (tmp_path / "parts").iterdir()}

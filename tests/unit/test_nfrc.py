@@ -16,12 +16,16 @@ from vipetsc.case.verb_cases import load_every
 from vipetsc.dynamics import simulate
 from vipetsc.figures.registry import draw
 from vipetsc.io.store import RunMemory
-from vipetsc.lattice import DenseCompliance
-from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.lattice import DenseCompliance, Spring
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import Hill
-from vipetsc.modes.response.nfrc import Curve, _first, follow_curves, swept
-from vipetsc.modes.response.steady import SteadyPoint, SteadyStates
+from vipetsc.modes.branches.files import read_branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.response_layout import measure, sweep_down, sweep_up
+from vipetsc.modes.branches.sweeps import Sweep, swept, with_stable_folds
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -38,7 +42,7 @@ def case(lattice=None, contacts=None, **nfrc):
 
 def curve_of(of, folder):
     folder.mkdir(exist_ok=True)
-    (curve,) = follow_curves(of, folder, MPI.COMM_SELF)
+    (curve,) = follow_all(of, folder, MPI.COMM_SELF)
     return curve
 
 
@@ -50,14 +54,13 @@ def refined(few, many, xi):
 
 def start_of(states, xi, cells, phase=0.0):
     """Displacement and velocity (cells, dofs) of a steady state at a phase."""
-    omega, amplitude = states.parameters(xi[-1])
+    omega, amplitude = states.drive(xi[-1])
     z = states.balance.unpack(xi[:-1] * states.clearance)
     forces, rates = states.balance.series(xi[:-1] * states.clearance, omega).forces, 1j * omega * np.arange(z.shape[1])
     first = forces[:, 1] if states.wave else np.append(forces[:, 1], amplitude)
-    states.linear(omega)
     parts = [states.compliance.field(k * omega, first if k == 1 else forces[:, k], cells) for k in range(1, z.shape[1])]
     if states.wave:
-        parts[0] = parts[0] + states._known[omega][1].field(cells) * amplitude * states.clearance
+        parts[0] = parts[0] + states.linear_motion(omega).wave.field(cells) * amplitude * states.clearance
     parts = [part * np.exp(1j * k * phase) for k, part in enumerate(parts, 1)]
     return sum(part.real for part in parts), sum((rates[k] * part).real for k, part in enumerate(parts, 1))
 
@@ -80,15 +83,17 @@ def moved(chain, contact, site, periods, omega, state, force=0.0):
 
 
 def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
-    omega, forces, compliance = 1.8, SiteForces([], [(0.0, 1.0)]), DenseCompliance(np.ones(1), np.eye(1), np.eye(1))
-    balance = Balance(compliance, forces, 15, True, cosines=False)
+    omega = 1.8
+    forces = SiteForces([], [Spring(0, 1, 1.0, cubic=1.0)])
+    compliance = DenseCompliance(np.ones(1), np.eye(1), np.eye(1))
+    balance = HarmonicBalance(compliance, forces, 15, True, cosines=False)
     linear = np.zeros((1, 16), complex)
     linear[0, 1] = 0.3 / (1 - omega**2)
-    counts = []
+    shift, counts = balance.shift(omega), []
     for guess in (-0.14, 1.8, -1.6):  # out of phase and small; in phase and large; between
         x = balance.pack(np.zeros((1, 16), complex))
         x[0] = guess
-        solved = root(lambda x: balance.residual(x, omega, linear), x, tol=1e-13)
+        solved = root(lambda x: balance.residual(x, omega, shift, linear), x, tol=1e-13)
         assert solved.success
         series = balance.series(solved.x, omega)
         hill = Hill(compliance, omega, 15, odd=True, finite=True)
@@ -108,19 +113,20 @@ def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
 
 
 def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
-    for curve in follow_curves(case(restitutions=[1.0, 0.7], range=[0.996, 1.01]), tmp_path, MPI.COMM_SELF):
+    for curve in follow_all(case(restitutions=[1.0, 0.7], range=[0.996, 1.01]), tmp_path, MPI.COMM_SELF):
         assert curve.complete and curve.ending == "reached the end of nfrc.range, 0.996"
         folds = [i for i, point in enumerate(curve.points) if point.kind == "fold"]
-        p, share, size = curve.column("amplitude"), curve.column("share"), curve.column("largest")[:, 0] / 10**-2.75
+        p, share = measure(curve, "amplitude"), measure(curve, "share")
+        size = measure(curve, "largest")[:, 0] / 10**-2.75
         assert p[folds] == pytest.approx([1.0014], abs=2e-4)
         assert np.abs(share.sum(axis=1) - 1).max() < 1e-8
         assert np.all(share > -1e-12) and (share[-1, 3] > 1e-7) == ("r0.7" in curve.name) and share[-1, 2] > 1e-5
         free = p < 1
         free[folds[0] :] = False
-        assert size[free] == pytest.approx(p[free], rel=1e-12) and np.all(curve.column("unstable")[free] == 0)
+        assert size[free] == pytest.approx(p[free], rel=1e-12) and np.all(measure(curve, "unstable")[free] == 0)
         after = np.arange(len(p)) > folds[0] + 1
-        assert np.all(curve.column("unstable")[after] % 2 == 1) and np.all(curve.column("growth")[after] > 0.01)
-        assert swept(curve, 1)[-1] <= folds[0] and swept(curve, -1) == swept(curve, 1)[::-1]
+        assert np.all(measure(curve, "unstable")[after] % 2 == 1) and np.all(measure(curve, "growth")[after] > 0.01)
+        assert sweep_up(curve)[-1] <= folds[0] and sweep_down(curve) == sweep_up(curve)[::-1]
 
 
 def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
@@ -130,14 +136,14 @@ def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
     curve = curve_of(of, tmp_path)
     assert curve.complete, curve.ending
     last, chain = curve.points[-1], of.model().chain
-    assert last.measures["episodes"] == 2 and last.measures["frequency"] == pytest.approx(2010)
+    assert last.measures.episodes == 2 and last.measures.frequency == pytest.approx(2010)
     more = of.model_copy(update={"nfrc": of.nfrc.model_copy(update={"harmonics": 41})})
     states = SteadyStates(more, 1.0, 14.0)
     u, v = start_of(states, refined(SteadyStates(of, 1.0, 14.0), states, last.xi), np.arange(6))
     state = np.concatenate([u.ravel(), v.ravel()])
     end = moved(chain, of.contact(1.0), 2, 1, 2010.0, state, 14.0)[:, -1]
     assert np.abs(end - state)[:24].max() < 1e-5 * np.abs(state[:24]).max()
-    assert np.isnan(curve.column("share")).all()  # nothing leaves and nothing is lost
+    assert np.isnan(measure(curve, "share")).all()  # nothing leaves and nothing is lost
 
 
 def test_a_steady_state_is_where_a_long_run_ends():
@@ -145,13 +151,13 @@ def test_a_steady_state_is_where_a_long_run_ends():
     place, force = {"sites": [250], "restitution": 0.3}, {"waveform": "harmonic", "cell": 230, "frequency": 1023.27}
     table = {"name": "x", "lattice": LATTICE | {"cells": 500}, "contacts": CONTACTS | place, "drive": force}
     options = {"source": "force", "largest_step": 1.0, "fixed": [1023.27]}
-    amplitude = 1.6 * SteadyStates(NfrcCase.from_table(table | {"nfrc": options}), 0.3, 1023.27).scale
+    amplitude = 1.6 * SteadyStates(NfrcCase.from_table(table | {"nfrc": options}), 0.3, 1023.27).parameter.scale
     few, many = (
         SteadyStates(NfrcCase.from_table(table | {"nfrc": options | {"harmonics": last, "range": [amplitude, 99.0]}}),
                      0.3, 1023.27) for last in (9, 61)
     )  # fmt: skip
-    measures = many.measured(refined(few, many, _first(few).xi))
-    assert measures["unstable"] == 0 and measures["episodes"] == 4
+    measures = many.measured(refined(few, many, first_state(few).xi))
+    assert measures.unstable == 0 and measures.episodes == 4
     period, samples = 2 * np.pi / 1023.27, 64  # fewer would take high harmonics for the first
     drive = force | {"amplitude": amplitude, "ramp": 40 * period}
     time = {"engine": "propagator", "end": 180 * period, "sample_interval": period / samples}
@@ -160,7 +166,7 @@ def test_a_steady_state_is_where_a_long_run_ends():
     u = memory.dataset["displacement"].values[-1 - 8 * samples : -1, 0]
     turns = np.exp(-2j * np.pi * np.arange(len(u)) / samples)
     first = 2 * np.abs(np.mean(turns * (u[:, 2] - u[:, 1])))
-    z = measures["harmonics"][0, 1] + 1j * measures["harmonics_imaginary"][0, 1]
+    z = measures.harmonics[0, 1]
     assert first == pytest.approx(abs(z), rel=5e-4)
 
 
@@ -175,20 +181,21 @@ def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
     curves = [curve_of(case(None, contacts, **nfrc, direction=way), tmp_path / way)
               for contacts, way in ((THREE, "forward"), (turned, "backward"))]  # fmt: skip
     for curve in curves:
-        share = curve.column("share")
+        share = measure(curve, "share")
         assert len(curve.points) >= 3 and np.abs(share.sum(axis=1) - 1).max() < 1e-8
-        assert share[-1].min() > 1e-9 and curve.column("episodes")[-1] >= 2
+        assert share[-1].min() > 1e-9 and measure(curve, "episodes")[-1] >= 2
     for name in ("share", "largest", "unstable"):
-        assert curves[0].column(name) == pytest.approx(curves[1].column(name), rel=1e-6, abs=1e-12)
+        assert measure(curves[0], name) == pytest.approx(measure(curves[1], name), rel=1e-6, abs=1e-12)
     # Even harmonics are zero, and what perturbations do is the same, found in one determinant or in two.
-    ((_, _, fixed),) = curves[0].case.curves()
+    ((_, _, fixed),) = NfrcCase.from_toml(curves[0].case).curves()
     both = [SteadyStates(case(None, THREE, **nfrc, symmetric=symmetric), 0.7, fixed) for symmetric in (True, False)]
     xi, parameter = curves[0].points[-1].xi[:-1], curves[0].points[-1].xi[-1]
     more = np.append(both[1].balance.pack(both[0].balance.unpack(xi)), parameter)
-    assert np.abs(both[1].residual(more)).max() < 1e-9
-    for measure in ("unstable", "growth", "share"):
-        expected = pytest.approx(curves[0].points[-1].measures[measure], rel=1e-6, abs=1e-9)
-        assert both[1].measured(more)[measure] == expected
+    shift = both[1].balance.shift(both[1].drive(more[-1])[0])
+    assert np.abs(both[1].residual(more, shift)).max() < 1e-9
+    for name in ("unstable", "growth", "fractions"):
+        expected = pytest.approx(getattr(curves[0].points[-1].measures, name), rel=1e-6, abs=1e-9)
+        assert getattr(both[1].measured(more), name) == expected
     (picture,) = draw("branches", [tmp_path / "forward"])
     assert picture.exists()
 
@@ -196,11 +203,11 @@ def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
 def test_what_a_force_gives_a_lattice_with_ends_is_lost(tmp_path):
     sites, options = THREE | {"sites": [3, 5, 8]}, {"source": "force", "infinite": False, "fixed": [2000.0]}
     states = SteadyStates(case({"cells": 12}, sites, **options), 0.7, 2000.0)
-    touching = min(sites["clearance"] / np.abs(states.linear(2000.0)[:, 1]))
+    touching = min(sites["clearance"] / np.abs(states.linear_motion(2000.0).harmonics[:, 1]))
     options |= {"range": [0.999 * touching, 1.02 * touching], "points": 4, "harmonics": 5}
     curve = curve_of(case({"cells": 12}, sites, **options), tmp_path)
-    touches = curve.column("episodes") > 0
-    assert touches.any() and curve.column("share")[touches, 3] == pytest.approx(1.0, abs=1e-8)
+    touches = measure(curve, "episodes") > 0
+    assert touches.any() and measure(curve, "share")[touches, 3] == pytest.approx(1.0, abs=1e-8)
 
 
 def test_a_curve_goes_on_to_the_same_bits(tmp_path):
@@ -210,29 +217,27 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
     of = case(harmonics=5, restitutions=[0.7], range=[0.999, 1.0005], first_step=2e-4, largest_step=3e-4)
     curve = curve_of(of, whole)
     begun = of.model_copy(update={"nfrc": of.nfrc.model_copy(update={"points": 3})})
-    (first,) = follow_curves(begun, parts, MPI.COMM_SELF)
+    (first,) = follow_all(begun, parts, MPI.COMM_SELF)
     assert not first.complete and "raise nfrc.points" in first.ending
-    (second,) = follow_curves(of, parts, MPI.COMM_SELF, resume=True)
+    (second,) = follow_all(of, parts, MPI.COMM_SELF, resume=True)
     assert second.complete
     name = f"branch-{curve.name}.h5"
     assert_same_bits(datasets(whole / name), datasets(parts / name))
     assert (whole / name.replace("h5", "csv")).read_text() == (parts / name.replace("h5", "csv")).read_text()
-    again = Curve.read(whole / name, of)
-    assert np.array_equal(again.column("share"), curve.column("share")) and again.complete
+    again = read_branch(whole / name)
+    assert np.array_equal(measure(again, "share"), measure(curve, "share")) and again.complete
     (picture,) = draw("branches", [whole])
     assert picture.name == f"branch-{curve.name}.png"
 
 
 def test_sweeps_jump_between_stable_states(tmp_path):
     """A made-up S with a stable upper part: up it jumps at one fold, to the nearer of two states, down at the other."""
-    curve = Curve("s", case())
     p = [0.5, 0.8, 1.0, 0.9, 0.7, 0.6, 0.8, 1.0, 1.2, 1.15, 1.05, 0.95]
-    for i, (at, stable) in enumerate(zip(p, [1, 1, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1], strict=True)):
-        measures = {"amplitude": at, "unstable": 1 - stable, "largest": np.array([0.1 * i])}
-        kind = "fold" if i in (2, 5) else "regular"
-        curve.points.append(SteadyPoint(np.zeros(1), np.zeros(1), 0.1, kind, measures))
-    assert swept(curve, 1) == [0, 1, 2, 8]
-    assert swept(curve, -1) == [8, 7, 6, 5, 0]
+    stable = np.array([1, 1, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1], bool)
+    fold = np.isin(np.arange(12), (2, 5))
+    up = Sweep(np.array(p), size=0.1 * np.arange(12), stable=with_stable_folds(stable, fold))
+    assert swept(up) == [0, 1, 2, 8]
+    assert swept(up._replace(parameter=-up.parameter), start=8) == [8, 7, 6, 5, 0]
 
 
 @pytest.mark.parametrize(
@@ -263,12 +268,12 @@ def test_a_site_is_needed_and_validate_reads_the_section(tmp_path):
 
 def test_a_force_on_an_infinite_lattice_gives_what_leaves_and_is_lost(tmp_path):
     force = {"source": "force", "harmonics": 7, "largest_step": 1.0}
-    touching = SteadyStates(case(**force), 0.7, 1023.27).scale
-    (curve,) = follow_curves(
+    touching = SteadyStates(case(**force), 0.7, 1023.27).parameter.scale
+    (curve,) = follow_all(
         case(contacts={"restitution": 0.7}, **force, range=[0.99 * touching, 1.0005 * touching]),
         tmp_path,
         MPI.COMM_SELF,
     )
-    assert curve.complete and curve.points[-1].measures["episodes"] == 2
-    assert np.abs(curve.column("share").sum(axis=1) - 1).max() < 1e-8
-    assert curve.points[-1].measures["share"][3] > 0
+    assert curve.complete and curve.points[-1].measures.episodes == 2
+    assert np.abs(measure(curve, "share").sum(axis=1) - 1).max() < 1e-8
+    assert curve.points[-1].measures.fractions[3] > 0

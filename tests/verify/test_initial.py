@@ -16,7 +16,6 @@ from vipetsc.io.netcdf import variable, write_netcdf
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import bloch
 from vipetsc.lattice.modes import linear_modes, mode_frequency
-from vipetsc.modes.branches.condensed_follow import CondensedFollower
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.spectra.modal_energies import ModalParts
 
@@ -179,7 +178,7 @@ def test_a_breather_comes_back_after_its_period_on_both_engines(tmp_path):
     contacts = {"law": "hertz", "sites": [6], "clearance": 10**-2.75, "restitution": 1.0}
     nnm = {"system": "condensed", "start_frequency": [1600.0], "truncation": 1e-8, "tolerance": 1e-12, "points": 1}
     case = NnmCase.from_table({"name": "b", "lattice": lattice, "contacts": contacts, "nnm": nnm})
-    follow_all(case, tmp_path, MPI.COMM_SELF, kind=CondensedFollower)
+    follow_all(case, tmp_path, MPI.COMM_SELF)
     period = 2 * np.pi / 1600
     initial = {"kind": "file", "path": str(tmp_path / "branch-breather-1600.h5"), "orbit": 1}
     for engine in ENGINES:

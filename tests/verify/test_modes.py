@@ -11,14 +11,20 @@ import pytest
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.lattice import Chain, Contact, contact_stiffness, four_band
 from vipetsc.modes.branches.branch_checks import BranchMonitor, is_jump, suspects
-from vipetsc.modes.continuation import special as special_points
+from vipetsc.modes.continuation import segment as segments
 from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.special import Segment, locate, switch
-from vipetsc.modes.point import Point, linear_start, resonance
+from vipetsc.modes.continuation.segment import Segment
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.shooting import shooting as shooting_problem
 from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.orbit import resonance
 from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
-from vipetsc.modes.shooting.shooting import MAPS, Relative, Shooting
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import SmoothSpring, System
 
 D = 10**-2.75
@@ -32,7 +38,7 @@ def reduced(law="bilinear", modulus: float = 1e8) -> System:
 
 def cubic() -> System:
     springs = [(None, 0, 1.0), (0, 1, 1.0), (None, 1, 1.0)]
-    return System.assemble([1.0, 1.0], springs, smooth=[SmoothSpring(None, 0, cubic=0.5)])
+    return System.assemble([1.0, 1.0], springs, smooth=[SmoothSpring.between(None, 0, cubic=0.5)])
 
 
 def follow(system: System, mode: int, start: float, flow=Dop853Flow, shooting: str = "quarter", **control):
@@ -53,14 +59,11 @@ def at_energy(problem: Shooting, points: list[Point], energy: float) -> Point:
     last = points[i]
     for _ in range(8):  # Newton in the energy along the branch
         share = (energy - last.energy) / last.energy_tangent
-        chart = Relative(problem.system, last.x, last.period)
-        xi = chart.encode(last.x, last.period)
-        tangent = np.linalg.solve(chart.derivative(xi), last.tangent)
-        row = tangent / np.linalg.norm(tangent)
-        attempt = problem.solve(chart, xi + share * tangent, row, row @ (xi + share * tangent))
+        frame = problem.frame(last, "relative")
+        guess = frame.xi + share * frame.direction(last)
+        attempt = frame.solve(guess, frame.tangent, frame.tangent @ guess)
         assert attempt.converged, attempt.history
-        null = np.linalg.svd(problem.matrix(attempt.xi))[2][-1]
-        last = Point.of(problem, attempt, chart, null)
+        last = frame.measures(attempt, np.linalg.svd(frame.jacobian(attempt.xi))[2][-1])
     assert last.energy == pytest.approx(energy, rel=1e-12)
     return last
 
@@ -179,12 +182,11 @@ def test_other_flows_agree(flow, law, bilinear, hertz):
     other = Shooting(flow(system), MAPS["quarter"], tolerance=1e-12)
     for energy in (0.1, 10.0, 1e4, 1e8):
         point = at_energy(problem, points, energy)
-        chart = Relative(system, point.x, point.period)
-        xi = chart.encode(point.x, point.period)
+        frame = other.relative_frame(point.x, point.period)
         row = np.array([0.0, 1.0, 0.0])  # the same w
-        attempt = other.solve(chart, xi + 1e-6 * (1 - row), row, row @ xi)  # begin beside the orbit
+        attempt = frame.solve(frame.xi + 1e-6 * (1 - row), row, row @ frame.xi)  # begin beside the orbit
         assert attempt.converged, attempt.history
-        found = Point.of(other, attempt, chart)
+        found = frame.measures(attempt)
         accuracy = (1e-11, 1e-11) if flow is Tsrk else (1e-4, 1e-4)
         assert found.energy == pytest.approx(point.energy, rel=accuracy[0])
         assert found.frequency == pytest.approx(point.frequency, rel=accuracy[1])
@@ -271,11 +273,10 @@ def test_degenerate_tangent_is_named():
     system = System.assemble([1.0, 1.0], [(None, 0, 1.0), (None, 1, 1.0)])
     problem = Shooting(Dop853Flow(system), MAPS["half"])
     x = np.array([1.0, 0.5])
-    chart = Relative(system, x, 2 * np.pi)
-    xi = chart.encode(x, 2 * np.pi)
-    attempt = problem.solve(chart, xi, np.array([1.0, 0.0, 0.0]), xi[0])
+    frame = problem.relative_frame(x, 2 * np.pi)
+    attempt = frame.solve(frame.xi, np.array([1.0, 0.0, 0.0]), frame.xi[0])
     with pytest.raises(ContinuationError, match=r"degenerate tangent at E = 0.625 J"):
-        Continuation(problem, Point.of(problem, attempt, chart), NnmTable())
+        Continuation(problem, frame.measures(attempt), NnmTable())
 
 
 def test_both_directions_give_the_same_curve():
@@ -335,12 +336,11 @@ def test_maps_agree(shooting, bilinear):
     unstable = max(points, key=lambda p: p.multiplier)
     for p in (point, unstable):
         other = Shooting(problem.flow, MAPS[shooting], tolerance=1e-11)
-        chart = Relative(problem.system, p.x, p.period)
-        xi = chart.encode(p.x, p.period)
+        frame = other.relative_frame(p.x, p.period)
         row = np.append(p.x / np.linalg.norm(p.x), 0.0)
-        attempt = other.solve(chart, xi + 1e-7, row, row @ xi)
+        attempt = frame.solve(frame.xi + 1e-7, row, row @ frame.xi)
         assert attempt.converged, attempt.history
-        found = Point.of(other, attempt, chart)
+        found = frame.measures(attempt)
         assert found.frequency == pytest.approx(p.frequency, rel=1e-9)
         assert found.multiplier == pytest.approx(p.multiplier, rel=1e-3)
 
@@ -399,7 +399,7 @@ def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
         return [p for a, b in steps for p in locate(problem, a, b, grazing=True) if p.kind == "grazing"]
 
     with monkeypatch.context() as patch:
-        patch.setattr(special_points, "brentq", lambda *_, **__: 1 / 0)  # nothing is bisected
+        patch.setattr(segments, "brentq", lambda *_, **__: 1 / 0)  # nothing is bisected
         touching = located()
     assert len(touching) == len(steps)
     for (a, b), point in zip(steps, touching, strict=True):
@@ -407,7 +407,7 @@ def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
         beside = [segment.at(point.step + shift * segment.length).episodes for shift in (-1e-4, 1e-4)]
         assert beside == [a.episodes, b.episodes]
         assert point.episodes == min(beside)
-    monkeypatch.setattr(special_points, "graze", lambda *_: (_ for _ in ()).throw(ArithmeticError("no luck")))
+    monkeypatch.setattr(shooting_problem, "graze", lambda *_: (_ for _ in ()).throw(ArithmeticError("no luck")))
     steps = steps[:3]
     for point, same in zip(touching, located(), strict=False):
         assert point.energy == pytest.approx(same.energy, rel=1e-9)

@@ -9,19 +9,16 @@ M. Krack, J. Gross, Harmonic Balance for Nonlinear Vibration Problems, Springer 
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from vipetsc.lattice import Contact
-from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import Hill
-from vipetsc.modes.newton import BorderedNewton
-from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steady import LinearMotion, Parameter, SteadyEquations
 
 K, STOP, GAP, FORCE, OFFSET, LAST = np.array([[1.0, -1.0], [-1.0, 2.0]]), 100.0, 1.0, 0.1, 10.0, 101
 C = 0.03 * K
@@ -35,21 +32,20 @@ class Damped:
         return np.array([np.linalg.inv(d)[:1, column : column + 1] for d in dynamic])
 
 
-class Example(SteadyStates):
+class Example(SteadyEquations):
     """The steady states of the example over the frequency."""
 
     def __init__(self):
-        self.options = SimpleNamespace(over="frequency")
-        self.compliance, self.fixed = Damped(), 1.0
-        self.forces = SiteForces([(Contact("bilinear", STOP), GAP + OFFSET)])
-        self.balance = Balance(self.compliance, self.forces, LAST, odd=False, cosines=False)
-        self.clearance, self.scale, self.count = GAP, 0.15, self.balance.size
-        self.newton = BorderedNewton(self.residual, self.matrix, self.count + 1, 1e-12, 12)
+        self.compliance = Damped()
+        forces = SiteForces([(Contact("bilinear", STOP), GAP + OFFSET)])
+        balance = HarmonicBalance(self.compliance, forces, LAST, odd=False, cosines=False)
+        over = Parameter("frequency", fixed=1.0, scale=0.15)
+        super().__init__(balance, GAP, over, tolerance=1e-12, max_newton=12)
 
-    def linear(self, omega):
+    def linear_motion(self, omega):
         z = np.zeros((1, LAST + 1), complex)
         z[0, :2] = OFFSET, FORCE * self.compliance.at(omega, 1)[0, 0, 0]
-        return z
+        return LinearMotion(z, None)
 
 
 def flow(omega, state, shares=()):
@@ -76,7 +72,7 @@ def flow(omega, state, shares=()):
 
 def fundamentals(states, xi):
     """Harmonics of order 1 of the displacement of the two masses."""
-    omega = states.parameters(xi[-1])[0]
+    omega = states.drive(xi[-1])[0]
     force = -states.balance.series(xi[:-1], omega).forces[0, 1]
     return np.linalg.solve(K + 1j * omega * C - omega**2 * np.eye(2), [force, FORCE])
 
@@ -107,8 +103,7 @@ def test_both_ways_give_one_curve_and_the_published_stability():
             spectrum = np.fft.rfft(flow(omega, state, np.arange(512) / 512)[2][:2]) / 256
             harmonics = spectrum[:1, : LAST + 1] + OFFSET * (np.arange(LAST + 1) == 0)
             harmonics[0, 0] -= spectrum[0, 0] / 2
-            states.balance.shift(omega)
-            xi = states.at(np.append(states.balance.pack(harmonics), 0.0), omega / states.scale)
+            xi = states.at(np.append(states.balance.pack(harmonics), 0.0), omega / states.parameter.scale)
             assert fundamentals(states, xi) == pytest.approx(spectrum[:, 1], rel=1e-6)
             hill = Hill(states.compliance, omega, LAST, odd=False, finite=True)
             fastest = hill.fastest(states.balance.series(xi[:-1], omega))

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -57,6 +57,7 @@ class NfrcCase(Case):
     nfrc: NfrcTable
 
     verb = section = "nfrc"
+    kept_by_resume: ClassVar[str] = "the case its curves were begun with, but for nfrc.points"
     takes = frozenset({"disorder", "rings"})
     waveforms = ("burst", "harmonic")
     premise = "steady states are those of a lattice"
@@ -105,6 +106,11 @@ class NfrcCase(Case):
     def warnings(self) -> list[str]:
         """Nothing: what a run in time is warned of does not concern steady states."""
         return []
+
+    def physics(self) -> "NfrcCase":
+        """What a curve that is resumed must keep: all but the number of its points."""
+        nfrc = self.nfrc.model_copy(update={"points": 1})
+        return self.model_copy(update={"nfrc": nfrc})
 
     @property
     def frequency(self) -> float:

@@ -4,7 +4,7 @@ The system itself is built by ``vipetsc.modes.system.System.from_case``.
 """
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -149,6 +149,7 @@ class NnmCase(CaseFile):
     nnm: NnmTable
 
     verb = section = "nnm"
+    kept_by_resume: ClassVar[str] = "the system, map and flow that its branches were begun with"
     takes = frozenset({"rings"})
     premise = "normal modes are those of a lattice"
 

@@ -28,12 +28,16 @@ E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 
 
 from vipetsc.case.nnm import Guards, NnmTable
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.special import locate, switch
-from vipetsc.modes.point import Point, linear_start
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError
 from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.reference import Newmark, Tsrk
-from vipetsc.modes.shooting.shooting import MAPS, Shooting
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import ContactPair, SmoothSpring, System

@@ -1,4 +1,15 @@
-"""Errors of the equations whose solutions form branches, shared by every method of finding them."""
+"""What continuation asks of a method: equations with one unknown more than there are equations, and their solutions.
+
+A ``Problem`` is a system together with a method (shooting, harmonic balance) whose solutions form branches. Around a
+point of a branch it gives a ``Frame``: unknowns xi of order one, in which a step is taken and corrected. Continuation,
+the location of special points and the files of branches know no more of a method than this.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
 
 
 class FlowError(RuntimeError):
@@ -11,3 +22,115 @@ class ContinuationError(RuntimeError):
 
 class StartError(ValueError):
     """There is no periodic orbit to begin a branch with; all ranks that seek one together find that out together."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """A point of a branch, with what continuation needs in order to go on from it.
+
+    ``tangent`` is the branch's direction in the units of the unknowns, of any length, and empty where a branch begins;
+    ``index`` counts regular points, ``step`` is the arclength of the step that led here and ``next_step`` that of the
+    step after it; ``kind`` is "regular" or the name of a special point.
+    """
+
+    tangent: np.ndarray
+    index: int
+    step: float
+    next_step: float
+    kind: str
+
+    def describe(self) -> str:
+        """Which point it is, for messages."""
+        return f"point {self.index}"
+
+
+@dataclass(eq=False)
+class Attempt:
+    """What Newton's method did: ``history`` of residual norms, ``reason`` why it stopped, last ``xi``.
+
+    It ``left_domain`` where the equations could not be evaluated; ``xi`` is then the guess.
+    """
+
+    converged: bool
+    reason: str
+    history: list[float]
+    xi: np.ndarray
+    left_domain: bool = False
+
+    @property
+    def residuals(self) -> str:
+        """The history as text."""
+        return " ".join(f"{r:.1e}" for r in self.history)
+
+
+S = TypeVar("S", bound=Solution)
+
+
+@dataclass(frozen=True)
+class SpecialKind(Generic[S]):
+    """A kind of special point: where ``test`` changes sign, by more than a ``floor`` on both sides.
+
+    ``seek`` (frame, guess, left, right) gives the point's unknowns, where equations for them are known, and raises
+    ArithmeticError where they have no solution; else the sign change is bracketed. ``finish`` (point, left, right) adds
+    what only such points are asked for.
+    """
+
+    name: str
+    test: Callable[[S], float]
+    floor: float = 0.0
+    seek: "Callable[[Frame[S], np.ndarray, S, S], np.ndarray] | None" = None
+    finish: Callable[[S, S, S], S] | None = None
+
+
+class Frame(Protocol[S]):
+    """Unknowns ``xi`` (n + 1,) of order one around a point of a branch, and the unit ``tangent`` there."""
+
+    xi: np.ndarray
+    tangent: np.ndarray
+
+    def encode(self, point: S) -> np.ndarray:
+        """The unknowns of another point of the branch."""
+
+    def direction(self, point: S) -> np.ndarray:
+        """The branch's direction at another point, of any length, in these unknowns."""
+
+    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
+        """Newton's method from ``guess`` for the solution at an ``arclength`` along the tangent."""
+
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent at a solution, on the side of the frame's own."""
+
+    def measures(self, attempt: Attempt, direction: np.ndarray) -> S:
+        """The point that an attempt has converged to, where ``direction`` is the unit tangent."""
+
+
+class Problem(Protocol[S]):
+    """Equations whose solutions form branches.
+
+    ``has_half_traces`` says whether points have the half-traces of their multipliers, ``guards`` which changes from
+    point to point are guarded (``continuation.guards``), and ``tolerance`` is that of Newton's method.
+    """
+
+    tolerance: float
+    has_half_traces: bool
+    guards: frozenset[str]
+
+    def frame(self, point: S, chart: str = "auto") -> Frame[S]:
+        """The unknowns around ``point``, which has a tangent, in the ``chart`` of that name where there is a choice."""
+
+    def first_tangent(self, start: S, direction: int) -> np.ndarray:
+        """Tangent at the first point, along which the energy (or parameter) grows (``direction`` 1) or falls (-1).
+
+        Raises ContinuationError where the tangent is not unique.
+        """
+
+    def turn(self, before: S, after: S) -> float:
+        """Angle in rad between the tangents of two points in relative units; 0 without a tangent."""
+
+    def special_kinds(self, left: S, right: S) -> Iterator[SpecialKind[S]]:
+        """What can happen on a branch between two points."""
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """The vector over its length."""
+    return vector / np.linalg.norm(vector)

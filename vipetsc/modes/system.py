@@ -1,16 +1,17 @@
 """A conservative system of masses, springs and contact pairs, with any number of degrees of freedom."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.sparse import issparse
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.resolve import build_chain, clearances
-from vipetsc.lattice import Chain, Contact, UnitCell
+from vipetsc.lattice import Chain, Contact, Spring, UnitCell
 
 
 @dataclass(frozen=True)
@@ -26,17 +27,21 @@ class ContactPair:
     law: Contact
 
 
-@dataclass(frozen=True)
-class SmoothSpring:
-    """A nonlinear spring of elongation z = u_end - u_start with the force ``quadratic`` z^2 + ``cubic`` z^3.
+class SmoothSpring(NamedTuple):
+    """A nonlinear spring between two masses (0-based), of elongation z = u_end - u_start; ``start`` None is the ground.
 
-    Units N/m^2 and N/m^3; ``start`` None is the ground. The linear part belongs into the stiffness matrix.
+    Its ``law`` is that of a spring of a cell, whose own ``start`` and ``end`` do not count here. The part k z belongs
+    into the stiffness matrix.
     """
 
     start: int | None
     end: int
-    cubic: float = 0.0
-    quadratic: float = 0.0
+    law: Spring
+
+    @classmethod
+    def between(cls, start: int | None, end: int, quadratic: float = 0.0, cubic: float = 0.0) -> Self:
+        """A spring with the force ``quadratic`` z^2 + ``cubic`` z^3 in N/m^2 and N/m^3."""
+        return cls(start, end, Spring(0, 1, stiffness=0.0, quadratic=quadratic, cubic=cubic))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +62,9 @@ class System:
         n = len(self.masses)
         if not (np.all(np.isfinite(self.masses)) and np.all(np.asarray(self.masses) > 0)):
             raise ValueError(f"masses {self.masses!r} must be positive (kg)")
-        k = self.stiffness
-        even = (
-            np.allclose(k, k.T, rtol=1e-12) if isinstance(k, np.ndarray) else abs(k - k.T).max() <= 1e-12 * abs(k).max()
-        )
-        if k.shape != (n, n) or not even:
+        if self.stiffness.shape != (n, n) or not _is_symmetric(self.stiffness):
             raise ValueError(f"the stiffness must be a symmetric matrix of shape ({n}, {n})")
+
         for pair in self.contacts:
             if pair.clearance <= 0:
                 raise ValueError(f"clearance {pair.clearance!r} must be positive (m)")
@@ -70,6 +72,7 @@ class System:
                 raise ValueError(
                     f"restitution {pair.law.restitution!r} dissipates; nonlinear normal modes need restitution = 1"
                 )
+
         ends = [(p.host, p.resonator) for p in self.contacts] + [(s.start, s.end) for s in self.springs]
         for start, end in ends:
             if start == end or not all(i is None or 0 <= i < n for i in (start, end)):
@@ -94,29 +97,37 @@ class System:
     @classmethod
     def from_case(cls, case: NnmCase) -> Self:
         """The system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
-        law, table = case.contact(), case.nnm.custom
+        law = case.contact()
+        table = case.nnm.custom
         if case.nnm.system == "chain":
             return cls.from_chain(build_chain(case.lattice, case.contacts), law)
         if table is None:
             return cls.reduced(case.lattice.unit_cell(), clearances(case.lattice, case.contacts, 1)[0], law)
+
         mass = [None, *range(len(table.masses))]  # the table counts them from 1, and 0 is the ground
+        smooth = table.smooth
         return cls.assemble(
-            table.masses,
-            [(mass[s.start], s.end - 1, s.stiffness) for s in table.springs],
-            [ContactPair(mass[p.host], p.resonator - 1, p.clearance, law) for p in table.contacts],
-            [SmoothSpring(mass[s.start], s.end - 1, s.cubic, s.quadratic) for s in table.smooth],
+            masses=table.masses,
+            springs=[(mass[s.start], s.end - 1, s.stiffness) for s in table.springs],
+            contacts=[ContactPair(mass[p.host], p.resonator - 1, p.clearance, law) for p in table.contacts],
+            smooth=[SmoothSpring.between(mass[s.start], s.end - 1, s.quadratic, s.cubic) for s in smooth],
         )
 
     @classmethod
     def from_chain(cls, chain: Chain, law: Contact, dense: bool = True) -> Self:
         """The finite lattice ``chain`` with its contact sites, as one system; else with a sparse stiffness."""
-        d, cell = chain.cell.dofs, chain.cell
+        cell = chain.cell
         pairs = (
-            ContactPair(site * d + cell.host, site * d + cell.resonator, clearance, law)
+            ContactPair(site * cell.dofs + cell.host, site * cell.dofs + cell.resonator, clearance, law)
             for site, clearance in zip(chain.sites, chain.clearances, strict=True)
         )
         stiffness = chain.stiffness_matrix()
-        return cls(chain.masses(), stiffness.toarray() if dense else stiffness, tuple(pairs))
+        return cls(
+            masses=chain.masses(),
+            stiffness=stiffness.toarray() if dense else stiffness,
+            contacts=tuple(pairs),
+            springs=tuple(_nonlinear_springs(chain)),
+        )
 
     @classmethod
     def reduced(cls, cell: UnitCell, clearance: float, law: Contact) -> Self:
@@ -159,7 +170,7 @@ class System:
     @property
     def odd(self) -> bool:
         """Whether all forces change sign with the displacement."""
-        return all(s.quadratic == 0 for s in self.springs)
+        return all(s.law.is_odd for s in self.springs)
 
     def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) without contact."""
@@ -183,9 +194,8 @@ class System:
         force = self.stiffness @ u
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             force = force + row * pair.law.force(row @ u, pair.clearance)
-        for row, s in zip(self.spring_rows, self.springs, strict=True):
-            z = row @ u
-            force = force + row * (s.quadratic * z**2 + s.cubic * z**3)
+        for row, spring in zip(self.spring_rows, self.springs, strict=True):
+            force = force + row * spring.law.nonlinear_force(row @ u)
         return force
 
     def energy(self, u: np.ndarray, v: np.ndarray) -> float:
@@ -193,9 +203,8 @@ class System:
         total = 0.5 * (self.masses * v) @ v + 0.5 * u @ self.stiffness @ u
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             total += pair.law.potential(row @ u, pair.clearance)
-        for row, s in zip(self.spring_rows, self.springs, strict=True):
-            z = row @ u
-            total += s.quadratic * z**3 / 3 + s.cubic * z**4 / 4
+        for row, spring in zip(self.spring_rows, self.springs, strict=True):
+            total += spring.law.nonlinear_energy(row @ u)
         return float(total)
 
     def grazing_energy(self, mode: int) -> float:
@@ -221,3 +230,29 @@ def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray
         if start is not None:
             row[start] = -1.0
     return rows
+
+
+def _is_symmetric(matrix: np.ndarray) -> bool:
+    """Whether a dense or sparse matrix equals its transpose, to rounding."""
+    if issparse(matrix):
+        return bool(abs(matrix - matrix.T).max() <= 1e-12 * abs(matrix).max())
+    return np.allclose(matrix, matrix.T, rtol=1e-12)
+
+
+def _nonlinear_springs(chain: Chain) -> Iterator[SmoothSpring]:
+    """The springs of a lattice that have more than a linear part, those to its walls among them."""
+    d = chain.cell.dofs
+    for spring in chain.cell.springs:
+        if spring.is_linear:
+            continue
+        for cell in range(chain.cells - spring.next_cell):
+            yield SmoothSpring(cell * d + spring.start, (cell + spring.next_cell) * d + spring.end, spring)
+        if not spring.next_cell:
+            continue
+        last = (chain.cells - 1) * d + spring.start
+        if chain.ends == "periodic":
+            yield SmoothSpring(last, spring.end, spring)
+        elif chain.ends == "fixed":
+            yield SmoothSpring(None, spring.end, spring)
+            # From the last mass to the wall the elongation is -u: an even part of the force changes its sign.
+            yield SmoothSpring(None, last, replace(spring, quadratic=-spring.quadratic))

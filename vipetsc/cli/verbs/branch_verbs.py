@@ -1,11 +1,14 @@
 """The verbs ``nnm`` and ``nfrc``: branches of free and of driven periodic motions, which are drawn alike."""
 
+import itertools
 import logging
 import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
@@ -31,11 +34,10 @@ SHOW_EVERY = 0.5  # s between two lines of the live table
 def follow_modes(case: NnmCase, work: Work) -> Outcome:
     """Follow the branches of the case; one that fails is written as far as it came."""
     from vipetsc.modes.branches.follow import claim_branches, follow_all
-    from vipetsc.modes.branches.lattice_follow import follower_of
 
     comm = work.comm
     with claim_branches(case, work.folder, comm, work.options.force, work.options.resume) as claim:
-        branches = follow_all(case, claim.folder, comm, claim.going_on, branch_log(), work.stop, follower_of(case))
+        branches = follow_all(case, claim.folder, comm, claim.going_on, branch_log(), work.stop)
         for branch in branches:
             work.report(branch_table(branch))
             echo_warnings(comm, [f"{branch.name}: {finding}" for finding in branch.findings])
@@ -51,13 +53,13 @@ def follow_modes(case: NnmCase, work: Work) -> Outcome:
 
 def follow_responses(case: NfrcCase, work: Work) -> Outcome:
     """Follow the curves of steady states of the case; one that fails is written as far as it came."""
-    from vipetsc.modes.response.nfrc import claim_curves, follow_curves
+    from vipetsc.modes.branches.follow import claim_branches, follow_all
 
     comm = work.comm
-    with claim_curves(case, work.folder, comm, work.options.force, work.options.resume) as claim:
-        curves = follow_curves(case, claim.folder, comm, claim.going_on, work.stop)
+    with claim_branches(case, work.folder, comm, work.options.force, work.options.resume) as claim:
+        curves = follow_all(case, claim.folder, comm, claim.going_on, stop=work.stop)
         for curve in curves:
-            work.report(table(curve.summary()))
+            work.report(table(curve_rows(case, curve)))
 
         work.stop.check(comm)
         # Curves that fail before their first point leave no file, and nothing to replace earlier ones by.
@@ -135,6 +137,8 @@ def branch_log() -> Callable[["Branch", "Point"], None]:
 
 def branch_table(branch: "Branch") -> str:
     """How a branch went: length, range, special points, power laws."""
+    from vipetsc.modes.branches.regions import slope_laws, tongues
+
     regular = branch.regular()
     lines = [f"{branch.name}: {len(regular)} points; {branch.ending}"]
     if regular:
@@ -152,14 +156,44 @@ def branch_table(branch: "Branch") -> str:
         lines.append(f"  {kind}: {len(of_kind)}")
         lines += [f"    E = {point.energy:.12g} J, f = {point.frequency:.11g} Hz" for point in of_kind[:MOST_SPECIAL]]
 
-    if tongues := branch.tongues():
-        lines.append(f"  {len(tongues)} tongues of internal resonances: {', '.join(f'{k}:1' for k in tongues)}")
-    for region, law in branch.fits().items():
+    passed = tongues(branch)
+    if passed:
+        lines.append(f"  {len(passed)} tongues of internal resonances: {', '.join(f'{k}:1' for k in passed)}")
+    for region, law in slope_laws(branch).items():
         lines.append(
             f"  region {region}: df/dE ~ E^{law['exponent']:.4f}, adjusted R^2 {law['adjusted_r2']:.5f}"
             f" ({law['points']} points)"
         )
     return "\n".join(lines)
+
+
+def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
+    """How a curve went: length, folds, jumps of a slow sweep up and down, stable points, energy balance."""
+    from vipetsc.modes.branches.response_layout import measure, sweep_down, sweep_up
+
+    options = case.nfrc
+    rows = [("curve", curve.name), ("points", f"{len(curve.points)}; {curve.ending}")]
+    if not curve.points:
+        return rows
+
+    unit = "rad/s"
+    if options.over == "amplitude":
+        unit = "clearances" if options.source == "wave" else "N"
+    parameter = measure(curve, options.over)
+    folds = parameter[curve.is_kind("fold")]
+    rows.append(("folds", ", ".join(f"{at:.6g}" for at in folds) + f" {unit}" if folds.size else "none"))
+
+    jumps = []
+    for direction, path in (("up", sweep_up(curve)), ("down", sweep_down(curve))):
+        jumps += [f"{parameter[a]:.5g} {direction}" for a, b in itertools.pairwise(path) if abs(a - b) > 1]
+    rows.append(("jumps", ", ".join(jumps) or "none"))
+
+    stable = measure(curve, "unstable") == 0
+    rows.append(("stable", f"{stable.sum()} of {len(stable)} points"))
+    if options.infinite:
+        error = np.nanmax(np.abs(measure(curve, "share").sum(axis=1) - 1))
+        rows.append(("T + R + U + L - 1", f"{error:.1e}"))
+    return rows
 
 
 def hold_branches(folders: Sequence[Path]) -> bool:

@@ -4,6 +4,7 @@
 harmonics, ``breather`` branches of conservative motions, ``hill`` the stability of a motion by Hill's determinant.
 """
 
-from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.modes.balance.conservative import ConservativeMotions
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.balance.hill import Hill

@@ -24,12 +24,13 @@ import numpy as np
 
 from vipetsc.compiled import allocating, kernel
 from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing_after_start
-from vipetsc.lattice import Contact
+from vipetsc.lattice import Contact, Spring
 
 # Samples per period and harmonic: the quintic's error is below (2 pi/24)^6/46080 = 7e-9 of the last harmonic.
 DENSITY = 24
-# Nodes of one panel of a quadrature, and the half of the phase that it may span.
-NODES, SPAN = 64, 64.0
+# Nodes of one panel of a quadrature, and half of the last harmonic's phase that it may span.
+NODES = 64
+SPAN = 64.0
 
 
 class Episode(NamedTuple):
@@ -67,9 +68,10 @@ def _evaluate(z: np.ndarray, theta: np.ndarray, motion: np.ndarray) -> None:
 
 @kernel
 def _transform(theta: np.ndarray, weighted: np.ndarray, out: np.ndarray) -> None:
-    """Adds sum_i weighted[:, i] exp(-i k theta_i) to ``out`` (rows, orders), k from 0 on."""
+    """Add sum_i weighted[:, i] exp(-i k theta_i) to ``out`` (rows, orders), k from 0 on."""
     for i in range(theta.size):
-        turn, phasor = np.exp(-1j * theta[i]), 1.0 + 0j
+        turn = np.exp(-1j * theta[i])
+        phasor = 1.0 + 0j
         for k in range(out.shape[1]):
             for row in range(out.shape[0]):
                 out[row, k] += weighted[row, i] * phasor
@@ -82,27 +84,34 @@ def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
 
     They are written into ``out`` in order; the first one is an upcrossing unless the period begins above.
     """
-    samples, count = motion.shape[0], 0
-    h, above = 2.0 * np.pi / samples, motion[0, 0] > offset
-    b, c = np.empty(6), np.empty(6)
+    samples = motion.shape[0]
+    h = 2.0 * np.pi / samples
+    count = 0
+    above = motion[0, 0] > offset
+    b = np.empty(6)
+    c = np.empty(6)
     for i in range(samples):
         bernstein(motion[i], motion[(i + 1) % samples], h, b)
         b -= offset
         if (b.max() <= 0.0 and not above) or (b.min() > 0.0 and above):
             continue
+
         c[:] = b if not above else -b
-        begin, share = 0.0, first_upcrossing(c)
-        while share <= 1.0 and count < out.size:
-            begin += share * (1.0 - begin)
-            out[count], count, above = (i + begin) * h, count + 1, not above
+        begin = 0.0
+        root = first_upcrossing(c)
+        while root <= 1.0 and count < out.size:
+            begin += root * (1.0 - begin)
+            out[count] = (i + begin) * h
+            count += 1
+            above = not above
             if begin >= 1.0:
                 break
-            for k in range(1, 6):  # de Casteljau: the rest of the interval
+            for k in range(1, 6):  # de Casteljau: the part of the interval after the root
                 for j in range(6 - k):
-                    c[j] = (1.0 - share) * c[j] + share * c[j + 1]
+                    c[j] = (1.0 - root) * c[j] + root * c[j + 1]
             c[:] = -c
             c[0] = 0.0
-            share = first_upcrossing_after_start(c, 0.0)
+            root = first_upcrossing_after_start(c, 0.0)
     return count
 
 
@@ -124,7 +133,7 @@ def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
 
 @lru_cache(maxsize=256)
 def _panels(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of an arc and their weights: ``count`` panels of Gauss's rule in phi, the share being sin^2 phi."""
+    """Places in an arc, from 0 to 1, and their weights: ``count`` panels of Gauss's rule in phi, at sin^2 phi."""
     x, weight = np.polynomial.legendre.leggauss(NODES)
     phi = (np.pi / 4 / count) * (x + 1 + 2 * np.arange(count)[:, None]).ravel()
     return np.sin(phi) ** 2, np.sin(2 * phi) * np.tile(weight, count) * (np.pi / 4 / count)
@@ -135,35 +144,40 @@ def nodes(pieces: Sequence[tuple[float, float]], orders: int) -> tuple[np.ndarra
 
     A whole period has uniform nodes.
     """
-    theta, weights = [np.empty(0)], [np.empty(0)]
+    theta = [np.empty(0)]
+    weights = [np.empty(0)]
     for a, b in pieces:
         if b - a >= 2 * np.pi:
             count = 4 * orders
             return np.arange(count) * (2 * np.pi / count), np.full(count, 2 * np.pi / count)
-        share, weight = _panels(1 + int((b - a) * orders * np.pi / 4 / SPAN))
-        theta.append(a + (b - a) * share)
+        place, weight = _panels(1 + int((b - a) * orders * np.pi / 4 / SPAN))
+        theta.append(a + (b - a) * place)
         weights.append((b - a) * weight)
     return np.concatenate(theta), np.concatenate(weights)
 
 
 class ForceSeries:
-    """Harmonics of the forces in one motion (module docstring), with K the number of the last harmonic of z.
+    """Harmonics of the forces in one motion (module docstring), with K the ``order`` of the highest harmonic of z.
 
     ``forces`` (pairs, 2K + 1) complex in N, those beyond K too; ``potential`` (pairs,) mean potential energy in J;
-    ``loss`` (pairs,) J per period; ``closed`` (pairs,) share of the time in contact; ``episodes`` in order.
+    ``loss`` (pairs,) J per period; ``closed`` (pairs,) fraction of the time in contact; ``episodes`` in order.
     """
 
-    def __init__(self, pairs: int, last: int) -> None:
-        self.last = last
-        self.forces = np.zeros((pairs, 2 * last + 1), complex)
-        self.potential, self.loss, self.closed = np.zeros((3, pairs))
+    def __init__(self, pairs: int, order: int) -> None:
+        self.order = order
+        self.forces = np.zeros((pairs, 2 * order + 1), complex)
+        self.potential = np.zeros(pairs)
+        self.loss = np.zeros(pairs)
+        self.closed = np.zeros(pairs)
         self.episodes: list[Episode] = []
-        self._slopes, self._rates = np.zeros((2, pairs, 2 * last + 1), complex)
+        # Fourier coefficients of df/dz and df/dz'.
+        self._slopes = np.zeros((pairs, 2 * order + 1), complex)
+        self._rates = np.zeros((pairs, 2 * order + 1), complex)
         self._onsets: list[_Onset] = []
 
     def add(self, pair: int, theta: np.ndarray, weights: np.ndarray, values: np.ndarray, rate: np.ndarray) -> None:
         """Add nodes of a pair with f, df/dz, df/dz' and the potential there (4, nodes) and z' (nodes,)."""
-        out = np.zeros((3, 2 * self.last + 1), complex)
+        out = np.zeros((3, 2 * self.order + 1), complex)
         _transform(theta, np.ascontiguousarray(values[:3] * weights / (2 * np.pi)), out)
         self.forces[pair] += 2 * out[0]
         self.forces[pair, 0] -= out[0, 0]
@@ -172,92 +186,135 @@ class ForceSeries:
         self.potential[pair] += values[3] @ weights / (2 * np.pi)
         self.loss[pair] += (values[0] * rate) @ weights
 
+    def add_onset(self, onset: _Onset) -> None:
+        """Add how the force of an arc depends on the approach velocity at its onset."""
+        self._onsets.append(onset)
+
     def jacobian(self, exponent: complex = 0.0, orders: np.ndarray | None = None) -> np.ndarray:
         """How f exp(-mu theta) depends on d_k (pairs, orders, orders), if z changes by sum_k d_k exp((i k + mu) theta).
 
         Rows and columns are ``orders`` of two-sided series, -K..K unless given; ``exponent`` is mu = lambda/Om of
         Hill's method. A Toeplitz matrix of the Fourier coefficients of df/dz if nothing dissipates.
         """
-        orders = np.arange(-self.last, self.last + 1) if orders is None else orders
-        lag, rate = orders[:, None] - orders + 2 * self.last, 1j * orders + exponent
-        matrix, rates = (np.hstack([part[:, :0:-1].conj(), part])[:, lag] for part in (self._slopes, self._rates))
-        matrix += rates * rate
+        if orders is None:
+            orders = np.arange(-self.order, self.order + 1)
+        lag = orders[:, None] - orders + 2 * self.order
+        rate = 1j * orders + exponent
+        slopes = np.hstack([self._slopes[:, :0:-1].conj(), self._slopes])
+        rates = np.hstack([self._rates[:, :0:-1].conj(), self._rates])
+        matrix = slopes[:, lag]
+        matrix += rates[:, lag] * rate
+
         for pair, phase, bend, theta, weights in self._onsets:
             decay = weights * np.exp(-exponent * (theta - phase))
-            out = np.zeros((2, self.last + 1), complex)
+            out = np.zeros((2, self.order + 1), complex)
             _transform(theta, np.ascontiguousarray([decay.real, decay.imag]), out)
-            up, down = out[0] + 1j * out[1], (out[0] - 1j * out[1]).conj()  # of orders k and -k
+            up = out[0] + 1j * out[1]  # of the order k
+            down = (out[0] - 1j * out[1]).conj()  # of the order -k
             row = np.where(orders < 0, down[np.abs(orders)], up[np.abs(orders)])
             matrix[pair] += np.outer(row, (rate - bend) * np.exp(1j * orders * phase))
         return matrix
 
 
 class SiteForces:
-    """Contact pairs (law, clearance in m), then smooth springs (quadratic, cubic in N/m^2, N/m^3), a row each."""
+    """Contact pairs (law, clearance in m), then nonlinear springs, a row each; k z of a spring is not a force."""
 
-    def __init__(self, contacts: Sequence[tuple[Contact, float]], springs: Sequence[tuple[float, float]] = ()) -> None:
-        self.contacts, self.springs, self.pairs = tuple(contacts), tuple(springs), len(contacts) + len(springs)
+    def __init__(self, contacts: Sequence[tuple[Contact, float]], springs: Sequence[Spring] = ()) -> None:
+        self.contacts = tuple(contacts)
+        self.springs = tuple(springs)
+        self.pairs = len(contacts) + len(springs)
 
     @property
     def odd(self) -> bool:
         """Whether all forces change sign with the elongations."""
-        return all(quadratic == 0 for quadratic, _ in self.springs)
+        return all(spring.is_odd for spring in self.springs)
+
+    def amplitude_scale(self, place: int, g: float) -> float:
+        """Amplitude in m at which a place with the compliance ``g`` in m/N begins to feel its force: the clearance.
+
+        That of a spring, which has none, is where the cubic part balances the lattice.
+        """
+        if place < len(self.contacts):
+            return self.contacts[place][1]
+        cubic = self.springs[place - len(self.contacts)].cubic
+        return float(1 / np.sqrt(np.abs(g * cubic) or 1.0))
 
     def series(self, z: np.ndarray, omega: float) -> ForceSeries:
-        """Of elongations with the harmonics ``z`` (pairs, K + 1) complex in m, at ``omega`` in rad/s.
+        """The forces of elongations with the harmonics ``z`` (pairs, K + 1) complex in m, at ``omega`` in rad/s.
 
         Raises ArithmeticError where a dissipative contact never separates: it has no onset.
         """
-        last = z.shape[1] - 1
-        answer = ForceSeries(self.pairs, last)
-        samples = 1 << int(np.ceil(np.log2(DENSITY * last + 8)))
-        spectrum = np.zeros((self.pairs, samples // 2 + 1), complex)
-        spectrum[:, : last + 1] = z * (samples / 2)
-        spectrum[:, 0] = z[:, 0].real * samples
-        order = 1j * np.arange(samples // 2 + 1)
-        motion = np.stack([np.fft.irfft(spectrum * order**d, samples) for d in range(4)], axis=-1)
+        order = z.shape[1] - 1
+        series = ForceSeries(self.pairs, order)
+        motion = self._sampled(z)
         for pair, (_, clearance) in enumerate(self.contacts):
             for side in (1, -1):
-                for arc in arcs(np.ascontiguousarray(side * motion[pair, :, :3]), clearance):
-                    self._add_arc(answer, Episode(pair, side, arc[0], arc[1] - arc[0], 0.0), motion[pair], z, omega)
-        uniform = np.arange(samples) * (2 * np.pi / samples), np.full(samples, 2 * np.pi / samples)
-        for pair, (quadratic, cubic) in enumerate(self.springs, len(self.contacts)):
-            x, rate = motion[pair, :, 0], motion[pair, :, 1]
-            potential = quadratic * x**3 / 3 + cubic * x**4 / 4
-            values = [quadratic * x**2 + cubic * x**3, 2 * quadratic * x + 3 * cubic * x**2, 0 * x, potential]
-            answer.add(pair, *uniform, np.array(values), rate)
-        answer.episodes.sort(key=lambda e: (e.pair, e.onset))
-        return answer
+                for begin, end in arcs(np.ascontiguousarray(side * motion[pair, :, :3]), clearance):
+                    arc = Episode(pair, side, begin, end - begin, approach=0.0)
+                    self._add_arc(series, arc, motion[pair], z, omega)
 
-    def _add_arc(self, answer: ForceSeries, arc: Episode, motion: np.ndarray, z: np.ndarray, omega: float) -> None:
-        """Add one arc of contact, whose approach is not yet known, to the ``answer``."""
+        samples = motion.shape[1]
+        theta = np.arange(samples) * (2 * np.pi / samples)
+        weights = np.full(samples, 2 * np.pi / samples)
+        for pair, spring in enumerate(self.springs, len(self.contacts)):
+            x = motion[pair, :, 0]
+            rate = motion[pair, :, 1]
+            values = [spring.nonlinear_force(x), spring.nonlinear_slope(x), 0 * x, spring.nonlinear_energy(x)]
+            series.add(pair, theta, weights, np.array(values), rate)
+
+        series.episodes.sort(key=lambda e: (e.pair, e.onset))
+        return series
+
+    def _sampled(self, z: np.ndarray) -> np.ndarray:
+        """The elongations and their first three derivatives by phase (pairs, samples, 4) over a period."""
+        order = z.shape[1] - 1
+        samples = 1 << int(np.ceil(np.log2(DENSITY * order + 8)))
+        spectrum = np.zeros((self.pairs, samples // 2 + 1), complex)
+        spectrum[:, : order + 1] = z * (samples / 2)
+        spectrum[:, 0] = z[:, 0].real * samples
+        rates = 1j * np.arange(samples // 2 + 1)
+        return np.stack([np.fft.irfft(spectrum * rates**d, samples) for d in range(4)], axis=-1)
+
+    def _add_arc(self, series: ForceSeries, arc: Episode, motion: np.ndarray, z: np.ndarray, omega: float) -> None:
+        """Add one arc of contact, whose approach is not known yet, to the ``series``."""
         pair, side, a, length, _ = arc
         law, clearance = self.contacts[pair]
-        c, end, at = law.damping, a + length, np.empty((1, 3))
+        c = law.damping
+        at = np.empty((1, 3))
         _evaluate(z[pair], np.array([a]), at)
-        approach, bend = at[0, 1], at[0, 2] / at[0, 1] if at[0, 1] else 0.0
+        approach = at[0, 1]
+        bend = at[0, 2] / at[0, 1] if at[0, 1] else 0.0
         if c and length >= 2 * np.pi:
             raise ArithmeticError("a dissipative contact never separates, so that it has no approach velocity")
-        if floored := c > 0 and abs(approach) * omega < law.approach_floor:
+        floored = c > 0 and abs(approach) * omega < law.approach_floor
+        if floored:
             approach = side * law.approach_floor / omega
-        pieces = list(_cut(a, end, _minima(side * motion[:, 0], side * motion[:, 1])))
+
+        pieces = list(_cut(a, a + length, _minima(side * motion[:, 0], side * motion[:, 1])))
         if c and law.adhesion == "clip":  # where g > 0: -side z' < |z'_minus|/c
             pushing = arcs(np.ascontiguousarray(side * motion[:, 1:]), -side * approach / c)
             pieces = list(_common(pieces, pushing))
-        theta, weights = nodes(pieces, 2 * answer.last)
+        theta, weights = nodes(pieces, 2 * series.order)
         at = np.empty((len(theta), 3))
         _evaluate(z[pair], theta, at)
-        x, rate = np.maximum(side * at[:, 0] - clearance, 0.0), at[:, 1]
-        elastic, slope = law.elastic_force(x), law.elastic_slope(x)
-        g = 1 + c * rate / approach if c else 1.0
-        per_rate = side * elastic * c / approach if c else 0 * x
+        x = np.maximum(side * at[:, 0] - clearance, 0.0)
+        rate = at[:, 1]
+
+        elastic = law.elastic_force(x)
+        slope = law.elastic_slope(x)
+        g = np.ones_like(rate)
+        per_rate = np.zeros_like(rate)
+        if c:
+            g = 1 + c * rate / approach
+            per_rate = side * elastic * c / approach
         values = np.array([side * elastic * g, slope * g, per_rate, law.potential(at[:, 0], clearance)])
-        answer.add(pair, theta, weights, values, rate)
+        series.add(pair, theta, weights, values, rate)
         if c and not floored:
+            # An onset that moves changes w'_minus, and with it the force of the whole arc.
             weighted = -per_rate * rate / approach * weights / (2 * np.pi)
-            answer._onsets.append(_Onset(pair, a, bend, theta, weighted))
-        answer.closed[pair] += length / (2 * np.pi)
-        answer.episodes.append(arc._replace(approach=abs(approach) * omega))
+            series.add_onset(_Onset(pair, a, bend, theta, weighted))
+        series.closed[pair] += length / (2 * np.pi)
+        series.episodes.append(arc._replace(approach=abs(approach) * omega))
 
 
 def _minima(value: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -20,89 +20,121 @@ Cf. G. W. Hill, Acta Math. 8 (1886) 1; von Groll and Ewins, J. Sound Vib. 241 (2
 J. N. Lyness, Math. Comput. 21 (1967) 543.
 """
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import trapezoid
 
+from vipetsc.modes.balance.harmonic_balance import Compliance
 from vipetsc.modes.balance.harmonics import ForceSeries
 
-# Growth rate over Om up to which a motion counts as stable: in a finite system, whose poles lie at Re lambda = 0, D is
-# smooth over this length of the line, and 1 % a period is told. Lines on which the fastest growth is looked for first.
-LEAST, LEAST_OF_FINITE, LINES = 1e-4, 1.6e-3, (0.1, 0.02)
-COARSE, FINEST = 24, 14  # intervals of half a strip; halvings of one in which D turns by more than TURN
-TURN = 0.7  # rad
+# Growth rate over Om up to which a motion counts as stable ...
+LEAST = 1e-4
+# ... in a finite system, whose poles lie at Re lambda = 0: D is smooth over this length of the line. 1 % a period.
+LEAST_OF_FINITE = 1.6e-3
+# Lines on which the fastest growth is looked for first: far from the poles D has few turns and is cheap to follow.
+LINES = (0.1, 0.02)
+# Intervals of half a strip at first, and halvings at most of one in which D turns by more than TURN rad.
+COARSE = 24
+FINEST = 14
+TURN = 0.7
 KEPT = 48  # orders of perturbations that are kept where nothing dissipates
-# Steps, first step and accuracy, over Om, of the secant method; |Im lambda| of what is no pair is nearer to 0 or 1/2.
-MOST_STEPS, STEP, ACCURACY, REAL = 30, 1e-4, 1e-10, 1e-7
+# Steps, first step and accuracy, over Om, of the secant method.
+MOST_STEPS = 30
+STEP = 1e-4
+ACCURACY = 1e-10
+REAL = 1e-7  # |Im lambda| over Om of what is no complex pair is nearer to 0 or 1/2 than this
+LARGEST_LOG = 300.0  # of a determinant, which overflows beyond
 
 
-class At(Protocol):
-    """A compliance (frequency, pair, pair) in m/N at complex frequencies in rad/s."""
+class Line(NamedTuple):
+    """D along Re lambda = const: Im lambda/Om from 0 to 1/2 as ``positions``, and log D with its turns added up."""
 
-    def at(self, omegas: np.ndarray) -> np.ndarray:
-        """G at ``omegas``."""
+    positions: np.ndarray
+    logs: np.ndarray
+
+    def zeros_beyond(self) -> int:
+        """The number of zeros to the right of the line; -1 if it cannot be told."""
+        turned = -float(self.logs[-1].imag) / np.pi
+        return round(turned) if abs(turned - round(turned)) < 0.25 else -1
 
 
 class Hill:
-    """Of motions at ``omega`` (rad/s) with harmonics up to ``last``, motions being ``odd`` or not; G is kept."""
+    """Stability of motions at ``omega`` (rad/s) with harmonics up to ``order``, ``odd`` ones alone or all.
 
-    def __init__(self, compliance: At, omega: float, last: int, odd: bool, finite: bool) -> None:
-        self.compliance, self.omega, self.finite, orders = compliance, omega, finite, np.arange(-last, last + 1)
+    The ``compliance`` at a perturbation's frequencies is kept, for motions that differ in their forces alone.
+    """
+
+    def __init__(self, compliance: Compliance, omega: float, order: int, odd: bool, finite: bool) -> None:
+        self.compliance = compliance
+        self.omega = omega
+        self.finite = finite
         self.least = LEAST_OF_FINITE if finite else LEAST
-        self._blocks = [orders[1 - last % 2 :: 2], orders[last % 2 :: 2]] if odd else [orders]
-        self._known: dict[tuple[int, complex], np.ndarray] = {}
-        self._of: tuple[ForceSeries, list[np.ndarray | None]] | None = None
+        orders = np.arange(-order, order + 1)
+        self._blocks = [orders[1 - order % 2 :: 2], orders[order % 2 :: 2]] if odd else [orders]
+        # Compliances by block and exponent, and the latest forces with their reduced Jacobians.
+        self._compliances: dict[tuple[int, complex], np.ndarray] = {}
+        self._reduced: tuple[ForceSeries, list[np.ndarray | None]] | None = None
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
         """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases."""
-        if self._of is None or self._of[0] is not series:
-            self._of = series, [self._eliminated(series, orders) for orders in self._blocks]
+        if self._reduced is None or self._reduced[0] is not series:
+            self._reduced = series, [self._eliminated(series, orders) for orders in self._blocks]
         out = np.ones(len(exponents), complex)
-        for block, (orders, jacobian) in enumerate(zip(self._blocks, self._of[1], strict=True)):
+        for block, (orders, jacobian) in enumerate(zip(self._blocks, self._reduced[1], strict=True)):
             low = orders if jacobian is None else orders[np.abs(orders) <= KEPT]
-            new = [mu for mu in exponents.tolist() if (block, mu) not in self._known]
-            if new:
-                g = self.compliance.at(((low - 1j * np.array(new)[:, None]) * self.omega).ravel())
-                parts = g.reshape(len(new), len(low), *g.shape[1:])
-                self._known |= {(block, mu): part for mu, part in zip(new, parts, strict=True)}
+            self._evaluate(block, low, exponents.tolist())
             for i, mu in enumerate(exponents.tolist()):
                 matrix = _flat(series.jacobian(mu, low)) if jacobian is None else jacobian
-                phase, log = np.linalg.slogdet(_plus_one(self._known[block, mu], matrix))
-                out[i] *= phase * np.exp(min(log, 300.0))
+                phase, log = np.linalg.slogdet(_plus_one(self._compliances[block, mu], matrix))
+                out[i] *= phase * np.exp(min(log, LARGEST_LOG))
         return out
+
+    def _evaluate(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> None:
+        """Keep the compliances of a block's ``orders`` at ``exponents`` where they are new: all in one call."""
+        new = [mu for mu in exponents if (block, mu) not in self._compliances]
+        if new:
+            g = self.compliance.at(((orders - 1j * np.array(new)[:, None]) * self.omega).ravel())
+            parts = g.reshape(len(new), len(orders), *g.shape[1:])
+            self._compliances |= {(block, mu): part for mu, part in zip(new, parts, strict=True)}
 
     def _eliminated(self, series: ForceSeries, orders: np.ndarray) -> np.ndarray | None:
         """J (order pair, order pair) of the orders kept, with what the others do; None if it depends on lambda."""
         if not np.array_equal(series.jacobian(1.0, orders[:2]), series.jacobian(0.0, orders[:2])):
             return None
         pairs = len(series.potential)
-        jacobian, high = _flat(series.jacobian(orders=orders)), np.abs(orders) > KEPT
+        jacobian = _flat(series.jacobian(orders=orders))
+        high = np.abs(orders) > KEPT
         if not high.any():
             return jacobian
-        g, rows = self.compliance.at(orders[high] * self.omega), np.repeat(high, pairs)
+
+        g = self.compliance.at(orders[high] * self.omega)
+        rows = np.repeat(high, pairs)
         inner = _plus_one(g, jacobian[np.ix_(rows, rows)])
         moved = np.linalg.solve(inner, _plus_one(g, jacobian[np.ix_(rows, ~rows)], 0.0))
         return jacobian[np.ix_(~rows, ~rows)] - jacobian[np.ix_(~rows, rows)] @ moved
 
-    def _line(self, series: ForceSeries, growth: float) -> tuple[np.ndarray, np.ndarray]:
-        """Im lambda/Om from 0 to 1/2 on Re lambda = ``growth`` Om, and log D there with its turns added up."""
-        shares = np.linspace(0, 0.5, max(COARSE, int(0.5 / growth) if self.finite else 0) + 1)
-        values = self.determinants(series, growth + 1j * shares)
+    def _line(self, series: ForceSeries, growth: float) -> Line:
+        """D on Re lambda = ``growth`` Om, so finely that no turn of it is missed."""
+        count = max(COARSE, int(0.5 / growth) if self.finite else 0) + 1
+        positions = np.linspace(0, 0.5, count)
+        values = self.determinants(series, growth + 1j * positions)
         for _ in range(FINEST):
             turns = np.abs(np.angle(values[1:] / values[:-1]))
             (wide,) = np.nonzero(turns > TURN)
             if not wide.size:
                 break
-            between = (shares[wide] + shares[wide + 1]) / 2
-            values = np.insert(values, wide + 1, self.determinants(series, growth + 1j * between))
-            shares = np.insert(shares, wide + 1, between)
+            middles = (positions[wide] + positions[wide + 1]) / 2
+            values = np.insert(values, wide + 1, self.determinants(series, growth + 1j * middles))
+            positions = np.insert(positions, wide + 1, middles)
+
         turned = np.cumsum(np.angle(values[1:] / values[:-1]))
-        return shares, np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0)
+        return Line(positions, np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0))
 
     def unstable(self, series: ForceSeries) -> int:
         """How many perturbations grow faster than ``least`` Om, two for a complex pair; -1 if that cannot be told."""
-        return _turns(self._line(series, self.least)[1])
+        return self._line(series, self.least).zeros_beyond()
 
     def fastest(self, series: ForceSeries) -> complex | None:
         """lambda/Om, Im lambda >= 0, of what grows fastest; 0 if nothing does, None if it is not found."""
@@ -114,40 +146,55 @@ class Hill:
 
     def _beyond(self, series: ForceSeries, growth: float) -> list[complex] | None:
         """lambda/Om of all that grow faster than ``growth`` Om; None if they cannot be told or are not all found."""
-        shares, logs = self._line(series, growth)
-        count, angle = _turns(logs), 2 * np.pi * shares
+        line = self._line(series, growth)
+        count = line.zeros_beyond()
         if count < 0:
             return None
-        regular, monic = logs + 1j * count * angle, [1.0]  # log D - N log w on w = exp(-2 pi growth - i angle)
+
+        # Fourier coefficients of log D - N log w on w = exp(-2 pi growth - i angle) are sums of powers of the zeros;
+        # Newton's identities turn these into the polynomial that vanishes at the zeros.
+        angle = 2 * np.pi * line.positions
+        regular = line.logs + 1j * count * angle
         sums = [-p * trapezoid((regular * np.exp(-1j * p * angle)).real, angle) / np.pi for p in range(1, count + 1)]
-        for p in range(1, count + 1):  # Newton's identities
+        monic = [1.0]
+        for p in range(1, count + 1):
             monic.append(-sum(monic[p - j] * sums[j - 1] for j in range(1, p + 1)) / p)
+
         zeros: list[complex] = []
         for guess in growth - np.log(np.roots(monic).astype(complex)) / (2 * np.pi):
-            mu = self._zero(series, complex(guess.real, abs(guess.imag)), zeros) if len(zeros) < count else None
-            if mu is not None and mu.real > 0.9 * growth:
-                zeros += [mu, mu.conjugate()] if REAL < mu.imag < 0.5 - REAL else [mu.real + 0.5j * round(2 * mu.imag)]
+            if len(zeros) >= count:
+                break
+            mu = self._zero(series, complex(guess.real, abs(guess.imag)), zeros)
+            if mu is None or mu.real <= 0.9 * growth:
+                continue
+            if REAL < mu.imag < 0.5 - REAL:
+                zeros += [mu, mu.conjugate()]
+            else:
+                zeros.append(mu.real + 0.5j * round(2 * mu.imag))
         return zeros if len(zeros) == count else None
 
-    def _zero(self, series: ForceSeries, guess: complex, known: list[complex]) -> complex | None:
-        """A zero of D beside the ``known`` ones, Im in [0, 1/2], by the secant method."""
+    def _zero(self, series: ForceSeries, guess: complex, others: list[complex]) -> complex | None:
+        """A zero of D that is none of the ``others``, Im in [0, 1/2], by the secant method."""
 
         def value(mu: complex) -> complex:
-            turns = [1 - np.exp(2 * np.pi * (zero - mu)) for zero in known]
-            return complex(self.determinants(series, np.array([mu]))[0] / np.prod(turns))
+            # Divided by what vanishes at the zeros found, so that the method does not return to them.
+            factors = [1 - np.exp(2 * np.pi * (zero - mu)) for zero in others]
+            return complex(self.determinants(series, np.array([mu]))[0] / np.prod(factors))
 
-        last, mu = guess + STEP * (1 + 1j), guess
-        before = value(last)
+        before = guess + STEP * (1 + 1j)
+        value_before = value(before)
+        mu = guess
         for _ in range(MOST_STEPS):
-            here = value(mu)
-            if here == before:
+            value_here = value(mu)
+            if value_here == value_before:
                 return None
-            last, mu, before = mu, mu - here * (mu - last) / (here - before), here
+            following = mu - value_here * (mu - before) / (value_here - value_before)
+            before, mu = mu, following
+            value_before = value_here
             if not abs(mu - guess) < 1:
                 return None
-            if abs(mu - last) < ACCURACY:
-                imag = abs(mu.imag - round(mu.imag))
-                return complex(mu.real, imag)
+            if abs(mu - before) < ACCURACY:
+                return complex(mu.real, abs(mu.imag - round(mu.imag)))
         return None
 
 
@@ -166,9 +213,3 @@ def _plus_one(g: np.ndarray, matrix: np.ndarray, one: float = 1.0) -> np.ndarray
     product = np.einsum("kij,kjn->kin", g, matrix.reshape(count, pairs, -1)).reshape(matrix.shape)
     product[np.diag_indices(min(product.shape))] += one
     return product
-
-
-def _turns(logs: np.ndarray) -> int:
-    """The number of zeros to the right of the line; -1 if it cannot be told."""
-    turned = -float(logs[-1].imag) / np.pi
-    return round(turned) if abs(turned - round(turned)) < 0.25 else -1

@@ -6,4 +6,5 @@ branches of a case over ranks.
 """
 
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.follow import Follower, claim_branches, follow_all

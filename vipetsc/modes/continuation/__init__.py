@@ -12,5 +12,7 @@ dE along the tangent vanishes at energy folds, dT at frequency folds; ``special`
 show, and switches branches; ``graze`` has a touch as two more equations.
 """
 
-from vipetsc.modes.continuation.arclength import Continuation, Frame
-from vipetsc.modes.continuation.special import Segment, at_energy, locate, switch
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.segment import Segment
+from vipetsc.modes.continuation.special import at_energy, locate
+from vipetsc.modes.continuation.switching import switch

@@ -31,9 +31,14 @@ from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.point import Point
 from vipetsc.modes.system import System
 
+# Power of the map that SLEPc is given; odd, so that mu and -mu stay apart.
 POWER = 25
 # Tolerance and restarts of the Krylov-Schur method, and its vectors beyond three times those wanted.
-TOLERANCE, RESTARTS, VECTORS = 1e-10, 16, 16
+TOLERANCE = 1e-10
+RESTARTS = 16
+VECTORS = 16
+MULTIPLIERS = 8  # multipliers where a case asks for them without a number
+NOISE = 1e-3  # of the first vector, whose other part is the motion of the contacts alone
 ONE_RANKS_OWN = 55  # PETSc's number of an error, lack of memory, that need not be met by all ranks
 
 logger = logging.getLogger(__name__)
@@ -43,7 +48,9 @@ class Monodromy:
     """The map of variations over an ``arc``, times ``sign``, in scaled blocks; as a matrix, ``POWER`` times that."""
 
     def __init__(self, arc: LatticeArc, scale: np.ndarray, sign: int) -> None:
-        self.arc, self.scale, self.sign = arc, scale, sign
+        self.arc = arc
+        self.scale = scale
+        self.sign = sign
 
     def apply(self, blocks: np.ndarray) -> np.ndarray:
         """The map once, on blocks (number, 2 dof, owned cell)."""
@@ -57,14 +64,18 @@ class Monodromy:
         y.setArray(block.ravel())
 
 
-def judge(flow: LatticeFlow, system: System, odd: bool, point: Point, u: np.ndarray, wanted: bool | int) -> Point:
+def with_multipliers(
+    flow: LatticeFlow, system: System, odd: bool, point: Point, u: np.ndarray, wanted: bool | int
+) -> Point:
     """The ``point``, at rest at the displacement ``u`` (n,), with its ``wanted`` largest multipliers; collective.
 
     Where SLEPc fails it has none, ``multiplier`` is NaN, and the log says why.
     """
+    count = MULTIPLIERS if wanted is True else int(wanted)
     try:
-        largest = largest_multipliers(flow, system, odd, u, point.period, 8 if wanted is True else int(wanted))
+        largest = largest_multipliers(flow, system, odd, u, point.period, count)
     except (PETSc.Error, np.linalg.LinAlgError) as error:
+        # What may be one rank's own ends the program: the other ranks would wait for it.
         if getattr(error, "ierr", 0) == ONE_RANKS_OWN:
             raise
         if flow.comm.rank == 0:
@@ -81,13 +92,18 @@ def largest_multipliers(
 
     The largest comes first. Raises FlowError where the orbit cannot be followed, CaseError without SLEPc; collective.
     """
-    comm, start, omega = flow.comm, np.append(u, 0 * u), 2 * np.pi / period
-    arc = flow.arc(flow.share(start), period / (2 if odd else 1))
-    scale = flow.share(np.sqrt(np.append(omega**2 * system.masses, system.masses)))
-    phase = flow.share(np.append(0 * u, -system.forces(u) / system.masses)) * scale
+    comm = flow.comm
+    start = np.append(u, 0 * u)
+    omega = 2 * np.pi / period
+    arc = flow.arc(flow.scatter(start), period / (2 if odd else 1))
+    scale = flow.scatter(np.sqrt(np.append(omega**2 * system.masses, system.masses)))
+
+    # The direction of the motion itself, by its acceleration: it starts at rest.
+    phase = flow.scatter(np.append(0 * u, -system.forces(u) / system.masses)) * scale
     phase /= np.sqrt(comm.allreduce(float(np.sum(phase**2))))
-    noise = 1e-3 * np.random.default_rng(1).standard_normal(len(start))
-    seed = flow.share(noise + np.tile(system.contact_rows.sum(axis=0), 2))
+    noise = NOISE * np.random.default_rng(1).standard_normal(len(start))
+    seed = flow.scatter(noise + np.tile(system.contact_rows.sum(axis=0), 2))
+
     monodromy = Monodromy(arc, scale, -1 if odd else 1)
     try:
         basis = _krylov_basis(monodromy, phase, seed, wanted, comm)
@@ -96,19 +112,23 @@ def largest_multipliers(
         values, residuals = _ritz(monodromy, basis, phase, comm)
     finally:
         arc.engine.destroy()
+
     order = np.argsort(-np.abs(values), kind="stable")[:wanted]
-    values = values[order] ** 2 if odd else values[order]
-    return np.stack([values, residuals[order].astype(complex)], axis=-1)
+    largest = values[order] ** 2 if odd else values[order]
+    return np.stack([largest, residuals[order].astype(complex)], axis=-1)
 
 
 def _krylov_basis(monodromy: Monodromy, phase: np.ndarray, seed: np.ndarray, wanted: int, comm: MPI.Comm) -> np.ndarray:
     """Orthonormal blocks (number, 2 dof, owned cell) that hold the eigenvectors of the largest multipliers."""
-    slepc, shape = load_slepc(), phase.shape
+    slepc = load_slepc()
+    shape = phase.shape
     shell = PETSc.Mat().createPython(((phase.size, None),) * 2, monodromy, comm=comm)
     shell.setUp()
-    vectors = [shell.createVecRight() for _ in range(2)]
-    for vector, block in zip(vectors, (phase, seed), strict=True):
-        vector.setArray(block.ravel())
+    deflated = shell.createVecRight()
+    deflated.setArray(phase.ravel())
+    first = shell.createVecRight()
+    first.setArray(seed.ravel())
+
     eps: Any = slepc.EPS().create(comm)
     eps.setOperators(shell)
     eps.setProblemType(slepc.EPS.ProblemType.NHEP)
@@ -116,13 +136,14 @@ def _krylov_basis(monodromy: Monodromy, phase: np.ndarray, seed: np.ndarray, wan
     size = shell.getSize()[0]
     eps.setDimensions(min(wanted, size - 2), min(3 * wanted + VECTORS, size - 1))
     eps.setTolerances(TOLERANCE, RESTARTS)
-    eps.setDeflationSpace(vectors[:1])
-    eps.setInitialSpace(vectors[1:])
+    eps.setDeflationSpace([deflated])
+    eps.setInitialSpace([first])
     eps.setOptionsPrefix("multipliers_")
     eps.setFromOptions()
     eps.solve()
+
     blocks = [vector.getArray(readonly=True).reshape(shape).copy() for vector in eps.getInvariantSubspace()]
-    for petsc_object in (eps, shell, *vectors):
+    for petsc_object in (eps, shell, deflated, first):
         petsc_object.destroy()
     return np.array(blocks).reshape(-1, *shape)
 
@@ -136,6 +157,7 @@ def _ritz(monodromy: Monodromy, basis: np.ndarray, phase: np.ndarray, comm: MPI.
     basis = np.linalg.solve(np.linalg.cholesky(products(basis, basis)), basis.reshape(len(basis), phase.size))
     moved = monodromy.apply(basis.reshape(-1, *phase.shape)).reshape(basis.shape)
     moved -= products(moved, phase[None]) * phase.ravel()
+
     values, vectors = np.linalg.eig(products(basis, moved))
-    rest = vectors.T @ moved - values[:, None] * (vectors.T @ basis)
-    return values, np.sqrt(comm.allreduce(np.sum(np.abs(rest) ** 2, axis=1)))
+    residual = vectors.T @ moved - values[:, None] * (vectors.T @ basis)
+    return values, np.sqrt(comm.allreduce(np.sum(np.abs(residual) ** 2, axis=1)))

@@ -6,37 +6,41 @@ whose size is bounded from below for a breather between the bands, and contacts 
 GMRES needs few products, and no preconditioner (options of PETSc begin with ``nnm_``).
 """
 
-from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
+from typing import Protocol
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
-from scipy.sparse import diags, spmatrix
+from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
-from vipetsc.modes.balance.breather import describing
+from vipetsc.modes.balance.conservative import describing_amplitude
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
-from vipetsc.modes.newton import BorderedNewton
+from vipetsc.modes.newton import BorderedNewton, Equations
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import StartError
-from vipetsc.modes.shooting.shooting import Chart, Shooting, ShootingMap
+from vipetsc.modes.problem import Attempt, StartError
+from vipetsc.modes.shooting.charts import Chart
+from vipetsc.modes.shooting.maps import ShootingMap
+from vipetsc.modes.shooting.shooting import ShootingEquations, ShootingFrame
 from vipetsc.modes.system import System
 
 # Residual of GMRES over the right side, its vectors before a restart, its products.
-RTOL, RESTART, MOST_PRODUCTS = 1e-10, 200, 600
+RTOL = 1e-10
+RESTART = 200
+MOST_PRODUCTS = 600
 REMEDY = "choose another nnm.start_frequency, between the pass bands"
 
 
-class Diagonal:
+class Diagonal(Chart):
     """The chart of lattices: initial values over the largest one, period over its value, without dense matrices."""
 
     def __init__(self, x: np.ndarray, period: float) -> None:
-        self.size, self.period = float(np.abs(x).max()), period
+        self.size = float(np.abs(x).max())
+        self.period = period
         self._scale = np.append(np.full(len(x), self.size), period)
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
@@ -47,27 +51,30 @@ class Diagonal:
         """Initial values and period."""
         return xi[:-1] * self.size, float(xi[-1] * self.period)
 
-    def derivative(self, xi: np.ndarray) -> spmatrix:
-        """d(x, period)/d xi."""
-        return diags(self._scale, format="csc")
+    def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
+        return self._scale * changes
+
+    def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
+        return (changes.T / self._scale).T
 
 
-class KrylovNewton(BorderedNewton):
-    """Newton's method with GMRES: ``product`` (xi, vector) is the derivative at xi times a vector.
+class KrylovEquations(Equations, Protocol):
+    """Equations whose derivative is known by its products with vectors."""
 
-    Rank r has the unknowns ``cuts[r]`` to ``cuts[r + 1]``.
-    """
+    def product(self, xi: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The derivative of the residual at ``xi`` times a ``change`` of the unknowns (n,)."""
 
-    def __init__(
-        self,
-        function: Callable[[np.ndarray], np.ndarray],
-        product: Callable[[np.ndarray, np.ndarray], np.ndarray],
-        cuts: list[int],
-        comm: MPI.Comm,
-        **limits: float,
-    ) -> None:
-        self._product, self._comm, self._ranges = product, comm, [*pairwise(cuts)]
-        super().__init__(function, lambda xi: xi, cuts[-1], **limits)  # type: ignore[arg-type]
+
+class KrylovNewton(BorderedNewton[KrylovEquations]):
+    """Newton's method with GMRES; rank r of ``comm`` has the unknowns ``cuts[r]`` to ``cuts[r + 1]``."""
+
+    def __init__(self, cuts: list[int], comm: MPI.Comm, max_newton: int) -> None:
+        self._comm = comm
+        self._ranges = [*pairwise(cuts)]
+        self._at: np.ndarray  # where the derivative is taken, from one assembly to the next
+        super().__init__(cuts[-1], max_newton)
 
     def _allocate(self, size: int) -> tuple[PETSc.Vec, PETSc.Mat]:
         first, stop = self._ranges[self._comm.rank]
@@ -88,86 +95,100 @@ class KrylovNewton(BorderedNewton):
     def _whole(self, vector: PETSc.Vec) -> np.ndarray:
         return np.concatenate(self._comm.allgather(vector.getArray(readonly=True).copy()))
 
-    def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
+    def _differentiate(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
         self._at = self._whole(x)
         matrix.assemble()
 
     def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The bordered derivative times ``x``."""
         change = self._whole(x)
-        y.setArray(self._local(np.append(self._product(self._at, change), self._row[0] @ change)))
+        product = self._equations.product(self._at, change)
+        y.setArray(self._local(np.append(product, self._row[0] @ change)))
 
-    def across(self, xi: np.ndarray, row: np.ndarray) -> np.ndarray:
+    def null_vector(self, equations: KrylovEquations, xi: np.ndarray, row: np.ndarray) -> np.ndarray:
         """The vector (size,) on which the derivative at ``xi`` vanishes and ``row`` does not, of unit length."""
-        self._at, self._row = xi, (row, 0.0)
+        self._equations = equations
+        self._at = xi
+        self._row = row, 0.0
         ksp = self._snes.getKSP()
         ksp.setOperators(self._snes.getJacobian()[0])
-        right, x = self._xi.duplicate(), self._xi.duplicate()
+        right = self._xi.duplicate()
+        x = self._xi.duplicate()
         right.setArray(self._local(np.append(np.zeros(len(xi) - 1), 1.0)))
         ksp.solve(right, x)
         vector = self._whole(x)
         return vector / np.linalg.norm(vector)
 
 
-class LatticeShooting(Shooting):
-    """Periodic orbits of the lattice ``chain`` with the contact ``law``, on all ranks of ``comm`` together."""
+class LatticeFrame(ShootingFrame[LatticeArc]):
+    """Shooting equations of a lattice around one orbit, with products of their derivative."""
 
-    dense = False
+    problem: "LatticeShooting"
+    chart: Diagonal
+
+    def product(self, xi: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The derivative of the residual at ``xi`` times a ``change`` of the unknowns (n,)."""
+        problem = self.problem
+        arc = self.arc(xi)
+        step = self.chart.to_changes(xi, change)
+        start = problem.flow.scatter(problem.start(step[:-1])[None])
+        moved = problem.flow.gather(arc.move(start))[0]
+        rate = problem.map.fraction * problem.end_rate(arc)
+        return (moved[problem.zero] + rate * step[-1]) / self.chart.size
+
+    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
+        return self.problem.newton.solve(self, guess, row, value, self.problem.tolerance)
+
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent at a solution, on the side of the frame's own."""
+        return self.problem.newton.null_vector(self, xi, self.tangent)
+
+
+class LatticeShooting(ShootingEquations[LatticeArc]):
+    """Periodic orbits of the lattice ``chain`` and its ``system``, on all ranks of ``comm`` together."""
+
+    has_half_traces = False
+    guards = frozenset({"turn_relative"})
 
     def __init__(
         self, system: System, chain: Chain, shooting_map: ShootingMap, comm: MPI.Comm, tolerance: float, max_newton: int
     ) -> None:
-        self.comm, self.lattice_flow = comm, LatticeFlow(chain, system.contacts[0].law, comm)
-        self._current: LatticeArc | None = None
-        flow: Any = self.lattice_flow
-        flow.system = system
-        super().__init__(flow, shooting_map, tolerance, max_newton)
+        super().__init__(system, shooting_map, tolerance)
+        self.flow = LatticeFlow(chain, system.contacts[0].law, comm)
+        layout = self.flow.layout
+        cuts = [*(layout.ranges[:, 0] * layout.dofs).tolist(), system.dofs + 1]
+        self.newton = KrylovNewton(cuts, comm, max_newton)
 
-    def _create_newton(self, size: int, max_newton: int) -> BorderedNewton:
-        layout = self.lattice_flow.layout
-        cuts = [*(layout.ranges[:, 0] * layout.dofs).tolist(), size]
-        limits = {"tolerance": self.tolerance, "max_newton": max_newton}
-        return KrylovNewton(self._function, self._derivative, cuts, self.comm, **limits)
+    def _integrate(self, start: np.ndarray, period: float) -> LatticeArc:
+        if self._latest is not None:
+            # Its engine holds windows of the whole orbit; the arc before can no longer move variations.
+            self._latest[2].engine.destroy()
+            self._latest = None
+        return self.flow.arc(self.flow.scatter(start), self.map.fraction * period)
 
-    def chart(self, name: str, x: np.ndarray, period: float, **options: bool) -> Any:
-        """The one of lattices, whatever its ``name``."""
+    def end(self, arc: LatticeArc) -> np.ndarray:
+        """The state (2n,) at an arc's end."""
+        return self.flow.gather(arc.end)
+
+    def stability(self, arc: LatticeArc) -> tuple[np.ndarray, float]:
+        """Nothing is known of an orbit's stability without its matrix (``floquet``)."""
+        return np.empty(0), np.nan
+
+    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> LatticeFrame:
+        """The unknowns around any initial values and period, in the chart of lattices whatever its name."""
+        return LatticeFrame(self, Diagonal(x, period), x, period, tangent)
+
+    def relative_chart(self, x: np.ndarray, period: float) -> Diagonal:
+        """The chart of lattices."""
         return Diagonal(x, period)
 
-    def arc(self, x: np.ndarray, period: float) -> Any:
-        """The arc from initial values ``x``; the one before can no longer move variations."""
-        start = np.zeros(2 * self.system.dofs)
-        start[self.free] = x
-        if self._current is not None:
-            self._current.engine.destroy()
-            self._current = None
-        self._current = self.lattice_flow.arc(self.lattice_flow.share(start), self.map.fraction * period)
-        return self._current
-
-    def residual(self, arc: Any) -> np.ndarray:
-        """What should vanish at the arc's end (n,)."""
-        return self.lattice_flow.whole(arc.end)[self._zero]
-
-    def _derivative(self, xi: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The derivative of the scaled equations at ``xi`` times a ``change`` of the unknowns."""
-        arc: Any = self._arc(xi)
-        n, moved = self.system.dofs, np.zeros(2 * self.system.dofs)
-        step = self._chart.derivative(xi) @ change
-        moved[self.free] = step[:-1]
-        end = self.lattice_flow.whole(arc.end)
-        rate = end[n:] if self.map.end == "centre" else -self.system.forces(end[:n]) / self.system.masses
-        moved = self.lattice_flow.whole(arc.move(self.lattice_flow.share(moved[None])))[0]
-        return (moved[self._zero] + self.map.fraction * rate * step[-1]) / self._chart.size
-
-    def tangent(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Unit tangent (n + 1,) at the last attempt's ``xi``, turned towards ``reference``."""
-        assert isinstance(self._newton, KrylovNewton)
-        return self._newton.across(xi, reference)
-
-    def null_vector(self, chart: Chart, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Singular values are not known: ones in their place; the null vector."""
-        self._chart, self._last = chart, None
-        row = np.append(xi[:-1], 0.0)
-        return np.ones(len(xi) - 1), self.tangent(xi, row / np.linalg.norm(row))
+    def null_vector(self, start: Point) -> np.ndarray:
+        """Tangent d(x, period) at a corrected orbit, of either sign; a second null vector would not be seen."""
+        frame = self.frame_at("relative", start.x, start.period, np.empty(0))
+        row = np.append(frame.xi[:-1], 0.0)
+        null = self.newton.null_vector(frame, frame.xi, row / np.linalg.norm(row))
+        return frame.chart.to_changes(frame.xi, null)
 
     def breather(self, omega: float) -> Point:
         """The orbit of a frequency ``omega`` in rad/s, between the bands, in which the first site touches.
@@ -175,14 +196,18 @@ class LatticeShooting(Shooting):
         The guess is a describing function, as for condensed motions. Raises ContinuationError if there is none,
         StartError if Newton's method does not converge from there.
         """
-        system, period = self.system, 2 * np.pi / omega
-        row, pair = system.contact_rows[0], system.contacts[0]
+        system = self.system
+        row = system.contact_rows[0]
+        pair = system.contacts[0]
         field = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc()).solve(row)  # of 1 N, in m
-        x = field * (describing(SiteForces([(pair.law, pair.clearance)]), 0, row @ field, omega) / (row @ field))
-        chart = self.chart("relative", x, period)
-        row = np.append(np.zeros(system.dofs), 1.0)
-        attempt = self.solve(chart, chart.encode(x, period), row, 1.0)
+        compliance = row @ field
+        amplitude = describing_amplitude(SiteForces([(pair.law, pair.clearance)]), 0, compliance, omega)
+
+        x = field * (amplitude / compliance)
+        frame = self.frame_at("relative", x, 2 * np.pi / omega, np.empty(0))
+        keep_period = np.append(np.zeros(system.dofs), 1.0)
+        attempt = frame.solve(frame.xi, keep_period, 1.0)
         if not attempt.converged:
             why = f"({attempt.reason}; residuals {attempt.residuals})"
             raise StartError(f"no breather of {omega:g} rad/s is found {why}: {REMEDY}")
-        return Point.of(self, attempt, chart)
+        return frame.measures(attempt)

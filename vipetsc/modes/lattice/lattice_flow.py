@@ -7,7 +7,7 @@ located on all ranks from the same numbers; any number of variations then moves 
 in compiled code. Displacements, contacts and variations have the same bits on any number of ranks.
 
 States are blocks (2 dof, owned cell), displacements in m before velocities in m/s, mass by mass as in
-``dynamics.layout``; ``share`` and ``whole`` go from and to the order of ``modes.system``, cell by cell.
+``dynamics.layout``; ``scatter`` and ``gather`` go from and to the order of ``modes.system``, cell by cell.
 """
 
 from dataclasses import dataclass
@@ -27,6 +27,8 @@ from vipetsc.modes.problem import FlowError
 
 # Errors allowed in a contact's substep, relative to its speed.
 RTOL = 1e-13
+# Errors are relative to a speed: of an orbit that starts at rest, at least this fraction of its fastest mode's.
+SLOWEST = 0.1
 
 
 @dataclass(eq=False)
@@ -52,47 +54,69 @@ class LatticeFlow:
     """The flow of ``chain``, whose contacts follow the law ``contact``, without drive, on the ranks of ``comm``."""
 
     def __init__(self, chain: Chain, contact: Contact, comm: MPI.Comm) -> None:
-        self.chain, self.contact, self.comm = chain, contact, comm
+        self.chain = chain
+        self.contact = contact
+        self.comm = comm
         self.layout = Layout(self._model(1.0, 1), comm)
         self._omega = StepSeries(chain, 1.0, RTOL).omega_max_h
 
     def _model(self, duration: float, samples: int) -> Model:
         """The lattice at rest, undriven, for so many samples."""
-        still, interval = ToneBurst(0.0, 1e-3 / duration, 1), duration / samples
-        of_time = duration, interval, "8vr", RTOL, (0.0, 0.0), 1.0, 1.0
-        return Model(self.chain, self.contact, (Drive(still, 0, 0),), *of_time)
+        still = ToneBurst(0.0, 1e-3 / duration, 1)
+        return Model(
+            chain=self.chain,
+            contact=self.contact,
+            drives=(Drive(still, 0, 0),),
+            end=duration,
+            sample_interval=duration / samples,
+            method="8vr",
+            rtol=RTOL,
+            atol=(0.0, 0.0),
+            scale=1.0,
+            speed=1.0,
+        )
 
     def arc(self, start: np.ndarray, duration: float) -> LatticeArc:
         """The orbit from the block ``start`` over ``duration`` seconds; raises FlowError on all ranks."""
         samples = max(int(np.ceil(self._omega * duration / LARGEST_OMEGA_H)), 1)
         model = self._model(duration, samples)
-        if why := TangentPropagator.refusal(model):
+        why = TangentPropagator.refusal(model)
+        if why:
             raise FlowError(why)
+
         engine = TangentPropagator(model, self.layout)
         largest = np.abs(start).max(axis=1, initial=0.0) if start.size else np.zeros(len(start))
         self.comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
         u, v = np.split(largest, 2)
         try:
-            engine.place(start, max(float(v.max()), 0.1 * self._omega * float(u.max())))
+            engine.place(start, max(float(v.max()), SLOWEST * self._omega * float(u.max())))
             end = engine.run(samples)
         except StalledError as error:  # of all ranks; anything else may be of one alone
             engine.destroy()
             raise FlowError(f"the orbit of {duration:.6g} s stops: {error}") from error
-        closed, episodes = engine.contacts()
-        spans = np.concatenate(self.comm.allgather(closed))
-        times = np.sort(spans, axis=0)  # of intervals that overlap the union has this length
-        gaps = np.maximum(times[1:, 0] - times[:-1, 1], 0.0).sum()
-        union = float(times[-1, 1] - times[0, 0] - gaps) if len(times) else 0.0
-        return LatticeArc(duration, start, end, self.comm.allreduce(episodes), union, engine)
 
-    def share(self, state: np.ndarray) -> np.ndarray:
+        intervals, episodes = engine.contacts()
+        closed = _union(np.concatenate(self.comm.allgather(intervals)))
+        return LatticeArc(duration, start, end, self.comm.allreduce(episodes), closed, engine)
+
+    def scatter(self, state: np.ndarray) -> np.ndarray:
         """The rank's block of a ``state`` (..., 2n) of the whole lattice."""
         layout = self.layout
         cells = state.reshape(*state.shape[:-1], 2, layout.cells, layout.dofs)[..., layout.start : layout.stop, :]
         return np.moveaxis(cells, -1, -2).reshape(*state.shape[:-1], 2 * layout.dofs, layout.owned).copy()
 
-    def whole(self, block: np.ndarray) -> np.ndarray:
+    def gather(self, block: np.ndarray) -> np.ndarray:
         """The state (..., 2n) of the whole lattice from the ``block`` of every rank, on all of them."""
         cells = np.concatenate(self.comm.allgather(block), axis=-1)
         halves = cells.reshape(*block.shape[:-2], 2, self.layout.dofs, self.layout.cells)
         return np.moveaxis(halves, -1, -2).reshape(*block.shape[:-2], -1).copy()
+
+
+def _union(intervals: np.ndarray) -> float:
+    """Length of the union of ``intervals`` (number, 2), which may overlap."""
+    if not len(intervals):
+        return 0.0
+    # Sorted by ends and by beginnings apart, the gaps between neighbours are those of the union.
+    times = np.sort(intervals, axis=0)
+    gaps = np.maximum(times[1:, 0] - times[:-1, 1], 0.0).sum()
+    return float(times[-1, 1] - times[0, 0] - gaps)

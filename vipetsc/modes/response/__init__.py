@@ -3,5 +3,4 @@
 ``steady`` has their equations, on those of harmonic balance; ``nfrc`` follows the curves of a case and writes them.
 """
 
-from vipetsc.modes.response.nfrc import Curve, follow_curves
-from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steady import Response, SteadyStates

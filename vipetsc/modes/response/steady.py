@@ -1,246 +1,342 @@
-r"""Steady answers of a lattice's sites to a harmonic force or to an incident Bloch wave, followed over a parameter.
+r"""Steady states of a lattice's sites under a harmonic force or an incident Bloch wave, followed over a parameter.
 
-With the contacts condensed (``condensed``) the harmonics Z of the relative displacements obey
+With the contacts condensed (``balance``) the harmonics Z of the relative displacements obey
 
     Z_k + G(k Om) F_k(Z) = a delta_k1 w(Om),
 
 w being what the force (1 N) or the wave (1 clearance of the first site) alone would make at the sites. Unknowns are Z
 over that clearance and the parameter, the amplitude a or the frequency Om over a scale; a curve of solutions is
-followed by pseudo-arclength (Keller 1977, see the package), folds in the parameter are located on it.
+followed by pseudo-arclength (``continuation``), folds in the parameter are located on it.
 
 **Energy.** A wave of the flux P a^2 comes in. What leaves at Om on the side that it goes to is transmitted (T), on the
 other reflected (R); what leaves at k Om, k > 1, is U; contacts lose L. T + R + U + L = 1 for any number of harmonics,
-as the loss is that of the harmonics kept. A force gives what it gives: shares are over that, T to higher cells.
+as the loss is that of the harmonics kept. A force gives what it gives: fractions are over that, T to higher cells.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import IncidentWave, WaveCompliance
-from vipetsc.modes.balance.harmonic_balance import Balance
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import Hill
-from vipetsc.modes.newton import Attempt, BorderedNewton
-from vipetsc.modes.problem import ContinuationError, FlowError
+from vipetsc.modes.newton import DenseNewton
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Solution, SpecialKind
 
-TURN, CORRECTION = 0.25, 0.1  # largest angle in rad between tangents, and correction over the step
-SLOPE = 1e-6  # relative step of a difference in frequency
-FOLD = 1e-11  # of the arclength, to which a fold is located
+# Relative step of a difference in frequency.
+SLOPE = 1e-6
+# A force's work over what it moves, below which nothing but rounding says that something leaves or is lost.
+LEAST_WORK = 1e-12
+# Frequencies whose linear motions are kept: those of a step and of its differences.
+KEPT_MOTIONS = 9
+# Samples a harmonic of the period in which the largest displacement is looked for.
+SAMPLES_A_HARMONIC = 16
 
 
-@dataclass(frozen=True, eq=False)
-class SteadyPoint:
-    """A steady state: unknowns ``xi``, unit ``tangent``, the next ``step``; ``kind`` is "regular" or "fold"."""
+class Measures(NamedTuple):
+    """What is measured of a steady state (``branches.response_layout`` has units and texts).
+
+    ``fractions`` (4,) of the energy that comes in are transmitted, reflected, at higher harmonics, and lost;
+    ``harmonics`` (site, order) complex in m; ``unstable`` perturbations grow, the fastest at ``growth`` over Om.
+    """
+
+    frequency: float
+    amplitude: float
+    largest: np.ndarray
+    fractions: np.ndarray
+    unstable: int
+    growth: float
+    closed: np.ndarray
+    episodes: int
+    truncation: float
+    harmonics: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Response(Solution):
+    """A steady state: unknowns ``xi``, the last of which is the parameter, and the unit ``tangent``."""
 
     xi: np.ndarray
-    tangent: np.ndarray
-    step: float
+    tangent: np.ndarray = field(default_factory=lambda: np.empty(0))
+    index: int = 0
+    step: float = 0.0
+    next_step: float = np.nan
     kind: str = "regular"
-    measures: dict[str, Any] = field(default_factory=dict)
+    measures: Measures | None = None
+
+    @property
+    def measured(self) -> Measures:
+        """The measures, which a state on its way into a file has."""
+        assert self.measures is not None
+        return self.measures
 
 
-class SteadyStates:
-    """Of the sites of a case with the ``restitution`` and the other parameter ``fixed`` (see ``NfrcTable``)."""
+class LinearMotion(NamedTuple):
+    """Harmonics (pairs, K + 1) in m that a drive of amplitude 1 alone makes at the sites; its wave if it is one."""
 
-    def __init__(self, case: NfrcCase, restitution: float, fixed: float) -> None:
-        self.case, self.restitution, self.fixed = case, restitution, fixed
-        model, self.options = case.model(), case.nfrc
-        options, point = self.options, (model.drive_cell, model.drive_mass)
-        self.wave = options.source == "wave"
-        self.compliance = WaveCompliance(model.chain, options.infinite, () if self.wave else (point,))
-        self.clearance, self.point, last = model.chain.clearances[0], point, options.harmonics
-        contact = case.contact(restitution)
-        self.forces = SiteForces([(contact, clearance) for clearance in model.chain.clearances])
-        self.balance = Balance(self.compliance, self.forces, last, options.symmetric, cosines=False)
-        self.count, self.hill = self.balance.size, self._hill(0.0)
-        self._known: dict[float, tuple[np.ndarray, IncidentWave | None]] = {}
-        low, high = options.range
-        self.scale = 1.0 if self.wave else float(self.clearance / np.abs(self.linear(case.frequency)[:, 1]).max())
-        if options.over == "frequency":
-            self.scale = (high - low) / 2
-        self.newton = BorderedNewton(self.residual, self.matrix, self.count + 1, options.tolerance, options.max_newton)
+    harmonics: np.ndarray
+    wave: IncidentWave | None
 
-    def parameters(self, p: float) -> tuple[float, float]:
-        """Frequency (rad/s) and amplitude at the scaled parameter ``p``."""
-        return (self.fixed, p * self.scale) if self.options.over == "amplitude" else (p * self.scale, self.fixed)
 
-    def linear(self, omega: float) -> np.ndarray:
-        """Harmonics (pairs, K + 1) in m of the linear lattice, for the amplitude 1; FlowError outside a wave's band."""
-        if omega not in self._known:
-            self._known = dict(list(self._known.items())[-8:])
-            z, pairs = np.zeros((self.forces.pairs, self.options.harmonics + 1), complex), self.forces.pairs
-            wave = None
-            if self.wave:
-                try:
-                    wave = self.compliance.incident(omega, self.options.band or 0, self.options.towards)
-                except ValueError as error:
-                    raise FlowError(str(error)) from None
-                z[:, 1] = wave.relative * self.clearance
-            else:
-                z[:, 1] = self.compliance.response(omega)[0, :, pairs]
-            self._known[omega] = z, wave
-        return self._known[omega][0]
+class Parameter(NamedTuple):
+    """What a curve goes over, "amplitude" or "frequency", the value of the other one, and the parameter's unit."""
+
+    over: str
+    fixed: float
+    scale: float
+
+
+class SteadyFrame:
+    """Steady states around one of them: unknowns and tangent are its own; ``shift`` is its compliance's."""
+
+    def __init__(self, equations: "SteadyEquations", xi: np.ndarray, tangent: np.ndarray) -> None:
+        self.equations = equations
+        self.xi = xi
+        self.tangent = tangent
+        self.shift = equations.balance.shift(equations.drive(xi[-1])[0])
+
+    def encode(self, point: Response) -> np.ndarray:
+        """The unknowns of another state."""
+        return point.xi
+
+    def direction(self, point: Response) -> np.ndarray:
+        """The curve's direction at another state."""
+        return point.tangent
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """What is to be zero (count,), over the clearance."""
-        omega, amplitude = self.parameters(xi[-1])
-        if not omega > 0:
-            raise FlowError("the frequency is not positive")
-        x = xi[:-1] * self.clearance
-        return self.balance.residual(x, omega, amplitude * self.linear(omega)) / self.clearance
+        """What should vanish (n,), over the clearance."""
+        return self.equations.residual(xi, self.shift)
 
-    def matrix(self, xi: np.ndarray) -> np.ndarray:
-        """The derivative (count, count + 1) of the ``residual``."""
-        omega, amplitude = self.parameters(xi[-1])
-        jacobian, rate = self.balance.derivative(xi[:-1] * self.clearance, omega)
-        if self.options.over == "amplitude":
-            column = self.balance.residual(np.zeros(self.count), omega, self.linear(omega))
-        else:
-            ends = [omega * (1 + sign * SLOPE) for sign in (1, -1)]
-            after, before = (self.balance.residual(np.zeros(self.count), w, amplitude * self.linear(w)) for w in ends)
-            column = rate + (after - before) / (ends[0] - ends[1])
-        return np.column_stack([jacobian, column * self.scale / self.clearance])
+    def jacobian(self, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual."""
+        return self.equations.jacobian(xi, self.shift)
 
-    def tangent(self, xi: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of ``near``."""
-        right = np.zeros(len(xi))
-        right[-1] = 1
-        direction = np.linalg.solve(np.vstack([self.matrix(xi), near]), right)
-        return np.asarray(direction / np.linalg.norm(direction))
+    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
+        """Newton's method from ``guess`` for the state at an ``arclength`` along the tangent."""
+        predicted = self.xi + arclength * self.tangent
+        return self.solve(guess, self.tangent, self.tangent @ predicted)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method with the row; what cannot be evaluated has not converged."""
+        """Newton's method for the state with row . xi = value; what cannot be evaluated has not converged."""
+        equations = self.equations
         try:
-            return self.newton.solve(guess, row, value)
+            return equations.newton.solve(self, guess, row, value, equations.tolerance)
         except ArithmeticError as error:
             return Attempt(False, str(error), [], guess, left_domain=True)
 
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent at a state, on the side of the frame's own."""
+        right = np.zeros(len(xi))
+        right[-1] = 1
+        direction = np.linalg.solve(np.vstack([self.jacobian(xi), self.tangent]), right)
+        return np.asarray(direction / np.linalg.norm(direction))
+
+    def measures(self, attempt: Attempt, direction: np.ndarray) -> Response:
+        """The state that an attempt has converged to; what is stored of it is measured once it is accepted."""
+        return Response(xi=attempt.xi, tangent=direction)
+
+
+class SteadyEquations(ABC):
+    """Steady states under a drive that alone makes the ``linear_motion``; unknowns are over the ``clearance``."""
+
+    has_half_traces = False
+    guards: frozenset[str] = frozenset()
+
+    def __init__(
+        self, balance: HarmonicBalance, clearance: float, parameter: Parameter, tolerance: float, max_newton: int
+    ) -> None:
+        self.balance = balance
+        self.clearance = clearance
+        self.parameter = parameter
+        self.tolerance = tolerance
+        self.newton = DenseNewton(balance.size + 1, max_newton)
+
+    @abstractmethod
+    def linear_motion(self, omega: float) -> LinearMotion:
+        """The motion of the linear lattice at ``omega`` in rad/s; raises FlowError where there is no such drive."""
+
+    def drive(self, p: float) -> tuple[float, float]:
+        """Frequency (rad/s) and amplitude at the scaled parameter ``p``."""
+        over, fixed, scale = self.parameter
+        return (fixed, p * scale) if over == "amplitude" else (p * scale, fixed)
+
+    def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """What is to be zero (n,), over the clearance."""
+        omega, amplitude = self.drive(xi[-1])
+        if not omega > 0:
+            raise FlowError("the frequency is not positive")
+        x = xi[:-1] * self.clearance
+        linear = amplitude * self.linear_motion(omega).harmonics
+        return self.balance.residual(x, omega, shift, linear) / self.clearance
+
+    def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """The derivative (n, n + 1) of the ``residual``."""
+        omega, amplitude = self.drive(xi[-1])
+        jacobian, column = self.balance.derivative(xi[:-1] * self.clearance, omega, shift)
+        if self.parameter.over == "amplitude":
+            column = self._drive_term(omega, 1.0, shift)
+        else:
+            ends = [omega * (1 + sign * SLOPE) for sign in (1, -1)]
+            after, before = (self._drive_term(end, amplitude, shift) for end in ends)
+            column = column + (after - before) / (ends[0] - ends[1])
+        return np.column_stack([jacobian, column * self.parameter.scale / self.clearance])
+
+    def _drive_term(self, omega: float, amplitude: float, shift: np.ndarray) -> np.ndarray:
+        """The residual's part that the drive makes (n,), in m: the residual at rest."""
+        rest = np.zeros(self.balance.size)
+        return self.balance.residual(rest, omega, shift, amplitude * self.linear_motion(omega).harmonics)
+
+    def frame(self, point: Response, chart: str = "auto") -> SteadyFrame:
+        """The unknowns around a state; there is one ``chart``."""
+        return SteadyFrame(self, point.xi, point.tangent)
+
+    def first_tangent(self, start: Response, direction: int) -> np.ndarray:
+        """Tangent at the first state, along which the parameter grows (``direction`` 1) or falls (-1)."""
+        along_parameter = np.eye(len(start.xi))[-1] * direction
+        return SteadyFrame(self, start.xi, along_parameter).tangent_at(start.xi)
+
+    def turn(self, before: Response, after: Response) -> float:
+        """Angle between the tangents of two states in relative units: that of the step, which is judged anyway."""
+        return 0.0
+
+    def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
+        """Folds in the parameter."""
+        yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
+
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
-        """The solution at the scaled parameter ``p`` near ``guess``; raises ContinuationError."""
-        row = np.eye(self.count + 1)[-1]
-        attempt = self.solve(np.append(guess[:-1], p), row, p)
+        """Unknowns of the state at the scaled parameter ``p`` near ``guess``; raises ContinuationError."""
+        along_parameter = np.eye(self.balance.size + 1)[-1]
+        begin = np.append(guess[:-1], p)
+        attempt = SteadyFrame(self, begin, along_parameter).solve(begin, along_parameter, p)
         if not attempt.converged:
-            value = self.parameters(p)[self.options.over == "amplitude"]
-            raise ContinuationError(f"no solution at {self.options.over} {value:.6g}: {attempt.reason}")
+            over = self.parameter.over
+            omega, amplitude = self.drive(p)
+            value = amplitude if over == "amplitude" else omega
+            raise ContinuationError(f"no solution at {over} {value:.6g}: {attempt.reason}")
         return attempt.xi
 
-    def measured(self, xi: np.ndarray) -> dict[str, Any]:
-        """What the file holds of a solution (``LAYOUT`` of ``nfrc``)."""
-        omega, amplitude = self.parameters(xi[-1])
+
+class SteadyStates(SteadyEquations):
+    """Steady states of the sites of a case with a ``restitution`` and the other parameter ``fixed`` (``NfrcTable``)."""
+
+    def __init__(self, case: NfrcCase, restitution: float, fixed: float) -> None:
+        model = case.model()
+        options = case.nfrc
+        self.case = case
+        self.options = options
+        self.restitution = restitution
+        self.wave = options.source == "wave"
+        self.point = model.drive_cell, model.drive_mass
+        self.compliance = WaveCompliance(model.chain, options.infinite, () if self.wave else (self.point,))
+        law = case.contact(restitution)
+        self.forces = SiteForces([(law, clearance) for clearance in model.chain.clearances])
+        # Latest linear motions by frequency, and the latest determinant: neighbours on a curve over the amplitude.
+        self._motions: dict[float, LinearMotion] = {}
+        self._hill: Hill | None = None
+
+        clearance = model.chain.clearances[0]
+        super().__init__(
+            balance=HarmonicBalance(self.compliance, self.forces, options.harmonics, options.symmetric, cosines=False),
+            clearance=clearance,
+            parameter=Parameter(options.over, fixed, self._scale(clearance)),
+            tolerance=options.tolerance,
+            max_newton=options.max_newton,
+        )
+
+    def _scale(self, clearance: float) -> float:
+        """Unit of the parameter: half the range of frequencies, or the amplitude that touches, 1 of a wave."""
+        low, high = self.options.range
+        if self.options.over == "frequency":
+            return (high - low) / 2
+        if self.wave:
+            return 1.0
+        linear = self.linear_motion(self.case.frequency).harmonics
+        return float(clearance / np.abs(linear[:, 1]).max())
+
+    def linear_motion(self, omega: float) -> LinearMotion:
+        """The motion of the linear lattice for the amplitude 1; FlowError outside a wave's band."""
+        if omega not in self._motions:
+            self._motions = dict(list(self._motions.items())[1 - KEPT_MOTIONS :])
+            self._motions[omega] = self._evaluate_linear(omega)
+        return self._motions[omega]
+
+    def _evaluate_linear(self, omega: float) -> LinearMotion:
+        pairs = self.forces.pairs
+        z = np.zeros((pairs, self.options.harmonics + 1), complex)
+        if not self.wave:
+            z[:, 1] = self.compliance.response(omega)[0, :, pairs]
+            return LinearMotion(z, None)
+        try:
+            wave = self.compliance.incident(omega, self.options.band or 0, self.options.towards)
+        except ValueError as error:
+            raise FlowError(str(error)) from None
+        z[:, 1] = wave.relative * self.case.model().chain.clearances[0]
+        return LinearMotion(z, wave)
+
+    def measured(self, xi: np.ndarray) -> Measures:
+        """What the file holds of a state."""
+        omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
-        z, series = self.balance.unpack(x), self.balance.series(x, omega)
-        padded = np.pad(z, ((0, 0), (0, 7 * z.shape[1]))) * np.where(np.arange(8 * z.shape[1]), 0.5, 1)
-        moved = np.fft.irfft(padded, axis=1, norm="forward")
-        if self.hill.omega != omega:
-            self.hill = self._hill(omega)
-        unstable = self.hill.unstable(series)
-        fastest = self.hill.fastest(series) if unstable else 0j
-        shares = self._shares(omega, amplitude, series.forces[:, : z.shape[1]], float(series.loss.sum()))
-        return {
-            "frequency": omega, "amplitude": amplitude, "harmonics": z.real, "harmonics_imaginary": z.imag,
-            "largest": np.abs(moved).max(axis=1),
-            "unstable": unstable, "growth": np.nan if fastest is None else fastest.real, "share": shares,
-            "closed": series.closed, "episodes": len(series.episodes), "truncation": self.balance.truncation(x, omega),
-        }  # fmt: skip
+        z = self.balance.unpack(x)
+        series = self.balance.series(x, omega)
 
-    def _hill(self, omega: float) -> Hill:
-        options = self.options
-        return Hill(self.compliance, omega, options.harmonics, options.symmetric, finite=not options.infinite)
+        hill = self.hill(omega)
+        unstable = hill.unstable(series)
+        fastest = hill.fastest(series) if unstable else 0j
+        forces = series.forces[:, : z.shape[1]]
+        return Measures(
+            frequency=omega,
+            amplitude=amplitude,
+            largest=_largest(z),
+            fractions=self._fractions(omega, amplitude, forces, float(series.loss.sum())),
+            unstable=unstable,
+            growth=np.nan if fastest is None else fastest.real,
+            closed=series.closed,
+            episodes=len(series.episodes),
+            truncation=self.balance.truncation(x, omega),
+            harmonics=z,
+        )
 
-    def _shares(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
-        """T, R, U and L over what comes in (4,); what leaves is not told of a finite lattice."""
-        first, shares = forces[:, 1], np.full(4, 0.0 if self.options.infinite else np.nan)
-        loss *= omega / (2 * np.pi)
-        wave = self._known[omega][1] if self.wave else None
+    def hill(self, omega: float) -> Hill:
+        """Hill's determinant at a frequency; the latest is kept, since it keeps the compliances of perturbations."""
+        if self._hill is None or self._hill.omega != omega:
+            options = self.options
+            finite = not options.infinite
+            self._hill = Hill(self.compliance, omega, options.harmonics, options.symmetric, finite)
+        return self._hill
+
+    def _fractions(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
+        """T, R, U, L over what comes in (4,), NaN where a finite lattice lets nothing leave; ``loss`` in J a period."""
+        wave = self.linear_motion(omega).wave
+        first = forces[:, 1]
         if wave is not None:
-            amplitude, given = amplitude * self.clearance, (amplitude * self.clearance) ** 2 * wave.flux
+            amplitude = amplitude * self.clearance
+            given = amplitude**2 * wave.flux
         else:
             first = np.append(first, amplitude)
             moved = self.compliance.field(omega, first, [self.point[0]])[0, self.point[1]]
             given = 0.5 * amplitude * float((1j * omega * moved).real)
-            given *= given > 1e-12 * amplitude * omega * abs(moved)  # nothing but rounding if nothing leaves or is lost
+            if not given > LEAST_WORK * amplitude * omega * abs(moved):
+                given = 0.0
+
+        powers = np.full(4, 0.0 if self.options.infinite else np.nan)
         if self.options.infinite:
-            out = self.compliance.outgoing(omega, first, wave, amplitude).sum(axis=1)
-            shares[:2] = out if self.options.towards > 0 else out[::-1]
+            outgoing = self.compliance.outgoing(omega, first, wave, amplitude).sum(axis=1)
+            powers[:2] = outgoing if self.options.towards > 0 else outgoing[::-1]
             for k in range(2, forces.shape[1]):
                 if np.any(forces[:, k]):
-                    shares[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
-        shares[3] = loss
-        return shares / given if given > 0 else np.full(4, np.nan)
+                    powers[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
+        powers[3] = loss * (omega / (2 * np.pi))
+        return powers / given if given > 0 else np.full(4, np.nan)
 
 
-class Steady:
-    """Iterates over the points of a curve from a first point on, folds among them; ``ending`` tells how it ended.
-
-    Raises ContinuationError if steps fall below the smallest: the message says where, why and which key to turn.
-    """
-
-    def __init__(self, states: SteadyStates, start: SteadyPoint, points: int) -> None:
-        self.states, self.point, self.points = states, start, points
-        self.ending, self.finished = "not finished", False
-
-    def __iter__(self) -> Iterator[SteadyPoint]:
-        low, high = (bound / self.states.scale for bound in self.states.options.range)
-        for _ in range(self.points):
-            last = self.point
-            point = self._next(last)
-            if last.tangent[-1] * point.tangent[-1] < 0:
-                yield self._fold(last, point)
-            if not low <= point.xi[-1] <= high:
-                bound = low if point.xi[-1] < low else high
-                xi = self.states.at(point.xi, bound)
-                point = SteadyPoint(xi, self.states.tangent(xi, point.tangent), point.step)
-                self.finished, self.ending = True, f"reached the end of nfrc.range, {bound * self.states.scale:g}"
-            self.point = point
-            yield point
-            if self.finished:
-                return
-        self.ending = f"{self.points} points reached: raise nfrc.points and resume to go on"
-
-    def _next(self, last: SteadyPoint) -> SteadyPoint:
-        """The next point behind ``last``; raises ContinuationError."""
-        states, step, why = self.states, last.step, ""
-        states.balance.shift(states.parameters(last.xi[-1])[0])
-        while step >= states.options.smallest_step:
-            guess = last.xi + step * last.tangent
-            attempt = states.solve(guess, last.tangent, last.tangent @ guess)
-            why = f"Newton's method ended with {attempt.reason} (residuals {attempt.residuals or 'none'})"
-            if attempt.converged:
-                tangent = states.tangent(attempt.xi, last.tangent)
-                angle = np.arccos(np.clip(tangent @ last.tangent, -1, 1))
-                far = np.linalg.norm(attempt.xi - guess) / step
-                if angle <= TURN and far <= CORRECTION:
-                    growth = min(1.6, 0.5 * TURN / max(angle, 1e-9))
-                    ahead = min(step * max(growth, 0.5), states.options.largest_step)
-                    return SteadyPoint(attempt.xi, tangent, ahead)
-                why = f"the curve turns too sharply ({angle:.2g} rad)"
-            step /= 2
-        omega, amplitude = states.parameters(last.xi[-1])
-        knob = "raise nfrc.harmonics or nfrc.max_newton, or lower nfrc.smallest_step"
-        raise ContinuationError(
-            f"no step from the last good point, {omega:.8g} rad/s at amplitude {amplitude:.6g}: {why}; {knob}"
-        )
-
-    def _fold(self, last: SteadyPoint, point: SteadyPoint) -> SteadyPoint:
-        """The point between two at which the parameter is largest or smallest, by the secant of the tangent's part."""
-        states = self.states
-        low, high = 0.0, float(last.tangent @ (point.xi - last.xi))
-        values, xi, tangent = [last.tangent[-1], point.tangent[-1]], point.xi, point.tangent
-        a, b = low, high
-        for _ in range(60):
-            step = a + (b - a) * values[0] / (values[0] - values[1])
-            attempt = states.solve(last.xi + step * last.tangent, last.tangent, last.tangent @ last.xi + step)
-            if not attempt.converged:
-                break
-            xi, tangent = attempt.xi, states.tangent(attempt.xi, last.tangent)
-            if abs(tangent[-1]) < FOLD or b - a < FOLD * high:
-                break
-            side = 0 if tangent[-1] * values[0] > 0 else 1
-            values[1 - side] *= 0.5  # Illinois
-            values[side] = tangent[-1]
-            a, b = (step, b) if side == 0 else (a, step)
-        return SteadyPoint(xi, tangent, point.step, "fold")
+def _largest(z: np.ndarray) -> np.ndarray:
+    """Largest |w| (pairs,) in m of the motions with the harmonics ``z`` (pairs, K + 1)."""
+    half = SAMPLES_A_HARMONIC // 2 * z.shape[1]
+    padded = np.pad(z, ((0, 0), (0, half - z.shape[1]))) * np.where(np.arange(half), 0.5, 1)
+    return np.abs(np.fft.irfft(padded, axis=1, norm="forward")).max(axis=1)

@@ -30,7 +30,11 @@ stable; c = 1 is a fold of the energy or a branch point; c = -1 breaks the symme
 place of w: an orbit that starts on its largest |w| depends on w - D through one).
 """
 
+from vipetsc.modes.shooting.charts import Chart, Grazing, Logarithmic, Relative
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.flow import Arc, Flow
+from vipetsc.modes.shooting.maps import MAPS, ShootingMap
+from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
 from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
-from vipetsc.modes.shooting.shooting import MAPS, Chart, Grazing, Logarithmic, Relative, Shooting, ShootingMap
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start

@@ -20,14 +20,21 @@ from vipetsc.modes.system import System
 # Outcomes of a flow: the time is covered; a step is too small; there are more changes than can be listed.
 DONE, STUCK, FULL = range(3)
 # Errors allowed per step, relative to the size of the orbit and of each variation.
-RTOL, RTOL_SENSITIVITY = 1e-13, 1e-11
+RTOL = 1e-13
+RTOL_SENSITIVITY = 1e-11
 # Contact changes of one arc beyond which a flow gives up.
 MOST_CHANGES = 2000
-# Share of an arc's time in which a contact at rest at its clearance moves by rounding alone.
+# Fraction of an arc's time in which a contact at rest at its clearance moves by rounding alone.
 SHORT = 1e-6
 STAGES = 12
 _TABLEAU = np.loadtxt(Path(__file__).with_suffix(".csv"), delimiter=",")
-A, B, E3, E5 = _TABLEAU[:STAGES], *_TABLEAU[STAGES:]
+A = _TABLEAU[:STAGES]
+B, E3, E5 = _TABLEAU[STAGES:]
+# The new step is this fraction of the one that would have the error allowed, and within these factors of the last.
+SAFETY = 0.9
+LEAST_FACTOR = 0.2
+MOST_FACTOR = 6.0
+SMALLEST_ERROR = 1e-12
 
 
 class Stepper(NamedTuple):
@@ -38,7 +45,7 @@ class Stepper(NamedTuple):
     errors, start and end with one dimension in place of two. ``errors`` (2, rows, 1 + m): of orders 3 and 5, over h.
     """
 
-    step: flow.Step
+    step: flow.FlowStep
     omega_ref: float
     stages: np.ndarray
     errors: np.ndarray
@@ -62,20 +69,33 @@ def _combine(stepper: Stepper, weights: np.ndarray, h: float) -> None:
 @kernel
 def _scaled_error(stepper: Stepper, h: float) -> float:
     """The largest error of a column over what is allowed; infinite if the step overflowed."""
-    y, end, errors, error, zero = stepper.start, stepper.end, stepper.errors, 0.0, 0.0
+    y = stepper.start
+    end = stepper.end
+    errors = stepper.errors
+
+    # A number that is not finite makes this sum one that is not zero; a test of each number would cost a branch.
+    zero = 0.0
     for value in stepper.flat[3]:
         zero += 0.0 * value
     if zero != 0.0:
         return np.inf
-    (k, estimates, _, _), n = stepper.flat, stepper.step.system.inverse_mass.size
+
+    k, estimates, _, _ = stepper.flat
     for e in range(estimates.shape[1]):
-        e3, e5 = 0.0, 0.0
+        e3 = 0.0
+        e5 = 0.0
         for r in range(STAGES):
             e3 += E3[r] * k[r, e]
             e5 += E5[r] * k[r, e]
-        estimates[0, e], estimates[1, e] = e3, e5
+        estimates[0, e] = e3
+        estimates[1, e] = e5
+
+    n = stepper.step.system.inverse_mass.size
+    error = 0.0
     for j in range(y.shape[1]):
-        fifth, third, scale = 0.0, 0.0, 0.0
+        fifth = 0.0
+        third = 0.0
+        scale = 0.0
         for i in range(2 * n):
             unit = 1.0 if i < n else 1.0 / stepper.omega_ref
             fifth = max(fifth, abs(errors[1, i, j]) * unit)
@@ -114,41 +134,61 @@ def _land(stepper: Stepper, t: float, h: float, change: Change) -> tuple[float, 
 
 
 @kernel
+def _list(event: np.ndarray, t: float, change: Change, kind: int) -> None:
+    """Fill a row of the events: time, contact, side and kind (1 onset, -1 separation)."""
+    event[0] = t
+    event[1] = change.contact
+    event[2] = change.side
+    event[3] = kind
+
+
+@kernel
 def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, int, float]:
     """Advance the ``start`` in place over ``duration`` seconds.
 
     Returns the outcome (DONE, STUCK or FULL), the number of ``events`` (capacity, 4) filled with time, contact, side
     and kind (1 onset, -1 separation), and the seconds with a contact closed.
     """
-    step, largest = stepper.step, 1.0 / stepper.omega_ref
-    (_, _, start, end), t, closed, count = stepper.flat, 0.0, 0.0, 0
+    step = stepper.step
+    largest = 1.0 / stepper.omega_ref
+    _, _, start, end = stepper.flat
+    t = 0.0
+    closed = 0.0
+    count = 0
     h = min(0.1 * largest, duration)
     flow.close(step.system, stepper.start, step.side)
     flow.observe(step, stepper.start, stepper.stages[0], step.start)
+
     while t < duration:
         last = t + h >= duration * (1.0 - 1e-15)
         if last:
             h = duration - t
         elif h < flow.SMALLEST_STEP * duration:
             return STUCK, count, closed
+
         error = _advance(stepper, h)
         if not error < 1.0:
             if not error < 1e300:
                 stepper.stages[1:] = 0.0  # or a number that overflowed would stay in the sums
-            h *= max(0.2, 0.9 * error ** (-0.125)) if error < 1e300 else 0.1
+            h *= max(LEAST_FACTOR, SAFETY * error ** (-0.125)) if error < 1e300 else 0.1
             continue
+        grown = min(largest, h * min(MOST_FACTOR, SAFETY * max(error, SMALLEST_ERROR) ** (-0.125)))
+
         flow.observe(step, stepper.end, stepper.end_rates, step.end)
-        grown = min(largest, h * min(6.0, 0.9 * max(error, 1e-12) ** (-0.125)))
         change = flow.first_change(step, h)
-        smooth, changed, whole = change.contact < 0, False, h
+        smooth = change.contact < 0
+        changed = False
+        whole = h
         if not smooth:
             h, changed = _land(stepper, t, h, change)
         if not smooth and not changed and t + h == t:  # what rounding took for an extremum lies before the step
             if whole > SHORT * duration:
                 return STUCK, count, closed
-            h, smooth = whole, True
+            h = whole
+            smooth = True
             _advance(stepper, h)
             flow.observe(step, stepper.end, stepper.end_rates, step.end)
+
         for e in range(end.size):
             start[e] = end[e]
         closed += h if np.any(step.side) else 0.0
@@ -157,8 +197,7 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
         if changed:
             if count >= events.shape[0]:
                 return FULL, count, closed
-            events[count, 0], events[count, 1] = t, change.contact
-            events[count, 2], events[count, 3] = change.side, flow.switch(step, change)
+            _list(events[count], t, change, flow.switch(step, change))
             count += 1
         flow.observe(step, stepper.start, stepper.stages[0], step.start)
     return DONE, count, closed
@@ -171,8 +210,8 @@ class Dop853Flow(Flow):
 
     def __init__(self, system: System) -> None:
         super().__init__(system)
-        rows, columns = 2 * system.dofs, 1 + 2 * system.dofs
-        block = np.zeros((STAGES + 5, -(-rows // 8) * 8, columns))
+        rows = -(-2 * system.dofs // 8) * 8
+        block = np.zeros((STAGES + 5, rows, 1 + 2 * system.dofs))
         flat = block.reshape(len(block), -1)
         stages, errors, (start, end, end_rates) = np.split(block, [STAGES, STAGES + 2])
         sums = flat[:STAGES], flat[STAGES : STAGES + 2], flat[STAGES + 2], flat[STAGES + 3]

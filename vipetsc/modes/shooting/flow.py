@@ -1,4 +1,4 @@
-"""What every flow shares: arcs of orbits, and the system in compiled form with its rates and contact changes.
+"""Arcs of orbits, and the system in compiled form with its rates and contact changes, for every flow.
 
 The set of closed contacts is frozen inside a step, so that the force is smooth there. After each step the gap of every
 contact is searched, and the step is repeated so that it ends on the first change (see the package's docstring).
@@ -12,11 +12,11 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel, njit
 from vipetsc.contact.law import ELASTIC, elastic_force_and_slope, elastic_records
+from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope, spring_laws
 from vipetsc.modes.shooting.landing import EXTREMUM, NONE, Change, first_rise, hermite
 from vipetsc.modes.system import System
 
 CONTACT = np.dtype([("clearance", np.float64), ("elastic", ELASTIC)])
-SPRING = np.dtype([("quadratic", np.float64), ("cubic", np.float64)])
 Shape = tuple[int, int, int]  # see restore
 # A step below this fraction of the interval means that the flow is stuck.
 SMALLEST_STEP = 1e-15
@@ -33,7 +33,7 @@ class CompiledSystem(NamedTuple):
     springs: np.ndarray
 
 
-class Step(NamedTuple):
+class FlowStep(NamedTuple):
     """What a step of a system leaves for the search.
 
     ``side`` (contacts,) of closed contacts, 1 or -1, 0 for open ones; ``start`` and ``end`` (contacts, 3) hold
@@ -57,8 +57,12 @@ def elongation(rows: np.ndarray, c: int, y: np.ndarray, first: int, j: int, n: i
 
 @inlined
 def _add(rows: np.ndarray, c: int, law: tuple[float, float], y: np.ndarray, pull: np.ndarray, shape: Shape) -> None:
-    """Add the pull of a spring with the elongations ``rows[c]`` u: its force on the orbit, its slope on variations."""
-    (force, slope), (first, n, columns) = law, shape
+    """Add the pull of a spring with the elongations ``rows[c]`` u by its ``law``, force and slope there.
+
+    The force acts on the orbit, the slope on its variations.
+    """
+    force, slope = law
+    first, n, columns = shape
     for j in range(columns):
         along = force if j == 0 else slope * elongation(rows, c, y, 0, j, n)
         for i in range(n):
@@ -80,6 +84,7 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
             if s != 0.0:
                 for j in range(columns):
                     pull[first + i, j] -= s * y[k, j]
+
     for c in range(side.size):
         if side[c] != 0:
             contact = system.contacts[c]
@@ -87,15 +92,18 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
             # past the exit, which is landed on anyway, the law is odd
             force, slope = elastic_force_and_slope(contact.elastic, x)
             _add(system.rows, c, (side[c] * force, slope), y, pull, shape)
+
     for s in range(system.springs.size):
-        a, b, z = system.springs[s].quadratic, system.springs[s].cubic, elongation(system.spring_rows, s, y, 0, 0, n)
-        _add(system.spring_rows, s, ((a + b * z) * z * z, (2.0 * a + 3.0 * b * z) * z), y, pull, shape)
+        z = elongation(system.spring_rows, s, y, 0, 0, n)
+        law = nonlinear_force(system.springs[s], z), nonlinear_slope(system.springs[s], z)
+        _add(system.spring_rows, s, law, y, pull, shape)
 
 
 @kernel
 def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarray) -> None:
     """Time derivative ``dy`` of the orbit, column 0, and variations of ``y`` (2n, 1 + m): displacements, velocities."""
-    n, columns = system.inverse_mass.size, y.shape[1]
+    n = system.inverse_mass.size
+    columns = y.shape[1]
     if n == 2 and columns == 5:  # the reduced model: numbers that the compiler knows
         restore(system, side, y, dy, (2, 2, 5))
     else:
@@ -107,12 +115,14 @@ def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarra
 
 
 @kernel
-def observe(step: Step, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
+def observe(step: FlowStep, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -> None:
     """Rates ``dy`` of the state ``y``, and w, w' and w'' of every contact into ``motion`` (contacts, 3)."""
     rates(step.system, step.side, y, dy)
-    n, rows = step.system.inverse_mass.size, step.system.rows
+    n = step.system.inverse_mass.size
+    rows = step.system.rows
     for c in range(motion.shape[0]):
-        motion[c, 0], motion[c, 1] = elongation(rows, c, y, 0, 0, n), elongation(rows, c, y, n, 0, n)
+        motion[c, 0] = elongation(rows, c, y, 0, 0, n)
+        motion[c, 1] = elongation(rows, c, y, n, 0, n)
         motion[c, 2] = elongation(rows, c, dy, n, 0, n)
 
 
@@ -125,33 +135,40 @@ def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
 
 
 @njit
-def begin(system: CompiledSystem, y: np.ndarray) -> Step:
+def begin(system: CompiledSystem, y: np.ndarray) -> FlowStep:
     """The record of a flow's steps, which begins at the state ``y``."""
     contacts = system.contacts.size
-    step = Step(system, np.empty(contacts, np.int64), np.empty((contacts, 3)), np.empty((contacts, 3)))
+    side = np.empty(contacts, np.int64)
+    step = FlowStep(system, side, np.empty((contacts, 3)), np.empty((contacts, 3)))
     close(system, y, step.side)
     return step
 
 
 @kernel
-def first_change(step: Step, h: float) -> Change:
+def first_change(step: FlowStep, h: float) -> Change:
     """The first change of a contact in a step of length ``h``, with the first attempt at it."""
     first = 1.0
     change = Change(-1, 0, 0.0, 0.0, False, 0.0, h, h, 0)
     for c in range(step.side.size):
         clearance = step.system.contacts[c].clearance
         for s in (-1, 1):
-            if step.side[c] == 0 or step.side[c] == s:
-                sign, offset = (float(s), clearance) if step.side[c] == 0 else (-float(s), -clearance)
-                share, outcome = first_rise(hermite(step.start[c], step.end[c], h, sign, offset))
-                if outcome != NONE and share < first:
-                    first = share
-                    change = Change(c, s, sign, offset, outcome == EXTREMUM, 0.0, h, share * h, 0)
+            if step.side[c] != 0 and step.side[c] != s:
+                continue
+            # An open contact's gap s w - D rises at an onset, a closed one's D - s w at its separation.
+            sign = float(s)
+            offset = clearance
+            if step.side[c] != 0:
+                sign = -sign
+                offset = -offset
+            position, outcome = first_rise(hermite(step.start[c], step.end[c], h, sign, offset))
+            if outcome != NONE and position < first:
+                first = position
+                change = Change(c, s, sign, offset, outcome == EXTREMUM, 0.0, h, position * h, 0)
     return change
 
 
 @kernel
-def switch(step: Step, change: Change) -> int:
+def switch(step: FlowStep, change: Change) -> int:
     """Close or open the contact of a ``change``: 1 for an onset, -1 for a separation."""
     onset = step.side[change.contact] == 0
     step.side[change.contact] = change.side if onset else 0
@@ -177,7 +194,7 @@ class Arc:
 
 
 class Flow(ABC):
-    """What every flow offers; a subclass gives its ``name`` and ``_advance``."""
+    """Arcs of the orbits of a ``system``; a subclass gives its ``name`` in case files and ``_advance``."""
 
     name: ClassVar[str]
 
@@ -187,12 +204,12 @@ class Flow(ABC):
         contacts["clearance"] = system.clearances
         contacts["elastic"] = elastic_records([pair.law for pair in system.contacts])
         self.compiled = CompiledSystem(
-            1 / np.asarray(system.masses, float),
-            np.ascontiguousarray(system.stiffness, float),
-            system.contact_rows,
-            contacts,
-            system.spring_rows,
-            np.array([(s.quadratic, s.cubic) for s in system.springs], SPRING),
+            inverse_mass=1 / np.asarray(system.masses, float),
+            stiffness=np.ascontiguousarray(system.stiffness, float),
+            rows=system.contact_rows,
+            contacts=contacts,
+            spring_rows=system.spring_rows,
+            springs=spring_laws([spring.law for spring in system.springs]),
         )
         self.omega = float(system.linear_modes()[0][-1])
 
@@ -207,9 +224,18 @@ class Flow(ABC):
         """
         y = np.hstack([np.asarray(start, float)[:, None], np.eye(len(start))])
         y, events, closed = self._advance(y, duration, period)
+
         closed_at_start = np.count_nonzero(self.system.gaps(start[: self.system.dofs]) > 0)
         episodes = closed_at_start + np.count_nonzero(events[:, 3] == 1)
-        return Arc(duration, start, y[:, 0].copy(), y[:, 1:].copy(), events, episodes, closed)
+        return Arc(
+            duration=duration,
+            start=start,
+            end=y[:, 0].copy(),
+            sensitivity=y[:, 1:].copy(),
+            events=events,
+            episodes=episodes,
+            closed=closed,
+        )
 
     @abstractmethod
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:

@@ -19,9 +19,9 @@ from vipetsc.contact.search import first_upcrossing_after_start
 NONE, CROSSING, EXTREMUM = 0, 1, 2
 # Attempts at an extremum, and of one landing in all.
 EXTREMUM_ATTEMPTS, MOST_ATTEMPTS = 40, 120
-# Of a polynomial of degree 5 in the share of a step, the lowest first.
+# Coefficients of a polynomial of degree 5 in the position in a step, from 0 to 1, the lowest first.
 Coefficients = tuple[float, float, float, float, float, float]
-# A slope at the start below this share of the curvature is the rounding of an extremum.
+# A slope at the start below this fraction of the curvature is the rounding of an extremum.
 ROUNDING = 1e-8
 
 
@@ -53,19 +53,25 @@ def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, i
     """
     contact, side, sign, offset, extremum, low, high, length, attempts = change
     gap = sign * motion[0] - offset
-    value, rate = (-sign * motion[1], -sign * motion[2]) if extremum else (gap, sign * motion[1])
+    value = gap
+    rate = sign * motion[1]
+    if extremum:  # where the slope turns negative
+        value = -sign * motion[1]
+        rate = -sign * motion[2]
     if value > 0.0:
         high = min(high, length)
     else:
         low = max(low, length)
     newton = -value / rate if rate > 0.0 else high
     attempts += 1
+
     # rounding of w' may keep Newton's method from the extremum for ever
     if abs(newton) > floor and (attempts < EXTREMUM_ATTEMPTS if extremum else high - low > floor):
         target = length + newton
         if not low < target < high:
             target = 0.5 * (low + high)
         return Change(contact, side, sign, offset, extremum, low, high, target, attempts), NONE
+
     if not extremum:
         return change, CROSSING
     if gap <= 0.0:
@@ -76,8 +82,12 @@ def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, i
 @kernel
 def hermite(a: np.ndarray, b: np.ndarray, h: float, sign: float, offset: float) -> Coefficients:
     """Coefficients of sign * w - offset on [0, 1] from (w, w', w'') at both ends of a step h."""
-    g0, r0, s0 = sign * a[0] - offset, sign * a[1] * h, sign * a[2] * h * h
-    g1, r1, s1 = sign * b[0] - offset, sign * b[1] * h, sign * b[2] * h * h
+    g0 = sign * a[0] - offset
+    r0 = sign * a[1] * h
+    s0 = sign * a[2] * h * h
+    g1 = sign * b[0] - offset
+    r1 = sign * b[1] * h
+    s1 = sign * b[2] * h * h
     d = g1 - g0 - r0 - 0.5 * s0
     e = r1 - r0 - s0
     f = s1 - s0
@@ -112,32 +122,32 @@ def _bisect(c: Coefficients, low: float, high: float, sign: float) -> float:
 
 
 @kernel
-def _extremum(c: Coefficients, share: float) -> float:
-    """The zero of the slope near ``share``, in its quarter of the step."""
-    low = 0.25 * min(np.floor(4.0 * share), 3.0)
+def _extremum(c: Coefficients, position: float) -> float:
+    """The zero of the slope near ``position``, in its quarter of the step."""
+    low = 0.25 * min(np.floor(4.0 * position), 3.0)
     sign = _slope(c, low)
     if sign * _slope(c, low + 0.25) >= 0.0:  # two of them in one quarter
-        return share
+        return position
     return _bisect(c, low, low + 0.25, sign)
 
 
 @njit
 def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
     """Where ``sign`` times the slope (5,) on [low, 1] turns positive, 2 if it does not; restricts it to [there, 1]."""
-    share = first_upcrossing_after_start(sign * slope, 0.0)
-    if share > 1.0:
-        return share
-    if share > 0.0:
-        for k in range(1, slope.size):
+    turn = first_upcrossing_after_start(sign * slope, 0.0)
+    if turn > 1.0:
+        return turn
+    if turn > 0.0:
+        for k in range(1, slope.size):  # de Casteljau: the part after the turn
             for i in range(slope.size - k):
-                slope[i] = (1.0 - share) * slope[i] + share * slope[i + 1]
+                slope[i] = (1.0 - turn) * slope[i] + turn * slope[i + 1]
         slope[0] = 0.0
-    return low + share * (1.0 - low)
+    return low + turn * (1.0 - low)
 
 
 @njit(_nrt=True)  # makes arrays, also where it is called from kernels
 def first_rise(c: Coefficients) -> tuple[float, int]:
-    """Where a gap that starts at or below zero first rises through it: share of the step, outcome."""
+    """Where a gap that starts at or below zero first rises through it: position in the step, outcome."""
     margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))  # above the interpolant's error
     b1 = c[0] + c[1] / 5.0  # Bernstein coefficients bound the gap
     b2 = c[0] + (4.0 * c[1] + c[2]) / 10.0
@@ -146,6 +156,7 @@ def first_rise(c: Coefficients) -> tuple[float, int]:
     b5 = _value(c, 1.0)
     if max(b1, b2, b3, b4, b5) <= -margin:
         return 1.0, NONE
+
     start = 0.0 if abs(c[1]) <= ROUNDING * abs(c[2]) else b1 - c[0]
     slope = np.array([start, b2 - b1, b3 - b2, b4 - b3, b5 - b4])
     high = 0.0
@@ -156,6 +167,7 @@ def first_rise(c: Coefficients) -> tuple[float, int]:
         high = _next_turn(slope, low, -1.0)
         top = _extremum(c, high) if high <= 1.0 else 1.0
         left = _extremum(c, low) if low > 0.0 else 0.0
+
         for part in range(1, 5):  # the first quarter of the step that ends above zero
             end = 0.25 * part
             if end > left:
@@ -167,6 +179,7 @@ def first_rise(c: Coefficients) -> tuple[float, int]:
                 left = end
         if high > 1.0:
             break
+
         peak = _value(c, top)
         if peak > margin:
             return _bisect(c, left, top, 0.0), CROSSING

@@ -1,5 +1,8 @@
 """Flows to compare the compiled one with: PETSc's Runge-Kutta methods, Newmark's rule, central differences.
 
+The keys ``nnm.flow``, ``nnm.compare`` and ``nnm.jacobian`` offer them to users, so that they stand here and not with
+the paper, whose comparisons they were written for.
+
 TSRK lands on contact changes as the compiled flow does, with steps taken one by one: TSEvent loses short contacts and
 error control. Newmark's rule is the paper's flow: a fixed number of steps a period, and the exact derivatives of the
 discrete flow as sensitivities (Peeters et al., Nonlinear normal modes, part II, Mech. Syst. Signal Process. 23, 2009,
@@ -18,7 +21,8 @@ from vipetsc.modes.shooting.landing import EXTREMUM, MOST_ATTEMPTS, NONE, Change
 from vipetsc.modes.system import System
 
 # Errors that TSRK allows per step, relative to the size of the orbit and of each variation.
-RTOL, RTOL_SENSITIVITY = 1e-13, 1e-10
+RTOL = 1e-13
+RTOL_SENSITIVITY = 1e-10
 # Steps a period of Newmark's rule.
 STEPS = 2000
 
@@ -36,23 +40,31 @@ class Tsrk(Flow):
         super().__init__(system)
         self._shape = 2 * system.dofs, 1 + 2 * system.dofs
         self._y = PETSc.Vec().createSeq(self._shape[0] * self._shape[1], comm=PETSc.COMM_SELF)
-        self._adaptive, self._fixed = self._solver("basic"), self._solver("none")
-        self._record: flow.Step
+        self._adaptive = self._solver("basic")
+        self._fixed = self._solver("none")
+        # The contacts that the rates are asked with, from one arc to the next.
+        self._record: flow.FlowStep
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
         step = self._record = flow.begin(self.compiled, y)
         self._set_tolerances(y[:, 0], period)
-        t, h, closed, events, dy = 0.0, 0.05 / self.omega, 0.0, [], np.empty(self._shape)
+        dy = np.empty(self._shape)
+        events: list[tuple[float, int, int, int]] = []
+        closed = 0.0
+        t = 0.0
+        h = 0.05 / self.omega
         while t < duration:
             length, state, h = self._step(self._adaptive, y, min(h, 1 / self.omega, duration - t))
             if length < flow.SMALLEST_STEP * duration and length < duration - t:
                 raise FlowError(f"TSRK's step became too small at {t:.6g} s of {duration:.6g} s")
+
             flow.observe(step, y, dy, step.start)
             flow.observe(step, state, dy, step.end)
             change = flow.first_change(step, length)
             changed = change.contact >= 0
             if changed:
                 length, state, changed = self._land(y, length, change)
+
             closed += length if np.any(step.side) else 0.0
             t = duration if duration - t - length <= 1e-16 * duration else t + length
             y = state
@@ -71,19 +83,24 @@ class Tsrk(Flow):
         ts.setMaxTime(1e300)
         ts.setMaxSteps(2**31 - 1)
         ts.setMaxStepRejections(-1)
+
         options = PETSc.Options(f"nnm_{adapt}_")
-        options["ts_adapt_type"], options["ts_adapt_wnormtype"] = adapt, "infinity"
+        options["ts_adapt_type"] = adapt
+        options["ts_adapt_wnormtype"] = "infinity"
         ts.setOptionsPrefix(f"nnm_{adapt}_")
         ts.setFromOptions()
         return ts
 
     def _set_tolerances(self, start: np.ndarray, period: float) -> None:
         """Absolute tolerances from the orbit's size; velocities count as displacements over a radian."""
-        n, omega = self.system.dofs, self.omega_ref(period)
+        n = self.system.dofs
+        omega = self.omega_ref(period)
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / omega)
         unit = np.repeat([1.0, omega], n)
-        absolute, relative = np.empty(self._shape), np.full(self._shape, RTOL_SENSITIVITY)
-        absolute[:, 0], relative[:, 0] = RTOL * size * unit, RTOL
+        relative = np.full(self._shape, RTOL_SENSITIVITY)
+        relative[:, 0] = RTOL
+        absolute = np.empty(self._shape)
+        absolute[:, 0] = RTOL * size * unit
         absolute[:, 1:] = RTOL_SENSITIVITY * unit[:, None] / unit[None, :]
         rtol, atol = (PETSc.Vec().createWithArray(a.ravel(), comm=PETSc.COMM_SELF) for a in (relative, absolute))
         self._adaptive.setTolerances(rtol=rtol, atol=atol)
@@ -103,7 +120,8 @@ class Tsrk(Flow):
 
     def _land(self, y: np.ndarray, h: float, change: Change) -> tuple[float, np.ndarray, bool]:
         """Step from ``y`` exactly onto a change found in a step of length ``h``: length, state, whether it is one."""
-        step, dy = self._record, np.empty(self._shape)
+        step = self._record
+        dy = np.empty(self._shape)
         for _ in range(MOST_ATTEMPTS):
             length = change.length
             _, state, _ = self._step(self._fixed, y, length)
@@ -117,7 +135,8 @@ class Tsrk(Flow):
 @njit
 def _forces(system: CompiledSystem, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Restoring forces (n,) in N and tangent stiffness (n, n) in N/m at displacements ``u`` (n,) in m."""
-    side, columns = np.empty(system.contacts.size, np.int64), np.hstack((u.reshape(-1, 1), np.eye(u.size)))
+    side = np.empty(system.contacts.size, np.int64)
+    columns = np.hstack((u.reshape(-1, 1), np.eye(u.size)))
     close(system, columns, side)
     pull = np.empty_like(columns)
     restore(system, side, columns, pull, (0, u.size, columns.shape[1]))
@@ -145,7 +164,8 @@ def _solve_step(system: CompiledSystem, guess: np.ndarray, a: np.ndarray, quarte
 
     Displacements as unknowns would lose digits to 4/h^2. Returns the tangent stiffness there, and whether it converged.
     """
-    scale, shift = 0.0, a
+    scale = 0.0
+    shift = a
     for _ in range(60):
         force, tangent = _forces(system, guess + quarter * a)
         shift = np.linalg.solve(_matrix(system, tangent, quarter), a + force * system.inverse_mass)
@@ -159,25 +179,31 @@ def _solve_step(system: CompiledSystem, guess: np.ndarray, a: np.ndarray, quarte
 @njit
 def _newmark(system: CompiledSystem, y: np.ndarray, h: float, path: np.ndarray) -> bool:
     """Advance ``y`` (2n, 1 + m) in place along the ``path`` (steps + 1, n) in steps of ``h``; whether it converged."""
-    steps, n = path.shape[0] - 1, path.shape[1]
+    steps = path.shape[0] - 1
+    n = path.shape[1]
     quarter = 0.25 * h * h
-    u, v = y[:n].copy(), y[n:].copy()
+    u = y[:n].copy()
+    v = y[n:].copy()
     force, tangent = _forces(system, u[:, 0].copy())
     a = _linear_accelerations(system, tangent, u)
     a[:, 0] = -force * system.inverse_mass
     path[0] = u[:, 0]
+
     for step in range(1, steps + 1):
         guess = u + h * v + quarter * a
         orbit = a[:, 0].copy()
         tangent, converged = _solve_step(system, guess[:, 0].copy(), orbit, quarter)
         if not converged:
             return False
+
         new = np.linalg.solve(_matrix(system, tangent, quarter), _linear_accelerations(system, tangent, guess))
         new[:, 0] = orbit
         u = guess + quarter * new
         v += 0.5 * h * (a + new)
-        a, path[step] = new, u[:, 0]
-    y[:n], y[n:] = u, v
+        a = new
+        path[step] = u[:, 0]
+    y[:n] = u
+    y[n:] = v
     return True
 
 
@@ -188,15 +214,18 @@ class Newmark(Flow):
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
         count = max(round(STEPS * duration / period), 1)
-        h, path = duration / count, np.empty((count + 1, self.system.dofs))
+        h = duration / count
+        path = np.empty((count + 1, self.system.dofs))
         if not _newmark(self.compiled, y, h, path):
             raise FlowError("Newmark's implicit step does not converge")
+
         side = np.sign(path @ self.system.contact_rows.T) * (self.system.gaps(path) > 0)
-        before, after = side[:-1], side[1:]
-        events = [
-            ((i + 1) * h, c, after[i, c] or before[i, c], 1 if after[i, c] else -1)
-            for i, c in zip(*np.nonzero(before != after), strict=True)
-        ]
+        before = side[:-1]
+        after = side[1:]
+        events = []
+        for i, c in zip(*np.nonzero(before != after), strict=True):
+            onset = after[i, c] != 0
+            events.append(((i + 1) * h, c, after[i, c] if onset else before[i, c], 1 if onset else -1))
         closed = float(np.any(after != 0, axis=1).sum() * duration / count)
         return y, np.array(events).reshape(-1, 4), closed
 
@@ -209,10 +238,13 @@ class FiniteDifferences(Flow):
 
     def __init__(self, flow: Flow, step: float = 1e-6) -> None:
         super().__init__(flow.system)
-        self.flow, self.step = flow, step
+        self.flow = flow
+        self.step = step
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
-        n, rate, start = self.system.dofs, 2 * np.pi / period, y[:, 0]
+        n = self.system.dofs
+        rate = 2 * np.pi / period
+        start = y[:, 0]
         size = max(np.abs(start[:n]).max(), np.abs(start[n:]).max() / rate)
         columns = []
         for move in np.diag(self.step * size * np.repeat([1.0, rate], n)):

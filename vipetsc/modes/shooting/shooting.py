@@ -1,194 +1,190 @@
-"""Shooting: a periodic orbit as a boundary value problem over a part of its period, solved by PETSc's SNES.
+"""Periodic orbits as solutions of boundary value problems over a part of their period, by PETSc's SNES.
 
-Newton's method works in the unknowns xi (n + 1,) of a chart, in place of initial values x (n,) and the period. A chart
-is made around a point of the branch; xi is of order one there, so that arclength is dimensionless. Each encodes
-(x, period) as xi, decodes it, and gives d(x, period)/d xi (n + 1, n + 1).
+Newton's method works in the unknowns xi (n + 1,) of a chart (``charts``), in place of initial values x (n,) and the
+period. ``Shooting`` has the matrix of the flow's sensitivities; a lattice without one shares ``ShootingEquations``.
 """
 
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from vipetsc.modes.newton import Attempt, BorderedNewton
-from vipetsc.modes.problem import FlowError
+from vipetsc.modes.newton import DenseNewton
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Frame, SpecialKind, unit
+from vipetsc.modes.shooting.charts import CHARTS, Chart, DenseChart, Relative, near_grazing
 from vipetsc.modes.shooting.flow import Arc, Flow
+from vipetsc.modes.shooting.graze import Touch, graze
+from vipetsc.modes.shooting.maps import ShootingMap
+from vipetsc.modes.shooting.orbit import resonance
+from vipetsc.modes.shooting.stability import half_traces, multipliers
 from vipetsc.modes.system import System
 
-
-class Relative:
-    """Initial values over the largest one, period over its value; gaps over their clearance.
-
-    Where an arc starts at rest, the resonator's displacement gives way to w = u_resonator - u_host over
-    max(|w|, D), or else a large common motion would hide the changes of w that make and break contacts.
-    """
-
-    def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
-        self.size, self.period = float(np.abs(x).max()), period
-        self.weights = np.eye(len(x)) / self.size
-        for row, pair in zip(system.contact_rows, system.contacts, strict=True):
-            if rest:
-                scale = min(max(abs(row @ x), pair.clearance), self.size)
-                self.weights[pair.resonator] = row / scale
-        self.inverse = np.linalg.inv(self.weights)
-        self._derivative = block_diag(self.inverse, period)
-
-    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
-        return np.append(self.weights @ x, period / self.period)
-
-    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
-        return self.inverse @ xi[:-1], float(xi[-1] * self.period)
-
-    def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi."""
-        return self._derivative
+# Half-traces of one system cross +-1 tangentially along narrow tongues, to rounding: crossings below are not told.
+LEAST_CROSSING = 1e-6
+# Singular values of the Jacobian below this fraction of the largest leave the tangent open.
+DEGENERATE = 1e-12
 
 
-class Logarithmic:
-    """Logarithms of the largest initial value and of the period; the other values over the largest one."""
-
-    def __init__(self, system: System, x: np.ndarray, period: float) -> None:
-        self.size, self.period = float(np.abs(x).max()), period
-        self.lead = int(np.abs(x).argmax())
-        self.sign = float(np.sign(x[self.lead]))
-
-    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
-        xi = np.append(x / x[self.lead], np.log(period / self.period))
-        xi[self.lead] = np.log(x[self.lead] / (self.sign * self.size))
-        return xi
-
-    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
-        lead = self.sign * self.size * np.exp(xi[self.lead])
-        x = xi[:-1] * lead
-        x[self.lead] = lead
-        return x, float(self.period * np.exp(xi[-1]))
-
-    def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi."""
-        x, period = self.decode(xi)
-        d = np.diag(np.append(np.full(len(x), x[self.lead]), period))
-        d[:-1, self.lead] = x
-        return d
-
-
-class Grazing:
-    """Relative, with y in place of the displacement of the contact nearest to its clearance: (|w| - D)/D = y |y|.
-
-    An orbit that starts on its largest |w| depends on w - D through a square root (bilinear contact), so that
-    this unknown makes the branch smooth through grazing.
-    """
-
-    def __init__(self, system: System, x: np.ndarray, period: float) -> None:
-        self.size, self.period = float(np.abs(x).max()), period
-        nearest = int(np.abs(np.abs(system.contact_rows @ x) / system.clearances - 1).argmin())
-        self.row, self.clearance = system.contact_rows[nearest], system.clearances[nearest]
-        self.index, self.sign = system.contacts[nearest].resonator, float(np.sign(self.row @ x))
-
-    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
-        xi = np.append(x / self.size, period / self.period)
-        q = self.sign * (self.row @ x) / self.clearance - 1
-        xi[self.index] = np.sign(q) * np.sqrt(np.abs(q))
-        return xi
-
-    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
-        x, y = xi[:-1] * self.size, xi[self.index]
-        x[self.index] = 0.0
-        x[self.index] = self.sign * self.clearance * (1 + y * abs(y)) - self.row @ x
-        return x, float(xi[-1] * self.period)
-
-    def derivative(self, xi: np.ndarray) -> np.ndarray:
-        """d(x, period)/d xi."""
-        d = np.diag(np.append(np.full(len(xi) - 1, self.size), self.period))
-        d[self.index, :-1] = -self.row * self.size
-        d[self.index, self.index] = self.sign * self.clearance * 2 * max(abs(xi[self.index]), 1e-9)
-        return d
-
-
-Chart = Relative | Logarithmic | Grazing
-CHARTS: dict[str, type[Chart]] = {"relative": Relative, "logarithmic": Logarithmic, "grazing": Grazing}
-
-
-@dataclass(frozen=True)
-class ShootingMap:
-    """Where an arc starts and ends, and what fraction of the period it takes.
-
-    ``rest`` is v = 0, ``centre`` is u = 0. An odd system's symmetric orbit goes from rest to the centre in a
-    quarter period; any reversible one from rest to rest in a half.
-    """
-
-    name: str
-    start: str
-    end: str
-    fraction: float
+class AnyArc(Protocol):
+    """What every flow's arc tells of the orbit."""
 
     @property
-    def quarter(self) -> bool:
-        """Whether it goes from one section to the other; the orbit is then odd about its end."""
-        return self.start != self.end
+    def duration(self) -> float:
+        """Its length in s."""
+
+    @property
+    def episodes(self) -> int:
+        """Contact episodes in it."""
+
+    @property
+    def closed(self) -> float:
+        """Time in s with a contact closed."""
 
 
-MAPS = {
-    "quarter": ShootingMap("quarter", "rest", "centre", 0.25),
-    "half": ShootingMap("half", "rest", "rest", 0.5),
-    "whole": ShootingMap("whole", "rest", "rest", 1.0),
-    "half-centre": ShootingMap("half-centre", "centre", "centre", 0.5),
-}
+A = TypeVar("A", bound=AnyArc)
 
 
-class Shooting:
-    """Periodic orbits of ``flow.system``: initial values x (n,) and period, by Newton's method (PETSc SNES).
+class ShootingFrame(Generic[A]):
+    """The shooting equations in the unknowns of a ``chart`` around one orbit.
 
-    x are displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre.
-    Raises ValueError if the map needs an odd system and the system is not. Newton's method solves the n equations and
-    one more linear row in the unknowns of a chart; it ends at a scaled residual of ``tolerance``, after a step below
-    ``STEP_TOLERANCE``, where rounding allows no more, or after ``max_newton`` steps.
+    ``tangent`` (n + 1,) is d(x, period) along the branch, where it is known.
     """
 
-    dense = True  # sensitivities are a matrix
+    tangent: np.ndarray
 
-    def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
-        if "centre" in (shooting_map.start, shooting_map.end) and not flow.system.odd:
+    def __init__(
+        self, problem: "ShootingEquations[A]", chart: Chart, x: np.ndarray, period: float, tangent: np.ndarray
+    ) -> None:
+        self.problem = problem
+        self.chart = chart
+        self.xi = chart.encode(x, period)
+        if tangent.size:
+            self.tangent = unit(chart.to_unknowns(self.xi, tangent))
+
+    def encode(self, point: Point) -> np.ndarray:
+        """The unknowns of another orbit."""
+        return self.chart.encode(point.x, point.period)
+
+    def direction(self, point: Point) -> np.ndarray:
+        """The branch's direction at another orbit, of any length."""
+        return self.chart.to_unknowns(self.encode(point), point.tangent)
+
+    def arc(self, xi: np.ndarray) -> A:
+        """The arc from the unknowns ``xi``; raises FlowError where there is none."""
+        if not np.all(np.isfinite(xi)) or self.chart.decode(xi)[1] <= 0:
+            raise FlowError("Newton left the domain: the period is not positive")
+        return self.problem.arc(*self.chart.decode(xi))
+
+    def residual(self, xi: np.ndarray) -> np.ndarray:
+        """What should vanish at the arc's end (n,), over the chart's unit."""
+        return self.problem.residual(self.arc(xi)) / self.chart.size
+
+    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
+        """Newton's method from ``guess`` for the orbit at an ``arclength`` along the tangent."""
+        return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
+
+    @abstractmethod
+    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
+
+    @abstractmethod
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent at a solution, on the side of the frame's own."""
+
+    def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
+        """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent if known."""
+        problem, chart = self.problem, self.chart
+        x, period = chart.decode(attempt.xi)
+        arc = problem.arc(x, period)
+        traces, largest = problem.stability(arc)
+
+        tangent = np.empty(0)
+        energy_tangent = slope = np.nan
+        if direction is not None:
+            tangent = chart.to_changes(attempt.xi, direction)
+            energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
+            slope = float(-tangent[-1] / period**2 / energy_tangent) if energy_tangent else np.inf
+
+        return Point(
+            x=x,
+            period=period,
+            energy=problem.energy(x),
+            residual=float(np.abs(problem.residual(arc)).max()) / float(np.abs(x).max()),
+            half_traces=traces,
+            multiplier=largest,
+            episodes=arc.episodes,
+            closed=arc.closed / arc.duration,
+            newton=len(attempt.history) - 1,
+            tangent=tangent,
+            slope=slope,
+            energy_tangent=energy_tangent,
+        )
+
+
+class ShootingEquations(ABC, Generic[A]):
+    """Periodic orbits of a ``system``: initial values x (n,) and period whose arc, a ``shooting_map``, closes.
+
+    x are displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre.
+    Raises ValueError if the map needs an odd system and the system is not.
+    """
+
+    has_half_traces: bool
+    guards: frozenset[str]
+
+    def __init__(self, system: System, shooting_map: ShootingMap, tolerance: float) -> None:
+        if "centre" in (shooting_map.start, shooting_map.end) and not system.odd:
             raise ValueError(
                 f"the {shooting_map.name} map needs forces that change sign with the displacement; "
                 "this system's do not: use map = 'half'"
             )
-        self.flow, self.system, self.map, self.tolerance = flow, flow.system, shooting_map, tolerance
-        n, size = self.system.dofs, self.system.dofs + 1
+        self.system = system
+        self.map = shooting_map
+        self.tolerance = tolerance
+        n = system.dofs
+        displacements, velocities = slice(0, n), slice(n, 2 * n)
         # the half of the state that is free at the arc's start, and the half that should vanish at its end
-        self.free = slice(0, n) if shooting_map.start == "rest" else slice(n, 2 * n)
-        self._zero = slice(n, 2 * n) if shooting_map.end == "rest" else slice(0, n)
-        self._newton = self._create_newton(size, max_newton)
-        self._chart: Chart
-        self._last: tuple[np.ndarray, Arc] | None = None
+        self.free = displacements if shooting_map.start == "rest" else velocities
+        self.zero = velocities if shooting_map.end == "rest" else displacements
+        self._latest: tuple[np.ndarray, float, A] | None = None
 
-    def _create_newton(self, size: int, max_newton: int) -> BorderedNewton:
-        return BorderedNewton(self._function, self.matrix, size, self.tolerance, max_newton)
+    def start(self, x: np.ndarray) -> np.ndarray:
+        """The state (2n,) at the start of the arc from initial values ``x``."""
+        state = np.zeros(2 * self.system.dofs)
+        state[self.free] = x
+        return state
 
-    def chart(self, name: str, x: np.ndarray, period: float, **options: bool) -> Chart:
-        """The chart of that name at ``x``; ``options`` are the chart's."""
-        return CHARTS[name](self.system, x, period, **options)
+    def arc(self, x: np.ndarray, period: float) -> A:
+        """The arc from initial values ``x``; raises FlowError where the flow fails. The latest one is kept."""
+        if self._latest is None or self._latest[1] != period or not np.array_equal(self._latest[0], x):
+            self._latest = x.copy(), period, self._integrate(self.start(x), period)
+        return self._latest[2]
 
-    def arc(self, x: np.ndarray, period: float) -> Arc:
-        """The arc from initial values ``x``; raises FlowError where the flow fails."""
-        start = np.zeros(2 * self.system.dofs)
-        start[self.free] = x
-        return self.flow.arc(start, self.map.fraction * period, period)
+    @abstractmethod
+    def _integrate(self, start: np.ndarray, period: float) -> A:
+        """The arc from a state ``start`` (2n,) over the map's fraction of the ``period``."""
 
-    def residual(self, arc: Arc) -> np.ndarray:
+    @abstractmethod
+    def end(self, arc: A) -> np.ndarray:
+        """The state (2n,) at an arc's end."""
+
+    @abstractmethod
+    def stability(self, arc: A) -> tuple[np.ndarray, float]:
+        """Half-traces of an orbit and the largest modulus of its multipliers, as far as they are known."""
+
+    def residual(self, arc: A) -> np.ndarray:
         """What should vanish at the arc's end (n,): displacements in m or velocities in m/s."""
-        return arc.end[self._zero]
+        return self.end(arc)[self.zero]
 
-    def jacobian(self, arc: Arc) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
-        n, masses = self.system.dofs, self.system.masses
-        rate = arc.end[n:] if self.map.end == "centre" else -self.system.forces(arc.end[:n]) / masses
-        return np.column_stack([arc.sensitivity[self._zero, self.free], self.map.fraction * rate])
+    def end_rate(self, arc: A) -> np.ndarray:
+        """Time derivative (n,) of what should vanish at the arc's end."""
+        n = self.system.dofs
+        end = self.end(arc)
+        if self.map.end == "centre":
+            return end[n:]
+        return -self.system.forces(end[:n]) / self.system.masses
 
     def energy(self, x: np.ndarray) -> float:
         """Energy in J of the orbit with initial values ``x``."""
@@ -199,33 +195,192 @@ class Shooting:
         """dE/dx (n,) in J over the unit of ``x``."""
         return self.system.forces(x) if self.map.start == "rest" else self.system.masses * x
 
-    def solve(self, chart: Chart, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Solve shooting(xi) = 0 and row . xi = value, starting from ``guess`` (n + 1,)."""
-        self._chart, self._last, self._newton.tolerance = chart, None, self.tolerance
-        attempt = self._newton.solve(guess, row, value)
-        return attempt if attempt.left_domain else replace(attempt, arc=self._arc(attempt.xi))
+    @abstractmethod
+    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> ShootingFrame[A]:
+        """The unknowns around any initial values and period; ``tangent`` may be empty."""
 
-    def matrix(self, xi: np.ndarray) -> np.ndarray:
-        """The scaled Jacobian (n, n + 1) of the shooting equations at ``xi``, in the chart of the last attempt."""
-        return self.jacobian(self._arc(xi)) @ self._chart.derivative(xi) / self._chart.size
+    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[A]:
+        """The unknowns around an orbit; the chart ``auto`` is grazing if it starts near a touch, else relative."""
+        if chart == "auto":
+            at_rest = self.map.start == "rest"
+            chart = "grazing" if at_rest and near_grazing(self.system, point.x) else "relative"
+        return self.frame_at(chart, point.x, point.period, point.tangent)
 
-    def tangent(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Unit tangent (n + 1,) in the chart of the last attempt, at its ``xi``, turned towards ``reference``."""
-        direction = np.linalg.svd(self.matrix(xi))[2][-1]  # the null vector
+    @abstractmethod
+    def null_vector(self, start: Point) -> np.ndarray:
+        """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
+
+    def first_tangent(self, start: Point, direction: int) -> np.ndarray:
+        """Tangent d(x, period) at a corrected orbit, towards growing (+1) or falling (-1) energy.
+
+        Raises ContinuationError at a branch point, where the tangent is not unique.
+        """
+        tangent = self.null_vector(start)
+        energy_tangent = self.energy_gradient(start.x) @ tangent[:-1]
+        return tangent * (np.sign(energy_tangent) * direction or direction)
+
+    def turn(self, before: Point, after: Point) -> float:
+        """Angle in rad between the tangents of two orbits in relative units at the first; 0 without a tangent."""
+        if not (before.tangent.size and after.tangent.size):
+            return 0.0
+        chart = self.relative_chart(before.x, before.period)
+        tangents = np.column_stack([before.tangent, after.tangent])
+        first, second = chart.to_unknowns(chart.encode(before.x, before.period), tangents).T
+        return float(np.arccos(min(unit(first) @ unit(second), 1.0)))
+
+    @abstractmethod
+    def relative_chart(self, x: np.ndarray, period: float) -> Chart:
+        """The chart ``relative``, with the gaps of contacts only where they are at the start of the map."""
+
+    def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
+        """Folds of the energy and of the frequency."""
+        # A linear branch has folds of rounding only, as where one of the orbits has no contact.
+        if self.system.springs or (left.episodes and right.episodes):
+            yield SpecialKind("fold-energy", lambda p: p.energy_tangent, finish=self.with_resonance)
+            yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
+
+    def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
+        """A fold of the energy with the resonance whose tongue it begins or ends, where that can be told."""
+        return fold
+
+
+class DenseFrame(ShootingFrame[Arc]):
+    """Shooting equations with the matrix of their derivative."""
+
+    problem: "Shooting"
+    chart: DenseChart
+
+    def jacobian(self, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual."""
+        return self.jacobian_of(self.arc(xi), xi)
+
+    def jacobian_of(self, arc: Arc, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
+        return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.chart.size
+
+    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
+        return self.problem.newton.solve(self, guess, row, value, self.problem.tolerance)
+
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent at a solution, on the side of the frame's own."""
+        return self.tangent_towards(xi, self.tangent)
+
+    def tangent_towards(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        """The unit tangent at a solution, on the side of ``reference``."""
+        direction = np.linalg.svd(self.jacobian(xi))[2][-1]  # the null vector
         return -direction if direction @ reference < 0 else direction
 
-    def null_vector(self, chart: Chart, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Singular values (n,) of the Jacobian in a ``chart``, largest first, and its unit null vector (n + 1,)."""
+
+class Shooting(ShootingEquations[Arc]):
+    """Periodic orbits of a ``flow``'s system: initial values x (n,) and period, by Newton's method (PETSc SNES).
+
+    Newton's method solves the n equations and one more linear row in the unknowns of a chart; it ends at a scaled
+    residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where rounding allows no more, or after
+    ``max_newton`` steps. Raises ValueError if the map needs an odd system and the system is not.
+    """
+
+    has_half_traces = True
+    guards = frozenset({"half_trace", "turn_relative"})
+
+    def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
+        super().__init__(flow.system, shooting_map, tolerance)
+        self.flow = flow
+        self.newton = DenseNewton(flow.system.dofs + 1, max_newton)
+
+    def _integrate(self, start: np.ndarray, period: float) -> Arc:
+        return self.flow.arc(start, self.map.fraction * period, period)
+
+    def end(self, arc: Arc) -> np.ndarray:
+        """The state (2n,) at an arc's end."""
+        return arc.end
+
+    def stability(self, arc: Arc) -> tuple[np.ndarray, float]:
+        """Half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""
+        traces = half_traces(self.system, self.map, arc)
+        return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
+
+    def jacobian(self, arc: Arc) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
+        sensitivity = arc.sensitivity[self.zero, self.free]
+        return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
+
+    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
+        """The unknowns of the ``chart`` of that name around any initial values and period."""
+        return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, _or_empty(tangent))
+
+    def relative_frame(self, x: np.ndarray, period: float) -> DenseFrame:
+        """The unknowns of ``relative_chart``."""
+        return DenseFrame(self, self.relative_chart(x, period), x, period, np.empty(0))
+
+    def relative_chart(self, x: np.ndarray, period: float) -> Relative:
+        """The chart ``relative``, with the gaps of contacts only where the map starts at rest."""
+        return Relative(self.system, x, period, rest=self.map.start == "rest")
+
+    def null_vector(self, start: Point) -> np.ndarray:
+        """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
+        chart = CHARTS["relative"](self.system, start.x, start.period)
+        xi = chart.encode(start.x, start.period)
         matrix = self.jacobian(self.arc(*chart.decode(xi))) @ chart.derivative(xi)
         values, directions = np.linalg.svd(matrix)[1:]
-        return values, directions[-1]
+        if values[-1] < DEGENERATE * values[0]:
+            raise ContinuationError(
+                f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values "
+                f"{values}; start elsewhere (nnm.start_energy) or switch branches there"
+            )
+        return chart.derivative(xi) @ directions[-1]
 
-    def _arc(self, xi: np.ndarray) -> Arc:
-        if self._last is None or not np.array_equal(self._last[0], xi):
-            self._last = xi.copy(), self.arc(*self._chart.decode(xi))
-        return self._last[1]
+    def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
+        """Folds, what the half-traces tell, and a contact that just touches.
 
-    def _function(self, xi: np.ndarray) -> np.ndarray:
-        if not np.all(np.isfinite(xi)) or self._chart.decode(xi)[1] <= 0:
-            raise FlowError("Newton left the domain: the period is not positive")
-        return self.residual(self._arc(xi)) / self._chart.size
+        A half-trace of 1 is a branch point (or a fold) that keeps the map's symmetry; -1 breaks it (quarter period) or
+        doubles the period (the others); 0 doubles the period of quarter-period orbits.
+        """
+        yield from super().special_kinds(left, right)
+        if not (self.system.springs or left.episodes or right.episodes):
+            return
+        levels = {1.0: "branch-point", -1.0: "period-doubling"}
+        if self.map.quarter:
+            levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
+        for level, name in levels.items():
+            for i in range(self.system.dofs - 1):
+                yield SpecialKind(name, HalfTraceAbove(i, level), LEAST_CROSSING)
+        if left.episodes != right.episodes:
+            yield SpecialKind(
+                "grazing",
+                lambda p: 1.0 if p.episodes == right.episodes else -1.0,
+                seek=self.seek_touch,
+                finish=without_touch,
+            )
+
+    def seek_touch(self, frame: Frame[Point], guess: np.ndarray, left: Point, right: Point) -> np.ndarray:
+        """Unknowns of the orbit near ``guess`` at which a contact grazes that only one of two orbits has."""
+        assert isinstance(frame, DenseFrame)
+        touching = max(left, right, key=lambda p: p.episodes)
+        touch = Touch.nearest(self.arc(touching.x, touching.period), self.map)
+        return graze(self, frame.chart, guess, touch)
+
+    def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
+        """A fold of the energy with the resonance whose tongue it begins or ends."""
+        return replace(fold, resonance=resonance(self, fold))
+
+
+class HalfTraceAbove:
+    """How far half-trace ``number`` (from 0) of a point is above a ``level``."""
+
+    def __init__(self, number: int, level: float) -> None:
+        self.number = number
+        self.level = level
+
+    def __call__(self, point: Point) -> float:
+        """The difference at a point."""
+        return float(np.real(point.half_traces[self.number])) - self.level
+
+
+def without_touch(grazing: Point, left: Point, right: Point) -> Point:
+    """A grazing orbit with the episodes of the neighbour that has fewer: what just touches is not counted."""
+    return replace(grazing, episodes=min(left.episodes, right.episodes))
+
+
+def _or_empty(tangent: np.ndarray | None) -> np.ndarray:
+    return np.empty(0) if tangent is None else tangent

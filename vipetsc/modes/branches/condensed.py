@@ -1,0 +1,198 @@
+"""Branches of conservative motions by harmonic balance, and the states of the lattice that belong to them."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+
+from vipetsc.case import NnmCase
+from vipetsc.case.nnm import NnmTable
+from vipetsc.case.resolve import build_chain
+from vipetsc.io.branch_kinds import CONDENSED
+from vipetsc.io.netcdf import Variables
+from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, pass_bands
+from vipetsc.lattice.moments import SeriesCompliance
+from vipetsc.modes.balance.conservative import ConservativeMotions
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.hill import Hill
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
+from vipetsc.modes.branches.stored_states import stored_states
+from vipetsc.modes.continuation.arclength import StepRule
+from vipetsc.modes.lattice.floquet import with_multipliers
+from vipetsc.modes.lattice.lattice_flow import LatticeFlow
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import Problem
+from vipetsc.modes.system import System
+
+# A field is left out below this fraction of its largest value.
+NEGLIGIBLE = 1e-16
+# A harmonic is followed so many cells from a site, at first and at last.
+FIRST_REACH = 8
+LAST_REACH = 2048
+
+
+class Condensed(NamedTuple):
+    """A case condensed onto contacts and springs: its motions, and the lattice or else the system that they are of."""
+
+    motions: ConservativeMotions
+    chain: Chain | None
+    system: System | None
+
+    @classmethod
+    def from_case(cls, case: NnmCase) -> "Condensed":
+        """The lattice of a case between its sites, or its system between its contacts and springs."""
+        options = case.nnm
+        if options.system == "condensed":
+            chain = build_chain(case.lattice, case.contacts)
+            forces = SiteForces([(case.contact(), clearance) for clearance in chain.clearances])
+            compliance = SeriesCompliance(WaveCompliance(chain))
+            return cls(ConservativeMotions(compliance, forces, options), chain, None)
+        system = System.from_case(case)
+        return cls(condensed_system(system, options), None, system)
+
+
+def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
+    """The motions of a ``system`` condensed onto its contacts and springs."""
+    rows = np.vstack([system.contact_rows, system.spring_rows])
+    contacts = [(pair.law, pair.clearance) for pair in system.contacts]
+    forces = SiteForces(contacts, [spring.law for spring in system.springs])
+    return ConservativeMotions(DenseCompliance(system.masses, system.stiffness, rows), forces, options)
+
+
+class CondensedMethod(NnmMethod):
+    """Branches of ``ConservativeMotions``."""
+
+    kind = CONDENSED
+    # Their states may begin runs, so that those of a branch that stopped are wanted too.
+    finishes_failed = True
+
+    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
+        super().__init__(case, comm)
+        self.motions, self.chain, self.system = Condensed.from_case(case)
+
+    def new_branch(self, name: str) -> Branch[Point]:
+        """A branch without points."""
+        return Branch(name, self.case.to_toml(), self.motions.forces.pairs, self.kind)
+
+    def name(self, job: int) -> str:
+        """The name of the branch of a mode, or of a start frequency."""
+        if self.system is None or self.options.start_frequency:
+            return f"breather-{self.options.start_frequency[job]:g}"
+        return self.system.branch_name(job)
+
+    def problem(self, job: int) -> ConservativeMotions:
+        """The equations of the case."""
+        return self.motions
+
+    def start(self, problem: Problem[Point], job: int) -> Point:
+        """The motion of a linear mode at a small energy, or of a start frequency with contact at the start sites."""
+        if self.system is not None and not self.options.start_frequency:
+            system = self.system
+            omega, shapes = system.linear_modes()
+            amplitude = np.sqrt(2 * start_energy(self.options, system, job)) / omega[job]
+            rows = np.vstack([system.contact_rows, system.spring_rows])
+            return self.motions.from_mode(rows @ shapes[:, job] * amplitude, float(omega[job]))
+        signs = np.zeros(self.motions.forces.pairs)
+        numbers = self.options.start_sites or [1]
+        signs[np.abs(numbers) - 1] = np.sign(numbers)
+        return self.motions.from_gap(self.options.start_frequency[job], signs)
+
+    def rule(self, problem: Problem[Point], start: Point, done: int) -> StepRule[Point]:
+        """Guarded steps; a branch that begins in a gap ends where it leaves it."""
+        options = self.options
+        if self.chain is not None:
+            omega = 2 * np.pi / start.period
+            bands = pass_bands(self.chain.cell)
+            low = max((band.high for band in bands if band.high < omega), default=0.0) / (2 * np.pi)
+            high = min((band.low for band in bands if band.low > omega), default=np.inf) / (2 * np.pi)
+            bounds = [max(low, options.frequency[0]), min(high, options.frequency[1])]
+            options = options.model_copy(update={"frequency": bounds})
+        return guarded_steps(problem, options, done)
+
+    def assess(self, problem: Problem[Point], point: Point) -> Point:
+        """The point with its largest multiplier by Hill's method, and with those of Floquet if they are asked for."""
+        motions = self.motions
+        omega = 2 * np.pi / point.period
+        hill = Hill(motions.compliance, omega, point.order, motions.forces.odd, finite=True)
+        fastest = hill.fastest(motions.balance(point.order).series(point.x, omega))
+        largest = np.nan if fastest is None else float(np.exp(2 * np.pi * fastest.real))
+        if self.options.multipliers and self.chain is not None:
+            point = self._with_multipliers(point, self.chain)
+        return replace(point, multiplier=largest)
+
+    def _with_multipliers(self, point: Point, chain: Chain) -> Point:
+        """The point with its largest Floquet multipliers, from the lattice's state at phase 0."""
+        cells = state_of(self.motions, point)
+        still = np.zeros(chain.cell.dofs)
+        u = np.array([cells.get(cell, still) for cell in range(chain.cells)]).ravel()
+        law = self.case.contact()
+        system = System.from_chain(chain, law, dense=False)
+        flow = LatticeFlow(chain, law, self.comm)
+        return with_multipliers(flow, system, self.motions.forces.odd, point, u, self.options.multipliers)
+
+    def finish(self, problem: Problem[Point], branch: Branch[Point]) -> None:
+        """Add the states at phase 0 of the first and the last point, and of those asked for."""
+        points = [branch.points[0], *self.asked(problem, branch), branch.regular()[-1]]
+        branch.extra = states(self.motions, points)
+
+
+def states(motions: ConservativeMotions, points: list[Point]) -> Variables:
+    """Displacements at phase 0, where all is at rest, of the cells in which they are not negligible."""
+    fields = [state_of(motions, point) for point in points]
+    cells = sorted(set().union(*fields))
+    u = np.array([[field.get(cell, 0 * next(iter(field.values()))) for cell in cells] for field in fields])
+    return stored_states(points, cells, u)
+
+
+def state_of(motions: ConservativeMotions, point: Point) -> dict[int, np.ndarray]:
+    """Displacement (dofs,) in m at phase 0 of every cell (from 0) in which it is not negligible."""
+    omega = 2 * np.pi / point.period
+    if isinstance(motions.compliance, DenseCompliance):
+        return {0: _system_state(motions, motions.compliance, point)}
+    assert isinstance(motions.compliance, SeriesCompliance)
+    balance = motions.balance(point.order)
+    forces = balance.series(point.x, omega).forces.real
+    total: dict[int, np.ndarray] = {}
+    for k in balance.orders:
+        for cell, u in _field(motions.compliance.compliance, k * omega, forces[:, k]).items():
+            total[cell] = total.get(cell, 0.0) + u
+    largest = max(np.abs(u).max() for u in total.values())
+    return {cell: u for cell, u in total.items() if np.abs(u).max() > NEGLIGIBLE * largest}
+
+
+def _system_state(motions: ConservativeMotions, compliance: DenseCompliance, point: Point) -> np.ndarray:
+    """Displacement (dofs,) in m at phase 0 of a system, by its linear modes with the added springs."""
+    omega = 2 * np.pi / point.period
+    balance = motions.balance(point.order)
+    shift = balance.shift(omega)
+    force = balance.shifted_force(point.x, omega, shift)
+    parts = compliance.parts
+    gaps = compliance.squared - (balance.orders * omega)[:, None] ** 2
+    dynamic = np.eye(len(gaps[0])) * gaps[:, None] + shift * (parts.T @ parts)
+    modal = np.linalg.solve(dynamic, parts.T @ force.real)
+    return np.asarray(-np.sum(compliance.vectors @ modal, axis=0)[:, 0])
+
+
+def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict[int, np.ndarray]:
+    """Displacement of the cells near the sites that ``forces`` (pairs,) move, as far as it is not negligible."""
+    chain = compliance.chain
+    reach = FIRST_REACH
+    while True:
+        near = _cells_near(chain, reach)
+        u = compliance.field(omega, forces, near).real
+        size = np.abs(u).max(axis=1)
+        rim = np.min(np.abs(np.subtract.outer(near, chain.sites)), axis=1) == reach
+        if reach >= LAST_REACH or not rim.any() or size[rim].max() <= NEGLIGIBLE * size.max():
+            return dict(zip(near.tolist(), u, strict=True))
+        reach *= 2
+
+
+def _cells_near(chain: Chain, reach: int) -> np.ndarray:
+    """Numbers of the cells within ``reach`` cells of a site."""
+    near = np.unique(np.add.outer(chain.sites, np.arange(-reach, reach + 1)))
+    if chain.ends == "periodic":
+        return np.unique(near % chain.cells)
+    return near[(near >= 0) & (near < chain.cells)]

@@ -1,0 +1,69 @@
+"""Branches of orbits of whole lattices, all ranks together, judged by their largest multipliers."""
+
+from mpi4py import MPI
+
+import numpy as np
+
+from vipetsc.case import NnmCase
+from vipetsc.case.resolve import build_chain
+from vipetsc.io.branch_kinds import ORBITS
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.orbits import NnmMethod, start_energy
+from vipetsc.modes.branches.stored_states import stored_states
+from vipetsc.modes.lattice.floquet import with_multipliers
+from vipetsc.modes.lattice.krylov import LatticeShooting
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import ContinuationError, FlowError, Problem, StartError
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import System
+
+
+class LatticeMethod(NnmMethod):
+    """Branches of a lattice by ``LatticeShooting``."""
+
+    kind = ORBITS
+    shared = True
+    # What all ranks meet together; anything else may be one rank's alone, and ends the program on all.
+    failures = ContinuationError, FlowError, StartError
+
+    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
+        super().__init__(case, comm)
+        options = case.nnm
+        chain = build_chain(case.lattice, case.contacts)
+        self.system = System.from_chain(chain, case.contact(), dense=False)
+        shooting_map = MAPS["quarter" if options.map == "auto" else options.map]
+        self.lattice = LatticeShooting(self.system, chain, shooting_map, comm, options.tolerance, options.max_newton)
+
+    def new_branch(self, name: str) -> Branch[Point]:
+        """A branch without points."""
+        return Branch(name, self.case.to_toml(), self.system.dofs, self.kind)
+
+    def name(self, job: int) -> str:
+        """The name of the branch of a mode, or of a start frequency."""
+        frequencies = self.options.start_frequency
+        return f"breather-{frequencies[job]:g}" if frequencies else self.system.branch_name(job)
+
+    def problem(self, job: int) -> LatticeShooting:
+        """The shooting equations of the lattice."""
+        return self.lattice
+
+    def start(self, problem: Problem[Point], job: int) -> Point:
+        """The orbit of a linear mode at a small energy, or a breather of a start frequency."""
+        if self.options.start_frequency:
+            return self.lattice.breather(self.options.start_frequency[job])
+        return linear_start(self.lattice, job, start_energy(self.options, self.system, job))
+
+    def assess(self, problem: Problem[Point], point: Point) -> Point:
+        """The point with its largest multipliers, if they are asked for."""
+        wanted = self.options.multipliers
+        if not wanted:
+            return point
+        return with_multipliers(self.lattice.flow, self.system, self.lattice.map.quarter, point, point.x, wanted)
+
+    def finish(self, problem: Problem[Point], branch: Branch[Point]) -> None:
+        """Add the states at phase 0 of the first and the last point."""
+        points = [branch.points[0], branch.regular()[-1]]
+        cells = self.lattice.flow.chain.cells
+        u = np.array([p.x.reshape(cells, -1) for p in points])
+        branch.extra = stored_states(points, range(cells), u)

@@ -1,0 +1,95 @@
+"""What differs between kinds of branches of a case: problems, starts, and what is added to points and files."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, Generic, NamedTuple
+
+from mpi4py import MPI
+
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.continuation.arclength import StepRule
+from vipetsc.modes.problem import ContinuationError, FlowError, Problem, S
+
+Monitor = Callable[[S], str | None]
+
+
+class Crossing(NamedTuple):
+    """A branch that crosses another one: its name, and the problem and first point to be found when it is followed."""
+
+    name: str
+    start: Callable[[], tuple[Problem[Any], Any]]
+
+
+class Method(ABC, Generic[S]):
+    """How the branches of one case are found; they are numbered from 0 on by ``jobs``.
+
+    ``kind`` is that of their files. ``shared``: all ranks follow a branch together. ``failures`` end a branch and not
+    the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_failed``: what is
+    added to the file of a whole branch is added to that of a branch that failed, too.
+    """
+
+    kind: ClassVar[str]
+    shared: ClassVar[bool] = False
+    failures: ClassVar[tuple[type[Exception], ...]] = (ContinuationError, FlowError, ValueError)
+    keeps_empty: ClassVar[bool] = True
+    finishes_failed: ClassVar[bool] = False
+    grazing: bool = False
+    locates: bool = True
+
+    def __init__(self, case: Any, comm: MPI.Comm) -> None:
+        self.case = case
+        self.comm = comm
+
+    @staticmethod
+    def jobs(case: Any) -> list[int]:
+        """Numbers of a case's branches: of modes from 0, or of start frequencies."""
+        if case.nnm.start_frequency:
+            return list(range(len(case.nnm.start_frequency)))
+        return [mode - 1 for mode in case.nnm.modes]
+
+    @abstractmethod
+    def new_branch(self, name: str) -> Branch[S]:
+        """A branch without points."""
+
+    @abstractmethod
+    def name(self, job: int) -> str:
+        """The name of a branch."""
+
+    @abstractmethod
+    def problem(self, job: int) -> Problem[S]:
+        """The equations of a branch."""
+
+    @abstractmethod
+    def start(self, problem: Problem[S], job: int) -> S:
+        """The first point of a branch."""
+
+    @abstractmethod
+    def rule(self, problem: Problem[S], start: S, done: int) -> StepRule[S]:
+        """Steps and end of a branch that has ``done`` regular points besides its start."""
+
+    def directions(self) -> list[int]:
+        """Directions from the start in which a branch is followed, the last one last."""
+        return [1]
+
+    def assess(self, problem: Problem[S], point: S) -> S:
+        """A point with what its file holds beyond what continuation needs."""
+        return point
+
+    def monitor(self, problem: Problem[S]) -> Monitor[S]:
+        """What says of every point whether its branch does what it should not."""
+        return lambda point: None
+
+    def jumps(self, problem: Problem[S], points: list[S]) -> Iterator[str]:
+        """Sentences about jumps between points."""
+        return iter(())
+
+    def finish(self, problem: Problem[S], branch: Branch[S]) -> None:
+        """Add what a whole branch's file holds beyond its points."""
+
+    def crossings(self, branch: Branch[S]) -> Iterator[Crossing]:
+        """Branches that cross a branch, as far as the case asks for them."""
+        return iter(())
+
+    def crossing_rule(self, problem: Problem[S], start: S, done: int) -> StepRule[S]:
+        """Steps and end of a branch that crosses another one."""
+        raise NotImplementedError

@@ -1,0 +1,159 @@
+"""Branches of periodic orbits shot with dense matrices, each on one rank."""
+
+import itertools
+import math
+from collections.abc import Iterator
+from functools import partial
+
+from mpi4py import MPI
+
+from vipetsc.case import NnmCase
+from vipetsc.case.nnm import NnmTable
+from vipetsc.io.branch_kinds import ORBITS
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, jumps, sampled
+from vipetsc.modes.branches.method import Crossing, Method, Monitor
+from vipetsc.modes.branches.regions import regions
+from vipetsc.modes.continuation.arclength import GuardedSteps, StepRule
+from vipetsc.modes.continuation.special import at_energy
+from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import Problem
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.flow import Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import System
+
+# The flows by their names in case files.
+FLOWS: dict[str, type[Flow]] = {flow.name: flow for flow in (Dop853Flow, Tsrk, Newmark)}
+# Energy in J of the first point where the mode touches no contact, and its fraction of the energy that touches.
+ANY_ENERGY = 1e-3
+BELOW_TOUCH = 100
+# How far above the lowest energy asked for a branch begins at least.
+ABOVE_LOWEST = 1.001
+
+
+class NnmMethod(Method[Point]):
+    """What branches of normal modes have in common, whatever finds them: the options of [nnm]."""
+
+    case: NnmCase
+
+    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
+        super().__init__(case, comm)
+        self.options = case.nnm
+        self.locates = case.nnm.locate
+
+    def rule(self, problem: Problem[Point], start: Point, done: int) -> StepRule[Point]:
+        """Guarded steps to the end of the ranges."""
+        return guarded_steps(problem, self.options, done)
+
+    def directions(self) -> list[int]:
+        """Down, up, or down first and then up."""
+        return {"up": [1], "down": [-1], "both": [-1, 1]}[self.options.direction]
+
+    def asked(self, problem: Problem[Point], branch: Branch[Point]) -> Iterator[Point]:
+        """The orbits at the energies asked for, wherever the branch passes one."""
+        for energy in self.options.orbits_at:
+            passed = False
+            for left, right in itertools.pairwise(branch.regular()):
+                if (left.energy < energy) == (right.energy < energy):
+                    continue
+                passed = True
+                try:
+                    yield at_energy(problem, left, right, energy, self.options.chart)
+                except ArithmeticError as error:
+                    branch.findings.append(f"the orbit of {energy:g} J after point {left.index} is not found: {error}")
+            if not passed:
+                branch.findings.append(f"the branch has no orbit of {energy:g} J")
+
+
+def guarded_steps(problem: Problem[Point], control: NnmTable, done: int) -> GuardedSteps:
+    """Steps by [nnm] of a branch that has ``done`` points besides its start."""
+    return GuardedSteps(problem, control.model_copy(update={"points": max(control.points - done, 0)}))
+
+
+def start_energy(options: NnmTable, system: System, mode: int) -> float:
+    """Energy in J of the first point of the branch of ``mode`` (from 0): well below the first touch."""
+    if options.start_energy != "auto":
+        return options.start_energy
+    graze = system.grazing_energy(mode)
+    energy = graze / BELOW_TOUCH if math.isfinite(graze) else ANY_ENERGY
+    return max(energy, options.energy[0] * ABOVE_LOWEST)
+
+
+class ShootingMethod(NnmMethod):
+    """Branches of orbits by ``Shooting``, with the checks that half-traces and other flows allow."""
+
+    kind = ORBITS
+
+    def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
+        super().__init__(case, comm)
+        options = case.nnm
+        self.system = System.from_case(case)
+        self.grazing = options.locate_grazing
+        self.crossing_options = options.model_copy(update={"points": options.switch_points, "chart": "relative"})
+
+        flow = FLOWS[options.flow](self.system)
+        if options.jacobian == "differences":
+            flow = FiniteDifferences(flow)
+        name = options.map
+        if name == "auto":
+            name = "quarter" if self.system.odd else "half"
+        self.shooting = Shooting(flow, MAPS[name], options.tolerance, options.max_newton)
+
+    def new_branch(self, name: str) -> Branch[Point]:
+        """A branch without points."""
+        return Branch(name, self.case.to_toml(), self.system.dofs, self.kind)
+
+    def name(self, job: int) -> str:
+        """The name of the branch of a mode."""
+        return self.system.branch_name(job)
+
+    def problem(self, job: int) -> Shooting:
+        """The shooting equations of the case."""
+        return self.shooting
+
+    def start(self, problem: Problem[Point], job: int) -> Point:
+        """The orbit of a linear mode at a small energy."""
+        return linear_start(self.shooting, job, start_energy(self.options, self.system, job))
+
+    def monitor(self, problem: Problem[Point]) -> Monitor[Point]:
+        """What says of every point whether its branch retraces itself, stands still or is another one."""
+        assert isinstance(problem, Shooting)
+        return BranchMonitor(problem, self.options.guards).check
+
+    def jumps(self, problem: Problem[Point], points: list[Point]) -> Iterator[str]:
+        """Sentences about jumps between points."""
+        assert isinstance(problem, Shooting)
+        return jumps(points, problem, self.options)
+
+    def finish(self, problem: Problem[Point], branch: Branch[Point]) -> None:
+        """Add the orbits of a branch, and what other flows make of it."""
+        orbits = [*self._typical(branch), *self.asked(problem, branch)]
+        branch.extra = sampled(self.shooting, orbits)
+        for name in self.options.compare:
+            branch.extra |= compare(self.shooting, branch.regular(), FLOWS[name](self.system))
+
+    def _typical(self, branch: Branch[Point]) -> list[Point]:
+        """The regular points in the middle of every region."""
+        by_region: dict[int, list[Point]] = {}
+        for point, region in zip(branch.points, regions(branch).tolist(), strict=True):
+            if point.kind == "regular":
+                by_region.setdefault(region, []).append(point)
+        groups = [by_region[region] for region in sorted(by_region)]
+        return [group[len(group) // 2] for group in groups]
+
+    def crossings(self, branch: Branch[Point]) -> Iterator[Crossing]:
+        """The branches that cross at the kinds of special points asked for."""
+        for kind in self.options.switch:
+            special = [p for p in branch.points if p.kind == kind]
+            for number, point in enumerate(special, 1):
+                start = partial(switch, self.shooting, point, self.options.switch_amplitude)
+                yield Crossing(f"{branch.name}-{kind}-{number}", start)
+
+    def crossing_rule(self, problem: Problem[Point], start: Point, done: int) -> StepRule[Point]:
+        """Steps by [nnm] in the relative chart: the crossing branch has its own contacts at the start of its arc."""
+        return guarded_steps(problem, self.crossing_options, done)

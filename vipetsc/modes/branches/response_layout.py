@@ -1,0 +1,155 @@
+"""Files of curves of steady states."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from vipetsc.io.netcdf import Variables, variable
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.kinds import stored_kinds
+from vipetsc.modes.branches.layout import Table
+from vipetsc.modes.branches.sweeps import Sweep, swept, with_stable_folds
+from vipetsc.modes.response.steady import Measures, Response
+
+
+class Stored(NamedTuple):
+    """A measure in a file: its dimensions besides the point, units and text."""
+
+    dimensions: str
+    units: str
+    text: str
+
+
+LAYOUT = {
+    "frequency": Stored("", "rad/s", "frequency"),
+    "amplitude": Stored("", "1", "amplitude: of a wave over the clearance of the first site, of a force in N"),
+    "largest": Stored("site", "m", "largest relative displacement"),
+    "share": Stored("way", "1", "energy that leaves or is lost, over what comes in"),
+    "unstable": Stored("", "1", "perturbations that grow (Hill's method); -1: not told"),
+    "growth": Stored("", "1", "largest growth rate over the frequency; 0 if none, NaN if not found"),
+    "closed": Stored("site", "1", "share of the time in contact"),
+    "episodes": Stored("", "1", "contact episodes a period"),
+    "truncation": Stored("", "1", "estimated size of the harmonics left out, over those kept"),
+    "harmonics": Stored("site order", "m", "harmonics Z of w = Re sum Z exp(i k Om t), real part"),
+    "harmonics_imaginary": Stored("site order", "m", "harmonics of w, imaginary part"),
+}
+
+
+def measure(branch: Branch[Response], stored: str) -> np.ndarray:
+    """A measure of every state, by its name in the file."""
+    if stored == "harmonics":
+        return np.array([p.measured.harmonics.real for p in branch.points])
+    if stored == "harmonics_imaginary":
+        return np.array([p.measured.harmonics.imag for p in branch.points])
+    field = "fractions" if stored == "share" else stored
+    return np.array([getattr(p.measured, field) for p in branch.points])
+
+
+class ResponseLayout:
+    """Steady states, their measures, and the states that a slow sweep of the parameter passes."""
+
+    noun = "curve"
+    needs = ("xi", "tangent", "next_step")
+
+    def variables(self, branch: Branch[Response]) -> Variables:
+        """Variables of a curve's file; those of its lattice are in ``Branch.extra``."""
+        xi = branch.column("xi")
+        up = np.array(sweep_up(branch), int)
+        down = np.array(sweep_down(branch), int)
+        passed = "points passed if the parameter grows slowly; not neighbours: a jump"
+        data = {
+            "unknown": variable("unknown", np.arange(xi.shape[1]), "1", "unknown; the last is the parameter"),
+            "xi": variable(("point", "unknown"), xi, "1", "unknowns"),
+            "tangent": variable(("point", "unknown"), branch.column("tangent"), "1", "unit tangent"),
+            "next_step": variable("point", branch.column("next_step"), "1", "arclength of the next step"),
+            "up": variable("up", np.arange(len(up)), "1", "place on the way up"),
+            "down": variable("down", np.arange(len(down)), "1", "place on the way down"),
+            "up_point": variable("up", up, "1", passed),
+            "down_point": variable("down", down, "1", "points passed if the parameter falls slowly"),
+        }
+        for name, (dimensions, units, text) in LAYOUT.items():
+            data[name] = variable(["point", *dimensions.split()], measure(branch, name), units, text)
+        return data
+
+    def attributes(self, branch: Branch[Response]) -> dict[str, Any]:
+        """Attributes of a curve's file that follow from its states: none."""
+        return {}
+
+    def table(self, branch: Branch[Response]) -> Table:
+        """A curve as CSV, without harmonics."""
+        count = len(branch.points)
+        columns = {}
+        for name, stored in LAYOUT.items():
+            if "order" in stored.dimensions:
+                continue
+            values = measure(branch, name).reshape(count, -1)
+            if values.shape[1] == 1:
+                columns[name] = values[:, 0].tolist()
+            else:
+                columns |= {f"{name}_{i}": column.tolist() for i, column in enumerate(values.T, 1)}
+        columns["kind"] = [p.kind for p in branch.points]
+        rows = [[str(value) for value in row] for row in zip(*columns.values(), strict=True)]
+        return Table(list(columns), rows)
+
+    def points(self, data: xr.Dataset) -> list[Response]:
+        """The states of a file."""
+        points = []
+        regular = -1
+        for i, kind in enumerate(stored_kinds(data)):
+            regular += kind == "regular"
+            row = {name: data[name].values[i] for name in LAYOUT}
+            measures = Measures(
+                frequency=float(row["frequency"]),
+                amplitude=float(row["amplitude"]),
+                largest=row["largest"],
+                fractions=row["share"],
+                unstable=int(row["unstable"]),
+                growth=float(row["growth"]),
+                closed=row["closed"],
+                episodes=int(row["episodes"]),
+                truncation=float(row["truncation"]),
+                harmonics=_complex(row["harmonics"], row["harmonics_imaginary"]),
+            )
+            points.append(
+                Response(
+                    xi=data["xi"].values[i],
+                    tangent=data["tangent"].values[i],
+                    index=regular if kind == "regular" else regular + 1,
+                    next_step=float(data["next_step"].values[i]),
+                    kind=kind,
+                    measures=measures,
+                )
+            )
+        return points
+
+    def dofs(self, data: xr.Dataset) -> int:
+        """Sites of a curve's lattice."""
+        return int(data.sizes["site"])
+
+
+def sweep_up(branch: Branch[Response]) -> list[int]:
+    """States that a slow growth of the parameter passes, from the first stable one."""
+    return swept(_sweep(branch, 1))
+
+
+def sweep_down(branch: Branch[Response]) -> list[int]:
+    """States that a slow fall of the parameter passes, from the last of the sweep up."""
+    way_up = sweep_up(branch)
+    return swept(_sweep(branch, -1), way_up[-1]) if way_up else []
+
+
+def _sweep(branch: Branch[Response], sign: int) -> Sweep:
+    """The curve as a sweep up (``sign`` 1) or down (-1) sees it."""
+    stable = measure(branch, "unstable") == 0
+    fold = branch.is_kind("fold")
+    parameter = sign * measure(branch, branch.about["over"])
+    return Sweep(parameter, size=measure(branch, "largest")[:, 0], stable=with_stable_folds(stable, fold))
+
+
+def _complex(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:
+    """The complex array with these parts; a sum would lose the sign of zeros, which are bits of a resumed file."""
+    out = np.empty(real.shape, complex)
+    out.real = real
+    out.imag = imaginary
+    return out

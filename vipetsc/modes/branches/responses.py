@@ -1,0 +1,85 @@
+"""Curves of steady states under a drive: the verb ``nfrc``."""
+
+from dataclasses import replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.io.branch_kinds import RESPONSES
+from vipetsc.io.netcdf import Variables, variable
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.method import Method
+from vipetsc.modes.problem import ContinuationError, FlowError, Problem
+from vipetsc.modes.response.steady import Response, SteadyStates
+from vipetsc.modes.response.steps import TurningSteps, first_state
+
+# Where energy goes that comes in.
+CHANNELS = "transmitted", "reflected", "upper", "lost"
+
+
+class ResponseMethod(Method[Response]):
+    """Curves of ``SteadyStates``: one for each restitution and each value of the parameter that is fixed."""
+
+    kind = RESPONSES
+    failures = ContinuationError, FlowError, ArithmeticError, ValueError
+    keeps_empty = False  # what pictures and tables are made of has a first state
+
+    case: NfrcCase
+
+    def __init__(self, case: NfrcCase, comm: MPI.Comm) -> None:
+        super().__init__(case, comm)
+        self.curves = case.curves()
+
+    @staticmethod
+    def jobs(case: Any) -> list[int]:
+        """Numbers of a case's curves."""
+        return list(range(len(case.curves())))
+
+    def new_branch(self, name: str) -> Branch[Response]:
+        """A curve without states."""
+        return Branch(
+            name=name,
+            case=self.case.to_toml(),
+            dofs=len(self.case.model().chain.sites),
+            kind=self.kind,
+            about={"over": self.case.nfrc.over},
+            extra=self._axes(),
+        )
+
+    def _axes(self) -> Variables:
+        """Sites, harmonics and channels, which the variables of states have for dimensions."""
+        chain = self.case.model().chain
+        orders = np.arange(self.case.nfrc.harmonics + 1)
+        return {
+            "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, from 1"),
+            "order": variable("order", orders, "1", "harmonic"),
+            "way": variable("way", np.array(CHANNELS), "1", "where energy goes"),
+            "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
+        }
+
+    def name(self, job: int) -> str:
+        """The name of a curve."""
+        return self.curves[job][0]
+
+    def problem(self, job: int) -> SteadyStates:
+        """The equations of a curve."""
+        _, restitution, fixed = self.curves[job]
+        return SteadyStates(self.case, restitution, fixed)
+
+    def start(self, problem: Problem[Response], job: int) -> Response:
+        """The state at the beginning of the range."""
+        assert isinstance(problem, SteadyStates)
+        return first_state(problem)
+
+    def rule(self, problem: Problem[Response], start: Response, done: int) -> TurningSteps:
+        """Steps to the end of the range; the start counts among ``nfrc.points``."""
+        assert isinstance(problem, SteadyStates)
+        return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
+
+    def assess(self, problem: Problem[Response], point: Response) -> Response:
+        """The state with its measures."""
+        assert isinstance(problem, SteadyStates)
+        return replace(point, measures=problem.measured(point.xi))

@@ -1,0 +1,73 @@
+"""Guards: what may not change too much from point to point, or a branch jumps to another arc unseen.
+
+Both arcs satisfy the equations to rounding, so that no residual tells them apart; neighbouring tongues of internal
+resonances differ in half-traces, contacts and direction.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.case.nnm import NnmTable
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import Problem
+
+# What a guard holds down, for messages, and where it is set.
+GUARDED = {
+    "half_trace": ("the half-trace changes too much", "nnm.guards.half_trace"),
+    "contacts": ("more than one contact appears or goes", "nnm.guards.contacts"),
+    "corrector": ("the corrector goes too far", "nnm.guards.corrector"),
+    "turn": ("the branch turns too sharply", "nnm.guards.turn"),
+    "turn_relative": ("the branch turns too sharply in the relative chart", "nnm.guards.turn_relative"),
+    "truncation": ("the harmonics left out are too large", "nnm.harmonics or nnm.truncation"),
+}
+# A change of these within its bound is no reason to slow down: they do not shrink with the step.
+ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
+
+
+class Strain(NamedTuple):
+    """How far a step strains the ``guard`` that it strains most; 1 is the bound."""
+
+    size: float
+    guard: str
+
+
+def strain(
+    problem: Problem[Point], control: NnmTable, before: Point, after: Point, geometry: dict[str, float]
+) -> Strain:
+    """The largest strain of a step between two points, whose ``geometry`` has its ``corrector`` and ``turn``."""
+    changes = {"contacts": float(abs(after.episodes - before.episodes)), **geometry}
+    if "half_trace" in problem.guards:
+        changes["half_trace"] = half_trace_change(before, after)
+    if "turn_relative" in problem.guards:
+        changes["turn_relative"] = problem.turn(before, after)
+    if "truncation" in problem.guards:
+        changes["truncation"] = after.truncation / control.truncation
+
+    worst = Strain(-np.inf, "")
+    for guard, change in changes.items():
+        bound = getattr(control.guards, guard, 1.0) or np.inf  # 0 switches a guard off
+        size = change / bound
+        if np.isnan(size):  # no change that can be told is within a bound
+            size = np.inf
+        if guard in ALL_OR_NOTHING and size <= 1:
+            size = 0.0
+        if size > worst.size:
+            worst = Strain(size, guard)
+    return worst
+
+
+def half_trace_change(a: Point, b: Point) -> float:
+    """Distance between the sets of asinh(c) of two points: no half-trace is further from the other set.
+
+    Half-traces may meet and turn into a complex pair, so that they have no lasting order. 0 for one degree of
+    freedom.
+    """
+    distance = np.abs(_squashed(a.half_traces)[:, None] - _squashed(b.half_traces)[None, :])
+    return float(max(distance.min(axis=axis, initial=np.inf).max(initial=0.0) for axis in (0, 1)))
+
+
+def _squashed(c: np.ndarray) -> np.ndarray:
+    """asinh(|c|) with the phase of c: asinh itself jumps on the imaginary axis."""
+    size = np.maximum(np.abs(c), np.finfo(float).tiny)
+    return c * (np.arcsinh(size) / size)

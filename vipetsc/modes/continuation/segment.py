@@ -1,0 +1,163 @@
+"""The branch between two of its points, on which special points are located and not interpolated."""
+
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache, partial
+from typing import Generic, NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from vipetsc.modes.problem import Problem, S, SpecialKind
+
+# A point of a segment is nearer to where it was sought than this fraction of its length.
+FURTHEST = 0.5
+# Rounding keeps Newton's method from the tolerance near the tips of narrow tongues; so many times of it is enough here.
+ROUNDING = 10
+# Attempts at a point that Newton's method does not reach, each in half of the segment before, and where to halve it.
+HALVINGS = 5
+MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
+# A turn is looked at if its value is estimated below this fraction of its neighbours' values.
+NEAR = 0.5
+
+
+class Knot(NamedTuple):
+    """Unknowns ``xi`` of a branch at an arclength, and their ``slope`` there."""
+
+    xi: np.ndarray
+    slope: np.ndarray
+
+
+class Segment(Generic[S]):
+    """The branch between two points, parametrised by arclength along the left point's tangent.
+
+    ``begin`` is the arclength from the start of the step that the segment is a part of. ``knots`` are the unknowns and
+    their slopes at the arclengths found so far, the ends at first: they give the first guess at others.
+    """
+
+    def __init__(self, problem: Problem[S], chart: str, left: S, right: S, begin: float = 0.0) -> None:
+        self.problem = problem
+        self.left = left
+        self.right = right
+        self.begin = begin
+        self.frame = problem.frame(left, chart)
+        self.between = partial(type(self), problem, chart)
+
+        end = self.frame.encode(right)
+        self.length = float(self.frame.tangent @ (end - self.frame.xi))
+        self.knots: dict[float, Knot] = {}
+        self._tie(0.0, self.frame.xi, self.frame.tangent)
+        self._tie(self.length, end, self.frame.direction(right))
+
+    def _tie(self, arclength: float, xi: np.ndarray, direction: np.ndarray) -> None:
+        """Keep unknowns and the branch's ``direction``, of any length, at an arclength."""
+        self.knots[arclength] = Knot(xi, direction / (self.frame.tangent @ direction))
+
+    def _guess(self, arclength: float) -> np.ndarray:
+        """The cubic through the nearest knots before and after an arclength."""
+        before = max(s for s in self.knots if s <= arclength)
+        after = min(s for s in self.knots if s >= arclength)
+        a, slope_a = self.knots[before]
+        b, slope_b = self.knots[after]
+        h = after - before
+        s = (arclength - before) / (h or 1.0)
+        bend = 3 * (b - a) - h * (2 * slope_a + slope_b) + s * (2 * (a - b) + h * (slope_a + slope_b))
+        return np.asarray(a + s * h * slope_a + s**2 * bend)
+
+    def at(self, arclength: float) -> S:
+        """The point at an arclength; raises ArithmeticError if Newton's method fails there or leaves the step."""
+        guess = self._guess(arclength)
+        attempt = self.frame.correct(guess, arclength)
+        allowed = ROUNDING * self.problem.tolerance
+        if attempt.left_domain or not (attempt.converged or attempt.history[-1] <= allowed):
+            raise ArithmeticError(f"{attempt.reason}; residuals {attempt.residuals}")
+        if np.linalg.norm(attempt.xi - guess) > FURTHEST * self.length:
+            raise ArithmeticError("Newton's method leaves the step")
+
+        direction = self.frame.tangent_at(attempt.xi)
+        point = self.frame.measures(attempt, direction)
+        self._tie(arclength, attempt.xi, direction)
+        return replace(point, index=self.right.index, step=arclength)
+
+    def roots(self, kind: SpecialKind[S], before: S | None) -> list[S]:
+        """Points where the kind's test vanishes: one between values of two signs, or two at both sides of a turn.
+
+        A turn is seen with the point ``before`` the left one.
+        """
+        a = kind.test(self.left)
+        b = kind.test(self.right)
+        if min(abs(a), abs(b)) <= kind.floor:
+            return []
+        if a * b < 0:
+            return [self.root(kind)]
+        if before is None or not self.left.step:
+            return []
+
+        turn = _turn((-self.left.step, kind.test(before)), (0.0, a), (self.length, b))
+        if turn is None:
+            return []
+        parts: tuple[Segment[S], ...] = ()
+        with suppress(ArithmeticError):  # whether there are two is not known, so that none is missed
+            parts = self.split(turn)
+        return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
+
+    def root(self, kind: SpecialKind[S], halvings: int = HALVINGS) -> S:
+        """The point where the kind's test vanishes; in the half with it if Newton's method fails before it is found.
+
+        Raises ArithmeticError if that does not help ``halvings`` times.
+        """
+        sys.audit("vipetsc.landing", kind.name)
+        try:
+            point = self._find(kind, seek=halvings > 0)
+            if kind.finish is not None:
+                point = kind.finish(point, self.left, self.right)
+            return replace(point, kind=kind.name, step=self.begin + point.step)
+        except (ArithmeticError, ValueError) as error:
+            if halvings == 0:
+                raise ArithmeticError(error) from error
+
+        first, second = self.split()
+        inside = first if kind.test(first.left) * kind.test(first.right) < 0 else second
+        return inside.root(kind, halvings - 1)
+
+    def _find(self, kind: SpecialKind[S], seek: bool) -> S:
+        """The point where a test vanishes, by the kind's own equations if it has some and ``seek``, or bracketed."""
+        at = cache(self.at)  # the root is one of the arclengths at which a value was asked for
+        if seek and kind.seek is not None:
+            xi = kind.seek(self.frame, self._guess(0.5 * self.length), self.left, self.right)
+            arclength = float(self.frame.tangent @ (xi - self.frame.xi))
+            if not 0 < arclength < self.length:
+                raise ArithmeticError("the touch lies outside of the step")
+        else:
+            value = partial(self._value, kind.test, at)
+            arclength = brentq(value, 0.0, self.length, xtol=1e-12 * self.length, rtol=1e-14)
+        return at(arclength)
+
+    def _value(self, test: Callable[[S], float], at: Callable[[float], S], arclength: float) -> float:
+        """A test at an arclength; the ends need no correction."""
+        if arclength == 0:
+            return test(self.left)
+        if arclength == self.length:
+            return test(self.right)
+        return test(at(arclength))
+
+    def split(self, arclength: float | None = None) -> "tuple[Segment[S], Segment[S]]":
+        """The parts before and after an arclength, or about the middle; raises ArithmeticError if there is none."""
+        places = self.length * MIDDLES if arclength is None else [arclength]
+        for place in places:
+            with suppress(ArithmeticError):
+                middle = self.at(place)
+                return self.between(self.left, middle, self.begin), self.between(middle, self.right, self.begin + place)
+        raise ArithmeticError("Newton's method fails within the step")
+
+
+def _turn(*values: tuple[float, float]) -> float | None:
+    """Where a value turns between the last two of three places, if it may cross zero there, by a parabola."""
+    (x0, z), (x1, a), (x2, b) = values
+    bend = ((b - a) / (x2 - x1) - (z - a) / (x0 - x1)) / (x2 - x0)
+    slope = (b - a) / (x2 - x1) - bend * (x2 - x1)
+    at = -slope / (2 * bend) if bend else x1
+    top = a + slope * at / 2
+    return at if x1 < at < x2 and top * np.sign(a) < NEAR * min(abs(a), abs(b)) else None

@@ -1,0 +1,91 @@
+"""Steps along a curve of steady states, where it begins, and where it ends."""
+
+import numpy as np
+
+from vipetsc.modes.continuation.arclength import Continuation, Geometry, Verdict
+from vipetsc.modes.problem import Attempt, ContinuationError
+from vipetsc.modes.response.steady import Response, SteadyStates
+
+# Largest angle in rad between tangents, and correction over the step, of a step that is accepted.
+TURN = 0.25
+CORRECTION = 0.1
+# A step grows by this factor at most, and not where the curve turns by half of what is allowed.
+MOST_GROWTH = 1.6
+LEAST_ANGLE = 1e-9  # rad, for the quotient
+# States on growing amplitudes to the beginning of a range.
+MOST_RAMP = 10_000
+
+
+class TurningSteps:
+    """Steps of a curve by [nfrc]: as long as it turns by half of what is allowed; the curve ends on its range."""
+
+    points_key = "nfrc.points"
+    chart = ""
+
+    def __init__(self, states: SteadyStates, points: int) -> None:
+        self.states = states
+        self.points = points
+        self.first_step = states.options.first_step
+        self.smallest_step = states.options.smallest_step
+
+    def not_converged(self, step: float, attempt: Attempt) -> Verdict:
+        """Half the step."""
+        residuals = attempt.residuals or "none"
+        return Verdict(False, step / 2, f"Newton's method ended with {attempt.reason} (residuals {residuals})")
+
+    def judge(self, before: Response, after: Response, geometry: Geometry) -> Verdict:
+        """Accept a step on which neither the tangent turns too far nor the correction is too long."""
+        if not (geometry.turn <= TURN and geometry.corrector <= CORRECTION):
+            return Verdict(False, after.step / 2, f"the curve turns too sharply ({geometry.turn:.2g} rad)")
+        growth = min(MOST_GROWTH, 0.5 * TURN / max(geometry.turn, LEAST_ANGLE))
+        return Verdict(True, min(after.step * max(growth, 0.5), self.states.options.largest_step))
+
+    def end(self, point: Response) -> tuple[Response, str] | None:
+        """The state on the end of the range, where ``point`` has passed it."""
+        states = self.states
+        scale = states.parameter.scale
+        low, high = (bound / scale for bound in states.options.range)
+        p = point.xi[-1]
+        if low <= p <= high:
+            return None
+        bound = low if p < low else high
+        xi = states.at(point.xi, bound)
+        tangent = states.frame(point).tangent_at(xi)
+        last = Response(xi=xi, tangent=tangent, index=point.index, step=point.step, next_step=point.next_step)
+        return last, f"reached the end of nfrc.range, {bound * scale:g}"
+
+    def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
+        """Where, why, and which key to turn."""
+        omega, amplitude = self.states.drive(last.xi[-1])
+        remedy = "raise nfrc.harmonics or nfrc.max_newton, or lower nfrc.smallest_step"
+        return (
+            f"no step from the last good point, {omega:.8g} rad/s at amplitude {amplitude:.6g}: {verdict.why}; {remedy}"
+        )
+
+
+def first_state(states: SteadyStates) -> Response:
+    """The state at the beginning of the range, by growing amplitudes from one that touches no contact.
+
+    Raises ContinuationError where amplitudes cannot grow so far.
+    """
+    low = states.options.range[0] / states.parameter.scale
+    omega, amplitude = states.drive(low)
+    linear = states.linear_motion(omega).harmonics
+    clearances = [clearance for _, clearance in states.forces.contacts]
+    guess = states.balance.pack(amplitude * linear) / states.clearance
+    if not amplitude * float((np.abs(linear[:, 1]) / clearances).max()) < 1:
+        guess = _ramp(states, omega, amplitude)
+
+    start = Response(xi=states.at(np.append(guess, low), low), next_step=states.options.first_step)
+    tangent = states.first_tangent(start, 1)
+    return Response(xi=start.xi, tangent=tangent, next_step=start.next_step)
+
+
+def _ramp(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
+    """Scaled harmonics of the state at ``omega`` to which growing amplitudes lead."""
+    below = states.options.model_copy(update={"over": "amplitude", "range": [1e-3 * amplitude, amplitude]})
+    ramp = SteadyStates(states.case.model_copy(update={"nfrc": below}), states.restitution, omega)
+    points = list(Continuation(ramp, first_state(ramp), TurningSteps(ramp, MOST_RAMP)))
+    if not points or not np.isclose(points[-1].xi[-1] * ramp.parameter.scale, amplitude):
+        raise ContinuationError(f"growing amplitudes do not reach {amplitude:g}: begin nfrc.range or nfrc.fixed lower")
+    return points[-1].xi[:-1]

@@ -1,0 +1,170 @@
+"""Charts: unknowns xi (n + 1,) of order one in place of the initial values x (n,) and the period of an orbit.
+
+A chart is made around a point of the branch. It encodes (x, period) as xi, decodes it, and gives d(x, period)/d xi
+(n + 1, n + 1); ``size`` is the unit of initial values. ``logarithmic`` is not needed by any other room: the case key
+``nnm.chart`` offers it to users, to compare charts with.
+"""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from vipetsc.modes.system import System
+
+# A largest |w| at the start within this fraction of the clearance is near grazing.
+NEAR_GRAZING = 0.05
+# The smallest root of the gap in a derivative: at the touch itself the derivative would be singular.
+SMALLEST_ROOT = 1e-9
+
+
+class Chart(ABC):
+    """Unknowns around initial values and period of one orbit."""
+
+    size: float
+    period: float
+
+    @abstractmethod
+    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
+        """The unknowns of initial values and period."""
+
+    @abstractmethod
+    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Initial values and period."""
+
+    @abstractmethod
+    def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
+
+    @abstractmethod
+    def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
+
+
+class DenseChart(Chart):
+    """A chart with the matrix of its derivative."""
+
+    @abstractmethod
+    def derivative(self, xi: np.ndarray) -> np.ndarray:
+        """d(x, period)/d xi."""
+
+    def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
+        return self.derivative(xi) @ changes
+
+    def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
+        return np.linalg.solve(self.derivative(xi), changes)
+
+
+class Relative(DenseChart):
+    """Initial values over the largest one, period over its value; gaps over their clearance.
+
+    Where an arc starts at rest, the resonator's displacement gives way to w = u_resonator - u_host over
+    max(|w|, D), or else a large common motion would hide the changes of w that make and break contacts.
+    """
+
+    def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
+        self.size = float(np.abs(x).max())
+        self.period = period
+        self.weights = np.eye(len(x)) / self.size
+        if rest:
+            for row, pair in zip(system.contact_rows, system.contacts, strict=True):
+                scale = min(max(abs(row @ x), pair.clearance), self.size)
+                self.weights[pair.resonator] = row / scale
+        self.inverse = np.linalg.inv(self.weights)
+        self._derivative = block_diag(self.inverse, period)
+
+    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
+        """The unknowns of initial values and period."""
+        return np.append(self.weights @ x, period / self.period)
+
+    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Initial values and period."""
+        return self.inverse @ xi[:-1], float(xi[-1] * self.period)
+
+    def derivative(self, xi: np.ndarray) -> np.ndarray:
+        """d(x, period)/d xi."""
+        return self._derivative
+
+
+class Logarithmic(DenseChart):
+    """Logarithms of the largest initial value and of the period; the other values over the largest one."""
+
+    def __init__(self, system: System, x: np.ndarray, period: float) -> None:
+        self.size = float(np.abs(x).max())
+        self.period = period
+        self.lead = int(np.abs(x).argmax())
+        self.sign = float(np.sign(x[self.lead]))
+
+    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
+        """The unknowns of initial values and period."""
+        xi = np.append(x / x[self.lead], np.log(period / self.period))
+        xi[self.lead] = np.log(x[self.lead] / (self.sign * self.size))
+        return xi
+
+    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Initial values and period."""
+        lead = self.sign * self.size * np.exp(xi[self.lead])
+        x = xi[:-1] * lead
+        x[self.lead] = lead
+        return x, float(self.period * np.exp(xi[-1]))
+
+    def derivative(self, xi: np.ndarray) -> np.ndarray:
+        """d(x, period)/d xi."""
+        x, period = self.decode(xi)
+        d = np.diag(np.append(np.full(len(x), x[self.lead]), period))
+        d[:-1, self.lead] = x
+        return d
+
+
+class Grazing(DenseChart):
+    """Relative, with y in place of the displacement of the contact nearest to its clearance: (|w| - D)/D = y |y|.
+
+    An orbit that starts on its largest |w| depends on w - D through a square root (bilinear contact), so that
+    this unknown makes the branch smooth through grazing.
+    """
+
+    def __init__(self, system: System, x: np.ndarray, period: float) -> None:
+        self.size = float(np.abs(x).max())
+        self.period = period
+        nearest = int(np.abs(np.abs(system.contact_rows @ x) / system.clearances - 1).argmin())
+        self.row = system.contact_rows[nearest]
+        self.clearance = system.clearances[nearest]
+        self.index = system.contacts[nearest].resonator
+        self.sign = float(np.sign(self.row @ x))
+
+    def encode(self, x: np.ndarray, period: float) -> np.ndarray:
+        """The unknowns of initial values and period."""
+        xi = np.append(x / self.size, period / self.period)
+        gap = self.sign * (self.row @ x) / self.clearance - 1
+        xi[self.index] = np.sign(gap) * np.sqrt(np.abs(gap))
+        return xi
+
+    def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Initial values and period."""
+        x = xi[:-1] * self.size
+        y = xi[self.index]
+        x[self.index] = 0.0
+        x[self.index] = self.sign * self.clearance * (1 + y * abs(y)) - self.row @ x
+        return x, float(xi[-1] * self.period)
+
+    def derivative(self, xi: np.ndarray) -> np.ndarray:
+        """d(x, period)/d xi."""
+        d = np.diag(np.append(np.full(len(xi) - 1, self.size), self.period))
+        d[self.index, :-1] = -self.row * self.size
+        d[self.index, self.index] = self.sign * self.clearance * 2 * max(abs(xi[self.index]), SMALLEST_ROOT)
+        return d
+
+
+CHARTS: dict[str, type[Relative | Logarithmic | Grazing]] = {
+    "relative": Relative,
+    "logarithmic": Logarithmic,
+    "grazing": Grazing,
+}
+
+
+def near_grazing(system: System, x: np.ndarray) -> bool:
+    """Whether a contact of an orbit that starts at rest at ``x`` (n,) is near its clearance there."""
+    distance = np.abs(system.gaps(x) / system.clearances)
+    return bool(distance.min(initial=np.inf) < NEAR_GRAZING)

@@ -1,0 +1,116 @@
+"""Grazing: the orbit of a branch whose contact just touches, by Newton's method with the touch as two of its equations.
+
+A pair of changes of a contact, an onset and a separation in either order, meets where the contact stands at its
+clearance on side s with w' = 0. With the time t of that as an unknown beyond those of the chart,
+
+    H(xi) = 0,    s w(t; xi) = D,    w'(t; xi) = 0,
+
+and the flow's sensitivities give all derivatives. At rest w' = 0 already, and t stays 0.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from vipetsc.modes.problem import FlowError
+from vipetsc.modes.shooting.charts import DenseChart, Grazing
+from vipetsc.modes.shooting.flow import Arc
+from vipetsc.modes.shooting.maps import ShootingMap
+from vipetsc.modes.shooting.orbit import ShotOrbits
+
+MOST_STEPS = 10
+# Newton steps are no longer than this, in unknowns of order one ...
+FURTHEST = 0.5
+# ... and after one below this only rounding is left, as the next would be its square.
+CLOSE = 1e-9
+# The flow must not end on an extremum; a parabola over this fraction of the time goes on to it, to rounding.
+SHORT = 1e-6
+
+
+class Touch(NamedTuple):
+    """Two changes of a ``contact`` on one ``side`` (1 or -1), a time ``apart`` in s, about the ``time`` in s."""
+
+    apart: float
+    time: float
+    contact: int
+    side: int
+
+    @classmethod
+    def nearest(cls, arc: Arc, shooting_map: ShootingMap) -> Self:
+        """The two neighbouring changes of an arc that are nearest to each other; one at time 0 if there are none."""
+        pairs = cls.neighbours(arc, shooting_map.start == "rest", shooting_map.end == "rest")
+        return min(pairs, default=cls(0.0, np.nan, 0, 0))
+
+    @classmethod
+    def neighbours(cls, arc: Arc, rest_before: bool, rest_after: bool) -> Iterator[Self]:
+        """Neighbouring changes of a contact on one side; at rest before and after the arc its mirror image adds one."""
+        for contact in np.unique(arc.events[:, 1]).astype(int):
+            times, _, sides, _ = arc.events[arc.events[:, 1] == contact].T
+            if rest_before:
+                times = np.append(-times[0], times)
+                sides = np.append(sides[0], sides)
+            if rest_after:
+                times = np.append(times, 2 * arc.duration - times[-1])
+                sides = np.append(sides, sides[-1])
+            for i in np.flatnonzero(sides[1:] == sides[:-1]):
+                yield cls(times[i + 1] - times[i], (times[i] + times[i + 1]) / 2, contact, int(sides[i]))
+
+
+def graze(problem: ShotOrbits, chart: DenseChart, guess: np.ndarray, touch: Touch) -> np.ndarray:
+    """Unknowns (n + 1,) of the orbit near ``guess`` where the two changes of a ``touch`` meet.
+
+    Raises ArithmeticError if Newton's method fails, as from a touch that is none.
+    """
+    xi = guess
+    time = touch.time
+    try:
+        for _ in range(MOST_STEPS):
+            matrix, values, duration = _equations(problem, chart, xi, touch._replace(time=time))
+            *step, later = np.linalg.solve(matrix, -values)
+            size = float(np.linalg.norm(step))
+            xi = xi + step
+            time = time + later
+            if not (size <= FURTHEST and 0 <= time <= 1.1 * duration):
+                raise ArithmeticError("Newton's method goes astray")
+            if size <= CLOSE:
+                return xi
+    except (FlowError, np.linalg.LinAlgError) as error:
+        raise ArithmeticError(error) from error
+    raise ArithmeticError(f"the touch is not found: last step {size:.1e}")
+
+
+def _equations(
+    problem: ShotOrbits, chart: DenseChart, xi: np.ndarray, touch: Touch
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Derivatives (n + 2, n + 2) and values (n + 2,) of the equations, and the arc's duration in s.
+
+    The unknowns are ``xi`` and the time of the ``touch``.
+    """
+    system = problem.system
+    n = system.dofs
+    row = touch.side * system.contact_rows[touch.contact] / system.clearances[touch.contact]
+    x, period = chart.decode(xi)
+    arc = problem.arc(x, period)
+    inner = chart.derivative(xi)
+
+    # The state just before the touch, and a parabola on to it.
+    part = problem.flow.arc(arc.start, (1 - SHORT) * touch.time, period)
+    remaining = SHORT * touch.time
+    u, v = np.split(part.end, 2)
+    du, dv = np.split(part.sensitivity[:, problem.free] @ inner[:-1], 2)
+    pull = -system.forces(u) / system.masses
+    u, v = u + remaining * (v + remaining / 2 * pull), v + remaining * pull
+
+    matrix = np.zeros((n + 2, n + 2))
+    matrix[:n, :-1] = problem.jacobian(arc) @ inner / chart.size
+    matrix[n] = np.append(row @ du, row @ v)
+    matrix[n + 1] = np.append(row @ dv, row @ pull)
+    values = np.array([*problem.residual(arc) / chart.size, row @ u - 1, row @ v])
+
+    resonator = system.contacts[touch.contact].resonator
+    if touch.time == 0 and isinstance(chart, Grazing) and chart.index == resonator:
+        # The gap's root is an unknown of this chart, and the gap is stationary in it at the touch.
+        matrix[n] = np.eye(n + 2)[chart.index]
+        values[n] = xi[chart.index]
+    return matrix, values, arc.duration

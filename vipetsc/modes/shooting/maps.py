@@ -1,0 +1,31 @@
+"""Which arc of a periodic orbit is integrated: from a section to a section, over a fraction of the period."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ShootingMap:
+    """Where an arc starts and ends, and what fraction of the period it takes.
+
+    ``rest`` is v = 0, ``centre`` is u = 0. An odd system's symmetric orbit goes from rest to the centre in a
+    quarter period; any reversible one from rest to rest in a half.
+    """
+
+    name: str
+    start: str
+    end: str
+    fraction: float
+
+    @property
+    def quarter(self) -> bool:
+        """Whether it goes from one section to the other; the orbit is then odd about its end."""
+        return self.start != self.end
+
+
+# The whole period is here to be compared with, by the case key ``nnm.map``: its condition is 1e6 times worse.
+MAPS = {
+    "quarter": ShootingMap("quarter", "rest", "centre", 0.25),
+    "half": ShootingMap("half", "rest", "rest", 0.5),
+    "whole": ShootingMap("whole", "rest", "rest", 1.0),
+    "half-centre": ShootingMap("half-centre", "centre", "centre", 0.5),
+}

@@ -1,0 +1,84 @@
+"""What is asked of one shot orbit: its samples, its resonance, and whether it repeats a shorter one."""
+
+from typing import Protocol
+
+import numpy as np
+
+from vipetsc.modes.point import Point
+from vipetsc.modes.shooting.flow import Arc, Flow
+from vipetsc.modes.shooting.maps import ShootingMap
+from vipetsc.modes.system import System
+
+# An orbit that comes back after a part of its period to within this fraction of its size repeats itself.
+SAME = 1e-6
+PRIMES = 2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47
+
+
+class ShotOrbits(Protocol):
+    """Orbits shot with sensitivities: what of ``Shooting`` is needed to look at one of them."""
+
+    flow: Flow
+    map: ShootingMap
+    system: System
+    free: slice
+
+    def arc(self, x: np.ndarray, period: float) -> Arc:
+        """The arc from initial values ``x``."""
+
+    def residual(self, arc: Arc) -> np.ndarray:
+        """What should vanish at the arc's end (n,)."""
+
+    def jacobian(self, arc: Arc) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual with respect to initial values and period."""
+
+
+def sample_orbit(problem: ShotOrbits, point: Point, samples: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements in m and velocities in m/s (samples, n) at uniform times, the end of the period left out.
+
+    Only the arc that was shot is integrated; its mirror images make up the period. ``samples`` is a multiple of 4.
+    """
+    states = [problem.arc(point.x, point.period).start]
+    for _ in range(round(problem.map.fraction * samples)):
+        states.append(problem.flow.arc(states[-1], point.period / samples, point.period).end)
+    u, v = np.hsplit(np.array(states), 2)
+
+    if problem.map.quarter:  # to the centre: odd about it
+        u = np.vstack([u, -u[-2::-1]])
+        v = np.vstack([v, v[-2::-1]])
+    if len(u) < samples:  # to a rest (or from centre to centre): mirror image about it
+        sign = -1 if problem.map.start == problem.map.end == "centre" else 1
+        u = np.vstack([u, sign * u[-2::-1]])
+        v = np.vstack([v, -sign * v[-2::-1]])
+    return u[:samples], v[:samples]
+
+
+def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
+    """How often the contacts' relative motion (all displacements without contacts) passes zero in half a period.
+
+    On a tongue of a k:1 internal resonance, mode two moves k times while mode one moves once.
+    """
+    u, _ = sample_orbit(problem, point, samples)
+    rows = problem.system.contact_rows
+    w = u @ rows.T if len(rows) else u
+    amplitude = np.abs(w).max(axis=0)
+    positive = w[:, amplitude > SAME * amplitude.max()] > 0
+    passes = np.sum(positive != np.roll(positive, 1, axis=0), axis=0)
+    return int(passes.max()) // 2
+
+
+def repetitions(problem: ShotOrbits, point: Point) -> int:
+    """The smallest prime number of times that an orbit passes the same motion in its period; 1 for its least period.
+
+    Along a branch from a linear mode it is 1 but where a tongue of an internal resonance crosses the other mode's
+    branch: there the orbit is the other mode's, passed k times.
+    """
+    start = problem.arc(point.x, point.period).start
+    rate = problem.flow.omega_ref(point.period)
+    size = np.abs(start).max() / (1.0 if problem.map.start == "rest" else rate)
+    scale = size * np.repeat([1.0, rate], problem.system.dofs)
+
+    for count in PRIMES:
+        later = problem.flow.arc(start, point.period / count, point.period).end
+        if np.all(np.abs(later - start) <= SAME * scale):
+            return count
+    return 1
