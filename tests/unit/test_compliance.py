@@ -46,9 +46,12 @@ def largest(error, of):
 @pytest.mark.parametrize(("cells", "sites"), [(1, (0,)), (2, (0, 1)), (3, (1,)), (12, (2, 3, 9)), (12, (0, 11))])
 def test_finite_lattices_as_dense_ones(name, ends, cells, sites):
     chain = Chain(CELLS[name], cells, ends, sites, (1e-3,) * len(sites))
-    compliance, rows, d = WaveCompliance(chain, points=((cells - 1, 0),)), rows_of(chain), chain.cell.dofs
+    compliance = WaveCompliance(chain, points=((cells - 1, 0),))
+    rows = rows_of(chain)
+    d = chain.cell.dofs
     point = np.eye(cells * d)[(cells - 1) * d]
-    stiffness, forces = chain.stiffness_matrix().toarray(), np.arange(1, len(sites) + 2) * (1 + 0.3j)
+    stiffness = chain.stiffness_matrix().toarray()
+    forces = np.arange(1, len(sites) + 2) * (1 + 0.3j)
     for omega, got in zip(FREQUENCIES, compliance.response(FREQUENCIES), strict=True):
         inverse = np.linalg.inv(stiffness - np.diag(chain.masses()) * omega**2)
         expected = rows @ inverse @ np.vstack([rows, point]).T
@@ -67,7 +70,8 @@ def test_an_infinite_lattice_is_the_limit_of_long_damped_ones(name):
     sites = (500, 503)
     chain = Chain(CELLS[name], 1000, "free", sites, (1e-3,) * 2)
     for omega in (0.0, 400 - 40j, 1023.27 - 40j, 3100.0 - 90j, 8000.0):
-        finite, infinite = WaveCompliance(chain).at(omega), WaveCompliance(chain, infinite=True).at(omega)
+        finite = WaveCompliance(chain).at(omega)
+        infinite = WaveCompliance(chain, infinite=True).at(omega)
         assert largest(finite - infinite, infinite) < 1e-10
     on_axis, below = (WaveCompliance(chain, infinite=True).at(1023.27 - decay) for decay in (0.0, 1e-6j))
     assert largest(on_axis - below, on_axis) < 1e-6  # from below, the outgoing side
@@ -75,7 +79,8 @@ def test_an_infinite_lattice_is_the_limit_of_long_damped_ones(name):
 
 
 def test_self_compliance_is_a_sum_over_bloch_waves():
-    cell, omega = CELLS["four-band"], np.array([10.0 - 20j, 900.0 - 20j, 3000.0 - 20j])
+    cell = CELLS["four-band"]
+    omega = np.array([10.0 - 20j, 900.0 - 20j, 3000.0 - 20j])
     waves = bloch(cell, 2 * np.pi * np.arange(4096) / 4096)
     weight = np.abs(waves.vectors[:, cell.resonator] - waves.vectors[:, cell.host]) ** 2
     sums = [np.mean(np.sum(weight / (waves.frequency**2 - w**2), axis=1)) for w in omega]
@@ -112,7 +117,8 @@ def test_a_linear_scatterer_keeps_or_takes_the_energy(name, band, direction):
 
 
 def test_the_flux_is_energy_times_group_velocity():
-    cell, kappa = CELLS["four-band"], 1.1
+    cell = CELLS["four-band"]
+    kappa = 1.1
     point = bloch(cell, kappa)
     compliance = WaveCompliance(Chain(cell, 3, sites=(1,)), infinite=True)
     wave = compliance.incident(float(point.frequency[2]), 3)

@@ -38,8 +38,10 @@ def damped(cell, alpha=0.0, beta=0.0, extra=(0.0, 0.0, 0.0, 0.0)):
 @pytest.mark.parametrize("cell", [four_band(), diatomic()])
 def test_rayleigh_damping_has_its_closed_form(cell):
     """zeta = (alpha/omega + beta omega)/2, and a wave of real frequency decays over v_g/(zeta omega) cells."""
-    alpha, beta = 20.0, 2e-5
-    lossy, omega = damped(cell, alpha, beta), bloch(cell, KAPPA).frequency
+    alpha = 20.0
+    beta = 2e-5
+    lossy = damped(cell, alpha, beta)
+    omega = bloch(cell, KAPPA).frequency
     point = damped_bloch(lossy, KAPPA)
     assert point.ratio == pytest.approx((alpha / omega + beta * omega) / 2, rel=1e-10)
     assert np.abs(point.rate) == pytest.approx(omega, rel=1e-10)
@@ -71,7 +73,8 @@ def test_bloch_waves_of_a_damped_ring_decay_as_the_bands_say(number):
     still = replace(model.drives[0], waveform=replace(model.drive, amplitude=0.0))
     model = replace(model, chain=Chain(cell, cells, "periodic"), drives=(still,))
     kappa = 2 * np.pi * number / cells
-    point, end = damped_bloch(cell, kappa), 0.01
+    point = damped_bloch(cell, kappa)
+    end = 0.01
     for s, phi in zip(point.rate, point.vectors.T, strict=True):
         wave = phi * np.exp(1j * kappa * np.arange(cells))[:, None]
         engine = Integrator(
@@ -80,7 +83,8 @@ def test_bloch_waves_of_a_damped_ring_decay_as_the_bands_say(number):
         start = [u.real.T.ravel() for u in (wave, s * wave)]
         engine.state.array[: 8 * cells] = np.concatenate(start)
         engine.advance(end)
-        found, there = engine.state.array_r[: 4 * cells].reshape(4, cells).T, (wave * np.exp(s * end)).real
+        found = engine.state.array_r[: 4 * cells].reshape(4, cells).T
+        there = (wave * np.exp(s * end)).real
         assert np.abs(found - there).max() < 1e-8 * np.abs(there).max()
         engine.destroy()
 
@@ -97,7 +101,9 @@ def test_ends_without_dashpots_send_all_back(ends):
 
 def test_a_packet_comes_back_as_computed():
     """What is left of a packet's energy after an end that absorbs little."""
-    cell, kappa, width = four_band("calibrated"), 1.8, 8
+    cell = four_band("calibrated")
+    kappa = 1.8
+    width = 8
     omega = float(bloch(cell, kappa).frequency[1])
     table = {
         "lattice": {"preset": "four-band", "cells": 130, "absorbing": {"cells": 10, "strength": 400.0}},
@@ -105,7 +111,8 @@ def test_a_packet_comes_back_as_computed():
         "initial": {"kind": "packet", "band": 2, "wavenumber": kappa, "cell": 70, "width": width, "amplitude": 1e-3},
         "time": {"end": 0.26, "engine": "propagator"},
     }
-    case, memory = Case.from_table(table), RunMemory(MPI.COMM_SELF)
+    case = Case.from_table(table)
+    memory = RunMemory(MPI.COMM_SELF)
     simulate(case, memory)
     energy = (memory.dataset["energy/kinetic"] + memory.dataset["energy/spring"]).values
     computed = reflection(absorber(cell, "fixed", 10, 400.0), omega, 10)
@@ -115,7 +122,9 @@ def test_a_packet_comes_back_as_computed():
 
 def test_an_absorbing_end_is_found_for_the_drive():
     case = small_case(lattice={"cells": 90, "absorbing": {"reflection": 1e-4}}, drive={"cycles": 30})
-    end, drive, chain = case.lattice.absorbing, case.drive, case.model().chain
+    end = case.lattice.absorbing
+    drive = case.drive
+    chain = case.model().chain
     section = absorber(chain.cell, "fixed", end.cells, end.strength)
     assert lobe_reflection(section, drive.frequency, drive.cycles) < 1e-4
     assert np.flatnonzero(chain.differs).tolist() == list(range(90 - end.cells, 90))
@@ -142,7 +151,8 @@ def test_profiles_defects_and_scatter_of_a_case():
     }
     lattice = {"profiles": profiles, "damping": {"mass": 5.0}}
     case = small_case(lattice=lattice, disorder=scattered)
-    varied, cell = case.model().chain.variation, case.model().chain.cell
+    varied = case.model().chain.variation
+    cell = case.model().chain.cell
     assert varied.masses[2, 1] == 2 * cell.masses[1]
     assert varied.stiffness[[0, -1], 0] == pytest.approx([2e4, 3e4])
     assert varied.damping[:, 3] == pytest.approx(0.1)
@@ -186,7 +196,8 @@ def lossy(cell, loss):
 
 @pytest.mark.parametrize("loss", [{2: 0.02}, {2: 0.002, 4: 0.003}, {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.001}])
 def test_dashpots_fitted_to_a_loss_are_the_best_by_the_complex_dispersion(loss):
-    cell, bands = four_band("calibrated"), np.array([*loss]) - 1
+    cell = four_band("calibrated")
+    bands = np.array([*loss]) - 1
     fitted = lossy(cell, loss)
 
     def misses(ground, beside):
@@ -210,7 +221,8 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
     case = small_case(
         lattice={"damping": {"loss": {"2": 0.02}}, "profiles": {"masses[1]": {"cells": [3], "factor": 2.0}}}
     )
-    resolved, chain = case.lattice.damping, case.model().chain
+    resolved = case.lattice.damping
+    chain = case.model().chain
     assert Case.from_toml(case.to_toml()) == case
     assert chain.cell == lossy(four_band("calibrated"), {2: 0.02})
     assert [*chain.cell.grounding] == resolved.grounding

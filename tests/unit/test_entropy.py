@@ -77,7 +77,8 @@ def test_fewer_cells_have_the_entropy_they_had(stride):
     loud = all_weight[:, ::stride] > 1e-4 * all_weight.max()
     assert np.abs(local - all_local[:, ::stride])[loud].max() < 1e-6
     assert weight == pytest.approx(all_weight[:, ::stride], rel=1e-6, abs=1e-9 * all_weight.max())
-    every, few = entropy(signal), entropy(signal, stride=stride)
+    every = entropy(signal)
+    few = entropy(signal, stride=stride)
     for name in ("energy_weighted", "masked", "joint"):
         assert getattr(few, name) == pytest.approx(getattr(every, name), rel=1e-3)
 
@@ -132,7 +133,8 @@ def test_snapshots_do_not_see_each_other():
 
 
 def test_averages_are_what_they_say():
-    signal, start = run(), 5
+    signal = run()
+    start = 5
     signal[:5] *= 100  # loud before the averages start: it must not count
     signal[8:] *= 0.05
     found = entropy(signal, start)
@@ -158,7 +160,8 @@ def test_the_mask_leaves_out_where_the_run_grows_quiet():
 
 
 def test_scattering_raises_every_average():
-    before, after = entropy(packet(200.0)[None]), entropy((packet(200.0) + packet(220.0, kappa=1.1))[None])
+    before = entropy(packet(200.0)[None])
+    after = entropy((packet(200.0) + packet(220.0, kappa=1.1))[None])
     for name in ("energy_weighted", "masked", "joint"):
         assert getattr(after, name) > getattr(before, name) + 0.1
 

@@ -35,7 +35,8 @@ def lattice(ends: str, cells: int, varied: str, damped: float) -> Model:
     if damped:
         springs = tuple(replace(spring, damping=damped * (2.0 + i)) for i, spring in enumerate(cell.springs))
         cell = replace(cell, springs=springs, grounding=(0.5 * damped, damped, 0.0, 2 * damped))
-    chain, random = replace(model.chain, cell=cell), np.random.default_rng(7)
+    chain = replace(model.chain, cell=cell)
+    random = np.random.default_rng(7)
     every = {"all": np.ones(cells, bool), "some": np.arange(cells) % 6 == 0, "none": np.zeros(cells, bool)}[varied]
     of_cells = [
         np.where(every[:, None], array * random.uniform(0.7, 1.3, array.shape if varied == "all" else 1), array)
@@ -46,9 +47,11 @@ def lattice(ends: str, cells: int, varied: str, damped: float) -> Model:
 
 def exponential(chain: Chain, t: float) -> np.ndarray:
     """The exact P(t), states ordered as (2 dof, cell)."""
-    n, size = chain.cells, chain.cells * chain.cell.dofs
+    n = chain.cells
+    size = chain.cells * chain.cell.dofs
     order = np.arange(size).reshape(n, -1).T.ravel()  # mass by mass
-    system, inverse = np.zeros((2 * size, 2 * size)), -1 / chain.masses()[order][:, None]
+    system = np.zeros((2 * size, 2 * size))
+    inverse = -1 / chain.masses()[order][:, None]
     system[:size, size:] = np.eye(size)
     system[size:, :size] = inverse * chain.stiffness_matrix().toarray()[np.ix_(order, order)]
     system[size:, size:] = inverse * chain.damping_rows(0, n).toarray()[np.ix_(order, order)]
@@ -77,12 +80,16 @@ def test_a_step_is_the_exponential_within_its_bound(ends, varied, damped):
     model = lattice(ends, 24, varied, damped)
     layout = Layout(model, MPI.COMM_SELF)
     for interval, tolerance in ((1.5e-4, 1e-15), (3e-4, 1e-7)):
-        series, halo = StepSeries(model.chain, interval, tolerance), HaloRegions(layout)
+        series = StepSeries(model.chain, interval, tolerance)
+        halo = HaloRegions(layout)
         stencil = create_stencil(series, layout, halo)
-        records, rows, n = halo.bind_columns([]), 2 * layout.dofs, layout.cells
+        records = halo.bind_columns([])
+        rows = 2 * layout.dofs
+        n = layout.cells
         matrix = np.empty((rows * n, rows * n))
         for column, unit in enumerate(np.eye(rows * n)):
-            state, out = unit.reshape(rows, n), np.empty((rows, n))
+            state = unit.reshape(rows, n)
+            out = np.empty((rows, n))
             exchange(records, 0, state)
             apply_propagator(stencil, state, records.columns, out)
             matrix[:, column] = out.ravel()
@@ -106,21 +113,27 @@ def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped, own)
         pairs = PAIRS | {23: Pair(2, 0, True) if ends == "periodic" else Pair(-1, 3)}
         chain = replace(model.chain, sites=(*pairs, 11), pairs=(*pairs.values(), Pair(-1, 2)), clearances=(1e-4,) * 8)
         model = replace(model, chain=chain)
-    layout, series = Layout(model, MPI.COMM_SELF), StepSeries(model.chain, 2e-4, 1e-15)
-    groups, halo = group_dofs(model, series.reach), HaloRegions(layout)
+    layout = Layout(model, MPI.COMM_SELF)
+    series = StepSeries(model.chain, 2e-4, 1e-15)
+    groups = group_dofs(model, series.reach)
+    halo = HaloRegions(layout)
     tables = create_dof_tables(groups, model, layout, series, halo)
     response = create_responses(groups, tables, model, series)
-    records, d, n = halo.bind_columns([]), layout.dofs, layout.cells
+    records = halo.bind_columns([])
+    d = layout.dofs
+    n = layout.cells
     state = np.random.default_rng(5).normal(size=(2 * d, n)) * np.repeat([1e-4, 0.1], d)[:, None]
     exchange(records, 0, state)
     taylor = np.zeros((len(groups.numbers), 2 * series.terms))
     for c in range(len(groups.first) - 1):
         expand_free_motion(tables, c, records.columns, taylor)
     step = exponential(model.chain, 0.7 * series.interval)
-    exact, masses = (step @ state.ravel()).reshape(2 * d, n), model.chain.masses().reshape(n, d)
+    exact = (step @ state.ravel()).reshape(2 * d, n)
+    masses = model.chain.masses().reshape(n, d)
     forms = np.zeros((len(taylor), d, n))
     for form, number in zip(forms, groups.numbers, strict=True):
-        drive, site = model.drives[max(-1 - number, 0)], max(number, 0)
+        drive = model.drives[max(-1 - number, 0)]
+        site = max(number, 0)
         pair, cell = (model.chain.contact_pairs[site], model.chain.sites[site]) if number >= 0 else (None, drive.cell)
         form[pair.resonator if pair else drive.mass, (cell + (pair is not None and pair.next_cell)) % n] += 1
         if pair and pair.host >= 0:
@@ -131,7 +144,8 @@ def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped, own)
         assert w == pytest.approx(np.sum(form * exact[:d]), rel=1e-11, abs=1e-17)
         assert rate / series.interval == pytest.approx(np.sum(form * exact[d:]), rel=1e-11)
         # An impulse on the DoF at .3 of the step.
-        moments, out = 0.7 ** np.arange(2 * series.terms)[None], np.zeros((2 * d, n))
+        moments = 0.7 ** np.arange(2 * series.terms)[None]
+        out = np.zeros((2 * d, n))
         apply_impulses(tables, i, moments, out)
         left = step @ np.append(np.zeros(d * n), form / masses.T)
         for part, expected in zip(out.reshape(2, -1), left.reshape(2, -1), strict=True):
@@ -146,18 +160,27 @@ def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped, own)
 @pytest.mark.parametrize("band", [0, 1, 3])
 def test_a_bloch_wave_decays_as_the_complex_dispersion_says(band):
     model = lattice("periodic", 16, "none", 0.02)
-    chain, layout, d = model.chain, Layout(model, MPI.COMM_SELF), model.chain.cell.dofs
-    kappa, series, halo = 2 * np.pi * 3 / 16, StepSeries(chain, 2e-4, 1e-15), HaloRegions(layout)
+    chain = model.chain
+    layout = Layout(model, MPI.COMM_SELF)
+    d = model.chain.cell.dofs
+    kappa = 2 * np.pi * 3 / 16
+    series = StepSeries(chain, 2e-4, 1e-15)
+    halo = HaloRegions(layout)
     # (s^2 M + s C(kappa) + K(kappa)) u = 0 as a linear problem.
-    inverse, zero, one = np.diag(1 / np.array(chain.cell.masses)), np.zeros((d, d)), np.eye(d)
+    inverse = np.diag(1 / np.array(chain.cell.masses))
+    zero = np.zeros((d, d))
+    one = np.eye(d)
     blocks = [[zero, one], [-inverse @ chain.cell.stiffness_matrix(kappa), -inverse @ chain.cell.damping_matrix(kappa)]]
     rates, vectors = np.linalg.eig(np.block(blocks))
     number = np.argsort(np.where(rates.imag > 0, rates.imag, np.inf))[band]
-    rate, shape = rates[number], vectors[:, number, None] * np.exp(1j * kappa * np.arange(16))
+    rate = rates[number]
+    shape = vectors[:, number, None] * np.exp(1j * kappa * np.arange(16))
     steps = int(4 / (-rate.real * series.interval))
     assert 100 < steps < 6000
     stencil = create_stencil(series, layout, halo)
-    records, state, out = halo.bind_columns([]), shape.real.copy(), np.empty_like(shape.real)
+    records = halo.bind_columns([])
+    state = shape.real.copy()
+    out = np.empty_like(shape.real)
     for _ in range(steps):
         exchange(records, 0, state)
         apply_propagator(stencil, state, records.columns, out)

@@ -52,8 +52,10 @@ def slab(item: ElementTree.Element, folder) -> np.ndarray:
 def test_every_reference_of_the_mesh_leads_to_its_field(folder):
     grids = ElementTree.parse(folder / "run.xdmf").getroot().findall("Domain/Grid/Grid")
     with open_run(folder / "run.h5") as run:
-        displacement, velocity = run["displacement"].values, run["velocity"].values
-        times, cells = run["field_time"].values, run["cell"].values
+        displacement = run["displacement"].values
+        velocity = run["velocity"].values
+        times = run["field_time"].values
+        cells = run["cell"].values
     assert len(grids) == len(times) == len(displacement)
     assert [float(grid.find("Time").get("Value")) for grid in grids] == times.tolist()
     for row, grid in enumerate(grids):

@@ -19,7 +19,8 @@ from vipetsc.io.lock import PATIENCE, locked
 
 ROOT = Path(__file__).parents[2]
 SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
-OLD, ANEW = "a = 1\n", "a = 2\n"
+OLD = "a = 1\n"
+ANEW = "a = 2\n"
 
 
 def claim(*arguments, **options):

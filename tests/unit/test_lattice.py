@@ -40,9 +40,12 @@ def cells(draw):
 
 def test_diatomic_bands_have_their_closed_form():
     """Host chain with a resonator: (A - m1 w2)(k - m2 w2) = k^2 with A = 2k(1 - cos kappa) + k."""
-    m1, m2, k = 0.01, 0.08, 9e4
+    m1 = 0.01
+    m2 = 0.08
+    k = 9e4
     a = 2 * k * (1 - np.cos(KAPPA)) + k
-    mean, product = (a / m1 + k / m2) / 2, (a * k - k**2) / (m1 * m2)
+    mean = (a / m1 + k / m2) / 2
+    product = (a * k - k**2) / (m1 * m2)
     upper = mean + np.sqrt(mean**2 - product)
     expected = np.sqrt(np.stack([product / upper, upper], axis=-1))
     assert np.allclose(bloch(diatomic(), KAPPA).frequency, expected, rtol=1e-9, atol=1e-3)
@@ -180,7 +183,8 @@ def test_burst_begins_and_ends_at_rest_and_peaks(envelope, peak):
 
 
 def test_wave_scale_is_linear_in_the_drive():
-    chain, burst = Chain(four_band(), 60), ToneBurst(1.0, 1206.34, 30)
+    chain = Chain(four_band(), 60)
+    burst = ToneBurst(1.0, 1206.34, 30)
     one = chain.wave_scale(burst)
     assert one > 0
     assert chain.wave_scale(ToneBurst(1e-3, 1206.34, 30)) == pytest.approx(1e-3 * one, rel=1e-12)
@@ -189,7 +193,8 @@ def test_wave_scale_is_linear_in_the_drive():
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_force_is_the_slope_of_the_potential(law):
-    contact, d = Contact(law, 1e6), 2e-3
+    contact = Contact(law, 1e6)
+    d = 2e-3
     w = np.array([-3e-3, -2.2e-3, -1e-3, 0.0, 1e-3, 2.2e-3, 3e-3])
     h = 1e-8
     slope = (contact.potential(w + h, d) - contact.potential(w - h, d)) / (2 * h)

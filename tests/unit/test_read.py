@@ -30,13 +30,15 @@ sites = [5, 5, 1]
 cycles = [30, 15, 30]
 amplitude = [0.1, 0.3]
 """
-LAWS, AMPLITUDES = ["hertz", "bilinear"], [0.1, 0.3]
+LAWS = ["hertz", "bilinear"]
+AMPLITUDES = [0.1, 0.3]
 
 
 @pytest.fixture
 def run(tmp_path):
     """A run of 30 cells, of which every third from the second on is recorded, with every second sample's fields."""
-    time, cells = np.arange(9) * 0.5, np.arange(2, 31, 3)
+    time = np.arange(9) * 0.5
+    cells = np.arange(2, 31, 3)
     data = {
         "time": ("time", time),
         "field_time": ("field_time", time[::2]),

@@ -24,7 +24,10 @@ def found():
 
 def slow(reading, lam, eta):
     """Signed deflection (kappa) and speeds (band) of one cell, from the paper's matrix with its -1/2 put in."""
-    m, k, k2, k3 = 0.005, 2e4, 1e4, lam * SPRING[reading]
+    m = 0.005
+    k = 2e4
+    k2 = 1e4
+    k3 = lam * SPRING[reading]
     masses = np.array([m, m * (1 - eta), m * eta, m])
 
     def modes(kappa):
@@ -36,10 +39,13 @@ def slow(reading, lam, eta):
         order = np.argsort(squared.real)
         return np.sqrt(squared.real[order].clip(0)), u[:, order]
 
-    deflection, speeds, h = [], [], 1e-5
+    deflection = []
+    speeds = []
+    h = 1e-5
     for kappa in KAPPA[1:-1]:
         _, u = modes(kappa)
-        u2, u3 = u[1, 1] / np.linalg.norm(u[:, 1]), u[2, 1] / np.linalg.norm(u[:, 1])
+        u2 = u[1, 1] / np.linalg.norm(u[:, 1])
+        u3 = u[2, 1] / np.linalg.norm(u[:, 1])
         deflection.append(abs(u3 - u2) * -np.sign((u2 * np.conj(u3)).real))
         speeds.append((modes(kappa + h)[0] - modes(kappa - h)[0]) / (2 * h))
     return np.array(deflection), np.abs(speeds)
@@ -123,7 +129,8 @@ def test_a_massless_host_or_resonator_is_refused(eta):
 def test_deflection_knows_neither_phase_nor_length_nor_direction(lam, eta, kappa, reading):
     """A wave to the left deflects as one to the right; a unit vector deflects by sqrt(2) at most."""
     cell = four_band(reading, lam, eta)
-    right, left = bloch(cell, kappa), bloch(cell, -kappa)
+    right = bloch(cell, kappa)
+    left = bloch(cell, -kappa)
     there = signed_deflection(cell, right)
     np.testing.assert_allclose(there, signed_deflection(cell, left), atol=1e-6)
     scaled = type(right)(right.frequency, right.vectors * 3 * np.exp(1j), right.group_velocity)

@@ -42,8 +42,12 @@ def split(signal, interval, edges):
 
 @pytest.mark.parametrize(("row", "direction"), [(5, 1), (5, -1), (12, 1)])
 def test_a_plane_wave_lands_on_its_bin(row, direction):
-    nt, n, interval, column = 128, 48, 0.01, 17
-    kappa, omega = direction * 2 * np.pi * row / n, 2 * np.pi * column / (nt * interval)
+    nt = 128
+    n = 48
+    interval = 0.01
+    column = 17
+    kappa = direction * 2 * np.pi * row / n
+    omega = 2 * np.pi * column / (nt * interval)
     t, x = np.arange(nt)[:, None] * interval, np.arange(n)
     velocity = np.cos(kappa * x - omega * t)[..., None]
     found = dispersion(velocity, [2.0], interval, tapers=(0, 0))
@@ -85,7 +89,8 @@ def test_parts_are_a_partition(nt, n, seed, inner):
 
 
 def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
-    velocity, edges = noise((64, 10, 2)), [0.0, 8.0, 20.0, np.inf]
+    velocity = noise((64, 10, 2))
+    edges = [0.0, 8.0, 20.0, np.inf]
     energy = part_energies(velocity, MASSES, 0.1, edges)
     total = kinetic_energy(velocity, MASSES).sum(axis=1)
     assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
@@ -104,7 +109,8 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
 def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, seed):
     """As many as the width of the part needs, wherever it lies and whatever the length."""
     low, high = sorted((10 * np.pi * one, 10 * np.pi * other))
-    velocity, edges = noise((nt, 3, 2), seed), [low, high]
+    velocity = noise((nt, 3, 2), seed)
+    edges = [low, high]
     energy = sum(kinetic_energy(part, MASSES).sum(axis=1) for part in split(velocity, 0.1, edges))
     assert np.allclose(
         part_energies(velocity, MASSES, 0.1, edges), [energy], rtol=0, atol=1e-12 * energy.max() + 1e-300
@@ -116,7 +122,8 @@ def test_a_narrow_part_takes_few_times_and_a_wide_one_every_stride():
     assert 3 * 255 <= narrow < 1100
     assert band_energies._fewest_steps(band_energies._Cosines(1100, 4400), 4420, 1) == 4420
     assert band_energies._fewest_steps(band_energies._Cosines(1100, 4400), 4420, 10) < 460
-    velocity, edges = noise((100, 3, 2)), [0.0, 20.0, np.inf]
+    velocity = noise((100, 3, 2))
+    edges = [0.0, 20.0, np.inf]
     every, some = (part_energies(velocity, MASSES, 0.1, edges, stride) for stride in (1, 10))
     assert np.allclose(every[0], some[0], rtol=1e-12) and not np.allclose(every[1], some[1], rtol=0.1)
 
@@ -161,7 +168,9 @@ def test_taper_keeps_the_mean_square():
 
 def test_ridge_of_a_packet_lies_on_the_branch():
     """A packet on band 2 of the four-band cell, made of its Bloch modes."""
-    cell, n, interval = four_band("calibrated"), 128, 4e-4
+    cell = four_band("calibrated")
+    n = 128
+    interval = 4e-4
     rows = np.arange(28, 46)
     kappa = 2 * np.pi * rows / n
     weight = np.exp(-(((rows - 37) / 4) ** 2))

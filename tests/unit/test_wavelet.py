@@ -61,7 +61,8 @@ def test_transform_is_the_direct_sum_over_the_periodised_wavelet(length, kc):
 @pytest.mark.parametrize(("cells", "kc", "odd"), [(90, 6.0, 0), (152, 6.0, 1), (90, 12.0, 0), (79, 12.0, 1)])
 def test_bank_is_transform_binning_and_inverse(cells, kc, odd):
     signal = noise((2, cells))
-    nodes, bank = Nodes.log(kc), filter_bank(cells, kc)
+    nodes = Nodes.log(kc)
+    bank = filter_bank(cells, kc)
     assert bank.length % 2 == odd
     parts = inverse(transform(signal, nodes.kappa, kc, bank.length), nodes, kc)
     assert parts.shape == (BINS, 2, bank.length)
@@ -71,7 +72,8 @@ def test_bank_is_transform_binning_and_inverse(cells, kc, odd):
 @pytest.mark.parametrize("kc", [6.0, 12.0])
 def test_analytic_bank_sums_to_one_where_the_nodes_reach(kc):
     bank = filter_bank(600, kc)
-    eta, total = wavenumbers(bank.length), bank.transfer.sum(axis=0)
+    eta = wavenumbers(bank.length)
+    total = bank.transfer.sum(axis=0)
     assert np.abs(total[(eta > np.pi / 60 * 1.6)] - 1).max() < 0.01
     assert total[0] == 0
     assert np.all(bank.transfer >= 0)
@@ -128,7 +130,8 @@ def test_analytic_parts_reconstruct_a_packet_within_one_percent():
 
 
 def test_partition_accounts_for_its_energies():
-    velocity, masses = noise((37, 80, 2)), np.array([0.01, 0.08])
+    velocity = noise((37, 80, 2))
+    masses = np.array([0.01, 0.08])
     velocity[0] = 0
     found = partition(velocity, masses, mean_over=1)
     assert found.field.shape == (12, 37, 80)

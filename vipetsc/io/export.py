@@ -62,7 +62,8 @@ def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> 
 
 def has_xdmf(folder: Path) -> bool:
     """Whether ``run.xdmf`` is there, and not older than ``run.h5``."""
-    mesh, run = folder / "run.xdmf", folder / "run.h5"
+    mesh = folder / "run.xdmf"
+    run = folder / "run.h5"
     return mesh.exists() and mesh.stat().st_mtime_ns >= run.stat().st_mtime_ns
 
 

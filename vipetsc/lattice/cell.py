@@ -78,7 +78,8 @@ class UnitCell:
     grounding: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if problems := cell_problems(self.masses, self.springs, self.host, self.resonator, self.grounding):
+        problems = cell_problems(self.masses, self.springs, self.host, self.resonator, self.grounding)
+        if problems:
             raise ValueError("; ".join(message for _, message in problems))
 
     @property
