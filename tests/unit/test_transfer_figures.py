@@ -13,7 +13,7 @@ from vipetsc.figures import runs, transfer_curves
 from vipetsc.figures.panels import block_means
 from vipetsc.figures.registry import FIGURES, draw
 from vipetsc.figures.style import rc_style
-from vipetsc.figures.sweep_members import Files, SweepMember, Sweeps
+from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
 from vipetsc.figures.transfer import closing_error
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
@@ -64,7 +64,7 @@ def whole(tmp_path_factory):
 
 
 def contact_motion(folder):
-    with SweepMember.open(folder) as member:
+    with MemberRun.open(folder) as member:
         return transfer_curves.ContactMotion.of(member)
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 from tests.conftest import small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
-from vipetsc.figures import panels, runs
+from vipetsc.figures import impact_panels, panels, runs
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import four_band, max_group_velocity
 
@@ -52,18 +52,18 @@ def impacts_of(sites: int, episodes: int, loss: float = 0.0):
 
 
 def test_impacts_that_markers_do_not_tell_apart_are_a_map():
-    few = runs.impacts(impacts_of(5, 20, 1e-6), None).axes
+    few = impact_panels.impacts(impacts_of(5, 20, 1e-6), None).axes
     assert len(few[0].collections) == 2 and not few[0].images and few[1].get_title() == "(b) Loss, episodes"
-    many = runs.impacts(impacts_of(59, 35_400), None).axes
+    many = impact_panels.impacts(impacts_of(59, 35_400), None).axes
     (image,) = many[0].images
     largest = np.ma.filled(image.get_array(), np.nan)
-    assert largest.shape == (59, runs.COLUMNS_OF_A_MAP) and not many[0].collections
+    assert largest.shape == (59, impact_panels.MAP_COLUMNS) and not many[0].collections
     at = 4000  # of site 48, as is number 3941 in the same column
-    assert largest[at % 59, int((at + 0.5) / 35_400 * runs.COLUMNS_OF_A_MAP)] == 1.0 + at
+    assert largest[at % 59, int((at + 0.5) / 35_400 * impact_panels.MAP_COLUMNS)] == 1.0 + at
     assert len(many[0].get_yticks()) <= 13 and many[0].get_yticklabels()[1].get_text() == "60"
     assert many[1].get_title() == "(b) Episodes" and {p.get_width() for p in many[1].patches} == {600}
-    pooled = runs.impacts(impacts_of(1000, 3000), None).axes[0].images[0]
-    assert len(pooled.get_array()) <= runs.ROWS_OF_A_MAP
+    pooled = impact_panels.impacts(impacts_of(1000, 3000), None).axes[0].images[0]
+    assert len(pooled.get_array()) <= impact_panels.MAP_ROWS
 
 
 def test_contacts_that_touch_from_the_beginning_show_their_indentation():
@@ -79,5 +79,5 @@ def test_contacts_that_touch_from_the_beginning_show_their_indentation():
     )
     depth = panels.indentations(data, case.model())
     assert depth[1, 5] == 2e-6 and np.count_nonzero(depth) == 1
-    raster, bars, *_ = runs.impacts(data.assign_attrs(case=case.to_toml()), None).axes
+    raster, bars, *_ = impact_panels.impacts(data.assign_attrs(case=case.to_toml()), None).axes
     assert raster.get_title() == "(a) Indentation" and [bar.get_width() for bar in bars.patches] == [0.0, 3.0]

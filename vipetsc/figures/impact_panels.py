@@ -23,7 +23,7 @@ SPEEDS = "viridis_r"
 class Episodes(NamedTuple):
     """Contact episodes of a run (episode), and the sites (site) where they may be.
 
-    ``site`` counts from 1; ``side`` is 1 or -1; ``onset`` in s, ``speed`` of the approach in m/s, ``force`` in N,
+    ``site`` counts from 1; ``side`` is 1 or -1; ``onset`` in s, ``speed`` of the approach in m/s,
     ``loss`` in J, 0 where it is not known; ``cells`` from 1; ``span`` is the first and the last time of the run.
     """
 
@@ -31,7 +31,6 @@ class Episodes(NamedTuple):
     side: np.ndarray
     onset: np.ndarray
     speed: np.ndarray
-    force: np.ndarray
     loss: np.ndarray
     cells: np.ndarray
     span: np.ndarray
@@ -44,7 +43,6 @@ class Episodes(NamedTuple):
             side=run["impacts/side"].values,
             onset=run["impacts/onset"].values,
             speed=np.abs(run["impacts/approach_velocity"].values),
-            force=np.abs(run["impacts/force"].values),
             loss=np.nan_to_num(run["impacts/loss"].values),
             cells=run["sites/cell"].values,
             span=run["time"].values[[0, -1]],
@@ -92,7 +90,8 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     else:
         _draw_speed_map(raster, episodes)
     _label_sites(raster, episodes, every=1 if has_rows else -(-len(episodes.cells) // MOST_LABELS))
-    _draw_bars(bars, episodes, are_pressed, has_rows)
+    force = np.abs(run["impacts/force"].values) if are_pressed else None
+    _draw_bars(bars, episodes, has_rows, force)
     return figure
 
 
@@ -146,15 +145,15 @@ def _label_sites(axes: Axes, episodes: Episodes, every: int) -> None:
     axes.set_ylim(0.4, len(episodes.cells) + 0.6)
 
 
-def _draw_bars(axes: Axes, episodes: Episodes, are_pressed: bool, has_rows: bool) -> None:
-    """Draw a bar for every site: the largest force of pressed contacts, or else the loss, or the number of episodes."""
+def _draw_bars(axes: Axes, episodes: Episodes, has_rows: bool, force: np.ndarray | None) -> None:
+    """Draw a bar for every site: the largest ``force`` of its episodes if given, or the loss, or how many there are."""
     sites = len(episodes.cells)
     count = np.bincount(episodes.site_index, minlength=sites)
     loss = np.bincount(episodes.site_index, episodes.loss, sites)
     length: np.ndarray
-    if are_pressed:
+    if force is not None:
         length = np.zeros(sites)
-        np.fmax.at(length, episodes.site_index, episodes.force)
+        np.fmax.at(length, episodes.site_index, force)
         axes.set(title="(b) Largest force", xlabel="Force (N)")
     elif loss.any():
         length = loss

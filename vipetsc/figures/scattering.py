@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import ROMAN
-from vipetsc.figures.sweep_members import AmplitudeSeries, SweepMember, from_series
+from vipetsc.figures.sweep_members import AmplitudeSeries, MemberRun, from_series
 from vipetsc.io.read import field_time
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.spectra import Nodes, inverse, transform
@@ -101,7 +101,7 @@ def wavelets(series: AmplitudeSeries) -> Figure:
     return figure
 
 
-def _wavelets(member: SweepMember, times: np.ndarray, kappa: np.ndarray) -> Wavelets:
+def _wavelets(member: MemberRun, times: np.ndarray, kappa: np.ndarray) -> Wavelets:
     """Return the transforms of the samples nearest to ``times`` (s) at the wavenumbers ``kappa``."""
     time = field_time(member.run)
     samples = [int(np.argmin(np.abs(time - t))) for t in times]
@@ -215,7 +215,7 @@ def _draw_driven_band(axes: Axes, series: AmplitudeSeries, colours: np.ndarray) 
     axes.set(title=f"(c) Band {wave.band} by bin", xlabel="κ (π rad/cell)", ylabel="ω (krad/s)", xlim=(0, 1))
 
 
-def _draw_contours(axes: Axes, member: SweepMember, colours: np.ndarray) -> None:
+def _draw_contours(axes: Axes, member: MemberRun, colours: np.ndarray) -> None:
     """Draw every bin where its energy exceeds ``LEVEL`` of the largest of any, filled and outlined in its colour."""
     field = member.analysis[FIELD].values
     cells = member.analysis["cell"].values
@@ -276,7 +276,7 @@ class Snapshot(NamedTuple):
     parts: np.ndarray
 
     @classmethod
-    def nearest(cls, member: SweepMember, wanted: float) -> Self:
+    def nearest(cls, member: MemberRun, wanted: float) -> Self:
         """Return the snapshot of the partition that is nearest to the time ``wanted`` in s."""
         snapshots = member.analysis["partition/snapshot"].values
         time = float(snapshots[np.argmin(np.abs(snapshots - wanted))])

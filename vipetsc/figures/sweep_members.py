@@ -52,7 +52,7 @@ class Sweeps(list[xr.Dataset]):
         self.files = files
 
 
-class SweepMember(NamedTuple):
+class MemberRun(NamedTuple):
     """A member of a sweep with its fields: its case, in the lattice's own terms (0-based) too, and its files."""
 
     folder: Path
@@ -70,11 +70,11 @@ class SweepMember(NamedTuple):
             yield cls(folder=folder, case=case, model=case.model(), run=run, analysis=analysis)
 
 
-def transfer_members(sweeps: Sweeps) -> Iterator[SweepMember]:
+def transfer_members(sweeps: Sweeps) -> Iterator[MemberRun]:
     """Yield the whole members with sites and a band above the driven one."""
     for ensemble in sweeps:
         for _, folder in whole_members(ensemble):
-            member = sweeps.files.get(folder, SweepMember.open)
+            member = sweeps.files.get(folder, MemberRun.open)
             # The transfer of a lattice without a higher band is not a number.
             if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
                 yield member
@@ -109,7 +109,7 @@ class AmplitudeSeries(NamedTuple):
 
     suffix: str
     title: str
-    runs: tuple[SweepMember, ...]
+    runs: tuple[MemberRun, ...]
     wave: DrivenWave
 
     @property
@@ -182,7 +182,7 @@ def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
     measured = [(ensemble, _triples(ensemble)) for ensemble in sweeps]
     several_sweeps = sum(bool(triples) for _, triples in measured) > 1
     for ensemble, triple in ((ensemble, triple) for ensemble, triples in measured for triple in triples):
-        runs = tuple(sweeps.files.get(member.folder, SweepMember.open) for member in triple)
+        runs = tuple(sweeps.files.get(member.folder, MemberRun.open) for member in triple)
         if all("velocity" in run.run and all(name in run.analysis for name in needs) for run in runs):
             wave = DrivenWave.of(runs[0].case)
             yield AmplitudeSeries(

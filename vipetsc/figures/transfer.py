@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
 from vipetsc.figures.style import Drawing
-from vipetsc.figures.sweep_members import Files, Labels, SweepMember, Sweeps, grouped, transfer_members
+from vipetsc.figures.sweep_members import Files, Labels, MemberRun, Sweeps, grouped, transfer_members
 from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
@@ -26,7 +26,7 @@ FIELD = "bands/kinetic_energy"  # (band, t, cell)
 INPUT_CELL = 5  # the paper's cell before the sites; the one behind them is the middle of the lattice, its cell 150
 
 
-class Segment(NamedTuple):
+class SegmentLook(NamedTuple):
     """Cells before or behind the first site: how they are named and marked on a page."""
 
     label: str
@@ -35,8 +35,8 @@ class Segment(NamedTuple):
 
 # By the spectra of the analysis.
 SEGMENTS = {
-    "dispersion_before": Segment("Input segment", style.SKY),
-    "dispersion_after": Segment("Output segment", style.YELLOW),
+    "dispersion_before": SegmentLook("Input segment", style.SKY),
+    "dispersion_after": SegmentLook("Output segment", style.YELLOW),
 }
 ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
 GAPS = (style.DASHED, (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))
@@ -52,7 +52,7 @@ def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
             yield Drawing(Labels.of(member.case).member_stem, partial(nine_panels, member))
 
 
-def nine_panels(member: SweepMember) -> Figure:
+def nine_panels(member: MemberRun) -> Figure:
     """Draw (a) all energy, (b-e) that of every pass band, (f, g) both segments, (h, i) spectra of two cells."""
     run = member.run
     cell = member.model.chain.cell
@@ -81,7 +81,7 @@ def nine_panels(member: SweepMember) -> Figure:
     return figure
 
 
-def _draw_space_time(page: SubFigure, member: SweepMember, tags: Iterator[str]) -> None:
+def _draw_space_time(page: SubFigure, member: MemberRun, tags: Iterator[str]) -> None:
     """Draw kinetic energy of all frequencies beside that of each pass band, to one scale; segments marked."""
     run = member.run
     energy = member.analysis["kinetic_energy"]
@@ -104,7 +104,7 @@ def _draw_space_time(page: SubFigure, member: SweepMember, tags: Iterator[str]) 
     _mark_segments(whole, member)
 
 
-def _mark_segments(axes: Axes, member: SweepMember) -> None:
+def _mark_segments(axes: Axes, member: MemberRun) -> None:
     """Draw lines along the cells before and behind the first site, on the right edge of a map over cells."""
     cells = member.analysis["kinetic_energy"]["cell"].values
     first = member.run["sites/cell"].values[leading_site(member.run)]
@@ -122,7 +122,7 @@ def _mark_segments(axes: Axes, member: SweepMember) -> None:
         axes.text(0.955, 0.5 * (low + high), name, transform=across, **text)
 
 
-def _draw_spectra(axes: Axes, member: SweepMember, velocity: np.ndarray) -> None:
+def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
     """Draw amplitude spectra of the masses of one cell, ``velocity`` (t, dof); pass bands shaded, history inset."""
     cell = member.model.chain.cell
     step = field_interval(member.run)
@@ -183,7 +183,7 @@ def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
         if (law, amplitude) not in folders:
             panels.annotate_empty(axes, "no such run")
             continue
-        member = files.get(folders[law, amplitude], SweepMember.open)
+        member = files.get(folders[law, amplitude], MemberRun.open)
         cell = member.model.chain.cell
         energy = panels.below_cutoff(member.analysis, cell, ["dispersion"])["dispersion"]
         energy = energy / (float(energy.max()) or 1.0)
@@ -221,7 +221,7 @@ def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndar
     return np.divide(np.abs(together - whole), whole, out=np.full_like(whole, np.nan), where=above_threshold)
 
 
-def energies_over_time(member: SweepMember) -> Figure:
+def energies_over_time(member: MemberRun) -> Figure:
     """Draw the parts and their sum against the total (mean over a period of the drive), and how far they miss it."""
     analysis = member.analysis
     time = analysis["bands/sample"].values

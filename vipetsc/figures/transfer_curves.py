@@ -19,7 +19,7 @@ from vipetsc.figures.sweep_members import (
     AMPLITUDE,
     Files,
     Labels,
-    SweepMember,
+    MemberRun,
     Sweeps,
     grouped,
     sites_of,
@@ -245,7 +245,7 @@ class ContactMotion(NamedTuple):
     ibtet: float
 
     @classmethod
-    def of(cls, member: SweepMember) -> Self:
+    def of(cls, member: MemberRun) -> Self:
         """Return the motion of ``member`` for ``PERIODS`` of the drive about its largest relative displacement."""
         run = member.run
         cell = member.model.chain.cell
@@ -281,7 +281,7 @@ def _settings(case: Case) -> str:
 
 def _regimes(folders: Sequence[Path], files: Files, curves_by_site: Mapping[tuple[Any, ...], TransferCurve]) -> Figure:
     """Draw the transfer over the amplitude with the members numbered, and the portrait of each beside it."""
-    motions = [ContactMotion.of(files.get(folder, SweepMember.open)) for folder in folders]
+    motions = [ContactMotion.of(files.get(folder, MemberRun.open)) for folder in folders]
     motions.sort(key=lambda motion: motion.case.drive.amplitude)
     case = motions[0].case
     labels = Labels.of(case)
