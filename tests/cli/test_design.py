@@ -80,17 +80,21 @@ def test_pictures_again_from_the_file_alone(in_process, case, tmp_path):
     assert in_process("design", case, "--out", out, "--set", "design.readings=['printed']").returncode == 0
     bare.mkdir()
     (out / "design.h5").rename(bare / "design.h5")
+
     done = in_process("plot", bare, "--format", "png", "--format", "pdf")
     assert done.returncode == 0, done.stderr
     drawn = {p.name: p.stat().st_size for p in (bare / "figures").iterdir()}
     assert drawn.keys() == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
     assert min(drawn.values()) > 5000
     assert (bare / "figures" / "cost_maps.png").read_bytes() == (out / "figures" / "cost_maps.png").read_bytes()
+
     one = in_process("plot", bare / "design.h5", "--fig", "cost_maps")
     assert one.stdout.split() == [str(bare / "figures" / "cost_maps.png")]
+
     wrong = in_process("plot", bare, "--fig", "ledger")
     assert wrong.returncode == 2
     assert "cost_maps" in wrong.stderr
+
     (bare / "design.h5").write_bytes(b"nothing")
     broken = in_process("plot", bare)
     assert broken.returncode == 2
@@ -153,6 +157,7 @@ def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
         done = in_process("design", case, "--out", folder, "--force")
         assert done.returncode == 2
         assert "of this kind" in done.stderr
+
     search = tmp_path / "search"
     search.mkdir()
     (search / "case.toml").write_text("")
@@ -161,6 +166,7 @@ def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
         done = in_process(*verb, "--out", search, "--force")
         assert done.returncode == 2
         assert "of this kind" in done.stderr
+
     missing = in_process("design", tmp_path / "nowhere.toml")
     assert missing.returncode == 2
     assert "a case file (TOML) is needed" in missing.stderr

@@ -47,41 +47,42 @@ def shown(tmp_path_factory):
         mark = "const m = document.querySelector('.mark');"
         found = "m.hidden ? [] : [parseFloat(m.style.left) / i.offsetWidth, parseFloat(m.style.top) / i.offsetHeight]"
 
-        def told(panel: dict, x: float, y: float) -> tuple[str, list[float]]:
-            """What stands below the picture with the pointer at shares of a panel; where the mark is, as shares."""
-            (west, north, east, south), across, up = panel["box"], x, y
+        def read_off(panel: dict, x: float, y: float) -> tuple[str, list[float]]:
+            """What stands below the picture with the pointer at (x, y), 0 to 1, of a panel; where the mark is."""
+            west, north, east, south = panel["box"]
             left, top, width, height = browser.ask(session, box + "return [b.left, b.top, b.width, b.height];")
-            x, y = west + across * (east - west), south + up * (north - south)
-            browser.drag(session, (left + x * width, top + y * height))
+            across = west + x * (east - west)
+            up = south + y * (north - south)
+            browser.drag(session, (left + across * width, top + up * height))
             text = browser.ask(session, "return document.querySelector('figure output').textContent;")
             return text, browser.ask(session, f"{image}{mark} return {found};")
 
-        yield axes, told
+        yield axes, read_off
         assert browser.measure(session)["errors"] == []
 
 
 @NEEDED
 def test_a_map_tells_the_value_of_its_colour(shown):
-    (area, _), told = shown
-    for share in (0.3, 0.42, 0.6, 0.77, 0.93):
-        text, mark = told(area, share, 0.2)
+    (area, _), read_off = shown
+    for x in (0.3, 0.42, 0.6, 0.77, 0.93):
+        text, mark = read_off(area, x, 0.2)
         value = float(re.search(r"; Energy \(J\) ≈ (\S+)$", text)[1])
-        assert value == pytest.approx(np.interp(share * CELLS - 0.5, np.arange(CELLS), ENERGY), rel=0.2), text
+        assert value == pytest.approx(np.interp(x * CELLS - 0.5, np.arange(CELLS), ENERGY), rel=0.2), text
         assert mark == []
-    assert told(area, 0.05, 0.2)[0].endswith("Energy (J) ≤ 0.000001")
-    assert "Energy (J) ≥" in told(area, 0.995, 0.2)[0]
-    assert "Energy" not in told(area, 0.6, 0.51)[0]  # the white line
+    assert read_off(area, 0.05, 0.2)[0].endswith("Energy (J) ≤ 0.000001")
+    assert "Energy (J) ≥" in read_off(area, 0.995, 0.2)[0]
+    assert "Energy" not in read_off(area, 0.6, 0.51)[0]  # the white line
 
 
 @NEEDED
 def test_logarithmic_axes_are_read_by_decades(shown):
-    (_, panel), told = shown
-    text, mark = told(panel, 0.5, 0.9)  # away from the points: the place itself
+    (_, panel), read_off = shown
+    text, mark = read_off(panel, 0.5, 0.9)  # away from the points: the place itself
     place = [float(number) for number in re.findall(r": ([\d.e+]+)", text)]
     assert place == pytest.approx([100, 10**4.5], rel=0.05) and mark == [], text
     west, north, east, south = panel["box"]
     for x, y in zip(*POINTS, strict=True):
         across, up = (np.log10(x) + 1) / 6, np.log10(y) / 5
-        text, mark = told(panel, across + 0.01, up)
+        text, mark = read_off(panel, across + 0.01, up)
         assert "two points" in text and f"N): {x:g};" in text and text.endswith(f": {y:g}")
         assert mark == pytest.approx([west + across * (east - west), south + up * (north - south)], abs=0.002)

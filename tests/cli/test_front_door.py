@@ -46,14 +46,17 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monke
     ended = on_ranks(ranks, "run", case, "--out", tmp_path / "out")
     assert ended.returncode == 0, ended.stderr
     assert "complete: 301 samples" in ended.stdout
+
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["complete"]
     assert summary["ranks"] == max(ranks, 1)
     assert summary["case"]["contacts"]["sites"] == [6, 12, 13]
     assert summary["statistics"]["ledger_error"] < 1e-8
     assert summary["petsc_version"]
+
     files = {p.name for p in (tmp_path / "out").iterdir()}
     assert files == {"run.h5", "summary.json", "case.toml", "analysis.h5", "run.xdmf", "figures"}
+
     pictures = {p.name: p.stat().st_size for p in (tmp_path / "out" / "figures").glob("*.png")}
     wanted = {"modal_energies", "spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
     assert {f"{name}.png" for name in wanted} <= pictures.keys()
@@ -78,7 +81,9 @@ def assert_the_same_command_finishes_what_is_missing(in_process, case, out):
         assert modified(out).keys() == before.keys()
         assert missing or modified(out) == before
         assert modified(out)[out / "run.h5"] == before[out / "run.h5"]
+
     assert {"status", "complete", "statistics", "case"} <= json.loads((out / "summary.json").read_text()).keys()
+
     (out / "run.h5").write_bytes((out / "run.h5").read_bytes()[:1000])
     cut = in_process("run", case, "--out", out)
     assert cut.returncode == 2
@@ -90,9 +95,11 @@ def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
     ended = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "runs" / "four-band" / "run.h5").exists()
+
     other = in_process("--set", "time.end=0.02", *QUICK, cwd=tmp_path)
     assert other.returncode == 2
     assert "time.end = 0.01 there, 0.02 here; --force replaces it" in other.stderr
+
     forced = in_process("--set", "time.end=0.02", *QUICK, "--force", cwd=tmp_path)
     assert forced.returncode == 0, forced.stderr
     assert "end = 0.02" in (tmp_path / "runs" / "four-band" / "case.toml").read_text()
@@ -223,9 +230,9 @@ def test_bands_as_json_and_picture(in_process, tmp_path):
 
 def test_bands_with_modes_of_the_finite_lattice(in_process, tmp_path):
     asked = "bands", "--set", "lattice.cells=40", "--out", tmp_path / "bands"
-    told = in_process(*asked, "--modes", "2", "--near", "2034")
-    assert told.returncode == 0, told.stderr
-    rows = [line.split() for line in told.stdout.splitlines() if line.endswith("edge")]
+    printed = in_process(*asked, "--modes", "2", "--near", "2034")
+    assert printed.returncode == 0, printed.stderr
+    rows = [line.split() for line in printed.stdout.splitlines() if line.endswith("edge")]
     assert [row[:3] for row in rows] == [["1", "2034.825055", "gap"], ["2", "2034.825055", "gap"]]
     with h5py.File(tmp_path / "bands" / "modes.h5") as file:
         assert file["shape"].shape == (2, 40, 4)

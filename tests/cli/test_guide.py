@@ -101,9 +101,11 @@ def test_what_the_guide_says_of_its_lattice_is_so(desk):
     assert case.lattice.unit_cell().dofs == 3
     assert len(Sweep.load(desk / "my-lattice.toml").members()) == 7
     assert System.from_case(NnmCase.load(desk / "my-lattice.toml")).branch_name(1) == "out-of-phase"
+
     with h5py.File(desk / "runs/my-lattice/run.h5") as file:
         assert len(file["impacts/onset"]) == 71
         assert file["energy/dissipated"][-1] / file["energy/work"][-1] == pytest.approx(1 / 3, abs=0.03)
+
     with h5py.File(desk / "runs/my-sweep/ensemble.h5") as file:
         ibtet, episodes = file["ibtet"][...], file["contact_episodes"][...]
         quiet = episodes == 0

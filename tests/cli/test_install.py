@@ -102,8 +102,8 @@ def test_the_top_level_holds_what_it_may():
 def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     """The console script alone and under mpirun, and a part of the tiny paper."""
     program, rank = site / "bin" / "vipetsc", ["mpirun", "--oversubscribe", "-n", "2"]
-    told = call(sys.executable, "-c", "import vipetsc; print(vipetsc.__file__)", cwd=tmp_path, site=site)
-    assert Path(told.stdout.strip()).is_relative_to(site)
+    printed = call(sys.executable, "-c", "import vipetsc; print(vipetsc.__file__)", cwd=tmp_path, site=site)
+    assert Path(printed.stdout.strip()).is_relative_to(site)
     assert call(program, "--version", cwd=tmp_path, site=site).stdout == f"vipetsc {package.__version__}\n"
     ended = call(*rank, program, "run", *TINY, cwd=tmp_path, site=site)
     assert ended.stdout.count("complete: ") == 1
@@ -112,8 +112,8 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     assert "scattering" in call(program, "paper", "--list", cwd=tmp_path, site=site).stdout
     shutil.copy2(ROOT / "tests/cli/tiny_paper.py", tmp_path)
     call(sys.executable, "tiny_paper.py", "paper", "fig01", "C8", "C10", cwd=tmp_path, site=site)
-    for made in ("design/design.h5", "scattering/ensemble.h5", "report.html"):
-        assert (tmp_path / "paper" / made).exists()
+    for path in ("design/design.h5", "scattering/ensemble.h5", "report.html"):
+        assert (tmp_path / "paper" / path).exists()
 
 
 def test_what_pip_cannot_bring_is_named(site, tmp_path):

@@ -44,6 +44,7 @@ def test_schema_manual_texts_and_validator_name_the_same_keys():
     assert {name: set(texts) for name, texts in keys.texts().items()} == {
         name: names for name, names in (validator | {"CaseFile": {"name"}}).items() if names
     }
+
     shown = {}
     for path, text in re.findall(r"^## \[(\S+)\]\n(.*?)(?=^## |\Z)", keys.chapter(), flags=re.M | re.S):
         shown.setdefault(path, set()).update(re.findall(r"^\| `(\w+)` \|", text, flags=re.M))
@@ -54,8 +55,8 @@ def test_schema_manual_texts_and_validator_name_the_same_keys():
 
 def test_a_refused_key_names_those_of_the_schema():
     _, problems = read_section(DriveTable, {"xyzzy": 1}, "drive")
-    told = set(problems[0].remedy.removeprefix("unknown key; valid keys: ").split(", "))
-    assert told == set(keys.json_schema()["$defs"]["DriveTable"]["properties"])
+    named = set(problems[0].remedy.removeprefix("unknown key; valid keys: ").split(", "))
+    assert named == set(keys.json_schema()["$defs"]["DriveTable"]["properties"])
 
 
 @pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)

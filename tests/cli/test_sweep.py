@@ -46,6 +46,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out)
     assert ended.returncode == 0, ended.stderr
+
     index = json.loads((out / "index.json").read_text())
     assert sum(index["members"].values()) == 12 and not index["members"]["failed"] and index["failed"] == []
     with h5py.File(out / "ensemble.h5") as file:
@@ -83,6 +84,7 @@ def test_a_member_is_made_again_whole_by_its_name_or_number(in_process, case, tm
         names, status = ensemble["member"].values.ravel(), ensemble["status"].values.ravel()
         work, entropy = ensemble["work"].values.ravel(), ensemble["entropy/masked"].values.ravel()
     assert status.tolist() == [1, 0]
+
     for number, name in enumerate((names[0], "1")):
         run = tmp_path / f"run-{number}"
         ended = in_process("run", out, "--member", name, "--out", run, "--set", "output.figures=false")
@@ -91,6 +93,7 @@ def test_a_member_is_made_again_whole_by_its_name_or_number(in_process, case, tm
         assert found["energy/work"][-1] == pytest.approx(work[number], rel=1e-6 if status[number] else 0)
         assert measured["entropy/masked"] == pytest.approx(entropy[number], rel=1e-6 if status[number] else 0)
         assert found["velocity"].shape == (301, 40, 2)
+
     for path, name, says in (
         (out, "2", "--member = '2': is no member"),
         (case, "x", "is no member"),
@@ -201,14 +204,17 @@ def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
         "sweep.contacts.sites=[2]",
     )
     assert in_process("sweep", case, "--out", out, *keys).returncode == 0
+
     before = {p: datasets(p) for p in [*out.glob("*/analysis.h5"), out / "ensemble.h5"]}
     for path in before:
         path.unlink()
+
     ended = vipetsc(2, "analyse", out)
     assert ended.returncode == 0, ended.stderr
     assert len(before) == 3
     for path, found in before.items():
         assert_same_bits(found, datasets(path))
+
     nothing = in_process("analyse", tmp_path)
     assert nothing.returncode == 2
     assert "holds no run.h5" in nothing.stderr

@@ -18,6 +18,7 @@ from vipetsc.io.folder import KINDS, FolderError
 
 ROOT = Path(__file__).parents[2]
 NAMES = [verb.name for verb in study_verbs()]
+DRAWN = [verb.name for verb in study_verbs() if verb.pictures]
 pytestmark = pytest.mark.parallel(1)
 
 
@@ -89,7 +90,7 @@ def test_petsc_options_of_what_is_simulated_are_checked(call, tmp_path, name):
         assert ended.returncode == DONE
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", DRAWN)
 def test_pictures_are_drawn_where_they_are_wanted_and_can_be(call, drawn, name):
     ended = call(name, finish)
     assert drawn == [VERBS[name].pictures.source]
@@ -132,7 +133,7 @@ def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
     assert len(rows) == len(set(rows))  # run and predict read it, and share the rows of the lattice
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", DRAWN)
 def test_results_are_recognised_by_their_file(tmp_path, name):
     pictures = VERBS[name].pictures
     file = tmp_path / pictures.file.replace("*", "x")
@@ -140,6 +141,12 @@ def test_results_are_recognised_by_their_file(tmp_path, name):
     assert pictures_of([tmp_path]) == (pictures, [tmp_path])
     if "*" not in pictures.file:
         assert pictures_of([file]) == (pictures, [tmp_path])
+
+
+def test_a_verb_may_have_nothing_to_draw(call, monkeypatch, drawn):
+    monkeypatch.setitem(VERBS, "law", replace(VERBS["law"], pictures=None))
+    assert call("law", finish).returncode == DONE
+    assert drawn == []
 
 
 def test_only_sweeps_and_branches_share_a_page(tmp_path):

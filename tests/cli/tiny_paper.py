@@ -71,6 +71,7 @@ def measure_claims(root: Path) -> list[dict]:
         if path.exists():
             with h5py.File(path) as file:
                 value = {"total": float(np.nansum(file[data][...]))}
+
         verdict = "holds" if value else "not measured"
         for reading in ("calibrated", "printed"):
             text = f"the {key} of the small lattice adds up"

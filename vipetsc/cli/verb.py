@@ -111,16 +111,16 @@ class StudyVerb(Verb):
     """A verb that computes results of a ``case`` into a folder.
 
     ``study`` computes, prints what came out, and says how it ended; all ranks call it. ``table`` are the rows that
-    ``validate`` prints of a case on so many ranks, ``pictures`` what is drawn of the results. The folder is named
-    after the case, with the ``suffix``. ``load`` reads the case from the parsed options, where ``CASE`` and ``--set``
-    do not say all.
+    ``validate`` prints of a case on so many ranks, ``pictures`` what is drawn of the results, if anything is. The
+    folder is named after the case, with the ``suffix``. ``load`` reads the case from the parsed options, where ``CASE``
+    and ``--set`` do not say all.
     """
 
     case: type[CaseFile]
     study: Callable[[Any, Work], Outcome]
     table: Callable[[Any, int], Rows]
-    pictures: Pictures
     results: FolderKind
+    pictures: Pictures | None = None
     suffix: str = ""
     load: Callable[[argparse.Namespace], CaseFile] | None = None
     is_stoppable: bool = True
@@ -138,7 +138,7 @@ class StudyVerb(Verb):
             outcome = self.study(case, work)
             # What was computed is saved; pictures are drawn by the command that goes on.
             stop.check(comm)
-            if outcome.drawable and case.wants_pictures:
+            if self.pictures and outcome.drawable and case.wants_pictures:
                 echo_paths(comm, draw_pictures(self.pictures, [folder], comm, afresh=False))
 
         # Last, where a user sees them; with --quiet they are all that is printed.

@@ -87,7 +87,7 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     from vipetsc.cli.verbs.verb_list import study_verbs
 
     # Verbs that leave the same kind of folder share their pictures.
-    known = {verb.pictures.source: verb.pictures for verb in study_verbs()}
+    known = {verb.pictures.source: verb.pictures for verb in study_verbs() if verb.pictures}
     files = {pictures.file for pictures in known.values()}
     folders = [path.parent if path.name in files else path for path in paths]
     for pictures in known.values():
