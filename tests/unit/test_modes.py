@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 
 from mpi4py import MPI
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -18,7 +19,7 @@ from scipy.integrate import DOP853
 
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import Guards, NnmCase, NnmTable
-from vipetsc.lattice import Contact, contact_stiffness, diatomic, four_band
+from vipetsc.lattice import Chain, Contact, Spring, UnitCell, contact_stiffness, diatomic, four_band
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, is_jump, sampled, suspects
 from vipetsc.modes.branches.files import LAYOUTS, read_branch, write_branch
@@ -529,6 +530,29 @@ def test_branch_file_round_trip(short_branch, tmp_path):
     assert [int(r["region"]) for r in rows] == regions(short_branch).tolist()
     assert list(rows[0])[-6:] == ["half_trace", "multiplier_max", "slope", "contacts", "region", "kind"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["branch-out-of-phase.csv", "branch-out-of-phase.h5"]
+
+
+def test_files_from_before_kinds_were_named_are_read(short_branch, tmp_path):
+    write_branch(short_branch, tmp_path, {})
+    path = tmp_path / "branch-out-of-phase.h5"
+    with h5py.File(path, "a") as file:
+        del file.attrs["branch_kind"]
+    again = read_branch(path)
+    assert again.kind == short_branch.kind
+    assert [p.energy for p in again.points] == [p.energy for p in short_branch.points]
+
+
+@pytest.mark.parametrize(("ends", "springs", "held"), [("fixed", 4, 1.0), ("free", 2, 0.0), ("periodic", 3, 0.0)])
+def test_a_chain_keeps_its_nonlinear_springs(ends, springs, held):
+    """Moved as a whole by 1 m, a lattice stretches the springs to its walls alone, one by 1 m, one by -1 m."""
+    spring = Spring(1, 0, 5.0, next_cell=True, quadratic=2.0, cubic=3.0)
+    cell = UnitCell((1.0, 2.0), (Spring(0, 1, 7.0), spring), host=0, resonator=1)
+    system = System.from_chain(Chain(cell, 3, ends), LAW)
+    assert len(system.springs) == springs
+    u = np.ones(system.dofs)
+    linear = 0.5 * u @ system.stiffness @ u
+    assert system.energy(u, 0 * u) - linear == pytest.approx(held * 2 * 3.0 / 4)
+    assert system.forces(u)[[0, -1]] - (system.stiffness @ u)[[0, -1]] == pytest.approx([held * 5.0, held * 1.0])
 
 
 def test_xarray_opens_the_branch(short_branch, tmp_path):

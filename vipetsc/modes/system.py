@@ -176,7 +176,10 @@ class System:
         """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) without contact."""
         stiffness = self.stiffness if isinstance(self.stiffness, np.ndarray) else self.stiffness.toarray()
         squared, shapes = eigh(stiffness, np.diag(self.masses))
-        return np.sqrt(np.maximum(squared, 0)), shapes * np.sign(shapes[np.abs(shapes).argmax(0), range(self.dofs)])
+        # eigh leaves the signs open: the largest displacement of each mode is positive.
+        signs = np.sign(shapes[np.abs(shapes).argmax(0), range(self.dofs)])
+        # A rigid-body motion has an eigenvalue of zero, which rounding may make negative.
+        return np.sqrt(np.maximum(squared, 0)), shapes * signs
 
     def branch_name(self, mode: int) -> str:
         """Name of the branch of ``mode`` (0-based): in-phase or out-of-phase for two masses, else its number."""
@@ -212,10 +215,13 @@ class System:
         omega, shapes = self.linear_modes()
         reach = np.abs(self.contact_rows @ shapes[:, mode])
         amplitude = (self.clearances[reach > 0] / reach[reach > 0]).min(initial=np.inf)
-        return float(0.5 * omega[mode] ** 2 * amplitude**2) if np.isfinite(amplitude) else np.inf
+        if not np.isfinite(amplitude):  # times omega = 0 of a rigid-body motion it would be no number
+            return np.inf
+        return float(0.5 * omega[mode] ** 2 * amplitude**2)
 
     def closed_frequencies(self) -> np.ndarray:
         """Frequencies (n,) in rad/s with every contact closed and no clearance: the bilinear law's limit."""
+        # With w >> D only the linear part of a bilinear contact counts: a spring of its stiffness.
         stiffness = self.stiffness.copy()
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             stiffness += pair.law.stiffness * np.outer(row, row)

@@ -249,6 +249,7 @@ class ConservativeMotions:
         row = np.append(0 * x, 1.0)
         weight = 0.0
         step = FIRST_WEIGHT
+        # The other harmonics change the motion smoothly with their weight; at once Newton's method would be lost.
         while weight < 1:
             tried = min(weight + step, 1.0)
             frame = HarmonicFrame(self, self.balance(FEWEST).weighted(tried), x, omega, size)

@@ -67,15 +67,19 @@ class CondensedLayout:
 
     def points(self, data: xr.Dataset) -> list[Point]:
         """The points of a file."""
+        # Odd harmonics alone begin with the order 1, all of them with 0.
         odd = data["order"].values[:1] == 1
         points = []
         for i, fields in enumerate(quantities(data)):
             order = int(data["harmonics_kept"].values[i])
             count = (order + 1) // 2 if odd else order + 1
+
+            # The first point of a branch that has gone no further has no tangent.
             tangent_period = data["tangent_period"].values[i]
             tangent = np.empty(0)
             if np.isfinite(tangent_period):
                 tangent = np.append(data["tangent"].values[i, :, :count].ravel(), tangent_period)
+
             point = Point(
                 **fields,
                 x=data["harmonics"].values[i, :, :count].ravel(),

@@ -31,15 +31,19 @@ def write_branch(branch: Branch[Any], folder: Path, about: dict[str, Any]) -> No
 def to_dataset(branch: Branch[Any]) -> xr.Dataset:
     """The branch as it is in its file."""
     layout = LAYOUTS[branch.kind]
+
+    # Codes are stored with their meanings, by which they are read: lists of kinds may grow.
     names = kinds_of(branch.kind)
     kinds = np.array([names.index(p.kind) for p in branch.points], np.int8)
     flags = {"flag_values": np.arange(len(names), dtype=np.int8), "flag_meanings": " ".join(names)}
+
     data = {
         "point": variable("point", np.arange(len(branch.points)), "1", f"place along the {layout.noun}"),
         "kind": variable("point", kinds, "1", "kind of point", **flags),
         **layout.variables(branch),
         **branch.extra,
     }
+
     attributes = {
         "name": branch.name,
         "case": branch.case,

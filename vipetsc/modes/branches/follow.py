@@ -180,11 +180,12 @@ class Follower:
         on request; the branch holds the points so far.
         """
         method = self.method
+        # A branch that is resumed has used some of its points; its start is not one of them.
         regular = branch.regular()
         rule = rule_of(problem, start, max(len(regular) - 1, 0))
         points = Continuation(problem, start, rule, direction, branch.next_step or None)
         check = method.monitor(problem)
-        for point in regular:
+        for point in regular:  # what watches the branch remembers it from its start
             check(point)
         before = regular[-2] if len(regular) > 1 else None
         last = points.point

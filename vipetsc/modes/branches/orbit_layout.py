@@ -26,6 +26,7 @@ class OrbitLayout:
         x = branch.column("x").reshape(count, n)
         tangent = branch.column("tangent").astype(float).reshape(count, n + 1)
         traces = branch.column("half_traces").astype(complex).reshape(count, pairs)
+
         at_rest = "initial displacement (velocity in m/s for maps from the centre)"
         return orbit_variables(branch) | {
             "dof": variable("dof", np.arange(1, n + 1), "1", "degree of freedom, from 1"),
@@ -57,6 +58,7 @@ class OrbitLayout:
         traces = data["half_trace"].values + 1j * data["half_trace_imaginary"].values
         tangents = np.column_stack([data["tangent"].values, data["tangent_period"].values])
         points = []
+        # Half-traces are real but where two pairs have met: their array keeps its type through a file.
         for fields, x, tangent, c in zip(quantities(data), data["initial"].values, tangents, traces, strict=True):
             points.append(Point(**fields, x=x, tangent=tangent, half_traces=c if np.any(c.imag != 0) else c.real))
         return points

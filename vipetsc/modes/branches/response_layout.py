@@ -57,6 +57,7 @@ class ResponseLayout:
         xi = branch.column("xi")
         up = np.array(sweep_up(branch), int)
         down = np.array(sweep_down(branch), int)
+
         passed = "points passed if the parameter grows slowly; not neighbours: a jump"
         data = {
             "unknown": variable("unknown", np.arange(xi.shape[1]), "1", "unknown; the last is the parameter"),
@@ -95,10 +96,12 @@ class ResponseLayout:
     def points(self, data: xr.Dataset) -> list[Response]:
         """The states of a file."""
         points = []
+        # Numbers are not stored: a fold has that of the regular point after it.
         regular = -1
         for i, kind in enumerate(stored_kinds(data)):
             regular += kind == "regular"
             row = {name: data[name].values[i] for name in LAYOUT}
+
             measures = Measures(
                 frequency=float(row["frequency"]),
                 amplitude=float(row["amplitude"]),

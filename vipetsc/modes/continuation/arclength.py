@@ -14,6 +14,18 @@ from vipetsc.modes.problem import Attempt, ContinuationError, Problem, S, Soluti
 S_contra = TypeVar("S_contra", bound=Solution, contravariant=True)
 
 
+# Strain of the guards at which the next step aims, Newton steps that need no shorter one, and its largest growth.
+AIM = 0.7
+EASY = 5
+MOST_GROWTH = 2
+# Factor of a step where Newton's method fails.
+FAILED_FACTOR = 0.4
+# Where a guard is strained: the strain aimed at, and bounds of the factor.
+AIM_AGAIN = 0.8
+LEAST_FACTOR = 0.1
+MOST_FACTOR = 0.7
+
+
 class Geometry(NamedTuple):
     """How a corrected step differs from its prediction.
 
@@ -78,15 +90,19 @@ class GuardedSteps:
 
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
         """A shorter step."""
-        return Verdict(False, step * 0.4, f"no convergence ({attempt.reason})", "nnm.max_newton or nnm.tolerance")
+        return Verdict(
+            False, step * FAILED_FACTOR, f"no convergence ({attempt.reason})", "nnm.max_newton or nnm.tolerance"
+        )
 
     def judge(self, before: Point, after: Point, geometry: Geometry) -> Verdict:
         """Accept a step that strains no guard beyond its bound."""
         size, guard = strain(self.problem, self.control, before, after, geometry._asdict())
         if size <= 1.0:
-            effort = max(size / 0.7, after.newton / 5, 0.5)
+            effort = max(size / AIM, after.newton / EASY, 1 / MOST_GROWTH)
             return Verdict(True, min(after.step / effort, self.control.largest_step))
-        return Verdict(False, after.step * min(max(0.8 / size, 0.1), 0.7), *GUARDED[guard])
+        # A strain that does not fall in proportion to the step must not keep the attempts from ending.
+        factor = min(max(AIM_AGAIN / size, LEAST_FACTOR), MOST_FACTOR)
+        return Verdict(False, after.step * factor, *GUARDED[guard])
 
     def end(self, point: Point) -> tuple[Point, str] | None:
         """The point itself where it has left the range of energies or of frequencies."""
@@ -100,8 +116,11 @@ class GuardedSteps:
 
     def stuck(self, last: Point, attempt: Attempt | None, verdict: Verdict) -> str:
         """Where, why, and which option to turn."""
-        verdict = self.no_step if attempt is None else verdict
-        residuals = "none" if attempt is None else attempt.residuals
+        residuals = "none"
+        if attempt is None:
+            verdict = self.no_step
+        else:
+            residuals = attempt.residuals
         return (
             f"step below {self.smallest_step:g} after point {last.index} "
             f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {verdict.why}; "
@@ -174,6 +193,7 @@ class Continuation(Generic[S]):
             else:
                 verdict = self.rule.not_converged(self.step, attempt)
 
+            # Also the step of a failure is kept: a loop that is asked again does not repeat the attempts.
             self.step = verdict.step
             if verdict.accepted:
                 return replace(point, next_step=self.step)

@@ -73,6 +73,7 @@ class Segment(Generic[S]):
         allowed = ROUNDING * self.problem.tolerance
         if attempt.left_domain or not (attempt.converged or attempt.history[-1] <= allowed):
             raise ArithmeticError(f"{attempt.reason}; residuals {attempt.residuals}")
+        # A solution far from the guess lies on another arc.
         if np.linalg.norm(attempt.xi - guess) > FURTHEST * self.length:
             raise ArithmeticError("Newton's method leaves the step")
 
@@ -118,6 +119,7 @@ class Segment(Generic[S]):
             if halvings == 0:
                 raise ArithmeticError(error) from error
 
+        # Nearer ends give better guesses, and a Newton step that left the segment may stay in its half.
         first, second = self.split()
         inside = first if kind.test(first.left) * kind.test(first.right) < 0 else second
         return inside.root(kind, halvings - 1)

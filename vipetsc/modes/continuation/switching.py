@@ -92,6 +92,7 @@ def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
         astray = float(np.linalg.norm(attempt.xi - frame.xi - step * row)) > ASTRAY * step
         if attempt.converged and not astray:
             first = frame.measures(attempt, frame.tangent_towards(attempt.xi, row))
+            # Near a tongue's tip Newton's method may end on another branch's orbit, passed several times.
             if repetitions(problem, first) == 1:
                 return first
     why = f"the last attempt, at {step:g}: {attempt.reason}; residuals {attempt.residuals}"

@@ -118,6 +118,7 @@ class SteadyFrame:
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
         """Newton's method from ``guess`` for the state at an ``arclength`` along the tangent."""
+        # The plane is that of the predictor, whose rounding the first residual then does not see.
         predicted = self.xi + arclength * self.tangent
         return self.solve(guess, self.tangent, self.tangent @ predicted)
 
@@ -179,6 +180,7 @@ class SteadyEquations(ABC):
         omega, amplitude = self.drive(xi[-1])
         jacobian, column = self.balance.derivative(xi[:-1] * self.clearance, omega, shift)
         if self.parameter.over == "amplitude":
+            # The residual is linear in the amplitude: the drive's term for the amplitude 1.
             column = self._drive_term(omega, 1.0, shift)
         else:
             ends = [omega * (1 + sign * SLOPE) for sign in (1, -1)]
@@ -287,6 +289,7 @@ class SteadyStates(SteadyEquations):
 
         hill = self.hill(omega)
         unstable = hill.unstable(series)
+        # The count is cheaper than the zeros themselves, and most states are stable.
         fastest = hill.fastest(series) if unstable else 0j
         forces = series.forces[:, : z.shape[1]]
         return Measures(
@@ -315,6 +318,7 @@ class SteadyStates(SteadyEquations):
         wave = self.linear_motion(omega).wave
         first = forces[:, 1]
         if wave is not None:
+            # A wave's amplitude counts in clearances of the first site.
             amplitude = amplitude * self.clearance
             given = amplitude**2 * wave.flux
         else:
@@ -329,6 +333,7 @@ class SteadyStates(SteadyEquations):
             outgoing = self.compliance.outgoing(omega, first, wave, amplitude).sum(axis=1)
             powers[:2] = outgoing if self.options.towards > 0 else outgoing[::-1]
             for k in range(2, forces.shape[1]):
+                # Even orders of a symmetric motion have no force, and waves are not solved for in vain.
                 if np.any(forces[:, k]):
                     powers[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
         powers[3] = loss * (omega / (2 * np.pi))

@@ -49,6 +49,7 @@ class TurningSteps:
         if low <= p <= high:
             return None
         bound = low if p < low else high
+        # A curve ends on its range, so that curves over the same range end at the same parameter.
         xi = states.at(point.xi, bound)
         tangent = states.frame(point).tangent_at(xi)
         last = Response(xi=xi, tangent=tangent, index=point.index, step=point.step, next_step=point.next_step)
@@ -76,6 +77,7 @@ def first_state(states: SteadyStates) -> Response:
     if not amplitude * float((np.abs(linear[:, 1]) / clearances).max()) < 1:
         guess = _ramp(states, omega, amplitude)
 
+    # Newton's method from the linear motion, or from the state on the ramp, which is one already but for rounding.
     start = Response(xi=states.at(np.append(guess, low), low), next_step=states.options.first_step)
     tangent = states.first_tangent(start, 1)
     return Response(xi=start.xi, tangent=tangent, next_step=start.next_step)

@@ -123,6 +123,7 @@ def _land(stepper: Stepper, t: float, h: float, change: Change) -> tuple[float, 
     """Repeat the step of length ``h`` at time ``t`` so that it ends on a change: its length, whether it is one."""
     step = stepper.step
     for _ in range(MOST_ATTEMPTS):
+        # Each attempt is a whole step from the start: its end has the order of the pair, an interpolant has not.
         length = change.length
         _advance(stepper, length)
         flow.observe(step, stepper.end, stepper.end_rates, step.end)

@@ -65,12 +65,14 @@ def graze(problem: ShotOrbits, chart: DenseChart, guess: np.ndarray, touch: Touc
     xi = guess
     time = touch.time
     try:
+        # Plain Newton's method: the bracketing of the caller takes over where it does not converge.
         for _ in range(MOST_STEPS):
             matrix, values, duration = _equations(problem, chart, xi, touch._replace(time=time))
             *step, later = np.linalg.solve(matrix, -values)
             size = float(np.linalg.norm(step))
             xi = xi + step
             time = time + later
+
             if not (size <= FURTHEST and 0 <= time <= 1.1 * duration):
                 raise ArithmeticError("Newton's method goes astray")
             if size <= CLOSE:

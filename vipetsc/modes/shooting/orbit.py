@@ -72,6 +72,7 @@ def repetitions(problem: ShotOrbits, point: Point) -> int:
     Along a branch from a linear mode it is 1 but where a tongue of an internal resonance crosses the other mode's
     branch: there the orbit is the other mode's, passed k times.
     """
+    # Displacements and velocities are compared with the orbit's size; a motion passed n times repeats for a prime of n.
     start = problem.arc(point.x, point.period).start
     rate = problem.flow.omega_ref(point.period)
     size = np.abs(start).max() / (1.0 if problem.map.start == "rest" else rate)

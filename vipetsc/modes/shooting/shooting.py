@@ -104,6 +104,7 @@ class ShootingFrame(Generic[A]):
         tangent = np.empty(0)
         energy_tangent = slope = np.nan
         if direction is not None:
+            # df/dE from the tangent: along a vertical piece of the branch the energy stands still.
             tangent = chart.to_changes(attempt.xi, direction)
             energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
             slope = float(-tangent[-1] / period**2 / energy_tangent) if energy_tangent else np.inf
@@ -216,6 +217,7 @@ class ShootingEquations(ABC, Generic[A]):
         Raises ContinuationError at a branch point, where the tangent is not unique.
         """
         tangent = self.null_vector(start)
+        # The null vector has either sign; where the energy is stationary, the direction itself decides.
         energy_tangent = self.energy_gradient(start.x) @ tangent[:-1]
         return tangent * (np.sign(energy_tangent) * direction or direction)
 
@@ -298,6 +300,7 @@ class Shooting(ShootingEquations[Arc]):
     def stability(self, arc: Arc) -> tuple[np.ndarray, float]:
         """Half-traces (n - 1,) of an orbit and the largest modulus of its multipliers."""
         traces = half_traces(self.system, self.map, arc)
+        # A single mass has the trivial pair alone, whose multiplier is 1.
         return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
 
     def jacobian(self, arc: Arc) -> np.ndarray:
@@ -339,6 +342,7 @@ class Shooting(ShootingEquations[Arc]):
         yield from super().special_kinds(left, right)
         if not (self.system.springs or left.episodes or right.episodes):
             return
+        # Seen by a quarter the basic map is half a period: what returns after twice of it is one period.
         levels = {1.0: "branch-point", -1.0: "period-doubling"}
         if self.map.quarter:
             levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}

@@ -36,6 +36,7 @@ def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
 
     traces = 1 - 2 * eigenvalues if shooting_map.quarter else 1 + 2 * eigenvalues
     traces = traces[np.argsort(traces.real)]
+    # Pairs of multipliers that leave the unit circle together have complex half-traces; all others are real.
     return traces.real if np.all(np.abs(traces.imag) == 0) else traces
 
 

@@ -15,6 +15,7 @@ def linear_start(problem: ShootingEquations[A], mode: int, energy: float) -> Poi
     omega, shapes = problem.system.linear_modes()
     if not omega[mode] > 0:
         raise StartError(f"mode {mode + 1} is a rigid-body motion; it has no period")
+    # From rest all of the energy is potential, from the centre all of it is kinetic.
     amplitude = np.sqrt(2 * energy) / (omega[mode] if problem.map.start == "rest" else 1.0)
     x = shapes[:, mode] * amplitude
     frame = problem.frame_at("relative", x, 2 * np.pi / omega[mode], np.empty(0))
