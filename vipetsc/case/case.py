@@ -76,6 +76,7 @@ class Case(CaseFile):
         if problems:
             return sections, problems
 
+        # The motion comes first: without a force, frequency and cell of the drive follow from it.
         beginning, problems = _beginning(sections)
         if problems:
             return sections, problems
@@ -128,6 +129,7 @@ class Case(CaseFile):
         length = lattice.cells if valid("lattice.cells") else None
         problems = list(check_drives(drive, lattice, cell, length, valid))
         yield from problems
+        # Only of drives that are sound, since waves are computed for it.
         if cell and not problems and drive.wave_choices and valid("lattice", "drive", "time.end"):
             yield from check_wave(cell, drive, time)
         if cell and not cell.springs and valid("drive", "time"):
@@ -150,6 +152,7 @@ class Case(CaseFile):
         chain = build_chain(self.lattice, contacts)
         drives = build_drives(self.drive, chain)
         scale = self._scale(chain, drives)
+
         return Model(
             chain=chain,
             contact=contact_of(contacts),
@@ -170,6 +173,7 @@ class Case(CaseFile):
         """Displacement in m of the drives' linear waves together, or of the motion at the beginning if that is more."""
         scale = 0.0
         if self.drive.amplitude:
+            # A wall's drive is a displacement: its force is that times the stiffness of the spring to it.
             for drive in drives:
                 scale += chain.wave_scale(drive.waveform, drive.cell, drive.mass) * (drive.stiffness or 1.0)
         if self.initial:
@@ -203,6 +207,7 @@ class Case(CaseFile):
         ``load``. The new case is checked and resolved as any other; raises CaseError.
         """
         table = self.model_dump(by_alias=True, exclude_none=True, include={*Case.model_fields})
+        # First what is left out, then what changes: a section may be begun anew with some keys.
         for section in without:
             table.pop(section, None)
         for section, values in changes.items():
@@ -243,6 +248,7 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
 
 def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[Problem]:
     """What can be wrong only once the ``given`` sections are ``resolved``: the absorbing end, the samples."""
+    # Once more: the absorbing end has its cells only now.
     driven = [drive.cell for _, drive in resolved["drive"].every]
     problems = list(check_inhomogeneity(resolved["lattice"], driven))
     if problems:

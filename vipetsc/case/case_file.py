@@ -148,6 +148,7 @@ class CaseFile(Section):
                 fields[key], wrong = read_section(kind, table.get(key, {}), key)
                 problems += wrong
 
+        # A check between keys would be about defaults where a key is invalid, and would confuse: it asks ``valid``.
         invalid = {problem.key for problem in problems}
 
         def valid(*keys: str) -> bool:
@@ -211,6 +212,7 @@ def read_toml(path: str | Path) -> Table:
     sys.audit("vipetsc.read", str(path))
     path = Path(path)
     try:
+        # utf-8-sig: editors on Windows begin files with a byte order mark, which TOML does not allow.
         return {"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         remedy = f"{error.strerror}; a case file (TOML) is needed"
@@ -279,6 +281,7 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
         return kind(), [Problem(name, table, f"must be a section [{name}]")]
 
     problems: dict[str, Problem] = {}
+    # Numbers that are out of range may be of the right type; they are left out in the second reading too.
     invalid = {key for key, value in table.items() if any(_out_of_range(value, ""))}
     try:
         section = kind(**table)
@@ -343,6 +346,7 @@ def _tried_type(location: Location) -> tuple[Location, str]:
 
 def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     """The problem behind one of pydantic's errors in section ``name``."""
+    # The types that were tried are no part of the path that a user knows, and items count from 1.
     keys = [part for part in item["loc"] if isinstance(part, int) or not BRANCH.fullmatch(part)]
     path = name + "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in keys)
     if item["type"] == "extra_forbidden":
@@ -362,6 +366,7 @@ def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]
     choices: list[type[Section]] = []
     for key in path:
         fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
+        # A name of a type chooses among the sections that the key before it may be.
         choices = [*sections_in(fields.get(str(key)))] or choices
         kind = next((choice for choice in choices if choice.__name__ == key), choices[0] if key in fields else kind)
     return kind

@@ -31,33 +31,52 @@ def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
 
 def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid: Valid) -> Iterator[Problem]:
     """What is wrong with the laws and the stops of ``count`` sites with the clearances ``gaps`` in m."""
-    each, where = lists_of(contacts), lambda key: f"contacts.{'each.' if key in lists_of(contacts) else ''}{key}"
-    for key, values in each.items():
+    per_site = lists_of(contacts)
+    for key, values in per_site.items():
         if len(values) != count:
             yield Problem(f"contacts.each.{key}", values, f"one value for each of the {count} sites is needed")
             return
-    if each.keys() & {*MATERIAL} and (contacts.stiffness is not None or "stiffness" in each):
+
+    # A stiffness would contradict a material; the lists over sites may give either.
+    has_material = bool(per_site.keys() & {*MATERIAL})
+    if has_material and (contacts.stiffness is not None or "stiffness" in per_site):
         yield Problem("contacts.stiffness", contacts.stiffness, "give it or the material of each site, not both")
         return
     if not valid("contacts"):
         return
-    if each.keys() & {*MATERIAL} and (lacking := [k for k in MATERIAL if None in values_of_sites(contacts, k, count)]):
+
+    lacking = [key for key in MATERIAL if None in values_of_sites(contacts, key, count)]
+    if has_material and lacking:
         yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
+    yield from _check_laws(contacts, count)
+    yield from _check_stops(contacts, count, gaps)
+
+
+def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
+    """Parameters stand with the law that takes them; a damping that grows without bound is not asked for."""
     laws = values_of_sites(contacts, "law", count) if count else [contacts.law]
     for key, parameter in PARAMETERS.items():
         values = values_of_sites(contacts, key, max(count, 1))
         is_given = any(value is not None for value in values)
+        path = _path_of(contacts, key)
         if is_given and parameter.law not in laws:
-            yield Problem(where(key), each.get(key, getattr(contacts, key)), f'is for law = "{parameter.law}"')
+            value = lists_of(contacts).get(key, getattr(contacts, key))
+            yield Problem(path, value, f'is for law = "{parameter.law}"')
         if parameter.law in laws and not is_given:
-            yield Problem(where(key), None, f'missing; the law "{parameter.law}" needs it')
-    names, restitutions = (values_of_sites(contacts, key, count) for key in ("damping", "restitution"))
-    for name, asked in sorted(set(zip(names, restitutions, strict=True)), key=str) or [
-        (contacts.damping, contacts.restitution)
-    ]:
-        if name in ("exact", "flores") and asked < LEAST_RESTITUTION:
+            yield Problem(path, None, f'missing; the law "{parameter.law}" needs it')
+
+    # Without sites the values for all are checked: normal modes need no list of sites.
+    names = values_of_sites(contacts, "damping", count) or [contacts.damping]
+    restitutions = values_of_sites(contacts, "restitution", count) or [contacts.restitution]
+    for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
+        if name in ("exact", "flores") and restitution < LEAST_RESTITUTION:
             remedy = f"the {name} damping grows without bound towards 0; at least {LEAST_RESTITUTION}"
-            yield Problem(where("restitution"), asked, remedy)
+            yield Problem(_path_of(contacts, "restitution"), restitution, remedy)
+
+
+def _check_stops(contacts: ContactsTable, count: int, gaps: list[float]) -> Iterator[Problem]:
+    """A contact that is closed at rest has one stop, and one that is pressed does not dissipate."""
+    restitutions = values_of_sites(contacts, "restitution", count)
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     for number, (plus, minus) in enumerate(stops, 1):
         if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
@@ -66,14 +85,20 @@ def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid
             return
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
             remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
-            yield Problem(where("precompression"), -min(plus, minus), f"site {number}: {remedy}")
+            yield Problem(_path_of(contacts, "precompression"), -min(plus, minus), f"site {number}: {remedy}")
             return
+
+
+def _path_of(contacts: ContactsTable, key: str) -> str:
+    """The path of a key, which may stand among the lists over sites."""
+    return f"contacts.each.{key}" if key in lists_of(contacts) else f"contacts.{key}"
 
 
 def resolved_per_site(contacts: ContactsTable, count: int) -> PerSiteTable | None:
     """The lists over sites, with a stiffness in place of a material."""
     if contacts.each is None or not lists_of(contacts).keys() & {*MATERIAL}:
         return contacts.each
+    # What a list does not give is the value for all sites.
     rows = zip(*(values_of_sites(contacts, key, count) for key in MATERIAL), strict=True)
     stiffness = [float(contact_stiffness(*row)) for row in rows]
     return contacts.each.model_copy(update=dict.fromkeys(MATERIAL) | {"stiffness": stiffness})
@@ -99,37 +124,50 @@ def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
 
 def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
     """The law of each site of a resolved case; () if they are alike."""
-    each = lists_of(contacts)
-    keys, laws = [key for key in each if key not in SIDES + JOINS], []
+    per_site = lists_of(contacts)
+    keys = [key for key in per_site if key not in SIDES + JOINS]
     if not keys:
         return ()
-    for values in zip(*(each[key] for key in keys), strict=True):
-        of_site = contacts.model_copy(update=dict(zip(keys, values, strict=True)))
-        laws.append(contact_of(of_site))
+
+    # Each site has the law of all, but for what its lists say.
+    laws = []
+    for values in zip(*(per_site[key] for key in keys), strict=True):
+        site = contacts.model_copy(update=dict(zip(keys, values, strict=True)))
+        laws.append(contact_of(site))
     return tuple(laws)
 
 
 def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
-    """What is said of each site's stops, in mm."""
-    told = ({"+": plus, "-": minus} for plus, minus in gaps)
-    texts = [" ".join(f"{s}{1e3 * gap:.4g}" for s, gap in stops.items() if gap < np.inf) for stops in told]
-    return texts or [f"{1e3 * gap:.4g}" for gap in clearances]
+    """The stops of each site in words, in mm: by their side where ``gaps`` differ, else the ``clearances``."""
+    if not gaps:
+        return [f"{1e3 * gap:.4g}" for gap in clearances]
+
+    texts = []
+    for plus, minus in gaps:
+        stops = [f"{side}{1e3 * gap:.4g}" for side, gap in (("+", plus), ("-", minus)) if gap < np.inf]
+        texts.append(" ".join(stops))
+    return texts
 
 
 def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:
-    """What each site joins; () if it is the cell's pair at all, and each in a cell of its own."""
-    cell_pair = [cell.host + 1, cell.resonator + 1]
-    values = (values_of_sites(contacts, key, count) for key in JOINS)
-    pairs = [Pair((a or cell_pair)[0] - 1, (a or cell_pair)[1] - 1, bool(b)) for a, b in zip(*values, strict=True)]
+    """The masses that each site joins; () if these are the cell's pair at all, and each in a cell of its own."""
+    pairs = []
+    given = values_of_sites(contacts, "pair", count)
+    next_cell = values_of_sites(contacts, "next_cell", count)
+    for pair, is_in_next_cell in zip(given, next_cell, strict=True):
+        host, resonator = pair or (cell.host + 1, cell.resonator + 1)
+        pairs.append(Pair(host - 1, resonator - 1, bool(is_in_next_cell)))
+
     sites = contacts.sites if isinstance(contacts.sites, list) else []
-    plain = set(pairs) <= {Pair(cell.host, cell.resonator)} and len(set(sites)) == len(sites)
-    return () if plain else tuple(pairs)
+    is_plain = set(pairs) <= {Pair(cell.host, cell.resonator)} and len(set(sites)) == len(sites)
+    return () if is_plain else tuple(pairs)
 
 
 def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
     """What is wrong with what contacts join, in the ``cells`` (1-based) with sites."""
     if any(len(lists_of(contacts).get(key, cells)) != len(cells) for key in JOINS):
         return  # as ``check_per_site`` says
+
     pairs = pairs_of_sites(contacts, cell, len(cells)) or [Pair(cell.host, cell.resonator)] * len(cells)
     for number, (at, pair) in enumerate(zip(cells, pairs, strict=True), 1):
         what = f"site {number} joins masses {pair.host + 1} and {pair.resonator + 1}"
@@ -143,8 +181,12 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
         if pair.next_cell and (pair.host < 0 or (at == lattice.cells and lattice.ends != "periodic")):
             yield Problem("contacts.next_cell", True, f"site {number} in cell {at} has no next cell to touch")
             return
-    named = contacts.pair or (contacts.each and contacts.each.pair)  # else a cell twice is one problem already
-    if named and (twice := [at for (at, _), times in Counter(zip(cells, pairs, strict=True)).items() if times > 1]):
+
+    # Without a pair of its own a cell that comes twice is refused by ``check_sites`` already.
+    has_pair = contacts.pair or (contacts.each and contacts.each.pair)
+    times = Counter(zip(cells, pairs, strict=True))
+    twice = [at for (at, _), count in times.items() if count > 1]
+    if has_pair and twice:
         yield Problem("contacts.sites", twice, "named twice with the same contact pair")
     if not cell.springs and cells and not any(pair.next_cell for pair in pairs):
         yield Problem("lattice.cell.springs", None, "neither springs nor contacts (contacts.next_cell) join the cells")
@@ -152,7 +194,12 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
 
 def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
     """Clearances in m on the sides + and - of each site, inf without a stop; () if they are ``gaps`` on both."""
-    both = zip(gaps, *(values_of_sites(contacts, key, len(gaps)) for key in SIDES), strict=True)
-    rows = [(a - (by or 0.0), (a if b is None else b) - (by or 0.0), side) for a, side, b, by in both]
-    stops = tuple((np.inf if s == "minus" else a, np.inf if s == "plus" else b) for a, b, s in rows)
-    return () if all(a == b for a, b in stops) else stops
+    values = [values_of_sites(contacts, key, len(gaps)) for key in SIDES]
+    stops = []
+    for gap, side, minus_gap, precompression in zip(gaps, *values, strict=True):
+        # Displacements count from the state under static load, in which the contact is pressed already.
+        pressed = precompression or 0.0
+        plus = gap - pressed
+        minus = (gap if minus_gap is None else minus_gap) - pressed
+        stops.append((np.inf if side == "minus" else plus, np.inf if side == "plus" else minus))
+    return () if all(plus == minus for plus, minus in stops) else tuple(stops)

@@ -79,6 +79,7 @@ def scatter(
         remedy = "names nothing that scatters, as in: clearance = { relative = 0.01 }"
         return {}, [Problem("disorder", disorder.seed, remedy)]
 
+    # A resolved case has no modulus: what is drawn scales the stiffness, which is proportional to it.
     values = values_of(lattice, contacts)
     values["modulus"] = [given.modulus] if given.modulus and values["stiffness"] else []
     drawn, problems = _draw(disorder, values)
@@ -87,6 +88,7 @@ def scatter(
 
     changed: dict[str, Table] = {}
     table: Table = lattice.model_dump(by_alias=True, exclude_none=True)
+    # Cells are drawn when the lattice is built: a million numbers do not belong into the text of a case.
     if disorder.cells:
         quantities = {key: deviation.model_dump(exclude_none=True) for key, deviation in disorder.cells.items()}
         table["scatter"] = {"seed": disorder.seed, "quantities": quantities}
@@ -130,6 +132,8 @@ def _drawn_contacts(contacts: ContactsTable, drawn: Mapping[str, list[float]], m
     table: Table = contacts.model_dump(by_alias=True, exclude_none=True)
     if "clearance" in drawn:
         table["clearance"] = drawn["clearance"]
+
+    # Numbers that differ from site to site are lists; one number stays that of all.
     for name in ("restitution", "stiffness"):
         if name not in drawn:
             continue
@@ -137,6 +141,7 @@ def _drawn_contacts(contacts: ContactsTable, drawn: Mapping[str, list[float]], m
             table["each"] = table.get("each", {}) | {name: drawn[name]}
         else:
             table[name] = drawn[name][0]
+
     if "sites" in drawn:
         table["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
     if "modulus" in drawn and modulus:

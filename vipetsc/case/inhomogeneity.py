@@ -20,7 +20,8 @@ from vipetsc.lattice.damped import absorber, reflection
 QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping)")
 MOST_VARIED = 10**8  # cells that may differ: every rank holds them all
 # Cells of an absorbing end that are tried, and logarithms of what comes back of the energy along the way.
-LENGTHS, LOSSES = (10, 20, 40, 80, 160), (8.0, 10.0, 13.0, 17.0)
+LENGTHS = (10, 20, 40, 80, 160)
+LOSSES = (8.0, 10.0, 13.0, 17.0)
 
 
 def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
@@ -28,8 +29,12 @@ def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
     match = QUANTITY.fullmatch(key)
     if match is None:
         return None
-    name, index = match[1] or match[4], int(match[2] or match[3]) - 1
-    return (name, index) if index < (cell.dofs if match[1] else len(cell.springs)) else None
+    masses_or_grounding, mass, spring, of_spring = match.groups()
+    if masses_or_grounding:
+        name, index, count = masses_or_grounding, int(mass) - 1, cell.dofs
+    else:
+        name, index, count = of_spring, int(spring) - 1, len(cell.springs)
+    return (name, index) if index < count else None
 
 
 def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
@@ -37,25 +42,35 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
     if isinstance(given, Profile):
         return np.linspace(given.first, given.last, len(values)), ""
     if isinstance(given, list):
-        wrong = f"one value for each of the {len(values)} cells is needed" if len(given) != len(values) else ""
-        return (values if wrong else np.array(given)), wrong
-    if outside := [c for c in given.cells if not 1 <= c <= len(values)]:
+        if len(given) != len(values):
+            return values, f"one value for each of the {len(values)} cells is needed"
+        return np.array(given), ""
+
+    outside = [cell for cell in given.cells if not 1 <= cell <= len(values)]
+    if outside:
         return values, f"cells {outside} are outside the lattice; cells count from 1 to {len(values)}"
     if (given.value is None) == (given.factor is None):
         return values, "give one of value and factor"
-    at, new = np.array(given.cells) - 1, values.copy()
-    new[at] = given.value if given.factor is None else given.factor * values[at]
-    return new, "" if given.factor is None or values[at].any() else "is 0, and so is any factor of it: give value"
+    at = np.array(given.cells) - 1
+    new = values.copy()
+    if given.factor is None:
+        new[at] = given.value
+        return new, ""
+    new[at] = given.factor * values[at]
+    return new, "" if values[at].any() else "is 0, and so is any factor of it: give value"
 
 
 def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:
-    nothing = "is 0 in all cells, and so is what is relative to it" if deviation.relative and not values.any() else ""
-    return deviation.draw(values, seed, key), nothing
+    drawn = deviation.draw(values, seed, key)
+    if deviation.relative and not values.any():
+        return drawn, "is 0 in all cells, and so is what is relative to it"
+    return drawn, ""
 
 
 def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Problem]]:
     """Masses, springs and dashpots of all cells without Rayleigh damping, and what is wrong with what differs."""
-    arrays, problems = Chain(cell, lattice.cells).coefficients(0, lattice.cells), list[Problem]()
+    arrays = Chain(cell, lattice.cells).coefficients(0, lattice.cells)
+    problems: list[Problem] = []
 
     def put(key: str, path: str, change: Callable[[np.ndarray], tuple[np.ndarray, str]]) -> None:
         place = place_of(key, cell)
@@ -63,36 +78,50 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Prob
             remedy = f"the cell has {cell.dofs} masses and {len(cell.springs)} springs; as in masses[1], grounding[1]"
             problems.append(Problem(path, None, f"{remedy}, springs[1].stiffness or springs[1].damping"))
             return
-        column = getattr(arrays, place[0])[:, place[1]]
+
+        name, index = place
+        column = getattr(arrays, name)[:, index]
         column[:], wrong = change(column.copy())
-        least = column.min()
-        if not wrong and not np.all((np.abs(column) < LARGEST) & ((np.abs(column) > 1 / LARGEST) | (column == 0))):
-            wrong = f"is no number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
-        elif not wrong and (least < 0 or (least == 0 and place[0] in ("masses", "stiffness"))):
-            wrong = (
-                f"is {least:.4g} in cell {int(column.argmin()) + 1}: no smaller than 0, and a mass or spring above it"
-            )
+        wrong = wrong or _wrong_values(name, column)
         if wrong:
             problems.append(Problem(path, None, wrong))
 
+    # Profiles first: a deviation is about what they give.
     for key, given in (lattice.profiles or {}).items():
         put(key, f'lattice.profiles."{key}"', partial(_profile, given))
-    if scatter := lattice.scatter:
+    scatter = lattice.scatter
+    if scatter:
         for key, deviation in scatter.quantities.items():
             put(key, f'disorder.cells."{key}"', partial(_drawn, deviation, scatter.seed, key))
     return arrays, problems
+
+
+def _wrong_values(name: str, column: np.ndarray) -> str:
+    """What is wrong with the values (cells,) of a quantity called ``name`` in ``Coefficients``; "" if nothing."""
+    size = np.abs(column)
+    if not np.all((size < LARGEST) & ((size > 1 / LARGEST) | (column == 0))):
+        return f"is no number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
+    least = column.min()
+    if least < 0 or (least == 0 and name in ("masses", "stiffness")):
+        return f"is {least:.4g} in cell {int(column.argmin()) + 1}: no smaller than 0, and a mass or spring above it"
+    return ""
 
 
 def cell_variation(lattice: LatticeTable) -> Variation | None:
     """What differs from the reference cell in a valid, resolved case; None if nothing may."""
     if not (lattice.profiles or lattice.scatter or lattice.absorbing):
         return None
-    cell, damping, absorbing = lattice.undamped_cell(), lattice.damping, lattice.absorbing
-    arrays = vary(lattice, cell)[0]
+
+    cell = lattice.undamped_cell()
+    arrays, _ = vary(lattice, cell)
+    damping = lattice.damping
     if damping:
-        ground, beside = damping.fitted(cell)
-        arrays.grounding[:] += damping.mass * arrays.masses + ground
-        arrays.damping[:] += damping.stiffness * arrays.stiffness + beside
+        # After profiles and scatter: Rayleigh damping is in proportion to the masses and springs that there are.
+        grounding, dashpots = damping.fitted(cell)
+        arrays.grounding[:] += damping.mass * arrays.masses + grounding
+        arrays.damping[:] += damping.stiffness * arrays.stiffness + dashpots
+
+    absorbing = lattice.absorbing
     if absorbing and absorbing.cells and absorbing.strength:
         graded = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength, 0)
         assert graded.variation is not None and graded.variation.grounding is not None
@@ -101,8 +130,10 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
             arrays.grounding[-absorbing.cells :] += extra
         if absorbing.end != "right":
             arrays.grounding[: absorbing.cells] += extra[::-1]
+
     reference = Chain(lattice.unit_cell(), 2).coefficients(0, 1)
-    differing = {n: a for n, a, r in zip(Coefficients._fields, arrays, reference, strict=True) if np.any(a != r)}
+    named = zip(Coefficients._fields, arrays, reference, strict=True)
+    differing = {name: array for name, array, uniform in named if np.any(array != uniform)}
     return Variation(**differing) if differing else None
 
 
@@ -113,8 +144,12 @@ def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterato
         return
     if lattice.profiles or lattice.scatter:
         yield from vary(lattice, lattice.undamped_cell())[1]
-    if (absorbing := lattice.absorbing) is None:
-        return
+    if lattice.absorbing is not None:
+        yield from _check_absorbing(lattice, lattice.absorbing, driven)
+
+
+def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: Sequence[int]) -> Iterator[Problem]:
+    """Waves come to the end that absorbs, and it leaves room for the driven cells."""
     if not lattice.undamped_cell().springs:
         yield Problem("lattice.absorbing", None, "no waves come to an end of a lattice without springs; leave it out")
     if lattice.ends == "periodic":
@@ -123,8 +158,11 @@ def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterato
     if 2 * n >= lattice.cells:
         yield Problem("lattice.absorbing.cells", n, f"half of the {lattice.cells} cells, or more")
         return
-    low, high = n * (absorbing.end != "right"), lattice.cells - n * (absorbing.end != "left")
-    if inside := [cell for cell in driven if not low < cell <= high]:
+
+    low = 0 if absorbing.end == "right" else n
+    high = lattice.cells if absorbing.end == "left" else lattice.cells - n
+    inside = [cell for cell in driven if not low < cell <= high]
+    if inside:
         yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {inside[0]} is in the absorbing end")
 
 
@@ -139,9 +177,14 @@ def designed_end(
     waves = [wave for frequency, _ in drives for wave in waves_at(cell, frequency)]
     if not waves:
         raise ValueError("the drive is in a gap: no wave comes to the end")
-    speed, best = max(wave[2] for wave in waves), np.inf
-    for cells in [table.cells] if table.cells else [n for n in LENGTHS if n <= most]:
-        for strength in [table.strength] if table.strength else [2 * speed * loss / cells for loss in LOSSES]:
+
+    speed = max(wave[2] for wave in waves)
+    lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= most]
+    best = np.inf
+    for cells in lengths:
+        # The dashpots take exp(-loss) of a wave's energy: the integral of strength x^3 over the way there and back.
+        strengths = [table.strength] if table.strength else [2 * speed * loss / cells for loss in LOSSES]
+        for strength in strengths:
             end = absorber(cell, ends, cells, strength)
             back = float(np.nanmax([lobe_reflection(end, *drive) for drive in drives]))
             best = min(best, back)
@@ -151,12 +194,15 @@ def designed_end(
 
 
 def lobe_reflection(chain: Chain, frequency: float, cycles: int) -> float:
-    """Share of a burst's energy that comes back from the right end of ``chain``.
+    """Fraction of a burst's energy that comes back from the right end of ``chain``.
 
     Mean over the pass bands in the main lobe of its spectrum, weighted with the square of that; NaN if there are none.
     """
     lobe = frequency * (1 + np.linspace(-2, 2, 17)[1:-1] / cycles)
     lobe = lobe[lobe > 0]
-    shares = np.array([reflection(chain, omega, chain.cells - 1) for omega in lobe.tolist()])
-    waves, weights = np.isfinite(shares), np.abs(ToneBurst(1.0, frequency, cycles).spectrum(lobe)) ** 2
-    return float(np.average(shares[waves], weights=weights[waves])) if waves.any() else np.nan
+    reflected = np.array([reflection(chain, omega, chain.cells - 1) for omega in lobe.tolist()])
+    is_wave = np.isfinite(reflected)
+    if not is_wave.any():
+        return np.nan
+    weights = np.abs(ToneBurst(1.0, frequency, cycles).spectrum(lobe)) ** 2
+    return float(np.average(reflected[is_wave], weights=weights[is_wave]))

@@ -123,6 +123,7 @@ def beginning_of(
 
     ``frequency`` in rad/s is the case's, if any.
     """
+    # Without contacts, and with equal cells: modes and packets are those of the linear, uniform lattice.
     chain = Chain(lattice.unit_cell(), lattice.cells, lattice.ends)
     resolve = {"mode": _mode, "packet": _packet, "file": _file}[initial.kind]
     try:

@@ -51,6 +51,7 @@ def json_schema() -> Schema:
             if key == "wavenumber":
                 item["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
             item["description"] = f"{text} ({unit})" if unit else text
+        # A schema shows the first paragraph of the docstring.
         schema["description"] = schema.get("description", "").partition("\n\n")[0].replace("\n", " ").replace("``", "`")
     classes["PetscTable"]["additionalProperties"] = {"type": ["string", "number", "boolean"]}
     # What a sweep takes in turn may be lists or ranges of anything.
@@ -69,12 +70,11 @@ def chapter() -> str:
         "# Every key of a case file",
         "",
         "As files are checked, and as `vipetsc schema` tells editors. Keys without a",
-    ]
-    lines += [
         "default may be left out, but for those marked as needed. Masses, cells, sites and bands count from 1.",
         "",
     ]
-    shown: set[str] = set()
+
+    shown: set[str] = set()  # a table that several keys may be is shown once
     for name, reference in schema["properties"].items():
         if "$ref" in reference:
             lines += _section(name, reference["$ref"].rpartition("/")[2], schema["$defs"], shown)
@@ -86,7 +86,8 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
     if name in shown:
         return
     shown.add(name)
-    schema, inner = classes[name], []
+    schema = classes[name]
+    inner: list[tuple[str, str]] = []
     yield from (f"## [{path}]", "", schema["description"], "")
     rows = [(key, item) for key, item in schema.get("properties", {}).items() if "description" in item]
     if rows:
@@ -95,8 +96,8 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
         unit, text = unit_and_text(name, key)
         needed = "needed" if key in schema.get("required", ()) else ""
         default = item.get("default")
-        plain = default is not None and "{" not in str(default)  # not a table of its own
-        shown_default = f"`{_toml(default)}`" if plain else needed
+        is_table = "{" in str(default)  # which is shown by itself
+        shown_default = needed if default is None or is_table else f"`{_toml(default)}`"
         yield f"| `{key}` | {_kind(item)} | {unit} | {shown_default} | {text} |"
         inner += [(f"{path}.{key}", reference) for reference in _references(item)]
     yield ""
@@ -120,11 +121,14 @@ def _toml(value: Any) -> str:
     """A default as it stands in a case file."""
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
-    return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else f"{value:g}"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else f"{value:g}"
 
 
 def _kind(item: Schema) -> str:
     """What the value of a key may be, with its bounds."""
+    # Optional keys are a choice of their type and null, which TOML does not have.
     if "anyOf" in item:
         return " or ".join(_kind(choice) for choice in item["anyOf"] if choice.get("type") != "null")
     if "$ref" in item:
@@ -132,14 +136,21 @@ def _kind(item: Schema) -> str:
     if "enum" in item or "const" in item:
         return ", ".join(f"`{_toml(value)}`" for value in item.get("enum", [item.get("const")]))
     if item.get("type") == "array":
-        low, high = item.get("minItems", 0), item.get("maxItems")
-        count = f"{low} " if low == high else f"{low} or more " if low else ""
-        return f"list of {count}{_kind(item['items'])}"
+        return f"list of {_count(item)}{_kind(item['items'])}"
     if item.get("type") == "object":
         return f"table of {_kind(item['additionalProperties'])}"
+    if "pattern" in item:
+        return "text as described"
+
     signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
     bounds = ", ".join(f"{sign} {item[key]:.6g}" for key, sign in signs.items() if key in item)
     names = {"number": "number", "integer": "whole number", "boolean": "true, false", "string": "text"}
-    if "pattern" in item:
-        return "text as described"
-    return " ".join(filter(None, (names[item["type"]], bounds)))
+    return f"{names[item['type']]} {bounds}".rstrip()
+
+
+def _count(item: Schema) -> str:
+    """How many items a list has, before what they are."""
+    low = item.get("minItems", 0)
+    if low == item.get("maxItems"):
+        return f"{low} "
+    return f"{low} or more " if low else ""

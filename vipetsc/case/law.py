@@ -86,6 +86,7 @@ class LawCase(Case):
         contacts = sections["contacts"]
         clearance = sections["law"].clearance
         if clearance is None:
+            # Of sites that differ the geometric mean: the law is one of ratios.
             gaps = contacts.clearance or _given_clearances(with_preset(table))
             clearance = float(np.exp(np.mean(np.log(gaps)))) if gaps else None
         if clearance is None:
@@ -96,6 +97,7 @@ class LawCase(Case):
         if problems:
             return sections, problems
 
+        # Only a whole case has a model, by whose burst the distance is judged.
         case = cls._of_sections(sections, clearance=clearance)
         problems = case._place_problems()
         if problems:
@@ -147,7 +149,7 @@ class LawCase(Case):
         drive, cells = self.drive.cell, self.lattice.cells
         assert isinstance(self.contacts.sites, list)
         offsets = [site - drive for site in self.contacts.sites if site != drive]
-        if self.lattice.ends == "periodic":
+        if self.lattice.ends == "periodic":  # the shorter way around
             offsets = [(offset + cells // 2) % cells - cells // 2 for offset in offsets]
 
         offset = min(offsets, key=abs, default=0)

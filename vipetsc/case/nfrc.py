@@ -74,6 +74,7 @@ class NfrcCase(Case):
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
         nfrc = nfrc.model_copy(update=update)
+        # Where bands overlap, the band of the fastest wave.
         if nfrc.source == "wave" and nfrc.band is None:
             first = nfrc.fixed[0] if nfrc.over == "amplitude" else nfrc.range[0]
             fastest = max(waves_at(cell, first), key=lambda wave: wave[2], default=None)
@@ -86,6 +87,7 @@ class NfrcCase(Case):
         yield from super().check(sections, valid)
         if not valid("nfrc"):
             return
+
         nfrc = sections["nfrc"]
         if not nfrc.range[0] < nfrc.range[1]:
             yield Problem("nfrc.range", nfrc.range, "must be [low, high]")
@@ -95,6 +97,8 @@ class NfrcCase(Case):
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
         if not nfrc.smallest_step < nfrc.largest_step:
             yield Problem("nfrc.smallest_step", nfrc.smallest_step, "must be below nfrc.largest_step")
+
+        # Curves are those of the sites: without one there is nothing to follow.
         if valid("contacts"):
             yield from check_stiffness(sections["contacts"], True, valid)
             bounded = sections["contacts"].damping in ("exact", "flores")

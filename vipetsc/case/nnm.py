@@ -25,8 +25,9 @@ from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Contact, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import connected_groups
 
-# Masses solved for with dense matrices, and without any; of a lattice, beyond which "auto" does without.
-MOST_MASSES, MOST_OF_LATTICE, FEW_MASSES = 4000, 40_000, 100
+MOST_MASSES = 4000  # that orbits are solved for with dense matrices
+MOST_OF_LATTICE = 40_000  # without any
+FEW_MASSES = 100  # of a lattice, beyond which "auto" does without
 # Keys of [contacts] that a preset gives, as for a run; the others are those of a run alone.
 MATERIAL = "law", "modulus", "radius", "poisson"
 
@@ -156,23 +157,28 @@ class NnmCase(CaseFile):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The sections, with the preset's material and clearances, and everything that is wrong with them."""
-        given, nnm = with_preset(table).get("contacts", {}), table.get("nnm", {})
-        lattice_free = isinstance(nnm, dict) and nnm.get("system") == "own"
-        if isinstance(given, dict) and not lattice_free:
-            stated = table.get("contacts", {})
-            table = table | {"contacts": {key: v for key, v in given.items() if key in MATERIAL or key in stated}}
+        contacts = with_preset(table).get("contacts", {})
+        nnm = table.get("nnm", {})
+        has_no_lattice = isinstance(nnm, dict) and nnm.get("system") == "own"
+        if isinstance(contacts, dict) and not has_no_lattice:
+            # Of a preset's contacts a run's damping and number of sites do not concern normal modes.
+            stated = {*MATERIAL, *table.get("contacts", {})}
+            table = table | {"contacts": {key: value for key, value in contacts.items() if key in stated}}
+
         fields, problems = super().read(with_default_preset(table))
         problems += refuse_disorder(cls, table)
         lattice, contacts = fields["lattice"], fields["contacts"]
-        if not (problems or lattice_free or contacts.clearance):
+        if not (problems or has_no_lattice or contacts.clearance):
             count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
             fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
         return fields, problems
 
     def warnings(self) -> list[str]:
         """What the case says that normal modes do not take."""
-        r = self.contacts.restitution
-        return [f"contacts.restitution = {r:g} counts as 1: normal modes lose nothing"] if r < 1 else []
+        restitution = self.contacts.restitution
+        if restitution == 1:
+            return []
+        return [f"contacts.restitution = {restitution:g} counts as 1: normal modes lose nothing"]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
@@ -182,8 +188,12 @@ class NnmCase(CaseFile):
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
         # A system of one's own needs no lattice, whatever stands there.
         refusable = {"contacts": contacts} if nnm.system == "own" else {"contacts": contacts, "lattice": lattice}
-        problems, dofs, rigid = [*_check_options(nnm), *refusals(cls, refusable, valid)], 2, 0
-        problems += [] if contacts.each else check_per_site(contacts, 0, [], valid)
+        problems = [*_check_options(nnm), *refusals(cls, refusable, valid)]
+        if not contacts.each:
+            problems += check_per_site(contacts, 0, [], valid)
+
+        # Masses of the system, and how many of its lowest modes are motions as a whole.
+        dofs, rigid = 2, 0
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:
@@ -192,22 +202,26 @@ class NnmCase(CaseFile):
         else:
             cell, wrong = check_cell(lattice)
             problems += wrong
+
+        # The reduced model is one contact pair, wherever it stands.
         if nnm.system in ("chain", "condensed"):
             problems += check_sites(lattice, contacts)
             if not site_cells(lattice, contacts):
                 problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
         if nnm.system == "chain":
             dofs = cell.dofs * lattice.cells if cell else 2
-            rigid = int(lattice.ends != "fixed")
-            krylov = nnm.is_krylov(dofs)
-            most, what = (MOST_OF_LATTICE, "on all ranks") if krylov else (MOST_MASSES, "with dense matrices")
+            rigid = int(lattice.ends != "fixed")  # nothing holds it
             problems += _check_shooting(nnm, dofs)
+            most, what = MOST_MASSES, "with dense matrices"
+            if nnm.is_krylov(dofs):
+                most, what = MOST_OF_LATTICE, "on all ranks"
             if dofs > most:
                 remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
                 return [*problems, Problem("lattice.cells", lattice.cells, remedy)]
         elif nnm.shooting == "krylov" or (nnm.multipliers and nnm.system != "condensed"):
             remedy = '"krylov" is for "chain", multipliers for that and "condensed"'
             problems.append(Problem("nnm.system", nnm.system, remedy))
+
         if nnm.system == "condensed":
             return [*problems, *_check_condensed(lattice, contacts, nnm, valid)]
         if nnm.system == "reduced":
@@ -216,8 +230,11 @@ class NnmCase(CaseFile):
             if contacts.clearance is None and lattice.preset is None:
                 problems.append(Problem("contacts.clearance", None, "missing; give the clearance in m"))
         problems += check_stiffness(contacts, nnm.custom is None or bool(nnm.custom.contacts), valid)
-        if still := [mode for mode in nnm.modes if mode <= rigid]:
+
+        still = [mode for mode in nnm.modes if mode <= rigid]
+        if still:
             problems.append(Problem("nnm.modes", still, "the system is free to move as a whole, which has no period"))
+        # A number of masses that is wrong itself says nothing about modes.
         beyond = [mode for mode in nnm.modes if mode > dofs]
         if beyond and not problems:
             problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))
@@ -242,7 +259,8 @@ class NnmCase(CaseFile):
 
     def contact(self) -> Contact:
         """The contact law without dissipation; the stiffness is 0 in a system without contacts."""
-        given, stiffness = self.contacts, self.contacts.stiffness or 0.0
+        given = self.contacts
+        stiffness = given.stiffness or 0.0
         if given.modulus and given.radius and given.poisson is not None:
             stiffness = contact_stiffness(given.modulus, given.radius, given.poisson)
         return Contact(given.law, stiffness, **parameters_of(given))
@@ -257,15 +275,13 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
             yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
     if nnm.direction != "up" and not nnm.energy[0] > 0:
         yield Problem("nnm.energy", nnm.energy, "going down needs a lowest energy above 0 (J)")
-    condensed = nnm.system == "condensed" or nnm.method == "condensed"
-    starts = ("start_sites",) if nnm.system == "chain" else ("start_frequency", "start_sites")
-    for key in ("compare", "switch") if condensed else starts:
-        if given := getattr(nnm, key):
-            yield Problem(f"nnm.{key}", given, f"goes with motions that are {'shot' if condensed else 'condensed'}")
+
+    yield from _check_method(nnm)
     if not nnm.smallest_step < nnm.largest_step:
         yield Problem("nnm.smallest_step", nnm.smallest_step, "must be below nnm.largest_step")
     if nnm.system != "own" or nnm.custom is None:
         return
+
     masses = len(nnm.custom.masses)
     pairs = [(f"springs[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.springs, 1)]
     pairs += [(f"smooth[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.smooth, 1)]
@@ -275,31 +291,54 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
             yield Problem(f"nnm.own.{key}", [start, end], f"is not a pair of the {masses} masses (0 is the ground)")
 
 
+def _check_method(nnm: NnmTable) -> Iterator[Problem]:
+    """Keys that belong to the other method than the one by which motions are found."""
+    foreign: tuple[str, ...]
+    if nnm.system == "condensed" or nnm.method == "condensed":
+        method, foreign = "shot", ("compare", "switch")
+    elif nnm.system == "chain":
+        method, foreign = "condensed", ("start_sites",)  # the frequency begins a branch of localised motions
+    else:
+        method, foreign = "condensed", ("start_frequency", "start_sites")
+    for key in foreign:
+        given = getattr(nnm, key)
+        if given:
+            yield Problem(f"nnm.{key}", given, f"goes with motions that are {method}")
+
+
 def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable, valid: Valid) -> Iterator[Problem]:
     """What is wrong with the start of a lattice's motions."""
     yield from check_stiffness(contacts, True, valid)
     if not nnm.start_frequency:
         yield Problem("nnm.start_frequency", [], "name frequencies in rad/s, between the pass bands or above them")
+
     count = len(site_cells(lattice, contacts))
-    if outside := [n for n in nnm.start_sites if not 1 <= abs(n) <= count]:
+    outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
+    if outside:
         yield Problem("nnm.start_sites", outside, f"number the sites from 1 to {count}, with a sign")
-    sound = not check_cell(lattice)[1]
-    if nnm.multipliers and sound and (masses := lattice.unit_cell().dofs * lattice.cells) > MOST_OF_LATTICE:
+    if check_cell(lattice)[1]:
+        return
+
+    cell = lattice.unit_cell()
+    masses = cell.dofs * lattice.cells
+    if nnm.multipliers and masses > MOST_OF_LATTICE:
         remedy = f"need the motion of all {masses} masses, and are found up to {MOST_OF_LATTICE}"
         yield Problem("nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs the sites alone")
-    bands = pass_bands(lattice.unit_cell()) if sound else ()
-    if inside := [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]:
-        told = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
-        yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({told} rad/s); motions there radiate")
+    # A motion whose frequency is in a band sends waves away: it is not localised, and nothing is periodic.
+    bands = pass_bands(cell)
+    inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
+    if inside:
+        edges = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
+        yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({edges} rad/s); motions there radiate")
 
 
 def _check_shooting(nnm: NnmTable, dofs: int) -> Iterator[Problem]:
-    """What of [nnm] does not go with the way in which a lattice of ``dofs`` masses is shot."""
+    """Keys of [nnm] that do not go with how a lattice of ``dofs`` masses is shot."""
     krylov = nnm.is_krylov(dofs)
-    defaults = {"compare": [], "switch": [], "orbits_at": [], "flow": "compiled", "jacobian": "variational"}
-    for key, value in defaults.items() if krylov else ():
-        if getattr(nnm, key) != value:
-            yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs dense matrices: nnm.shooting = "dense"')
+    if krylov:
+        for key in ("compare", "switch", "orbits_at", "flow", "jacobian"):
+            if getattr(nnm, key) != NnmTable.model_fields[key].default:
+                yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs dense matrices: nnm.shooting = "dense"')
     if nnm.shooting == "dense" and (nnm.multipliers or nnm.start_frequency):
         key = "multipliers" if nnm.multipliers else "start_frequency"
         yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs nnm.shooting = "krylov"; "dense" has all half-traces')

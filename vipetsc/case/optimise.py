@@ -57,13 +57,19 @@ class ObjectiveTable(Section):
     @property
     def name(self) -> str:
         """The measure, with its band and part."""
-        of = f" {self.band}" if self.band else ""
-        return self.measure + of + (f" {self.part[0]:g}-{self.part[1]:g}" if self.part else "")
+        name: str = self.measure
+        if self.band:
+            name += f" {self.band}"
+        if self.part:
+            name += f" {self.part[0]:g}-{self.part[1]:g}"
+        return name
 
     def describe(self) -> str:
         """The objective in words."""
-        at = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
-        return f"{self.goal} {self.name}" + (f", the {self.over} at {at} N" if at else "")
+        if not self.amplitudes:
+            return f"{self.goal} {self.name}"
+        amplitudes = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
+        return f"{self.goal} {self.name}, the {self.over} at {amplitudes} N"
 
 
 class OptimiseTable(Section):
@@ -96,6 +102,18 @@ class Variable(NamedTuple):
     unit: str
     kind: Literal["log", "linear", "whole"]
 
+    def to_unit(self, value: float) -> float:
+        """The position between the bounds, 0 to 1, of a ``value``."""
+        if self.kind == "log":
+            return float(np.log(value / self.low) / np.log(self.high / self.low))
+        return (value - self.low) / (self.high - self.low)
+
+    def from_unit(self, position: float) -> float:
+        """The value at a ``position`` between the bounds, 0 to 1."""
+        if self.kind == "log":
+            return float(self.low * (self.high / self.low) ** position)
+        return self.low + (self.high - self.low) * position
+
 
 class OptimiseCase(CaseFile):
     """The case to begin with, resolved (``base``), and its ``table`` without ``[optimise]``."""
@@ -118,12 +136,15 @@ class OptimiseCase(CaseFile):
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
             table["time"] = {"engine": "auto"} | table.get("time", {})
+
         options, problems = read_section(OptimiseTable, section, "optimise")
         try:
             base = _case(table)
+            # Designs are made without scatter, and run with it: both must be possible.
             _case(table, table.get("disorder"))
         except CaseError as error:
             return {}, problems + error.problems
+
         wrong = list(_problems(options, base, "disorder" in table))
         wrong += refusals(cls, dict(base), lambda *keys: True)
         invalid = tuple(problem.key for problem in problems)
@@ -170,36 +191,43 @@ class OptimiseCase(CaseFile):
         """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
         bounds, cell = self.options.variables, self.base.lattice.unit_cell()
         gaps = list(clearance or self.base.model().chain.clearances)
-        values = [*(gaps if bounds.clearance else []), *((gaps[0], gaps[-1]) if bounds.profile else ())]
-        values += [*(self.sites if bounds.sites else [])]
-        values += [self.base.contacts.restitution] if bounds.restitution else []
+        values: list[float] = []
+        if bounds.clearance:
+            values += gaps
+        if bounds.profile:
+            values += [gaps[0], gaps[-1]]
+        if bounds.sites:
+            values += self.sites
+        if bounds.restitution:
+            values.append(self.base.contacts.restitution)
         values += [cell.masses[int(number) - 1] for number in bounds.masses]
         values += [cell.springs[int(number) - 1].stiffness for number in bounds.springs]
+        # The case may lie outside the bounds; the search does not.
         return np.clip(values, *np.transpose([(v.low, v.high) for v in self.variables()]))
 
     def to_unit(self, values: np.ndarray) -> np.ndarray:
         """The point in the unit cube (variable) of ``values``."""
-        return np.array([
-            np.log(x / v.low) / np.log(v.high / v.low) if v.kind == "log" else (x - v.low) / (v.high - v.low)
-            for x, v in zip(values, self.variables(), strict=True)
-        ])  # fmt: skip
+        return np.array([variable.to_unit(x) for x, variable in zip(values, self.variables(), strict=True)])
 
     def from_unit(self, point: np.ndarray) -> np.ndarray:
         """The values (variable) at a ``point`` of the unit cube; sites in rising order, no two in one cell."""
         variables = self.variables()
-        values = np.array([
-            v.low * (v.high / v.low) ** x if v.kind == "log" else v.low + (v.high - v.low) * x
-            for x, v in zip(np.clip(point, 0.0, 1.0), variables, strict=True)
-        ])  # fmt: skip
-        if whole := [i for i, v in enumerate(variables) if v.kind == "whole"]:
-            order, last = np.arange(len(whole)), variables[whole[0]].high
+        inside = np.clip(point, 0.0, 1.0)
+        values = np.array([variable.from_unit(x) for x, variable in zip(inside, variables, strict=True)])
+
+        whole = [i for i, variable in enumerate(variables) if variable.kind == "whole"]
+        if whole:
+            # Rising without the number of those before, then with it: no two are the same.
+            order = np.arange(len(whole))
+            last = variables[whole[0]].high
             cells = np.maximum.accumulate(np.sort(np.round(values[whole])) - order)
             values[whole] = np.minimum(cells, last - order[-1]) + order
         return values
 
     def design(self, values: np.ndarray) -> Case:
         """The case with ``values`` (variable); raises CaseError if it is impossible."""
-        bounds, left, count = self.options.variables, iter(map(float, values)), len(self.sites)
+        bounds, count = self.options.variables, len(self.sites)
+        left = iter(map(float, values))
         table = with_preset(copy.deepcopy(self.table))
         contacts = table["contacts"] | {"sites": self.sites, "clearance": [*self.base.model().chain.clearances]}
         if bounds.clearance:
@@ -210,12 +238,14 @@ class OptimiseCase(CaseFile):
             contacts["sites"] = [int(cell) for cell in islice(left, count)]
         if bounds.restitution:
             contacts["restitution"] = next(left)
+
         if bounds.masses or bounds.springs:
             cell = self.base.lattice.undamped_cell()
             masses, stiffness = list(cell.masses), [spring.stiffness for spring in cell.springs]
-            for values_of, numbers in ((masses, bounds.masses), (stiffness, bounds.springs)):
-                for number in numbers:
-                    values_of[int(number) - 1] = next(left)
+            for number in bounds.masses:
+                masses[int(number) - 1] = next(left)
+            for number in bounds.springs:
+                stiffness[int(number) - 1] = next(left)
             table["lattice"] = with_cell(table["lattice"], cell, {"masses": masses, "springs": stiffness})
         return _case(table | {"contacts": contacts})
 
@@ -236,29 +266,15 @@ def _case(table: Table, disorder: Any = None) -> Case:
 
 def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Problem]:
     """What is wrong between the keys of the section and the case to begin with."""
-    bounds, cell, sites = options.variables, base.lattice.unit_cell(), base.model().chain.sites
-    at, given = "optimise.variables", options.variables.model_dump(exclude_none=True)
+    bounds = options.variables
+    sites = base.model().chain.sites
     if not sites:
         yield Problem("contacts.sites", base.contacts.sites, "no sites: without contacts a design has nothing to do")
-    if not any(given.values()):
+    if not any(bounds.model_dump(exclude_none=True).values()):
         valid = ", ".join(VariablesTable.model_fields)
-        yield Problem(at, None, f"names nothing that varies; give [low, high] for any of {valid}")
-    if bounds.clearance and bounds.profile:
-        yield Problem(f"{at}.profile", bounds.profile, "give clearance or profile, not both")
-    pairs = {key: pair for key, pair in given.items() if isinstance(pair, list)}
-    for kind, count in (("masses", len(cell.masses)), ("springs", len(cell.springs))):
-        for number, pair in given[kind].items():
-            pairs[f"{kind}.{number}"] = pair
-            if not (number.isdecimal() and 1 <= int(number) <= count):
-                yield Problem(f"{at}.{kind}.{number}", pair, f"the cell's {kind} count from 1 to {count}")
-    for key, (low, high) in pairs.items():
-        if key != "sites" and not low < high:
-            yield Problem(f"{at}.{key}", [low, high], "must be [low, high] with low below high")
-    if bounds.sites:
-        low, high = bounds.sites
-        if not 1 <= low < high <= base.lattice.cells or high - low + 1 < len(sites):
-            remedy = f"must lie within cells 1 to {base.lattice.cells} and hold all {len(sites)} sites"
-            yield Problem(f"{at}.sites", bounds.sites, remedy)
+        yield Problem("optimise.variables", None, f"names nothing that varies; give [low, high] for any of {valid}")
+    yield from _bounds_problems(bounds, base, len(sites))
+
     if options.samples > 1 and not disorder:
         yield Problem("optimise.samples", options.samples, "there is no [disorder] to draw them from")
     if options.start == "matched" and not (bounds.clearance or bounds.profile):
@@ -267,12 +283,42 @@ def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Pr
         yield from _problems_of(objective, f"optimise.objective[{number}]", base, bool(bounds.masses or bounds.springs))
 
 
+def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator[Problem]:
+    """What is wrong with the bounds of what varies in a case with so many ``sites``."""
+    at = "optimise.variables"
+    if bounds.clearance and bounds.profile:
+        yield Problem(f"{at}.profile", bounds.profile, "give clearance or profile, not both")
+
+    cell = base.lattice.unit_cell()
+    given = bounds.model_dump(exclude_none=True)
+    pairs = {key: pair for key, pair in given.items() if isinstance(pair, list)}
+    for kind, count in (("masses", len(cell.masses)), ("springs", len(cell.springs))):
+        for number, pair in given[kind].items():
+            pairs[f"{kind}.{number}"] = pair
+            if not (number.isdecimal() and 1 <= int(number) <= count):
+                yield Problem(f"{at}.{kind}.{number}", pair, f"the cell's {kind} count from 1 to {count}")
+
+    for key, (low, high) in pairs.items():
+        if key != "sites" and not low < high:
+            yield Problem(f"{at}.{key}", [low, high], "must be [low, high] with low below high")
+    if bounds.sites:
+        low, high = bounds.sites
+        if not 1 <= low < high <= base.lattice.cells or high - low + 1 < sites:
+            remedy = f"must lie within cells 1 to {base.lattice.cells} and hold all {sites} sites"
+            yield Problem(f"{at}.sites", bounds.sites, remedy)
+
+
 def _problems_of(objective: ObjectiveTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
     """What is wrong with an objective, of a cell that stays as it is unless ``varied``."""
-    bands, band, part = pass_bands(base.lattice.unit_cell()), objective.band, objective.part
+    bands = pass_bands(base.lattice.unit_cell())
+    band, part = objective.band, objective.part
+
+    # The top of the driven band and of those that overlap it.
     top = base.drive.frequency or 0.0
-    for other in sorted(bands, key=lambda b: b.low):  # of the driven band and those that overlap it
-        top = max(top, other.high) if other.low <= top else top
+    for other in sorted(bands, key=lambda band: band.low):
+        if other.low <= top:
+            top = max(top, other.high)
+
     if objective.measure == "transmitted" and base.lattice.ends == "periodic":
         remedy = "nothing lies beyond the last site of a ring; lattice.ends = fixed or free, or another measure"
         yield Problem(f"{at}.measure", objective.measure, remedy)

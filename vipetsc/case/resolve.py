@@ -42,6 +42,7 @@ def with_preset(table: Table) -> Table:
     """
     table = with_default_preset(table)
     initial = table.get("initial", {})
+    # Types are not checked yet: whatever is no table stays as it is, and is refused where sections are read.
     if isinstance(initial, dict) and initial.get("kind", "zero") != "zero" and "drive" not in table:
         table = table | {"drive": {"amplitude": 0.0}}
 
@@ -133,17 +134,24 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     for key, value in (("lattice.lambda", lattice.lam), ("lattice.eta", lattice.eta)):
         if value is not None and lattice.preset != "four-band":
             problems.append(Problem(key, value, "only the four-band preset has it"))
-    wrong = cell_problems(*lattice.cell.arguments()) if lattice.cell else []
-    problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
-    problems += [] if problems or lattice.damping is None else _check_damping(lattice.damping, lattice.undamped_cell())
+    if lattice.cell:
+        wrong = cell_problems(*lattice.cell.arguments())
+        problems += [Problem(f"lattice.cell.{key}", None, message) for key, message in wrong]
+    if lattice.damping and not problems:
+        problems += _check_damping(lattice.damping, lattice.undamped_cell())
     if problems:
         return None, problems
+
     cell = lattice.unit_cell()
     if not cell.springs:
         return cell, problems
-    next_cell = tuple((0, s.start + 1) for s in cell.springs if s.next_cell)
-    group = connected_groups(cell.dofs + 1, (*next_cell, *((s.start + 1, s.end + 1) for s in cell.springs)))
-    if loose := [str(mass) for mass, number in enumerate(group) if number != group[0]]:
+
+    # Node 0 stands for the next cell: what is not joined to it belongs to no chain.
+    to_next_cell = [(0, spring.start + 1) for spring in cell.springs if spring.next_cell]
+    within = [(spring.start + 1, spring.end + 1) for spring in cell.springs]
+    group = connected_groups(cell.dofs + 1, (*to_next_cell, *within))
+    loose = [str(mass) for mass, number in enumerate(group) if number != group[0]]
+    if loose:
         remedy = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
         problems.append(Problem("lattice.cell.springs", None, remedy))
     return cell, problems
@@ -151,33 +159,40 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
 
 def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
     """What is wrong with the loss of bands, or with dashpots that are given in its place."""
-    loss, fitted, bands = damping.loss, (damping.grounding, damping.springs), [str(i + 1) for i in range(cell.dofs)]
-    if loss is not None and (not loss or loss.keys() - {*bands} or not cell.springs):
-        remedy = "a cell without springs has no bands" if not cell.springs else f"give it by band, 1 to {cell.dofs}"
+    loss = damping.loss
+    bands = {str(number) for number in range(1, cell.dofs + 1)}
+    fitted = (damping.grounding, damping.springs)
+    expected = [cell.dofs, len(cell.springs)]
+    if loss is not None and (not loss or loss.keys() - bands or not cell.springs):
+        remedy = f"give it by band, 1 to {cell.dofs}" if cell.springs else "a cell without springs has no bands"
         yield Problem("lattice.damping.loss", loss, f"{remedy}, as in loss = {{ 2 = 0.02 }}")
     elif loss is not None and (damping.mass or damping.stiffness):
         yield Problem("lattice.damping.loss", loss, "give it, or mass and stiffness, not both")
-    elif fitted != (None, None) and (loss is None or [len(f or ()) for f in fitted] != [cell.dofs, len(cell.springs)]):
+    elif fitted != (None, None) and (loss is None or [len(values or ()) for values in fitted] != expected):
         yield Problem("lattice.damping.grounding", fitted[0], "it and springs are fitted to loss; leave them out")
 
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
     """What is wrong with where the contacts are, and with their clearances."""
     sites, clearance = contacts.sites, contacts.clearance
-    count = sites.count if isinstance(sites, Span) else sites if isinstance(sites, int) else 0
-    if count > lattice.cells:
+    count = 0 if isinstance(sites, list) else sites.count if isinstance(sites, Span) else sites
+    if count > lattice.cells:  # before so many are placed
         yield Problem("contacts.sites", count, f"more sites than the lattice has cells, {lattice.cells}")
         return
+
     cells = site_cells(lattice, contacts)
-    if outside := [c for c in cells if not 1 <= c <= lattice.cells]:
+    outside = [cell for cell in cells if not 1 <= cell <= lattice.cells]
+    if outside:
         yield Problem("contacts.sites", outside, f"outside the lattice; cells count from 1 to {lattice.cells}")
     if isinstance(sites, Span) and None not in (sites.last, sites.spacing):
         yield Problem("contacts.sites.spacing", None, "give last or spacing, not both")
-    plain = contacts.pair is None and (contacts.each is None or contacts.each.pair is None)
-    if plain and (twice := sorted(cell for cell, times in Counter(cells).items() if times > 1)):
+    has_pair = contacts.pair is not None or (contacts.each is not None and contacts.each.pair is not None)
+    twice = sorted(cell for cell, times in Counter(cells).items() if times > 1)
+    if twice and not has_pair:
         yield Problem("contacts.sites", twice, "named twice; a cell carries one contact pair")
     if isinstance(sites, int) and sites > 0 and lattice.preset is None:
         yield Problem("contacts.sites", sites, "a count needs a preset; list the cells or give {first, last, count}")
+
     if isinstance(clearance, list) and len(clearance) != len(cells):
         yield Problem("contacts.clearance", clearance, f"one clearance for each of the {len(cells)} sites is needed")
     if clearance is None and lattice.preset is None and cells:
@@ -187,12 +202,13 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
 def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid) -> Iterator[Problem]:
     """What is wrong with the sites of a run and with the law."""
     yield from check_sites(lattice, contacts)
-    counted = isinstance(contacts.sites, int) and lattice.preset is None  # which needs a preset to place them
-    given = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
-    yield from check_stiffness(contacts, bool(contacts.sites) and not counted and not given, valid)
-    sites = [] if counted else site_cells(lattice, contacts)
-    placed = contacts.clearance is not None or lattice.preset is not None or not sites
-    gaps = clearances(lattice, contacts, len(sites)) if placed else []
+    is_unplaced = isinstance(contacts.sites, int) and lattice.preset is None  # a count needs a preset to place it
+    has_stiffnesses = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
+    yield from check_stiffness(contacts, bool(contacts.sites) and not is_unplaced and not has_stiffnesses, valid)
+
+    sites = [] if is_unplaced else site_cells(lattice, contacts)
+    has_clearances = contacts.clearance is not None or lattice.preset is not None or not sites
+    gaps = clearances(lattice, contacts, len(sites)) if has_clearances else []
     if len(gaps) == len(sites):
         yield from check_per_site(contacts, len(sites), gaps, valid)
 
@@ -274,6 +290,7 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
     """The end and the sample interval in s of a lattice of ``cells`` cells under a resolved ``drive``."""
     end = time.end
     if end == "traverse":
+        # Until the last drive is over, and the wave of the first has crossed the lattice.
         settled = max(waveform_of(one).settled for _, one in drive.every)
         end = settled + cells / packet_speed(cell, drive)
 

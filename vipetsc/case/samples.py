@@ -30,32 +30,41 @@ class SamplesTable(Section):
 
 def with_samples(table: Table) -> tuple[Table, list[Problem]]:
     """``table`` with the samples of the files that its drives name, and what is wrong with these."""
-    problems: list[Problem] = []
-
-    def filled(drive: Any, key: str) -> Any:
-        samples = drive.get("samples") if isinstance(drive, dict) else None
-        if not isinstance(samples, dict) or not isinstance(samples.get("file"), str) or "sha256" in samples:
-            return drive
-        if {"time", "value"} & samples.keys():
-            problems.append(Problem(f"{key}.samples.file", samples["file"], "give it or time and value, not both"))
-            return drive
-        path = Path(samples["file"]).resolve()
-        try:
-            rows, digest = _read(path, samples.get("dataset")), file_hash(path)
-        except (OSError, ValueError, KeyError) as error:
-            problems.append(Problem(f"{key}.samples.file", samples["file"], str(error)))
-            return drive
-        columns = np.where(np.abs(rows) < 1 / LARGEST, 0.0, rows).T.tolist()
-        told = {"file": str(path), "sha256": digest, "time": columns[0], "value": columns[1]}
-        return drive | {"samples": samples | told}
-
     drive = table.get("drive")
-    if isinstance(drive, dict):
-        drive = filled(drive, "drive")
-        if isinstance(drive.get("more"), list):
-            drive = drive | {"more": [filled(one, f"drive.more[{i}]") for i, one in enumerate(drive["more"], 1)]}
-        table = table | {"drive": drive}
-    return table, problems
+    if not isinstance(drive, dict):
+        return table, []
+
+    drive, problems = _filled(drive, "drive")
+    if isinstance(drive.get("more"), list):
+        others = []
+        for number, other in enumerate(drive["more"], 1):
+            filled, wrong = _filled(other, f"drive.more[{number}]")
+            others.append(filled)
+            problems += wrong
+        drive = drive | {"more": others}
+    return table | {"drive": drive}, problems
+
+
+def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
+    """The table of a drive with the samples of the file that it names, and what is wrong with that."""
+    samples = drive.get("samples") if isinstance(drive, dict) else None
+    # With a hash it is a resolved one: runs are read where their files are gone.
+    if not isinstance(samples, dict) or not isinstance(samples.get("file"), str) or "sha256" in samples:
+        return drive, []
+
+    key = f"{path}.samples.file"
+    if {"time", "value"} & samples.keys():
+        return drive, [Problem(key, samples["file"], "give it or time and value, not both")]
+    file = Path(samples["file"]).resolve()
+    try:
+        rows, digest = _read(file, samples.get("dataset")), file_hash(file)
+    except (OSError, ValueError, KeyError) as error:
+        return drive, [Problem(key, samples["file"], str(error))]
+
+    # Numbers smaller than a case may have are noise about 0.
+    times, values = np.where(np.abs(rows) < 1 / LARGEST, 0.0, rows).T.tolist()
+    filled = {"file": str(file), "sha256": digest, "time": times, "value": values}
+    return drive | {"samples": samples | filled}, []
 
 
 def _read(path: Path, dataset: Any) -> np.ndarray:
@@ -66,8 +75,10 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
     else:
         lines = [re.split(r"[,;\s]+", line.strip()) for line in path.read_text(encoding="utf-8-sig").splitlines()]
         lines = [line for line in lines if line[0] and not line[0].startswith("#")]
+        # A table may begin with a line of names.
+        has_header = bool(lines) and not re.match(r"[-+.\d]", lines[0][0])
         try:
-            rows = np.array(lines[1 if lines and not re.match(r"[-+.\d]", lines[0][0]) else 0 :], float)
+            rows = np.array(lines[1:] if has_header else lines, float)
         except ValueError:
             raise ValueError("is no table of numbers: time and value in two columns are needed") from None
     if rows.ndim != 2 or rows.shape[1] != 2 or len(rows) > MOST_SAMPLES:

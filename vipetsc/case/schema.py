@@ -22,23 +22,28 @@ MULTIPLE_OF_PI = r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*"
 
 def number(value: Any) -> Any:
     """Wavenumbers may be written as multiples of pi: "5pi/9"."""
-    match = isinstance(value, str) and re.fullmatch(MULTIPLE_OF_PI, value)
-    if not match:
+    if not isinstance(value, str):
+        return value
+    match = re.fullmatch(MULTIPLE_OF_PI, value)
+    if match is None:
         return value
     return float(match[1] or 1) * np.pi / float(match[2] or 1)
 
 
 def once(values: list[Any]) -> list[Any]:
     """``values`` if none of them comes twice; raises ValueError."""
-    if twice := [value for value in dict.fromkeys(values) if values.count(value) > 1]:
+    twice = [value for value in dict.fromkeys(values) if values.count(value) > 1]
+    if twice:
         raise ValueError(f"names {', '.join(map(repr, twice))} more than once")
     return values
 
 
-MOST_CELLS, MOST_SITES = 10**12, 10**6
+MOST_CELLS = 10**12
+MOST_SITES = 10**6
 
 
 def _text(value: Any) -> Any:
+    """PETSc's options are text; a case may give numbers and truth values."""
     return str(value) if isinstance(value, bool | int | float) else value
 
 
@@ -98,6 +103,18 @@ class SpringTable(Section):
     quadratic: Finite | None = None
     cubic: Finite | None = None
 
+    def spring(self) -> Spring:
+        """The spring, with 0-based indices."""
+        return Spring(
+            start=self.start - 1,
+            end=self.end - 1,
+            stiffness=self.stiffness,
+            next_cell=self.next_cell,
+            damping=self.damping or 0.0,
+            quadratic=self.quadratic or 0.0,
+            cubic=self.cubic or 0.0,
+        )
+
 
 class CellTable(Section):
     """A unit cell; ``contact`` names host and resonator (1-based; 1 and 2), ``grounding`` dashpots to ground."""
@@ -108,16 +125,14 @@ class CellTable(Section):
     grounding: list[Finite] | None = None
 
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
-        """Those of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
-        parts = [[part or 0.0 for part in (s.damping, s.quadratic, s.cubic)] for s in self.springs]
-        ends = [(s.start - 1, s.end - 1, s.stiffness, s.next_cell) for s in self.springs]
-        springs = tuple(Spring(*end, *part) for end, part in zip(ends, parts, strict=True))
+        """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
+        springs = tuple(spring.spring() for spring in self.springs)
         host, resonator = self.contact or (1, min(2, len(self.masses)))
         return tuple(self.masses), springs, host - 1, resonator - 1, tuple(self.grounding or ())
 
 
 class DampingTable(Section):
-    """Dashpots everywhere: to ground ``mass`` times each mass, beside each spring ``stiffness`` times its stiffness.
+    """Dashpots everywhere: to ground ``mass`` times each mass, along each spring ``stiffness`` times its stiffness.
 
     A mode of frequency w then has the damping ratio (mass/w + stiffness w)/2. In their place ``loss``, twice the ratio
     asked of bands, by number; ``grounding`` (dof) and ``springs`` (spring) are the dashpots in N s/m fitted to it.
@@ -153,20 +168,30 @@ class LatticeTable(Section):
 
     def unit_cell(self) -> UnitCell:
         """The unit cell: ``cell``, or the preset's in its reading, damped; raises ValueError for an invalid one."""
-        cell, damping = self.undamped_cell(), self.damping
+        cell = self.undamped_cell()
+        damping = self.damping
         if damping is None or not (damping.mass or damping.stiffness or damping.loss):
             return cell
-        ground, beside = damping.fitted(cell)
-        beside = np.multiply(damping.stiffness, [s.stiffness for s in cell.springs]) + beside
-        springs = tuple(replace(s, damping=s.damping + c) for s, c in zip(cell.springs, beside.tolist(), strict=True))
-        grounding = np.add(cell.grounding or 0.0, np.multiply(damping.mass, cell.masses) + ground)
+
+        fitted_grounding, fitted_dashpots = damping.fitted(cell)
+        dashpots = np.multiply(damping.stiffness, [spring.stiffness for spring in cell.springs]) + fitted_dashpots
+        springs = tuple(
+            replace(spring, damping=spring.damping + dashpot)
+            for spring, dashpot in zip(cell.springs, dashpots.tolist(), strict=True)
+        )
+        grounding = np.add(cell.grounding or 0.0, np.multiply(damping.mass, cell.masses) + fitted_grounding)
         return replace(cell, springs=springs, grounding=tuple(grounding.tolist()))
 
     def undamped_cell(self) -> UnitCell:
         """The unit cell without what ``damping`` adds."""
         if self.cell is not None:
             return UnitCell(*self.cell.arguments())
-        options = {key: value for key, value in (("lam", self.lam), ("eta", self.eta)) if value is not None}
+
+        options: dict[str, float] = {}
+        if self.lam is not None:
+            options["lam"] = self.lam
+        if self.eta is not None:
+            options["eta"] = self.eta
         return PRESETS[str(self.preset)].cell(self.reading, **options)
 
 

@@ -68,6 +68,7 @@ class Sweep(CaseFile):
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
             table["time"] = {"engine": "auto"} | table.get("time", {})
+        # What is measured is not varied: ``analyse`` measures a sweep again.
         sections = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
@@ -176,6 +177,7 @@ class Sweep(CaseFile):
         Raises CaseError if none of these is a valid case, and if one is not because of what its disorder draws: the
         samples that are left would be of another distribution.
         """
+        # Drawn with a seed of its own, so that every rank and every call tries the same ones.
         numbers = np.arange(self.count)
         if most < self.count:
             numbers = np.sort(np.random.default_rng(0).choice(self.count, most, replace=False))
@@ -222,6 +224,7 @@ def _values(value: Any) -> tuple[Any, ...]:
     remedy = "give a list of values, { log = [first, last], count = n } or { linear = [first, last], count = n }"
     if not isinstance(value, dict) or len(value) != 2 or "count" not in value:
         raise ValueError(remedy)
+    # What is left is checked step by step, so that the message is about the first thing that is wrong.
     (kind,) = value.keys() - {"count"}
     ends, count = value[kind], value["count"]
     if not (isinstance(ends, list) and len(ends) == 2 and all(type(end) in (int, float) for end in ends)):

@@ -75,6 +75,7 @@ def disorder_of(
     if "disorder" not in table:
         return None
 
+    # The case is valid, and so is the section.
     disorder, _ = read_section(DisorderTable, table["disorder"], "disorder")
     nominal = {key: section for key, section in table.items() if key != "disorder"}
     return disorder, Case.from_table(nominal), Case.from_table(table)

@@ -106,6 +106,7 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     chain, drive, at = model.chain, model.drive, model.drive_cell
     if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
         return
+    # Sites are what a run is about; without them it is what is kept, or what is near the drive.
     window = [cell - 1 for cell in output.window or (at + 1,)]
     measured, name = (chain.sites, "site in cell") if chain.sites else (window, "cell")
     for end, cell in (("left", 0), ("right", chain.cells - 1)):
@@ -156,6 +157,7 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     if not model.chain.sites or not speed:
         return
 
+    # The stiffest law decides, at the speed of the undisturbed wave.
     laws = {*(model.laws or (model.contact,))}
     time = min(law.impact_time(speed, model.chain.cell.reduced_mass) for law in laws)
     step = float(petsc.get("ts_dt", DEFAULT_STEP / model.drive.frequency))
