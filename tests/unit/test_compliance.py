@@ -141,3 +141,14 @@ def test_a_long_lattice_costs_what_a_short_one_does():
     weight = np.abs(waves.vectors[:, 2] - waves.vectors[:, 1]) ** 2
     expected = np.mean(np.sum(weight / (waves.frequency**2 - 1023.27**2), axis=1))
     assert WaveCompliance(ring).at(1023.27)[0, 0, 0] == pytest.approx(expected, rel=1e-7)
+
+
+def test_an_infinite_lattice_is_at_rest_beyond_static_forces():
+    """Opposite forces stretch the cells between them; beyond, all cells are shifted alike on either side."""
+    compliance = WaveCompliance(
+        Chain(four_band("calibrated"), 30, sites=(10, 14), clearances=(1e-3,) * 2), infinite=True
+    )
+    field = compliance.field(0.0, [1.0, -0.3], [-60, -20, 9, 15, 40, 90])
+    assert field[0] == pytest.approx(field[1], rel=1e-9)
+    assert field[4] == pytest.approx(field[5], rel=1e-9)
+    assert np.ptp(field[1].real) < 1e-9 * np.abs(field).max()
