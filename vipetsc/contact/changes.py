@@ -117,7 +117,8 @@ def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: fl
     ``room`` (2, 6) is overwritten.
     """
     first = ModeChange(2.0, -1, 0)
-    b, c = room[0], room[1]
+    b = room[0]
+    c = room[1]
     for i in range(contacts.size):
         if abs(contacts[i].mode) == PERMANENT:
             continue

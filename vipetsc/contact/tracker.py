@@ -54,6 +54,7 @@ def with_room(tracks: Tracks) -> Tracks:
     wanted = used + tracks.sites.size
     if wanted <= tracks.log.size:
         return tracks
+    # Twice what is wanted: however many episodes there are, the log is copied a few times only.
     log = np.empty(2 * wanted, tracks.log.dtype)
     log[:used] = tracks.log[:used]
     return Tracks(tracks.sites, log, tracks.closed)
@@ -62,7 +63,8 @@ def with_room(tracks: Tracks) -> Tracks:
 @njit(error_model="numpy")
 def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extremes) -> None:
     """Update the open episode of site ``i`` with the extremes ``reached`` in an interval of time."""
-    track, site = tracks.sites[i], contacts[i]
+    track = tracks.sites[i]
+    site = contacts[i]
     episode = track.episode
     episode.indentation = max(episode.indentation, reached.indentation)
     episode.force = max(episode.force, reached.force)
@@ -117,12 +119,14 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
 @njit(error_model="numpy")
 def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: float, energy: float, t: float) -> None:
     """Give site ``i`` its new mode at w' = ``rate``; begin or end its episode, ``energy`` in J dissipated so far."""
-    site, track = contacts[i], tracks.sites[i]
+    site = contacts[i]
+    track = tracks.sites[i]
     episode = track.episode
     was_free = site.mode == FREE
     site.mode = mode
     if was_free:
         side = 1 if mode > 0 else -1
+        # A grazing onset would make the factor g unbounded.
         track.counts.floored += abs(rate) < site.floor
         site.approach = side * max(abs(rate), site.floor)
         episode.site = track.number
@@ -132,7 +136,7 @@ def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: flo
         episode.separation = np.nan
         episode.indentation = 0.0
         episode.force = 0.0
-        episode.loss = -energy
+        episode.loss = -energy  # what the site has dissipated by its end is added
     elif mode == FREE:
         track.pulls = False
         episode.separation = t
@@ -180,7 +184,8 @@ class ImpactTracker:
         ``motion`` (site, 2) has w and w' of all numbered sites. When these contacts began is not known: w'_minus is the
         speed with which two masses alone come to w at w' without loss: mu (w'_minus^2 - w'^2)/2 is the elastic energy.
         """
-        sites, tracked = self.contacts, self.tracks.sites
+        sites = self.contacts
+        tracked = self.tracks.sites
         numbered = np.flatnonzero(tracked["number"] >= 0)
         w, rate = motion[tracked["number"][numbered]].T
         plus = w - sites["clearance"][numbered]
@@ -192,8 +197,10 @@ class ImpactTracker:
         near = LANDED_W * sites["scale"][numbered]
         touching = (deep > near) | ((deep >= -near) & (side * rate > 0))
         closing = touching & (sites["mode"][numbered] == FREE)
-        closed, side = numbered[closing], side[closing]
-        deep, rate = np.maximum(deep[closing], 0.0), rate[closing]
+        closed = numbered[closing]
+        side = side[closing]
+        deep = np.maximum(deep[closing], 0.0)
+        rate = rate[closing]
 
         law = sites[closed]
         stored = np.array([elastic_energy(site["elastic"], x) for site, x in zip(law, deep, strict=True)])

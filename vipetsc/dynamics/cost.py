@@ -6,20 +6,43 @@ return to the sites, up to several times as many.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from vipetsc.case import Case, Model
 from vipetsc.dynamics.propagator.engine import Propagator, step_series
+from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.run import select_engine
 from vipetsc.lattice import bloch, pass_bands, waves_at
 
-# Of ts, in s: an accepted step of 8vr, a mass in it; steps that the top band needs; steps that an episode costs.
-STEP, MASS, RESOLVED, EPISODE_STEPS = 3.7e-5, 1.3e-7, 0.37, 60.0
+# Of ts: seconds an accepted step of 8vr and a mass in it; radians of the top band in a step, steps an episode costs.
+STEP = 3.7e-5
+MASS = 1.3e-7
+RESOLVED = 0.37
+EPISODE_STEPS = 60.0
+# Steps that end on samples, over those that are needed.
+SAMPLED_STEPS = 1.3
 # Of the propagator, in s: what it begins with, a linear step, a cell in it, an episode.
-BEGIN, LINEAR_STEP, CELL, EPISODE = 0.06, 2e-5, 6.5e-8, 3.5e-4
+BEGIN = 0.06
+LINEAR_STEP = 2e-5
+CELL = 6.5e-8
+EPISODE = 3.5e-4
 # Of cells with rows of their own, in s: a number of these in a step, what it takes to make one.
-OWN_NUMBER, MAKE_NUMBER = 4e-10, 7e-7
+OWN_NUMBER = 4e-10
+MAKE_NUMBER = 7e-7
+
+
+class Seconds(NamedTuple):
+    """CPU time in s of an engine: without contacts, and for their episodes."""
+
+    linear: float
+    contacts: float
+
+    @property
+    def total(self) -> float:
+        """Both together."""
+        return self.linear + self.contacts
 
 
 @dataclass(frozen=True)
@@ -50,45 +73,69 @@ class Cost:
 
 def estimate(case: Case, ranks: int = 1) -> Cost:
     """The cost of a run of ``case`` on so many ranks; every site is taken to meet the linear wave of the drive."""
-    model, engine = case.model(), case.time.engine
+    model = case.model()
     kind, note = select_engine(case, model)
     episodes = expected_episodes(model)
-    masses = model.chain.cells * model.chain.cell.dofs / ranks
-    steps = (
-        1.3 * model.samples * max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
-    )
-    by_ts = (steps * (STEP + MASS * masses), EPISODE_STEPS * episodes * (STEP + MASS * masses))
-    linear, exact = None, (0.0, 0.0)
+    by_ts = _runge_kutta_seconds(model, episodes, ranks)
+    exact = None
     if not case.petsc and Propagator.refusal(model) is None and (series := step_series(model)):
-        count = model.samples * round(model.sample_interval / series.interval)
-        differing, tables = series.own_rows()
-        numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1) / ranks
-        step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * differing * numbers
-        begin = BEGIN + MAKE_NUMBER * tables * numbers
-        exact = begin + count * step, EPISODE * episodes
-        linear = sum(exact)
-        if differing and kind is Propagator:
-            size = f"{tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
-            note = f"{differing} cells have rows of their own, {size}"
-    free, contacts = by_ts if kind.name == "ts" else exact
-    return Cost(kind.name, note if engine != "ts" else None, episodes, free + contacts, contacts, linear)
+        exact, own_rows = _propagator_seconds(model, series, episodes, ranks)
+        if own_rows and kind is Propagator:
+            note = own_rows
+
+    seconds = by_ts if kind.name == "ts" or exact is None else exact
+    return Cost(
+        engine=kind.name,
+        note=note if case.time.engine != "ts" else None,
+        episodes=episodes,
+        seconds=seconds.total,
+        contacts=seconds.contacts,
+        propagator=exact.total if exact else None,
+    )
+
+
+def _runge_kutta_seconds(model: Model, episodes: float, ranks: int) -> Seconds:
+    """What ``ts`` takes for ``model`` with so many contact episodes."""
+    step = STEP + MASS * model.chain.cells * model.chain.cell.dofs / ranks
+    steps_per_sample = max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
+    return Seconds(SAMPLED_STEPS * model.samples * steps_per_sample * step, EPISODE_STEPS * episodes * step)
+
+
+def _propagator_seconds(model: Model, series: StepSeries, episodes: float, ranks: int) -> tuple[Seconds, str | None]:
+    """What the propagator takes, and a note on cells with rows of their own, if there are any."""
+    steps = model.samples * round(model.sample_interval / series.interval)
+    differing, tables = series.own_rows()
+    numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1) / ranks
+    step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * differing * numbers
+    begin = BEGIN + MAKE_NUMBER * tables * numbers
+    seconds = Seconds(begin + steps * step, EPISODE * episodes)
+    if not differing:
+        return seconds, None
+    size = f"{tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
+    return seconds, f"{differing} cells have rows of their own, {size}"
 
 
 def expected_episodes(model: Model) -> float:
     """Contact episodes if each site meets the drive's linear wave: two a cycle while |w| is above the clearance.
 
-    The wave's largest displacement is ``model.scale``; what it is of |w| the Bloch wave tells.
+    The wave's largest displacement is ``model.scale``; the Bloch wave states what part of it |w| is.
     """
-    cell, drive = model.chain.cell, model.drive
+    cell = model.chain.cell
+    drive = model.drive
     waves = waves_at(cell, drive.frequency)
     if not (waves and drive.amplitude and model.chain.sites):
         return 0.0
-    shares = []
+
+    largest = 0.0
     for band, kappa, _ in waves:
         shape = bloch(cell, kappa).vectors[:, band - 1]
-        shares.append(abs(shape[cell.resonator] - shape[cell.host]) / np.abs(shape).max())
+        largest = max(largest, abs(shape[cell.resonator] - shape[cell.host]) / np.abs(shape).max())
     gaps = np.min(model.gaps, axis=1) if model.gaps else np.asarray(model.chain.clearances)
-    z = model.scale * max(shares) / np.maximum(gaps, 1e-300)
+    z = model.scale * largest / np.maximum(gaps, 1e-300)
+
+    # The fraction of a burst in which its envelope sin^2 is above 1/z.
     above = np.where(z > 1, 1 - 2 / np.pi * np.arcsin(np.sqrt(1 / np.maximum(z, 1))), 0.0)
-    endless = model.end * drive.frequency / (2 * np.pi)
-    return float(2 * (drive.cycles if np.isfinite(drive.duration) else endless) * above.sum())
+    cycles = model.end * drive.frequency / (2 * np.pi)
+    if np.isfinite(drive.duration):
+        cycles = drive.cycles
+    return float(2 * cycles * above.sum())

@@ -44,7 +44,9 @@ def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
             continue
 
         drive = drives[number]
-        wave, factor = drive.waveform, drive.stiffness or 1.0
+        # A moving wall at the end of a spring acts as a force: its displacement times the spring's stiffness.
+        wave = drive.waveform
+        factor = drive.stiffness or 1.0
         row["duration"] = wave.duration
         row["highest"] = wave.highest
         row["stiffness"] = drive.stiffness

@@ -16,7 +16,10 @@ from vipetsc.dynamics.matrices import LatticeMatrices
 
 # Direct solvers for one rank, for several; the first that PETSc has. MUMPS takes ten times as long for a band.
 DIRECT = ("superlu", "petsc"), ("superlu_dist", "mumps")
-TOLERANCE, RESTARTS, OF_COPIES = 1e-11, 60, 4
+TOLERANCE = 1e-11
+# Restarts of the first search, and of one for further copies of a mode, which mostly finds none.
+RESTARTS = 60
+COPY_RESTARTS = 4
 SHIFT = 1e-9  # of the largest Om^2, by which s differs from the frequency asked, which may be that of a mode
 
 
@@ -45,42 +48,51 @@ def load_slepc() -> Any:
 def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     """The ``count`` modes nearest to ``near`` in rad/s, lowest first; all ranks must call it.
 
-    After them others are sought beside them, a few restarts long, until none is nearer: a Krylov space may miss copies
-    of a mode. Raises CaseError where they lie so close, as at the edge of a band, that not all can be told apart.
+    After them further ones are sought, a few restarts long, until none is nearer: a Krylov space may miss copies of a
+    mode. Raises CaseError where modes lie so close, as at the edge of a band, that not all can be separated.
     """
-    eps, square = load_slepc().EPS().create(matrices.comm), near**2
+    eps = load_slepc().EPS().create(matrices.comm)
+    square = near**2
     eps.setOperators(matrices.stiffness, matrices.mass)
     eps.setProblemType(eps.ProblemType.GHEP)
     eps.setWhichEigenpairs(eps.Which.TARGET_MAGNITUDE)
     eps.setTarget(square - SHIFT * matrices.largest)
     _solve_directly(eps.getST())
-    pairs: list[tuple[float, PETSc.Vec]] = []
+
+    found: list[tuple[float, PETSc.Vec]] = []
     wanted = count
     while wanted:
-        eps.setDimensions(wanted, min(max(3 * wanted, 20), matrices.rows - len(pairs)))
-        eps.setTolerances(TOLERANCE, OF_COPIES if pairs else RESTARTS)
-        eps.setDeflationSpace([vector for _, vector in pairs])
+        eps.setDimensions(wanted, min(max(3 * wanted, 20), matrices.rows - len(found)))
+        eps.setTolerances(TOLERANCE, COPY_RESTARTS if found else RESTARTS)
+        eps.setDeflationSpace([vector for _, vector in found])
         eps.solve()
-        farthest, before = max((abs(value - square) for value, _ in pairs), default=np.inf), len(pairs)
+
+        before = len(found)
+        farthest = max((abs(value - square) for value, _ in found), default=np.inf)
         for i in range(min(eps.getConverged(), wanted)):
             vector = matrices.vector()
             value = eps.getEigenpair(i, vector).real
+            # Of later searches only what is nearer than a mode found before can be one that was missed.
             if abs(value - square) < farthest:
-                pairs.append((value, vector))
-        if not before and len(pairs) < count:
-            remedy = f"only {len(pairs)} of {count} modes come out, the others crowd: ask for fewer, or for another"
+                found.append((value, vector))
+        if not before and len(found) < count:
+            remedy = f"only {len(found)} of {count} modes come out, the others crowd: ask for fewer, or for another"
             raise CaseError([Problem("--near", near, remedy)])
-        wanted = int(before != len(pairs) < matrices.rows)
-    pairs = sorted(sorted(pairs, key=lambda pair: abs(pair[0] - square))[:count], key=lambda pair: pair[0])
+        # From then on one at a time, until none is nearer than those that there are.
+        wanted = int(before != len(found) < matrices.rows)
     eps.destroy()
-    return NearModes(*(np.array(part) for part in zip(*(_mode(matrices, *pair) for pair in pairs), strict=True)))
+
+    nearest = sorted(found, key=lambda pair: abs(pair[0] - square))[:count]
+    modes = [_mode(matrices, value, vector) for value, vector in sorted(nearest, key=lambda pair: pair[0])]
+    frequency, shapes, residual = zip(*modes, strict=True)
+    return NearModes(np.array(frequency), np.array(shapes), np.array(residual))
 
 
 def _solve_directly(st: Any) -> None:
     """Let the spectral transformation ``st`` invert with a direct solver."""
     st.setType("sinvert")
-    several = st.comm.size > 1
-    solver = next((name for name in DIRECT[several] if name == "petsc" or PETSc.Sys.hasExternalPackage(name)), None)
+    solvers = DIRECT[1] if st.comm.size > 1 else DIRECT[0]
+    solver = next((name for name in solvers if name == "petsc" or PETSc.Sys.hasExternalPackage(name)), None)
     if solver is None:
         remedy = "has no direct solver for several ranks, superlu_dist or mumps; call it on one"
         raise CaseError([Problem("PETSc", None, remedy)], "this machine")
@@ -92,9 +104,10 @@ def _solve_directly(st: Any) -> None:
 
 def _mode(matrices: LatticeMatrices, value: float, vector: PETSc.Vec) -> tuple[float, np.ndarray, float]:
     """Frequency, shape and residual of a mode."""
-    stiff, heavy = matrices.stiffness * vector, matrices.mass * vector
-    mass = vector.dot(heavy)
-    stiff.axpy(-value, heavy)
-    shape = vector.array_r.reshape(-1, matrices.chain.cell.dofs) / np.sqrt(mass)
-    frequency = 0.0 if value < 1e-12 * matrices.largest else float(np.sqrt(value))  # free ends
-    return frequency, shape, stiff.norm() / (matrices.largest * heavy.norm())
+    residual = matrices.stiffness * vector
+    momentum = matrices.mass * vector
+    shape = vector.array_r.reshape(-1, matrices.chain.cell.dofs) / np.sqrt(vector.dot(momentum))
+    residual.axpy(-value, momentum)
+    # A lattice with free ends moves as a whole: its square frequency is zero up to rounding, of either sign.
+    frequency = 0.0 if value < 1e-12 * matrices.largest else float(np.sqrt(value))
+    return frequency, shape, residual.norm() / (matrices.largest * momentum.norm())

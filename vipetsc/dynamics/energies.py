@@ -20,6 +20,7 @@ from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.dynamics.springs import CHUNK, add_nonlinear_energies, add_squares, displacement, is_varied
 
 _FINE = 2.0**40  # multiples of the finer remainder in one unit
+# A sum of whole multiples beyond which an energy counts as runaway: 2^13 of it still fit an integer.
 LARGEST = 2.0**50
 _KINETIC, _SPRING, _CONTACT, _DISSIPATED, _DAMPING = range(5)
 ENERGY_SUMS = 5
@@ -60,7 +61,8 @@ def _kinetic_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energie
 @kernel
 def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
     """Spring energies of the cells from ``first`` on: springs to the next cell, and the first one's to a left wall."""
-    shape, n = lattice.shape, lattice.shape.cells
+    shape = lattice.shape
+    n = lattice.shape.cells
     energies[:] = 0.0
     if is_varied(lattice):
         add_squares(y, lattice, first, 0, lattice.stiffness, energies)
@@ -110,7 +112,8 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
             add_nonlinear_energies(y, lattice, first, energies)
         _add(sums, _SPRING, energies, unit)
 
-    elastic, owned = np.empty(lattice.site_dofs.size), 0
+    elastic = np.empty(lattice.site_dofs.size)
+    owned = 0
     for i in range(lattice.site_dofs.size):
         if lattice.site_dofs[i].ledger >= 0:
             w, _ = relative_motion(y, lattice.site_dofs, i)
@@ -175,6 +178,7 @@ class EnergyMeter:
             duration = min(max(drive.waveform.duration for drive in model.drives), model.end)
             cells = duration * model.speed
         scale = sum(model.chain.cell.masses) * speed**2 * max(cells, 1.0)
+        # 36 bits below the scale, the remainders 76: an energy of 2^14 times the scale is still summed.
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
         self.largest = self.unit * LARGEST
 

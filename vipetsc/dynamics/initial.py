@@ -31,6 +31,7 @@ def set_in_motion(setup: Setup) -> None:
         sums = measure(y, meter.lattice, meter.unit)
         relative = [relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))]
 
+    # A site between two ranks comes from both, with the same bits.
     motion = np.zeros((len(setup.model.chain.sites), 2))
     for numbers, rows in layout.comm.allgather((layout.contacts, relative)):
         motion[list(numbers)] = np.reshape(rows, (-1, 2))
@@ -42,7 +43,8 @@ def set_in_motion(setup: Setup) -> None:
 
 def _fields(model: Model, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Displacement and velocity (cell, dof) of the rank's cells, the same to the last bit on any partition."""
-    initial, chain = model.initial, model.chain
+    initial = model.initial
+    chain = model.chain
     assert initial is not None
     if initial.kind == "file":
         return _read_fields(initial, layout)

@@ -90,6 +90,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         row["target"] = (layout.dofs + drive.mass) * layout.owned + drive.cell - layout.start
         row["inverse"] = 1 / chain.coefficients(drive.cell, drive.cell + 1).masses[0, drive.mass]
 
+    # Couplings are in the order of their masses: a mass has consecutive rows.
     couplings = cell.couplings()
     rows = np.searchsorted([coupling.mass for coupling in couplings], np.arange(layout.dofs + 1)).tolist()
     masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
@@ -150,6 +151,7 @@ def _coefficients(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray,
         return none, none, none, none
 
     masses, grounding, stiffness, damping = chain.coefficients(layout.start - 1, layout.stop)
+    # Springs are those from the cell before the first one on, which reach into it; masses begin with the first one.
     inverse_masses = (1 / masses[1:]).T.flatten()
     if not layout.damped:
         none = np.zeros(0)

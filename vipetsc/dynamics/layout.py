@@ -47,6 +47,7 @@ class Layout:
         cuts = cell_cuts(self.cells, comm.size)
         driven = np.array([drive.cell for drive in model.drives], np.int64)
         ledger_sizes, _ = np.histogram([*driven, *chain.sites], cuts)
+        # Behind a rank's cells one component for each drive and site that it owns.
         sizes = self.rows * np.diff(cuts) + ledger_sizes
         self.ranges = np.array([*pairwise(cuts)])
         self.offsets = np.append(0, np.cumsum(sizes))
@@ -134,6 +135,7 @@ def cell_cuts(cells: int, ranks: int) -> list[int]:
 def sites_within(chain: Chain, start: int, stop: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Numbers of the sites of the cells ``start`` to ``stop``, and of all that act on a mass there."""
     cells = np.array(chain.sites, np.int64)
+    # A site's host is in its own cell; its resonator may be in the next one, which another rank may own.
     offsets = np.array([int(pair.next_cell) for pair in chain.pairs] or [0] * len(cells))
     resonator_cells = (cells + offsets) % chain.cells
     owned = (cells >= start) & (cells < stop)

@@ -18,11 +18,15 @@ from vipetsc.io.store import GATHER_LIMIT
 
 # States that an engine holds, each of 2 numbers a mass: two for each stage of a method and its saved copies; measured.
 STAGES = {"2a": 2, "3bs": 4, "5f": 6, "5dp": 7, "5bs": 8, "6vr": 9, "7vr": 10, "8vr": 13}
-STATES_BESIDE_STAGES, PROPAGATOR_STATES = 4.6, 3.0
+STATES_BESIDE_STAGES = 4.6
+PROPAGATOR_STATES = 3.0
 # Copies of a chunk on the rank that keeps it, and besides on rank 0 while those of all are gathered.
-COPIES, GATHERED = 2, 3
+COPIES = 2
+GATHERED = 3
 # Bytes of one sample's energies; of a site on every rank, and on the one that owns it.
-SAMPLE_BYTES, SITE_BYTES, OWN_SITE_BYTES = 300, 600, 2500
+SAMPLE_BYTES = 300
+SITE_BYTES = 600
+OWN_SITE_BYTES = 2500
 REMEDIES = {
     "lattice.cells": 'fewer cells or more machines need less, and so does time.engine = "propagator"',
     "contacts.sites": "fewer sites or more machines need less",
@@ -37,26 +41,45 @@ def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) ->
     The engine's states; sites; a chunk of fields and losses, on rank 0 a gathered one of all cells; all samples'
     energies. What a process begins with comes besides.
     """
-    chain, recorded = model.chain, recorded_cells(output, model.chain.cells)
-    owned, per_cell = -(-chain.cells // ranks), len(output.fields) * chain.cell.dofs
-    own_sites = int(np.histogram(chain.sites, np.append(np.arange(0, chain.cells, owned), chain.cells))[0].max())
-    of_cell = 2 * chain.cell.dofs + (engine == "ts" and chain.is_damped)
-    tables = 0 if chain.is_uniform() and not chain.is_damped else 2 * (chain.cell.dofs + len(chain.cell.springs))
-    varied = sum(array.nbytes for _, array in chain.variation.items()) if chain.variation else 0
-    if engine == "propagator" and varied and (series := step_series(model)):
-        # Rows of cells that differ.
-        varied += 8 * (2 * chain.cell.dofs) ** 2 * (2 * series.reach + 1) * series.own_rows()[1] // ranks
-    states = 2 * STAGES[model.method] + STATES_BESIDE_STAGES if engine == "ts" else PROPAGATOR_STATES
-    local, every = min(owned, len(recorded)) * per_cell + own_sites, len(recorded) * per_cell + len(chain.sites)
-    together = ranks == 1 or written_together(model, output, ranks)
-    rows = min(chunk_samples(8 * (local if together else every)), model.samples)
-    chunk = 8 * rows * (COPIES * local + (0 if together else GATHERED * every))
+    chain = model.chain
+    owned = -(-chain.cells // ranks)
+    first_cells = np.append(np.arange(0, chain.cells, owned), chain.cells)
+    own_sites = int(np.histogram(chain.sites, first_cells)[0].max())
     return {
-        "lattice.cells": (states * of_cell + 2 * tables) * 8 * owned + varied,
+        "lattice.cells": _bytes_of_states(model, engine, ranks),
         "contacts.sites": SITE_BYTES * len(chain.sites) + OWN_SITE_BYTES * own_sites,
-        "output.window": chunk,
+        "output.window": _bytes_of_chunk(model, output, ranks, own_sites),
         "time.sample_interval": model.samples * SAMPLE_BYTES,
     }
+
+
+def _bytes_of_states(model: Model, engine: str, ranks: int) -> float:
+    """Bytes of the engine's states on a rank, and of the numbers of cells that differ."""
+    chain = model.chain
+    cell = model.chain.cell
+    owned = -(-chain.cells // ranks)
+    per_cell = 2 * cell.dofs + (engine == "ts" and chain.is_damped)
+    tables = 0 if chain.is_uniform() and not chain.is_damped else 2 * (cell.dofs + len(cell.springs))
+    states = 2 * STAGES[model.method] + STATES_BESIDE_STAGES if engine == "ts" else PROPAGATOR_STATES
+    differing = sum(array.nbytes for _, array in chain.variation.items()) if chain.variation else 0
+    if engine == "propagator" and differing and (series := step_series(model)):
+        numbers = (2 * cell.dofs) ** 2 * (2 * series.reach + 1)
+        differing += 8 * numbers * series.own_rows()[1] // ranks
+    return (states * per_cell + 2 * tables) * 8 * owned + differing
+
+
+def _bytes_of_chunk(model: Model, output: OutputTable, ranks: int, own_sites: int) -> int:
+    """Bytes of the copies of a chunk of fields and losses on the fullest rank."""
+    chain = model.chain
+    recorded = len(recorded_cells(output, chain.cells))
+    per_cell = len(output.fields) * chain.cell.dofs
+    local = min(-(-chain.cells // ranks), recorded) * per_cell + own_sites
+    every = recorded * per_cell + len(chain.sites)
+    # A chunk that is gathered lies on rank 0 whole: its length follows from all cells.
+    together = ranks == 1 or written_together(model, output, ranks)
+    rows = min(chunk_samples(8 * (local if together else every)), model.samples)
+    gathered = 0 if together else GATHERED * every
+    return 8 * rows * (COPIES * local + gathered)
 
 
 def memory_available() -> int:
@@ -66,14 +89,18 @@ def memory_available() -> int:
         free = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
         taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, StopIteration):  # not Linux
-        free, taken = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), 0
+        free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        taken = 0
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return free if limit == resource.RLIM_INFINITY else min(free, max(limit - taken, 0))
+    if limit == resource.RLIM_INFINITY:
+        return free
+    return min(free, max(limit - taken, 0))
 
 
 def check_indices(model: Model) -> None:
     """Raise CaseError if the state has more components than this PETSc's indices count."""
-    chain, most = model.chain, int(np.iinfo(PETSc.IntType).max)
+    chain = model.chain
+    most = int(np.iinfo(PETSc.IntType).max)
     size = chain.cells * (2 * chain.cell.dofs + chain.is_damped) + len(chain.sites) + 1
     if size > most:
         remedy = f"makes a state of {size} numbers, more than the {most} that the indices of this PETSc count"
@@ -91,12 +118,15 @@ def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm)
     if comm.size > 1 and output.writer == "gather" and sample > GATHER_LIMIT:
         remedy = f'a sample of {sample / 1e9:.3g} GB is more than one message holds; "parallel" sends none'
         raise CaseError([Problem("output.writer", output.writer, remedy)])
-    parts, node = memory_needed(model, output, engine, comm.size), comm.Split_type(MPI.COMM_TYPE_SHARED)
-    share = comm.allreduce(memory_available() // node.size, MPI.MIN)
-    node.Free()
+
+    # The ranks of a machine divide what it has left.
+    machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    available = comm.allreduce(memory_available() // machine.size, MPI.MIN)
+    machine.Free()
+    parts = memory_needed(model, output, engine, comm.size)
     needed = sum(parts.values())
-    if needed > share:
+    if needed > available:
         key = max(parts, key=lambda part: parts[part])
         size = f"{model.chain.cells} cells, {len(model.chain.sites)} sites and {model.samples} samples"
-        need = f"{size} need {needed / 1e9:.3g} GB of memory on a rank, which has {share / 1e9:.3g} GB"
+        need = f"{size} need {needed / 1e9:.3g} GB of memory on a rank, which has {available / 1e9:.3g} GB"
         raise CaseError([Problem(key, None, f"{need}; {REMEDIES[key]}")])

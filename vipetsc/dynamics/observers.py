@@ -107,11 +107,13 @@ class Guard(Observer):
     most_work = 0.0
 
     def observe(self, block: Block) -> None:
-        energies, largest = block.energies, self.setup.meter.largest
+        energies = block.energies
+        largest = self.setup.meter.largest
         most_work = np.maximum.accumulate(np.append(self.most_work, np.abs(energies.work)))[1:]
         finite = np.isfinite(energies.work) & (energies.total < largest)
         runs_away = (np.abs(energies.residual) > RUNAWAY * most_work) & (energies.total > NEGLIGIBLE * largest)
 
+        # The samples before the first refused one are good.
         refused = np.flatnonzero(~finite | runs_away)
         if refused.size:
             k = int(refused[0])
@@ -152,7 +154,8 @@ class Ledger(Observer):
 
     def warnings(self) -> list[str]:
         """A sentence where the balance has a larger error than a trajectory of the tolerance asked explains."""
-        error, rtol = self.statistics()["ledger_error"], self.setup.model.rtol
+        error = self.statistics()["ledger_error"]
+        rtol = self.setup.model.rtol
         bound = min(max(LEDGER_PER_RTOL * rtol, LEAST_LEDGER), MOST_LEDGER)
         if error is None or error <= bound:
             return []

@@ -51,7 +51,8 @@ class Recorder(Observer):
 
     def begin(self, setup: Setup) -> None:
         super().begin(setup)
-        layout, output = setup.layout, setup.case.output
+        layout = setup.layout
+        output = setup.case.output
         recorded = np.array(recorded_cells(output, setup.model.chain.cells))
         first, stop = np.searchsorted(recorded, [layout.start, layout.stop]).tolist()
         local = recorded[first:stop] - layout.start
@@ -89,7 +90,8 @@ class Recorder(Observer):
 
     def room(self, number: int, most: int) -> Samples:
         """Room for the samples from ``number`` on: for as many as the chunk still takes, and at ``most`` so many."""
-        meter, output = self.setup.meter, self.setup.case.output
+        meter = self.setup.meter
+        output = self.setup.case.output
         here = slice(self._held, self._held + most)
         fields = self._fields[:, self._rows :][:, :most]
         return Samples(
@@ -133,8 +135,10 @@ class Recorder(Observer):
         says; of episodes that are still open, in the ``last`` one. Rank 0's has times and energies besides.
         """
         sys.audit("vipetsc.flush")
-        comm, output = self.setup.layout.comm, self.setup.output
+        comm = self.setup.layout.comm
+        output = self.setup.output
         episodes = self.setup.engine.take_episodes(unfinished=last)
+        # Beyond a failure what engines come to in a block is no solution.
         episodes = episodes[episodes["onset"] <= self.end]
 
         chunk = self._gather(episodes)
@@ -149,7 +153,8 @@ class Recorder(Observer):
 
     def _gather(self, episodes: np.ndarray) -> dict[str, np.ndarray]:
         """Fields, losses and ``episodes`` of the chunk: this rank's, or those of all on rank 0 and none elsewhere."""
-        comm, recording = self.setup.layout.comm, self.setup.output.recording
+        comm = self.setup.layout.comm
+        recording = self.setup.output.recording
         sites = np.array(self.setup.layout.sites, np.int64)
         rank_part = sites, self._losses[: self._held], episodes, self._fields[:, : self._rows]
         gathered = [rank_part] if recording.together or comm.size == 1 else comm.gather(rank_part)
@@ -181,7 +186,8 @@ class Recorder(Observer):
 
     def warnings(self) -> list[str]:
         """Sites that nothing reached; indentations for which there is no theory of contact."""
-        sites, radius = len(self.setup.model.chain.sites), self.setup.case.contact_radius
+        sites = len(self.setup.model.chain.sites)
+        radius = self.setup.case.contact_radius
         if sites and not self.episodes:
             return [f"no contact: nothing reached {'the site' if sites == 1 else f'one of the {sites} sites'}"]
 

@@ -203,6 +203,7 @@ class Run:
     def __init__(self, setup: Setup, observers: Sequence[type[Observer]]) -> None:
         self.setup = setup
         self.recorder = Recorder()
+        # The recorder is the last one: it keeps what all others accept.
         self.observers = [*(kind() for kind in observers), self.recorder]
         longest = max(BLOCK_CELLS // setup.layout.cells, 1)
         self.longest = min(longest, *(observer.longest for observer in self.observers))
@@ -223,7 +224,8 @@ class Run:
 
     def advance(self) -> tuple[str, str]:
         """Go to the end, or to where the run stops or fails: how it ended, and a sentence about it."""
-        setup, engine = self.setup, self.setup.engine
+        setup = self.setup
+        engine = self.setup.engine
         total = setup.model.samples
         while self.samples < total:
             samples = self.recorder.room(self.samples, min(self.longest, total - self.samples))
@@ -234,6 +236,7 @@ class Run:
                 self.last = float(block.times[-1])
 
             if failure:
+                # Engines go through a block in one piece: episodes may have begun after the failure.
                 self.recorder.end = failure.time + setup.model.sample_interval
                 good = "none" if self.last is None else f"t = {self.last:.6g} s"
                 where = f"at t = {failure.time:.6g} s ({fastest_cell(setup)})"
@@ -282,7 +285,9 @@ class Run:
 
     def finish(self, ending: str, sentence: str, begin: tuple[float, float], note: dict[str, str]) -> Result:
         """Write the last checkpoint of a run that was stopped, or the files of one that ended."""
-        engine, output, comm = self.setup.engine, self.setup.output, self.setup.output.comm
+        engine = self.setup.engine
+        output = self.setup.output
+        comm = self.setup.output.comm
         if ending == STOPPED:
             self.checkpoint()
             sentence += "; the same command goes on from there"

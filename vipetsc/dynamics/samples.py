@@ -43,13 +43,15 @@ class Samples(NamedTuple):
 @njit(error_model="numpy")
 def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
     """Put the rank's part ``y`` of the state, ghosts up to date, in as sample ``k``; False if it is not finite."""
-    shape, drives = samples.lattice.shape, samples.lattice.drives
+    shape = samples.lattice.shape
+    drives = samples.lattice.drives
     number = samples.number + k
     samples.sums[k] = measure(y, samples.lattice, samples.unit)
 
     for i in range(drives.rows.size):
         drive = drives.rows[i]
         samples.work[k, drive.number] = y[shape.work + i]
+        # The state's work is that of the force k U; the spring to a moving wall holds what the wall does besides.
         if drive.stiffness > 0.0:
             energy = wall_energy(drives, i, number * samples.interval, y[drive.target - shape.dofs * shape.cells])
             samples.work[k, drive.number] += energy

@@ -32,6 +32,7 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     sites = create_contacts(laws, gaps, masses, model.scale)
 
     least = gaps.min(axis=1)
+    # Beads that touch or are pressed part and meet all the time: their force has its kink, and no change is landed on.
     permanent = (least < 0) | ((least == 0) & joins_next_cell & (sites["damping"] == 0))
     hold(sites, laws, permanent, speed=model.scale * model.drive.frequency)
     return sites

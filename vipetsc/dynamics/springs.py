@@ -131,7 +131,8 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
     """Accelerations (cells,) of a mass by its springs and dashpots, in chunks of cells whose neighbours are owned."""
     n = acceleration.size
     here = y[mass * n : (mass + 1) * n]
-    row, inverse = lattice.masses[mass], lattice.masses[mass].inverse_mass
+    row = lattice.masses[mass]
+    inverse = lattice.masses[mass].inverse_mass
     for a in range(1, n - 1, CHUNK):
         b = min(a + CHUNK, n - 1)
         out = acceleration[a:b]
@@ -197,7 +198,8 @@ def add_squares(
     ``values`` is the table ``stiffness`` with ``half`` 0, or ``damping`` with ``half`` = dofs: of velocities. A spring
     to a wall on the left is the first cell's.
     """
-    shape, n = lattice.shape, lattice.shape.cells
+    shape = lattice.shape
+    n = lattice.shape.cells
     for s in range(lattice.springs.size):
         spring = lattice.springs[s]
         start, end = half + spring.start, half + spring.end

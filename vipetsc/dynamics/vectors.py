@@ -72,7 +72,8 @@ def _prefetch(typing_context: Any, x: Any, i: Any) -> Any:
     """Bring x[i : i + LANES] into the cache; it may lie beyond the end of ``x``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        flag, address = ir.IntType(32), ir.IntType(8).as_pointer()
+        flag = ir.IntType(32)
+        address = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [address, flag, flag, flag])
         function = builder.module.declare_intrinsic("llvm.prefetch", [address], kind)
         for cell in range(0, LANES, 8):  # a line of the cache has 64 bytes

@@ -167,6 +167,7 @@ class Contact:
             return 0.75 * (1 - e**2)
         if self.factor == "flores":
             return 1.6 * (1 - e) / e
+        # Close to 1 the equation has lost its digits, and both dampings are the same to 1e-12.
         if self.factor != "exact" or e > 1 - 1e-6:
             return 1.5 * (1 - e)
         return float(brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), (1 - 1e-12) / e, (e,)))
@@ -175,6 +176,7 @@ class Contact:
     def effective_restitution(self) -> float:
         """-w'_plus/w'_minus of two masses that nothing but the contact acts on, above the ``approach_floor``."""
         c = self.damping
+        # Near c = 0 the equation's terms cancel: its expansion takes their place.
         return 1 - 2 * c / 3 if c < 1e-6 else float(brentq(lambda e: rebound(c, e), 0.0, min(1.0, (1 - 1e-12) / c)))
 
     def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:

@@ -59,7 +59,8 @@ class Integrator(Engine):
     ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
     """
 
-    name, dashpots = "ts", True
+    name = "ts"
+    dashpots = True
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         self.comm = layout.comm
@@ -247,7 +248,8 @@ class Integrator(Engine):
 
         ``change`` is this rank's first one; the rank whose position is the smallest judges the landing for all.
         """
-        comm, tracker = self.comm, self.tracker
+        comm = self.comm
+        tracker = self.tracker
         owner = comm.allreduce(comm.rank if change.position == position else comm.size, MPI.MIN)
         attempt = Landing(length=position * h, longest=h, residual=np.inf, attempts=0)
         outcome = RETRY
@@ -273,7 +275,8 @@ class Integrator(Engine):
 
     def _judge(self, attempt: Landing, change: ModeChange) -> tuple[Landing, int]:
         """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it."""
-        tracker, site = self.tracker, change.site
+        tracker = self.tracker
+        site = change.site
         value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, tracker.end[site])
         attempt, outcome = correct(attempt, value, rate, tolerance, goal=tolerance)
         if outcome != SEARCH:

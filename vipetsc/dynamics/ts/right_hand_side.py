@@ -98,6 +98,7 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
     for k in range(d * n):
         f[k] = y[d * n + k]
 
+    # Mass by mass: each inner loop runs over cells that lie side by side in memory.
     for mass in range(d):
         spring_accelerations(y, lattice, mass, f[(d + mass) * n : (d + mass + 1) * n])
         if lattice.nonlinear.size > 0:
@@ -140,7 +141,9 @@ CONTEXT = np.dtype(
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     context: Any = carray(pointer(address), (1,), CONTEXT)[0]
     shape = context.shape
-    error = (native.ghosts_begin(u, 1, 0) or native.ghosts_end(u, 1, 0)) if shape.exchange else 0
+    error = 0
+    if shape.exchange:
+        error = native.ghosts_begin(u, 1, 0) or native.ghosts_end(u, 1, 0)
     error = error or native.get_read(u, address)
     if error != 0:
         return error
@@ -148,6 +151,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     error = native.get_write(f, address)
     if error != 0:
         return error
+
     at, size = context.address, context.length
     lattice = LatticeRecord(
         shape,
@@ -163,8 +167,11 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.stiffness), (size.stiffness,), np.float64),
         carray(pointer(at.damping), (size.damping,), np.float64),
     )
+    y = carray(pointer(state), (shape.ghosted,), np.float64)
     rate = carray(pointer(context.array), (shape.owned,), np.float64)
-    right_hand_side(t, carray(pointer(state), (shape.ghosted,), np.float64), rate, lattice)
+    right_hand_side(t, y, rate, lattice)
+
+    # PETSc wants the same address back that it gave, at the place where it put it.
     error = native.restore_write(f, address)
     if error != 0:
         return error
@@ -183,13 +190,19 @@ def compile_callback() -> CFunc:
 
 def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
     """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``."""
-    callback, context = compile_callback(), np.zeros(1, CONTEXT)
+    callback = compile_callback()
+    context = np.zeros(1, CONTEXT)
     tables = lattice._asdict() | lattice.drives._asdict()
     context["shape"] = lattice.shape
     context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
     context["length"] = tuple(tables[name].size for name in _TABLES)
-    ts.setAttr("callback", (callback, context, lattice))  # PETSc holds bare pointers: all must live as long as ts
-    pointers = (ctypes.c_void_p(p) for p in (ts.handle, None, callback.address, context.ctypes.data))
-    error = native.petsc_library().TSSetRHSFunction(*pointers)
+    # PETSc holds bare pointers: all that they point to must live as long as ts.
+    ts.setAttr("callback", (callback, context, lattice))
+    error = native.petsc_library().TSSetRHSFunction(
+        ctypes.c_void_p(ts.handle),
+        ctypes.c_void_p(None),
+        ctypes.c_void_p(callback.address),
+        ctypes.c_void_p(context.ctypes.data),
+    )
     if error:
         raise RuntimeError(f"TSSetRHSFunction failed with PETSc error {error}")

@@ -27,10 +27,13 @@ AHEAD = 6 * LANES
 @njit(error_model="numpy")
 def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> None:
     """Add to ``y`` (n,) the sum of ``factors`` (j,) times the vectors (n,) at ``addresses`` (j or more,)."""
-    n, count = y.size, factors.size
+    n = y.size
+    count = factors.size
     whole = n - n % LANES
     for i in range(0, whole, LANES):
-        total, first = add_product(zeros(), 1.0, y, i), 0
+        total = add_product(zeros(), 1.0, y, i)
+        first = 0
+        # PETSc takes the vectors by fours, those that are left over first.
         for stop in range((count - 1) % 4 + 1, count + 1, 4):
             part = zeros()
             for j in range(first, stop):
@@ -38,8 +41,10 @@ def add_products(y: np.ndarray, factors: np.ndarray, addresses: np.ndarray) -> N
                     x = carray(pointer(addresses[j]), (n,), np.float64)
                     prefetch(x, i + AHEAD)
                     part = add_product(part, factors[j], x, i)
-            total, first = add(total, part), stop
+            total = add(total, part)
+            first = stop
         store(total, y, i)
+
     for i in range(whole, n):
         first = 0
         for stop in range((count - 1) % 4 + 1, count + 1, 4):
@@ -61,8 +66,10 @@ def _callback(y: int, count: int, factors: int, vectors: int) -> int:
         error = error or native.get_read(handles[j], at + 8 * j)
     if error != 0:
         return error
+
     target = carray(pointer(addresses[count]), (addresses[count + 1],), np.float64)
     add_products(target, carray(pointer(factors), (count,), np.float64), addresses)
+
     for j in range(count):
         error = error or native.restore_read(handles[j], at + 8 * j)
     return error or native.restore_write(y, at + 8 * count)
@@ -82,8 +89,10 @@ def register_sums(vector: PETSc.Vec) -> None:
 
 
 def _set_operation(vector: PETSc.Vec) -> None:
-    arguments = ctypes.c_void_p(vector.handle), ctypes.c_int(MAXPY), ctypes.c_void_p(_compile().address)
-    if error := native.petsc_library().VecSetOperation(*arguments):
+    """Let ``vector`` add by the compiled callback."""
+    callback = ctypes.c_void_p(_compile().address)
+    error = native.petsc_library().VecSetOperation(ctypes.c_void_p(vector.handle), ctypes.c_int(MAXPY), callback)
+    if error:
         raise RuntimeError(f"VecSetOperation failed with PETSc error {error}")
 
 
