@@ -59,30 +59,30 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     eps.setTarget(square - SHIFT * matrices.largest)
     _solve_directly(eps.getST())
 
-    found: list[tuple[float, PETSc.Vec]] = []
+    pairs: list[tuple[float, PETSc.Vec]] = []
     wanted = count
     while wanted:
-        eps.setDimensions(wanted, min(max(3 * wanted, 20), matrices.rows - len(found)))
-        eps.setTolerances(TOLERANCE, COPY_RESTARTS if found else RESTARTS)
-        eps.setDeflationSpace([vector for _, vector in found])
+        eps.setDimensions(wanted, min(max(3 * wanted, 20), matrices.rows - len(pairs)))
+        eps.setTolerances(TOLERANCE, COPY_RESTARTS if pairs else RESTARTS)
+        eps.setDeflationSpace([vector for _, vector in pairs])
         eps.solve()
 
-        before = len(found)
-        farthest = max((abs(value - square) for value, _ in found), default=np.inf)
+        before = len(pairs)
+        farthest = max((abs(value - square) for value, _ in pairs), default=np.inf)
         for i in range(min(eps.getConverged(), wanted)):
             vector = matrices.vector()
             value = eps.getEigenpair(i, vector).real
-            # Of later searches only what is nearer than a mode found before can be one that was missed.
+            # Of later searches only what is nearer than a mode pairs before can be one that was missed.
             if abs(value - square) < farthest:
-                found.append((value, vector))
-        if not before and len(found) < count:
-            remedy = f"only {len(found)} of {count} modes come out, the others crowd: ask for fewer, or for another"
+                pairs.append((value, vector))
+        if not before and len(pairs) < count:
+            remedy = f"only {len(pairs)} of {count} modes come out, the others crowd: ask for fewer, or for another"
             raise CaseError([Problem("--near", near, remedy)])
         # From then on one at a time, until none is nearer than those that there are.
-        wanted = int(before != len(found) < matrices.rows)
+        wanted = int(before != len(pairs) < matrices.rows)
     eps.destroy()
 
-    nearest = sorted(found, key=lambda pair: abs(pair[0] - square))[:count]
+    nearest = sorted(pairs, key=lambda pair: abs(pair[0] - square))[:count]
     modes = [_mode(matrices, value, vector) for value, vector in sorted(nearest, key=lambda pair: pair[0])]
     frequency, shapes, residual = zip(*modes, strict=True)
     return NearModes(np.array(frequency), np.array(shapes), np.array(residual))
