@@ -72,7 +72,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
         for i in range(min(eps.getConverged(), wanted)):
             vector = matrices.vector()
             value = eps.getEigenpair(i, vector).real
-            # Of later searches only what is nearer than a mode pairs before can be one that was missed.
+            # Of later searches only what is nearer than the modes so far can be one that was missed.
             if abs(value - square) < farthest:
                 pairs.append((value, vector))
         if not before and len(pairs) < count:
