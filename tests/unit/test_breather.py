@@ -70,6 +70,7 @@ def displacement(problem: ConservativeMotions, point: Point) -> np.ndarray:
     return u
 
 
+@pytest.mark.slow
 def test_a_mass_between_two_stops_has_its_period_in_closed_form():
     k, kc, m, clearance = 3.0, 40.0, 2.0, 0.1
     pair = ContactPair(None, 0, clearance, Contact("bilinear", kc))
@@ -119,6 +120,7 @@ KERSCHEN = System.assemble(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "mode", "energy", "truncation"),
     [
@@ -168,6 +170,7 @@ def test_breathers_of_the_built_in_lattice(omega):
     assert point.frequency == pytest.approx(omega / (2 * np.pi), rel=1e-14)
 
 
+@pytest.mark.slow
 def test_a_breather_returns_after_a_period_in_its_chain():
     chain = Chain(four_band("calibrated"), 12, "fixed", (5,), (D,))
     problem, point = breather(12, 6, 1600.0, 2e-9, max_newton=12)
@@ -239,6 +242,7 @@ def followed(given: NnmCase, folder, resume: bool = False, stop: StopRequest | N
     return branches
 
 
+@pytest.mark.slow
 def test_files_states_and_the_way_on(tmp_path):
     (whole,) = followed(case(), tmp_path / "whole")
     (part,) = followed(case(points=2), tmp_path / "part")
@@ -262,6 +266,7 @@ def test_files_states_and_the_way_on(tmp_path):
     assert isinstance(draw([tmp_path / "whole" / "branch-breather-4000.h5"]), Figure)
 
 
+@pytest.mark.slow
 def test_a_stopped_branch_goes_on(tmp_path):
     stop = StopRequest()
     stop.requested = True
@@ -272,6 +277,7 @@ def test_a_stopped_branch_goes_on(tmp_path):
     assert [p.energy for p in rest.points] == [p.energy for p in whole.points]
 
 
+@pytest.mark.slow
 def test_a_branch_that_fails_keeps_its_points_and_names_the_knob(tmp_path):
     more = "harmonics = 61\ntruncation = 1e-5\ndirection = 'up'\nsmallest_step = 1e-4"
     (stuck,) = followed(case("3700.0", 60, more=more.replace("1e-5", "4.4e-7")), tmp_path)
@@ -308,6 +314,7 @@ def test_branches_shot_with_dense_matrices_have_no_start_frequency():
             NnmCase.from_toml(text)
 
 
+@pytest.mark.slow
 def test_the_tongues_of_the_in_phase_mode_are_followed():
     """Kerschen's 3:1 and 5:1: a harmonic balance passes their tips, and shooting from it finds the same orbits."""
     problem, points = branch(KERSCHEN, 0, 1.0, truncation=1e-7, points=130, largest_step=0.15)

@@ -240,6 +240,7 @@ def test_errors_travel_between_ranks():
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
+@pytest.mark.slow
 @given(st.text(max_size=30), st.text(max_size=10))
 def test_any_override_is_taken_or_refused(key, value):
     """Nonsense never escapes as anything but a CaseError."""

@@ -321,6 +321,7 @@ def touches(case):
     return int(case.drive.amplitude >= ONSET)
 
 
+@pytest.mark.slow
 def test_power_law_entropies_hold_everywhere(tmp_path):
     put_entropies(
         tmp_path,
@@ -338,6 +339,7 @@ def test_power_law_entropies_hold_everywhere(tmp_path):
     assert found.files == ["scattering/ensemble.h5", "scattering-neighbours/ensemble.h5"]
 
 
+@pytest.mark.slow
 def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
     def ragged(case):
         a = case.drive.amplitude
@@ -352,6 +354,7 @@ def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
     assert measure("C9", tmp_path).verdict == FAILS
 
 
+@pytest.mark.slow
 def test_entropies_that_only_rise_do_not_decay(tmp_path):
     put_entropies(
         tmp_path,
@@ -369,6 +372,7 @@ def test_entropies_that_only_rise_do_not_decay(tmp_path):
     assert "6 of 6 configurations have their peak at 10 N or above: nothing is behind it" in bars.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("c7, c8, verdicts", [(0.951, 0.901, (HOLDS, HOLDS)), (0.949, 0.899, (IN_PART, IN_PART))])
 def test_fits_on_either_side_of_their_thresholds(tmp_path, c7, c8, verdicts):
     put_entropies(tmp_path, ["5pi/9"], lambda case: law(case.drive.amplitude), lambda case: 0.1)
@@ -381,6 +385,7 @@ def test_fits_on_either_side_of_their_thresholds(tmp_path, c7, c8, verdicts):
         assert measure(claim, tmp_path).verdict == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line, nonlinear", [(0.95, 0.5), (0.5, 0.95), (np.nan, 0.95)])
 def test_the_better_fit_counts_at_every_wavenumber(tmp_path, line, nonlinear):
     put_entropies(tmp_path, ["5pi/9"], lambda case: law(case.drive.amplitude), lambda case: 0.1, neighbours=False)
@@ -393,6 +398,7 @@ def test_the_better_fit_counts_at_every_wavenumber(tmp_path, line, nonlinear):
     assert found.value[f"{fit}, log-log line alone"] == (line > 0.9)
 
 
+@pytest.mark.slow
 def test_fits_of_three_points_do_not_count(tmp_path):
     put_entropies(tmp_path, ["5pi/9"], lambda case: law(case.drive.amplitude), lambda case: 0.1)
     for points, expected in ((4, HOLDS), (3, IN_PART)):
@@ -474,6 +480,7 @@ def put_scattering(root, new, back, beside=0.0, error=0.006):
     put_sweep(root / "scattering-amplitudes", table, content, episodes)
 
 
+@pytest.mark.slow
 def test_scattering_as_the_paper_has_it_holds(tmp_path):
     put_scattering(tmp_path, (0.0, 0.5, 0.1), (0.0, 0.2, 0.8))
     for id in ("C1", "C2", "C3", "C4", "C5", "C6"):
@@ -550,6 +557,7 @@ def test_coordinates_of_a_zipped_axis_meet_in_one_member(tmp_path):
             evidence.select("interband", "calibrated", sites=1, cycles=15)
 
 
+@pytest.mark.slow
 def test_transfer_as_the_paper_has_it_holds(tmp_path):
     put_transfer(tmp_path, 0.35)
     onset, single = measure("C11", tmp_path), measure("C14", tmp_path)
@@ -561,6 +569,7 @@ def test_transfer_as_the_paper_has_it_holds(tmp_path):
     assert single.uncertainty["amplitudes, hertz"] == 17
 
 
+@pytest.mark.slow
 def test_scatter_stands_beside_the_maxima_and_decides_nothing(tmp_path):
     put_transfer(tmp_path, 0.35)
     before = {claim: measure(claim, tmp_path) for claim in ("C11", "C14")}
@@ -609,6 +618,7 @@ def test_a_prediction_holds_by_its_errors_and_its_onset(tmp_path, rms, loss, ons
     assert row.value["amplitudes with contact on one side alone, bilinear"] == (onset > 20)
 
 
+@pytest.mark.slow
 def test_an_onset_ends_at_half_the_maximum(tmp_path):
     ratio = "ratio of amplitudes from the floor to half the maximum, hertz"
     for folder, slow, expected in (("a", 0.0, 10**0.25), ("b", 90.0, 10.0)):
@@ -616,6 +626,7 @@ def test_an_onset_ends_at_half_the_maximum(tmp_path):
         assert measure("C11", tmp_path / folder).value[ratio] == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_transfer_of_another_size_holds_in_part(tmp_path):
     put_transfer(tmp_path, 0.2, floor=1e-3, one=0.3)
     onset, single = measure("C11", tmp_path), measure("C14", tmp_path)
@@ -711,6 +722,7 @@ def put_bands(root, velocity, change, laws=LAWS):
     put_runs(root, content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "velocity, change, expected, missed",
     [
@@ -747,12 +759,14 @@ def test_no_motion_misses_the_modal_energies_by_more_than_the_bound(monkeypatch)
         assert 0.015 < np.max(np.abs(parts / total - 1)) <= bound < 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_runs_of_one_law_that_do_not_add_up_are_enough(tmp_path, law):
     put_bands(tmp_path, in_two_bands, overlapping, [law])
     assert measure("C13", tmp_path).verdict == FAILS
 
 
+@pytest.mark.slow
 def test_a_beat_across_an_edge_shows_over_a_period_and_not_over_the_record(tmp_path):
     put_bands(tmp_path, on_an_edge, as_it_is)
     value = measure("C13", tmp_path).value

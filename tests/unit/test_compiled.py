@@ -71,6 +71,7 @@ def package(tmp_path):
     return folder, ask
 
 
+@pytest.mark.slow
 def test_kernels_are_found_again_until_what_they_are_made_of_changes(package):
     folder, ask = package
     assert ask() == [[12.0, 7.0], [0, 0, 0], True]
@@ -113,6 +114,7 @@ def test_every_kernel_is_kept_this_way():
         )
 
 
+@pytest.mark.slow
 def test_the_callback_of_petsc_is_found_again():
     compile_callback()
     code = "from vipetsc.dynamics.ts.right_hand_side import compile_callback; print(compile_callback().cache_hits)"

@@ -41,6 +41,7 @@ def largest(error, of):
     return float(np.abs(error).max() / np.abs(of).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("name", CELLS)
 @pytest.mark.parametrize(("cells", "sites"), [(1, (0,)), (2, (0, 1)), (3, (1,)), (12, (2, 3, 9)), (12, (0, 11))])

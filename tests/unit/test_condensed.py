@@ -56,6 +56,7 @@ def series_of(samples, orders):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", CONSERVATIVE)
 @pytest.mark.parametrize("seed", range(3))
 def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
@@ -91,6 +92,7 @@ def test_a_dissipative_contact_loses_what_its_law_says(law):
     assert [episode.approach for episode in series.episodes] == pytest.approx([max(approach, law.approach_floor)] * 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "kind"),
     [*itertools.product(CONSERVATIVE, ("at rest", "odd", "any")), *itertools.product(DISSIPATIVE, ("odd", "any"))],

@@ -75,6 +75,7 @@ EVERY = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @EVERY
 def test_a_step_is_the_exponential_within_its_bound(ends, varied, damped):
     model = lattice(ends, 24, varied, damped)
@@ -104,6 +105,7 @@ def test_a_step_is_the_exponential_within_its_bound(ends, varied, damped):
 PAIRS = {0: Pair(-1, 1), 1: Pair(0, 3, True), 2: Pair(3, 0), 3: Pair(1, 2), 11: Pair(2, 2, True), 22: Pair(1, 0, True)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [True, False])
 @EVERY
 def test_free_motion_and_impulses_are_the_exponential(ends, varied, damped, own):

@@ -96,6 +96,7 @@ def assert_not_blank(path):
     assert np.all(edge == 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", figure_names("run"))
 def test_every_figure_draws(folder, name):
     (path,) = draw("run", [folder[0]], [name])
@@ -136,6 +137,7 @@ def test_analysis_opens_in_xarray_and_agrees_with_the_run(tmp_path):
         assert trapezoid(bands.energy.sum("part")) == pytest.approx(trapezoid(kinetic.sum(axis=1)), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_ranks_share_the_figures_and_formats(tmp_path):
     write_run(tmp_path / "run.h5")
     written = [p.name for rank in range(2) for p in draw("run", [tmp_path], formats=("pdf",), rank=rank, ranks=2)]
@@ -162,6 +164,7 @@ ODD = UnitCell(
 APART = UnitCell((1.0, 2.0, 3.0), (Spring(0, 0, 5.0, True), Spring(1, 2, 1.0)), host=0, resonator=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", [diatomic(), four_band(), ODD, APART])
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_any_cell_can_be_drawn(tmp_path, cell, ends):
@@ -177,6 +180,7 @@ def test_any_cell_can_be_drawn(tmp_path, cell, ends):
     assert_not_blank(draw_bands(cell, tmp_path / "bands.png"))
 
 
+@pytest.mark.slow
 def test_warnings_about_a_run_stand_below_its_pictures_each_once(tmp_path):
     write_run(tmp_path / "run.h5")
     (plain,) = draw("run", [tmp_path], ["ledger"])

@@ -93,6 +93,7 @@ def case(**nnm) -> NnmCase:
     return NnmCase.from_table(table)
 
 
+@pytest.mark.slow
 def test_a_branch_is_stored_with_its_multipliers_and_gone_on_with(tmp_path):
     short, whole = tmp_path / "short", tmp_path / "whole"
     for folder in (short, whole):

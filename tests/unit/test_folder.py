@@ -213,6 +213,7 @@ def held(folder):
             process.kill()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [

@@ -24,6 +24,7 @@ from vipetsc.modes.response.steps import first_state
 CONDENSED = {"system": "condensed", "points": 1, "truncation": 1e-7}
 
 
+@pytest.mark.slow
 def test_multipliers_of_a_breather_are_those_of_floquet(tmp_path):
     """A pair off the real axis; its harmonics left out, 1e-7, and Hill's eliminated ones change it by less than 1e-6.
 
@@ -67,6 +68,7 @@ def one_period(of, omega, force, state, start):
     return y
 
 
+@pytest.mark.slow
 def test_multipliers_of_a_dissipative_state_are_those_of_its_period_map():
     """r = .7, two cells under a force: the map's derivative by differences."""
     omega, force = 1700.0, 19.5
@@ -88,6 +90,7 @@ def test_multipliers_of_a_dissipative_state_are_those_of_its_period_map():
     assert np.exp(2 * np.pi * measures.growth) == pytest.approx(largest, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_where_slepc_fails_the_branch_goes_on_without_multipliers(tmp_path, monkeypatch, caplog):
     def fails(*_):
         raise PETSc.Error(73)

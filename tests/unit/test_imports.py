@@ -72,11 +72,13 @@ def test_every_part_has_its_floor():
     assert {module.split(".")[0] for module in MODULES} == set(FLOORS)
 
 
+@pytest.mark.slow
 def test_imports_point_down():
     upward = {f"{m} -> {other}" for m in MODULES for other in arrows(m) if floor(other) < floor(m)}
     assert upward == set()
 
 
+@pytest.mark.slow
 def test_no_circle():
     try:
         order = tuple(TopologicalSorter({m: arrows(m) for m in MODULES}).static_order())
@@ -114,6 +116,7 @@ def test_sources_name_neither_petsc_nor_mpi(part):
             assert not FORBIDDEN & {name.split(".")[0] for name in imported(path)}, path
 
 
+@pytest.mark.slow
 def test_importing_them_loads_neither_petsc_nor_mpi():
     modules = [f"vipetsc.{module}" for module in MODULES if module.split(".")[0] in SERIAL]
     assert len(modules) > 15
@@ -129,6 +132,7 @@ def test_figures_wait_with_matplotlib():
     assert done.stdout.strip() == "False"
 
 
+@pytest.mark.slow
 def test_no_function_hides_a_module():
     """What a package hands out has no name of one of its modules: importing the module would replace it."""
     code = f"""

@@ -21,6 +21,7 @@ PACKET = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width"
 TABLE = {"name": "t", "lattice": {"preset": "four-band", "cells": 24}, "contacts": {"sites": 0}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_modes_solve_the_eigenvalue_problem(ends):
     """Counted and found one by one, they are those of dense matrices, copies on a ring too."""

@@ -63,6 +63,7 @@ CONTACTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sites", [(5,), (5, 6, 11)])
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 @pytest.mark.parametrize("kind", CONTACTS)

@@ -159,6 +159,7 @@ def mirrored(folder):
         yield name, case(drive={"cell": cell, "mass": mass}, contacts={"restitution": 0.5, "sites": []})
 
 
+@pytest.mark.slow
 def test_refined_to_the_onset_and_gone_on_with(tmp_path):
     of = case(law=COARSE | {"finest": 0.01, "tolerance": 0.1, "samples": 2})
     law = make_law(of, tmp_path / "law", MPI.COMM_SELF)
@@ -263,6 +264,7 @@ def test_a_case_without_sites_gives_the_clearance_and_the_bursts_length(tmp_path
     assert [type(of) for of in load_every(path)] == [LawCase]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("restitution", "least"), [(0.9, 0.45)])
 def test_matched_sites_outdo_the_papers(restitution, least, tmp_path):
     """Ten sites at 24.33 N; the paper's five give .34."""

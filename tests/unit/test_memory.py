@@ -18,6 +18,7 @@ def needed(case, engine, ranks=1):
     return sum(memory_needed(case.model(), case.output, engine, ranks).values())
 
 
+@pytest.mark.slow
 def test_memory_grows_with_cells_and_sites_of_a_rank_but_not_with_samples_times_sites():
     """As counted and fitted to one run: 192 MB of states of a million cells, 2.4 to 3.5 kB a site."""
 

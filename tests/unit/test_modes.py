@@ -137,6 +137,7 @@ def test_the_relative_chart_weighs_gaps_by_the_larger_of_gap_and_clearance(gap, 
     assert xi == pytest.approx([x[0] / (5 * D), gap / scale, 1.0], rel=1e-12)
 
 
+@pytest.mark.slow
 @given(
     c=st.tuples(*[st.floats(-1, 1)] * 6),
     size=st.tuples(*[st.floats(-3, 0)] * 6),
@@ -569,6 +570,7 @@ def test_xarray_opens_the_branch(short_branch, tmp_path):
         assert (float(orbits.energy[0]), int(orbits.number[0])) == (last.energy, last.index)
 
 
+@pytest.mark.slow
 def test_picture_from_the_file(short_branch, tmp_path):
     from vipetsc.figures.registry import draw
 
@@ -710,6 +712,7 @@ def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
     assert branch.findings == ["the branch has no orbit of 9 J"]
 
 
+@pytest.mark.slow
 def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
     monkeypatch.setattr("vipetsc.modes.branches.follow.SAVE_EVERY", 0.0)
     nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05], "switch": ["period-doubling"]}

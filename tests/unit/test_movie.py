@@ -72,6 +72,7 @@ def test_envelopes_of_bands_sum_to_the_energy_of_a_ring_and_are_where_the_wave_i
         )
 
 
+@pytest.mark.slow
 def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
     content = movie_frames(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))  # a frame is 1.5 ms
     onsets = np.linspace(0.01, 0.04, 6)
@@ -131,6 +132,7 @@ def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monk
     assert content.cells.tolist() == list(range(5, 15))
 
 
+@pytest.mark.slow
 def test_a_gif_holds_every_frame_for_its_time(clear, stage):
     count = len(stage.content.time)
     (path,) = movie.write_movie(stage, 3.0, [clear / "figures" / "movie.gif"])
@@ -164,6 +166,7 @@ def test_an_mp4_is_made_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypa
     assert [p.name for p in path.parent.iterdir()] == ["movie.mp4"]
 
 
+@pytest.mark.slow
 def test_without_ffmpeg_there_is_a_gif_and_a_remedy(clear, monkeypatch, capsys):
     monkeypatch.setattr(movie, "ffmpeg", lambda: None)
     few = ["plot", str(clear), "--movie", "--speed", "0.016", "--rate", "2", "--width", "320"]
@@ -207,6 +210,7 @@ def test_what_cannot_be_is_told_and_nothing_written(clear, words, capsys):
     assert sorted(clear.rglob("*")) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["no sites", "window after the site", "single cell", "every third sample"])
 def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
     write_run(tmp_path / "run.h5", **SHAPES[shape])

@@ -22,6 +22,7 @@ def read(path, text, *overrides):
     return load_every(path, overrides)
 
 
+@pytest.mark.slow
 def test_spoilt_cases_are_read_or_refused(tmp_path):
     verdicts = [(m, judge(m, tmp_path / "case.toml")) for m in islice(mutations(11, without=SWEEPS), 150)]
     assert [(m.parent, m.changes, v.defect) for m, v in verdicts if v.defect] == []

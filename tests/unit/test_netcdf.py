@@ -91,6 +91,7 @@ def test_files_of_another_kind_are_refused(tmp_path):
         open_netcdf(tmp_path / "foreign.h5", "run", ("time", "energy/kinetic", "values", "case"))
 
 
+@pytest.mark.slow
 def test_it_loads_neither_petsc_nor_mpi():
     code = "import sys, vipetsc.io.netcdf; print(*{'petsc4py', 'mpi4py'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -112,6 +112,7 @@ def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
     assert counts == [0, 0, 1]
 
 
+@pytest.mark.slow
 def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
     for curve in follow_all(case(restitutions=[1.0, 0.7], range=[0.996, 1.01]), tmp_path, MPI.COMM_SELF):
         assert curve.complete and curve.ending == "reached the end of nfrc.range, 0.996"
@@ -129,6 +130,7 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
         assert sweep_up(curve)[-1] <= folds[0] and sweep_down(curve) == sweep_up(curve)[::-1]
 
 
+@pytest.mark.slow
 def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
     """Over frequency, from a state in contact on; both parameters enter the equations."""
     of = case({"cells": 6}, {"sites": [3]}, source="force", infinite=False, over="frequency", range=[2000.0, 2010.0],
@@ -146,6 +148,7 @@ def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
     assert np.isnan(measure(curve, "share")).all()  # nothing leaves and nothing is lost
 
 
+@pytest.mark.slow
 def test_a_steady_state_is_where_a_long_run_ends():
     """From rest, r = .3, under a force, until waves come back from the ends: the first harmonic of w."""
     place, force = {"sites": [250], "restitution": 0.3}, {"waveform": "harmonic", "cell": 230, "frequency": 1023.27}
@@ -173,6 +176,7 @@ def test_a_steady_state_is_where_a_long_run_ends():
 THREE = {"sites": [10, 12, 15], "clearance": [D, 0.97 * D, 0.9 * D], "restitution": 0.7}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nfrc", [{}, {"over": "frequency", "range": [1023.0, 1040.0], "fixed": [0.9008], "points": 3}])
 def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
     """T + R + U + L = 1; the lattice is its own mirror image, so that a wave may come from the other side."""
@@ -200,6 +204,7 @@ def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
     assert picture.exists()
 
 
+@pytest.mark.slow
 def test_what_a_force_gives_a_lattice_with_ends_is_lost(tmp_path):
     sites, options = THREE | {"sites": [3, 5, 8]}, {"source": "force", "infinite": False, "fixed": [2000.0]}
     states = SteadyStates(case({"cells": 12}, sites, **options), 0.7, 2000.0)
@@ -210,6 +215,7 @@ def test_what_a_force_gives_a_lattice_with_ends_is_lost(tmp_path):
     assert touches.any() and measure(curve, "share")[touches, 3] == pytest.approx(1.0, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_a_curve_goes_on_to_the_same_bits(tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     whole.mkdir()

@@ -123,6 +123,7 @@ def test_a_profile_is_log_spaced_and_a_cell_takes_its_masses_and_springs():
     assert case.contacts.stiffness == searched.base.contacts.stiffness
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.lists(st.floats(-0.2, 1.2), min_size=3, max_size=3), st.sampled_from([(1, 40), (7, 9), (38, 40), (5, 30)]))
 def test_sites_are_distinct_in_order_and_within_their_bounds(point, bounds):
@@ -248,6 +249,7 @@ def recorder(searched):
     return Recorder(searched.to_unit(searched.begin()), np.zeros(3), smooth(3), 0.2, 1, None)
 
 
+@pytest.mark.slow
 def test_a_search_spends_its_budget_and_keeps_the_best():
     small = plan("optimise.budget=200")
     search = spent(OptimumSearch(small, Bowl(), recorder(small), small.begin()))

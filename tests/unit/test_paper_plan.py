@@ -154,6 +154,7 @@ def test_a_search_is_done_when_its_file_has_its_case(searched):
     assert plan.steps[0].results(root) == [root / "design" / "design.h5"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_path):
     plan, root = searched[0], tmp_path / "paper"
@@ -192,6 +193,7 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
         make.make_paper(plan, root)
 
 
+@pytest.mark.slow
 def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_same_again():
     steps = {step.name: step for step in paper_plan(FULL).steps}
     assert {step.checks for step in steps.values() if step.checks} == {
@@ -216,6 +218,7 @@ def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_s
         assert step.text == replace(step).text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_path, monkeypatch):
     plan, root = replace(searched[0], measure=lambda root: []), tmp_path / "paper"

@@ -58,6 +58,7 @@ def answer(made):
     return SiteResponse.of(answers, case.lattice.unit_cell(), case.model().drive.frequency, answers[0]["largest"])
 
 
+@pytest.mark.slow
 def test_energy_is_whole_and_no_share_is_negative(made):
     data = made[2]
     total = data["predicted/bands"].sum("band") + data["predicted/dissipated"]

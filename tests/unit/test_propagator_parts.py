@@ -460,6 +460,7 @@ def test_a_tape_holds_the_closed_sites_of_a_substep_and_counts_rows_beyond_its_e
     assert cluster.tape.used[0] == 0
 
 
+@pytest.mark.slow
 def test_ten_thousand_sites_are_set_up_and_gone_on_with():
     many = {"sites": {"first": 5, "spacing": 10, "count": 10_000}}
     model = small_case(lattice={"cells": 100_100}, contacts=many, time={"sample_interval": 1e-4}).model()

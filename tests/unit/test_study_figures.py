@@ -92,6 +92,7 @@ def members(ensemble):
     return [folder for _, folder in whole_members(ensemble)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_every_figure_is_drawn_from_files(whole):
     folder = Path(whole.attrs["folder"])
@@ -102,6 +103,7 @@ def test_every_figure_is_drawn_from_files(whole):
         assert path.suffix == ".pdf" or np.ptp(imread(path)[..., :3]) > 0.5
 
 
+@pytest.mark.slow
 def test_nothing_is_yielded_where_the_data_lack(whole, curves):
     for name in OF_FIELDS:
         assert list(FIGURES[name].function(Sweeps([curves], Files()))) == []
@@ -117,6 +119,7 @@ def test_suffixes_tell_figures_apart(curves):
     assert named[:4] == [f"curves-{name}" for name in names]
 
 
+@pytest.mark.slow
 def test_amplitudes_share_scales_and_show_what_was_measured(whole):
     figure = only("amplitudes", [whole])
     assert figure._suptitle.get_text() == "Calibrated reading, 2 sites, κ* = 5π/9"
@@ -144,6 +147,7 @@ def test_amplitudes_share_scales_and_show_what_was_measured(whole):
         assert list(marks.get_ydata()) == case.contacts.sites
 
 
+@pytest.mark.slow
 def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
     figure = only("wavelets", [whole])
     panels = np.reshape([axes for axes in figure.axes if axes.images], (4, 3))
@@ -182,6 +186,7 @@ def test_bins_shown_hold_the_driven_ones(share, count, shown):
     assert own - 1 in bins or own + 1 in bins
 
 
+@pytest.mark.slow
 def test_partition_shows_seven_bins_and_all_colours(whole):
     figure = only("partition", [whole])
     with h5py.File(members(whole)[1] / "analysis.h5") as file:
@@ -204,6 +209,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
     assert [bool(axes.collections) for axes in panels] == [True] * 3
 
 
+@pytest.mark.slow
 def test_explained_inverse_is_the_filter_banks(whole):
     figure = only("partition_explained", [whole])
     by_title = {axes.get_title(loc="left"): axes for axes in figure.axes if axes.get_title(loc="left")}
@@ -216,6 +222,7 @@ def test_explained_inverse_is_the_filter_banks(whole):
         assert f"(c.{('i', 'ii', 'iii', 'iv')[row]})" in trace.get_title(loc="left")
 
 
+@pytest.mark.slow
 def test_reconstruction_shows_energies_error_and_cross_terms(whole):
     figure = only("reconstruction", [whole])
     grid = np.reshape(figure.axes, (3, 3))
@@ -237,6 +244,7 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
         np.testing.assert_allclose(cross.lines[0].get_ydata()[late], share, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("average", AVERAGES)
 def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
     figures = offered_figures("entropy", [curves])
@@ -285,6 +293,7 @@ def test_some_configuration_has_a_power_law(curves):
     assert np.isfinite(curves["fits/entropy/energy_weighted/factor"]).any()
 
 
+@pytest.mark.slow
 def test_all_panels_by_wavenumber_and_configuration(curves):
     figures = offered_figures("entropy_all", [curves])
     assert len(figures) == 2 * len(AVERAGES)
@@ -297,6 +306,7 @@ def test_all_panels_by_wavenumber_and_configuration(curves):
             np.testing.assert_allclose(line.get_ydata(), normalised(chosen["entropy/masked"].values))
 
 
+@pytest.mark.slow
 def test_entropy_maps_leave_quiet_cells_blank(whole):
     figure = only("entropy_maps", [whole])
     images = maps(figure)

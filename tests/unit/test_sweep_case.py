@@ -122,6 +122,7 @@ def test_names_of_members_are_those_of_their_values():
             plan.number(name)
 
 
+@pytest.mark.slow
 def test_many_members_are_cheap_until_one_is_asked_for():
     plan = read("[sweep.drive]\namplitude = { linear = [0.0, 1.0], count = 250_000 }")
     assert len(plan.ids()) == plan.count == 250_000 and len(plan.members(20)) == 20

@@ -93,12 +93,14 @@ def panel(figure, text):
     return found
 
 
+@pytest.mark.slow
 def test_a_relation_says_what_its_values_are(reduced):
     with open_netcdf(reduced / "backbone.h5", "relation") as relation:
         assert {"energy", "ibtet", "fitted"} <= {str(name).rpartition("/")[2] for name in relation.variables}
         assert all(item.attrs["units"] and item.attrs["long_name"] for item in relation.variables.values())
 
 
+@pytest.mark.slow
 def test_ibtet_shows_the_ensembles_values(reduced):
     (figure,) = offered_figures("ibtet", reduced).values()
     for law in ("hertz", "bilinear"):
@@ -175,6 +177,7 @@ def test_reduced_sweeps_have_no_pictures_of_fields(reduced):
         assert not offered_figures(name, reduced)
 
 
+@pytest.mark.slow
 def test_whole_members_alone_make_no_curves(whole):
     for name in ("ibtet", "ibtet_backbone"):
         assert not offered_figures(name, whole)
@@ -184,6 +187,7 @@ def test_nothing_to_draw_from_nothing():
     assert all(not dict(FIGURES[name].function(Sweeps([], Files()))) for name in NAMES)
 
 
+@pytest.mark.slow
 def test_transfer_has_a_panel_a_band_and_both_segments(whole):
     figures = offered_figures("transfer", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
@@ -204,6 +208,7 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole):
         assert shown.get_extent()[1] == pytest.approx(file["bands/sample"][-1], rel=0.02)
 
 
+@pytest.mark.slow
 def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
     figure = offered_figures("transfer", whole)["hertz-calibrated-1-site-4-cycles-60N"]
     axes = panel(figure, "cell 10")
@@ -216,6 +221,7 @@ def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
     assert abs(x[np.argmax(y)] - driven) < 0.2 * driven
 
 
+@pytest.mark.slow
 def test_dispersions_stand_by_law_and_amplitude(whole):
     (figure,) = offered_figures("transfer_dispersions", whole).values()
     found = all_axes(figure)
@@ -225,6 +231,7 @@ def test_dispersions_stand_by_law_and_amplitude(whole):
         assert axes.images[0].get_array().max() == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_band_energies_sum_to_the_total(whole):
     """Over the whole record the parts are orthogonal; the running mean differs from the total by cross terms."""
     figures = offered_figures("band_energies", whole)
@@ -248,6 +255,7 @@ def test_closing_error_is_exact_for_parts_in_quadrature():
     assert np.isnan(closing_error(parts, np.append(total[:-500], np.zeros(500)), 10)[-1])
 
 
+@pytest.mark.slow
 def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     (figure,) = offered_figures("phase_regimes", whole, reduced).values()
     curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
@@ -270,6 +278,7 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     np.testing.assert_array_equal(host[1], motion.velocity[:, 0])
 
 
+@pytest.mark.slow
 def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatch):
     monkeypatch.setattr(transfer_curves, "PERIODS", 0.1)
     folder = member_folder(open_ensemble(whole).isel(law=0, amplitude=1))
@@ -280,11 +289,13 @@ def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatc
     assert len(shown) < 0.1 * len(u) * runs.REFINE
 
 
+@pytest.mark.slow
 def test_regimes_without_an_ensemble_beside_them(whole):
     (figure,) = offered_figures("phase_regimes", whole).values()
     assert len(all_axes(figure)[0].lines) == 2  # the two points themselves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["png", "pdf"])
 def test_files_are_named_by_figure_and_suffix(reduced, kind):
     written = draw("sweep", [reduced], ["ibtet", "ibtet_backbone"], [kind])

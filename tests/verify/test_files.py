@@ -109,6 +109,7 @@ def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
     assert np.isfinite(run["displacement"]).all()
 
 
+@pytest.mark.slow
 def test_another_analysis_of_the_same_run(made, folder):
     """It is measured anew, not refused and not simulated; anything else is another case."""
     shutil.copytree(made, folder / "run")

@@ -172,6 +172,7 @@ def test_a_file_that_changes_is_noticed(tmp_path):
         simulate(case, RunMemory())
 
 
+@pytest.mark.slow
 def test_a_breather_comes_back_after_its_period_on_both_engines(tmp_path):
     """From the file of a condensed branch, whose harmonics left out are 1e-8 of the motion."""
     lattice = {"preset": "four-band", "reading": "calibrated", "cells": 14}

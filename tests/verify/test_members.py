@@ -96,6 +96,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
         assert json.loads((out / "index.json").read_text())["members"]["missing"] == 0
 
 
+@pytest.mark.slow
 def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     """Its run keeps what it was asked to, its analysis is that of everything; damaged files are made again."""
     table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}

@@ -33,6 +33,7 @@ def losses(run, analysis):
     return np.bincount(cluster, run["impacts/loss"].values, len(analysis["bands/cluster"]))
 
 
+@pytest.mark.slow
 def test_built_in_run(builtin):
     run, analysis = builtin
     energy, time, work = analysis["bands/modal_energy"], analysis["bands/instant"].values, run["energy/work"].values[-1]

@@ -233,6 +233,7 @@ def test_short_contacts_inside_a_step_are_found():
         assert len(arc.events) == changes
 
 
+@pytest.mark.slow
 def test_in_phase_through_the_first_tongues(in_phase):
     """The grazing cascade and the 5:1 and 7:1 resonances, without a jump; grazing at its own energy."""
     problem, points = in_phase
@@ -310,6 +311,7 @@ def test_without_guards_the_branch_jumps_and_the_detector_says_so():
     assert not is_jump(problem, guarded[60], guarded[62], control)  # it is followed again with the guards on
 
 
+@pytest.mark.slow
 def test_cubic_benchmark():
     """Kerschen and Peeters (2009): linear frequencies, both modes to E = 1e6, the 3:1 and the 5:1 tongue."""
     system = cubic()

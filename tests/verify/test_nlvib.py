@@ -88,6 +88,7 @@ def shot(omega, state):
     pytest.fail(f"no orbit at {omega:g} rad/s")
 
 
+@pytest.mark.slow
 def test_both_ways_give_one_curve_and_the_published_stability():
     """Past the folds: stable at .635 rad/s; at .6 a pair grows, at .74, near resonance, a real negative multiplier."""
     states, state = Example(), np.array([-1.0, -1.0, 0.0, 0.0])

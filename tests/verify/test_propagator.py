@@ -120,6 +120,7 @@ def agree(folder, case: Case, velocity: float = 1e-7, onset: float = 1e-9) -> di
     return result.statistics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lattice", "contacts", "drive", "time"),
     [
@@ -179,6 +180,7 @@ def test_agrees_on_other_cells(folder):
         assert agree(folder / name, Case.from_table(table), 1e-6, 1e-8)["episodes"] > 20
 
 
+@pytest.mark.slow
 def test_agrees_on_half_of_the_builtin_run(folder):
     assert agree(folder, Case.load(None, ["time.end=0.44"]), 1e-7, 1e-9)["episodes"] > 80
     statistics = simulate(with_engine(Case.load(), "propagator"), folder / "whole").statistics
@@ -316,6 +318,7 @@ def cases(draw) -> Case:
     return Case.from_table(table)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
 @given(cases())
 def test_both_engines_agree_on_random_lattices(tmp_path_factory, case):

@@ -78,6 +78,7 @@ def reference(case: Case):
     return samples[:, n:].reshape(len(times), chain.cells, dofs), np.array(onsets).reshape(-1, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lattice", "contacts", "drive", "end"),
     [
@@ -99,6 +100,7 @@ def test_agrees_with_an_independent_integration(folder, lattice, contacts, drive
     assert np.linalg.norm(ours["velocity"] - velocity) < 1e-6 * np.linalg.norm(velocity)
 
 
+@pytest.mark.slow
 def test_diatomic_agrees_with_an_independent_integration(folder):
     case = Case.from_table(
         {
@@ -127,6 +129,7 @@ def test_work_of_the_linear_diatomic_case(folder):
     assert result.statistics["work"] == pytest.approx(1.542815e-5, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 @pytest.mark.parametrize("restitution", [1.0, 0.7])
 @pytest.mark.parametrize(
@@ -285,6 +288,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     assert episode["loss"] == pytest.approx(0.5 * reduced * (1 - rebound**2), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_the_linear_ridge_lies_on_the_bloch_branch(folder):
     from vipetsc.lattice import bloch
     from vipetsc.spectra import fourier
@@ -320,6 +324,7 @@ def test_a_floor_on_the_approach_velocity_is_counted(folder):
     assert counted["floored"] == np.sum(np.abs(log) < 0.3) > 0
 
 
+@pytest.mark.slow
 def test_fixed_steps_converge_with_the_order_of_the_method(folder, petsc_options):
     """-ts_adapt_type none -ts_dt H: halving H divides the error of 3bs by 2^3, with bilinear contacts in the run."""
     simulate(small_case(contacts={"law": "bilinear"}, time={"rtol": 1e-13, "end": 0.03}), folder / "exact")
