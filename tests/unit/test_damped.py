@@ -99,6 +99,16 @@ def test_ends_without_dashpots_send_all_back(ends):
     assert np.isnan(reflection(chain, 890.0, 9))  # in a gap
 
 
+def test_an_absorbing_end_reflects_alike_on_either_side():
+    """A diatomic cell is its own mirror image: so is the lattice, with the end on the other side."""
+    omega = max_group_velocity(diatomic(), 2)[1]
+    right = absorber(diatomic(), "fixed", 10, 400.0)
+    left = replace(right, variation=Variation(grounding=right.variation.grounding[::-1]))
+    computed = reflection(right, omega, 10)
+    assert 1e-6 < computed < 0.9
+    assert reflection(left, omega, 10, "left") == pytest.approx(computed, rel=1e-9)
+
+
 def test_a_packet_comes_back_as_computed():
     """What is left of a packet's energy after an end that absorbs little."""
     cell = four_band("calibrated")
