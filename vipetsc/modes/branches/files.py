@@ -24,8 +24,9 @@ LAYOUTS: dict[str, Layout[Any]] = {ORBITS: OrbitLayout(), CONDENSED: CondensedLa
 def write_branch(branch: Branch[Any], folder: Path, about: dict[str, Any]) -> None:
     """Write ``branch-<name>.h5`` and ``.csv``, each complete or as it was; ``about`` are further attributes."""
     sys.audit("vipetsc.save", branch.name)
-    write_netcdf(folder / f"branch-{branch.name}.h5", to_dataset(branch).assign_attrs(about))
+    # The HDF5 file last: it says whether a branch is complete, and what is complete is not written again.
     write_text(folder / f"branch-{branch.name}.csv", str(LAYOUTS[branch.kind].table(branch)))
+    write_netcdf(folder / f"branch-{branch.name}.h5", to_dataset(branch).assign_attrs(about))
 
 
 def to_dataset(branch: Branch[Any]) -> xr.Dataset:
