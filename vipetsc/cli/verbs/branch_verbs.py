@@ -33,43 +33,44 @@ SHOW_EVERY = 0.5  # s between two lines of the live table
 
 def follow_modes(case: NnmCase, work: Work) -> Outcome:
     """Follow the branches of the case; one that fails is written as far as it came."""
-    from vipetsc.modes.branches.follow import claim_branches, follow_all
 
-    comm = work.comm
-    with claim_branches(case, work.folder, comm, work.options.force, work.options.resume) as claim:
-        branches = follow_all(case, claim.folder, comm, claim.going_on, branch_log(), work.stop)
-        for branch in branches:
-            work.report(branch_table(branch))
-            echo_warnings(comm, [f"{branch.name}: {finding}" for finding in branch.findings])
+    def report(branch: "Branch") -> None:
+        work.report(branch_table(branch))
+        echo_warnings(work.comm, [f"{branch.name}: {finding}" for finding in branch.findings])
 
-        # Branches that were stopped do not take the place of earlier ones.
-        work.stop.check(comm)
-        claim.publish()
-
-    # Branches are known on rank 0 alone; all ranks must agree on how the verb ends.
-    failures = [f"{branch.name}: {branch.ending}" for branch in branches if branch.ending.startswith("failed")]
-    return Outcome(failures=comm.bcast(failures))
+    return follow_branches(case, work, report, show_point=branch_log())
 
 
 def follow_responses(case: NfrcCase, work: Work) -> Outcome:
     """Follow the curves of steady states of the case; one that fails is written as far as it came."""
+    return follow_branches(case, work, report=lambda curve: work.report(table(curve_rows(case, curve))))
+
+
+def follow_branches(
+    case: NnmCase | NfrcCase,
+    work: Work,
+    report: Callable[["Branch"], None],
+    show_point: "Callable[[Branch, Point], None] | None" = None,
+) -> Outcome:
+    """Follow all branches of the case on all ranks, ``report`` each that has ended, and publish their files."""
     from vipetsc.modes.branches.follow import claim_branches, follow_all
 
     comm = work.comm
     with claim_branches(case, work.folder, comm, work.options.force, work.options.resume) as claim:
-        curves = follow_all(case, claim.folder, comm, claim.going_on, stop=work.stop)
-        for curve in curves:
-            work.report(table(curve_rows(case, curve)))
+        branches = follow_all(case, claim.folder, comm, claim.going_on, show_point, work.stop)
+        for branch in branches:
+            report(branch)
 
+        # Branches that were stopped do not take the place of earlier ones.
         work.stop.check(comm)
-        # Curves that fail before their first point leave no file, and nothing to replace earlier ones by.
-        has_curves = on_root(comm, lambda: any(claim.folder.glob("branch-*.h5")))
-        if has_curves:
+        # Branches that fail before their first point leave no file, and nothing to replace earlier ones by.
+        has_branches = on_root(comm, lambda: any(claim.folder.glob("branch-*.h5")))
+        if has_branches:
             claim.publish()
 
-    # Curves are known on rank 0 alone; all ranks must agree on how the verb ends.
-    failures = [f"{curve.name}: {curve.ending}" for curve in curves if curve.ending.startswith("failed")]
-    return Outcome(drawable=has_curves, failures=comm.bcast(failures))
+    # Branches are known on rank 0 alone; all ranks must agree on how the verb ends.
+    failures = [f"{branch.name}: {branch.ending}" for branch in branches if branch.ending.startswith("failed")]
+    return Outcome(drawable=has_branches, failures=comm.bcast(failures))
 
 
 def nnm_rows(case: NnmCase, ranks: int) -> Rows:
