@@ -1,4 +1,4 @@
-"""What to simulate: strict TOML in, a typed, frozen and fully resolved case out.
+"""Cases, which say what to simulate: strict TOML in, a typed, frozen and fully resolved case out.
 
 ``case_file`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case);
 ``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers; ``case``, ``sweep``,

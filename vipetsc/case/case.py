@@ -42,7 +42,7 @@ ORDER = ("lattice", "contacts", "disorder", "drive", "initial", "time", "output"
 
 
 class Case(CaseFile):
-    """A lattice run with every default filled in; make one with ``load``, ``from_table`` or ``from_toml``."""
+    """A lattice run with every default filled in, built by ``load``, ``from_table`` or ``from_toml``."""
 
     lattice: LatticeTable
     contacts: ContactsTable
@@ -60,13 +60,13 @@ class Case(CaseFile):
     @classmethod
     @cache
     def sections(cls) -> dict[str, type[Section]]:
-        """The class of each section that the verb reads, in the order in which the manual shows them."""
-        classes = super().sections() | {"disorder": DisorderTable}  # which a resolved case holds no more
+        """Class of each section that the verb reads, in the order of the manual."""
+        classes = super().sections() | {"disorder": DisorderTable}  # a resolved case holds the values drawn instead
         return {name: classes.pop(name) for name in ORDER} | classes
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The resolved sections, and everything that is wrong with them."""
+        """The resolved sections, and all problems with them."""
         table, unread = with_samples(with_preset(table))
         sections, problems = super().read(table)
         # A file of samples that cannot be read leaves keys empty, which are no problems of their own.
@@ -103,17 +103,19 @@ class Case(CaseFile):
         # What is drawn may be out of bounds: it is checked as if it stood in the file.
         tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in resolved.items()}
         sections, problems = super().read(tables | drawn)
+        # The file has no such value: the message names the seed that drew it.
         return sections, [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in problems]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """What is wrong between keys."""
+        """Problems between keys."""
         lattice, contacts, drive, time = (sections[name] for name in ("lattice", "contacts", "drive", "time"))
         cell: UnitCell | None = None
         if valid("lattice"):
             cell, problems = check_cell(lattice)
             yield from problems
         if cell and valid("drive"):
+            # The cell of a moved wall is filled in on resolution only.
             driven = [one.cell for _, one in drive.every if one.end is None]
             yield from check_inhomogeneity(lattice, driven)
 
@@ -142,12 +144,13 @@ class Case(CaseFile):
             yield Problem("output.window", window, f"must be [first, last] within cells 1 to {length}")
 
     def model(self) -> Model:
-        """The case in the terms of ``vipetsc.lattice``, made once: a case does not change."""
+        """The case in the terms of ``vipetsc.lattice``, built once, since a case does not change."""
         return self._model
 
     @cached_property
     def _model(self) -> Model:
         contacts, time = self.contacts, self.time
+        # ``read`` has replaced both words by numbers; the assertion narrows their types.
         assert time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
         drives = build_drives(self.drive, chain)
@@ -186,8 +189,10 @@ class Case(CaseFile):
         assert drive.frequency is not None
         if time.atol == "scaled":
             small = WEAKEST * time.rtol * scale
+            # The velocity of a harmonic wave is its frequency times its displacement.
             return small, small * drive.frequency
         if time.atol == "paper":
+            # The paper's tolerance is one number for displacements and velocities.
             small = 1e-9 * abs(drive.amplitude)
             return small, small
         return time.atol, time.atol
@@ -230,13 +235,13 @@ class Case(CaseFile):
         return self.output.figures
 
     def warnings(self) -> list[str]:
-        """What is allowed but likely not meant, one sentence each."""
+        """Sentences about what is allowed but likely not meant."""
         options = (self.petsc.model_extra if self.petsc else None) or {}
         return [*loss_warnings(self.lattice), *warnings_of(self.model(), self.output, options)]
 
 
 def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem]]:
-    """What the motion at t = 0 is, if there is some, or what is wrong with it."""
+    """Motion at t = 0, None for a lattice at rest, and the problems with it."""
     initial, drive = sections.get("initial"), sections["drive"]
     if initial is None or not initial.moves:
         return None, []
@@ -247,8 +252,8 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
 
 
 def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[Problem]:
-    """What can be wrong only once the ``given`` sections are ``resolved``: the absorbing end, the samples."""
-    # Once more: the absorbing end has its cells only now.
+    """Problems that show only in the ``resolved`` sections: of the absorbing end and of the samples."""
+    # Checked a second time: the absorbing end and the wall of a drive have their cells only now.
     driven = [drive.cell for _, drive in resolved["drive"].every]
     problems = list(check_inhomogeneity(resolved["lattice"], driven))
     if problems:

@@ -1,7 +1,7 @@
 """Strict reading of case files: TOML tables into typed sections, every problem reported at once.
 
 A key that is unknown, of the wrong type or impossible becomes a ``Problem``: the key's path, the value, what to do
-and, where there is one, the nearest valid key. ``CaseFile`` is the one way from a TOML file to a case; every verb's
+and, where there is one, the nearest valid key. ``CaseFile`` reads every case from its TOML file; every verb's
 case is a subclass that declares the sections it reads.
 """
 
@@ -27,7 +27,7 @@ FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
 # The types that pydantic tried a value as, in the path of an error: "float", "list[int]", "Span".
 BRANCH = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
 LARGEST = 1e50
-MISTYPED = 100  # errors within a value that weigh as much as another type: more than anybody makes in one
+MISTYPED = 100  # errors within a value that weigh as much as another type: no value has so many
 LONGEST_VALUE = 200  # characters of a value that a message shows
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Location = tuple[int | str, ...]  # the path of an error in a section, as pydantic gives it
@@ -37,7 +37,7 @@ Valid = Callable[..., bool]  # whether neither any of the keys given nor a key i
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong with a case: the key's path, its value, and what to do."""
+    """Problem of a case: the key's path, its value, and what to do."""
 
     key: str
     value: Any
@@ -58,7 +58,7 @@ class CaseError(ValueError):
     def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
         self.problems = list(problems)
         self.source = source
-        super().__init__(self.problems, source)  # what it is pickled by, on its way to other ranks
+        super().__init__(self.problems, source)  # the arguments of unpickling on other ranks
 
     def __str__(self) -> str:
         plural = "s" if len(self.problems) > 1 else ""
@@ -75,7 +75,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 
 
 class CaseFile(Section):
-    """What a verb reads from a case file: a ``name`` and the sections that a subclass declares as its fields.
+    """Case of a verb as its file gives it: a ``name`` and the sections that a subclass declares as its fields.
 
     A subclass names its ``verb`` and the ``section`` that this verb alone reads ("" for ``run``), and which features of
     a lattice run it ``takes`` (``vipetsc.case.features``); ``waveforms`` are the drives that it takes, () for all, and
@@ -94,7 +94,7 @@ class CaseFile(Section):
     builtin_table: ClassVar[Table] = {}
 
     @classmethod
-    @cache  # every case that is read asks for those of all verbs
+    @cache  # reading a case asks for the sections of all verbs
     def sections(cls) -> dict[str, type[Section]]:
         """The class of each section that the verb reads, by the section's name."""
         classes: dict[str, type[Section]] = {}
@@ -127,7 +127,7 @@ class CaseFile(Section):
         problems: list[Problem] = []
         if overrides:
             table, problems = with_overrides(table, overrides)
-        valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}  # a section of another verb may stand by
+        valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}  # sections of other verbs are allowed
         problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
         problems += _check_name(name)
@@ -158,11 +158,11 @@ class CaseFile(Section):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterable[Problem]:
-        """What is wrong between keys; those that are not ``valid`` are reported already and hold their defaults."""
+        """Problems between keys; those that are not ``valid`` are reported already and hold their defaults."""
         return ()
 
     def warnings(self) -> list[str]:
-        """What is allowed but likely not meant, one sentence each."""
+        """Sentences about what is allowed but likely not meant."""
         return []
 
     def runs(self) -> list["CaseFile"]:
@@ -182,7 +182,7 @@ class CaseFile(Section):
         return copied
 
     def __getstate__(self) -> dict[Any, Any]:
-        # Cases are sent to other ranks; what cached properties hold is larger than the case, and is made again there.
+        # Cases are sent to other ranks, which compute cached properties again: these are larger than the case.
         fields = {name: value for name, value in self.__dict__.items() if name in type(self).model_fields}
         return super().__getstate__() | {"__dict__": fields}
 
@@ -194,12 +194,13 @@ class CaseFile(Section):
 def _declared_sections(kind: type[CaseFile]) -> Iterator[str]:
     """The names of the sections that some verb's case reads, ``kind`` and its subclasses among them."""
     yield from kind.sections()
+    # ``__subclasses__`` lists direct subclasses only; the case of ``predict`` derives from that of ``law``.
     for subclass in kind.__subclasses__():
         yield from _declared_sections(subclass)
 
 
 def _check_name(name: Any) -> Iterator[Problem]:
-    """What is wrong with the name of a case, which is that of a folder."""
+    """Problems with the name of a case, which names its output folder."""
     if not isinstance(name, str) or not name:
         yield Problem("name", name, "must be a non-empty string")
     elif not (name.isprintable() and FOLDER.fullmatch(name) and len(name.encode()) <= LONGEST_NAME):
@@ -234,6 +235,7 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
 
     ``section.key=`` takes the key out.
     """
+    # The table may be the built-in one, which later cases read too.
     table = copy.deepcopy(table)
     problems: list[Problem] = []
     for override in overrides:
@@ -246,12 +248,14 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
 
 
 def _value_of(text: str) -> Any:
-    """The value that ``text`` is: TOML, a number such as .5, or a bare word; None of nothing."""
+    """Value written in ``text``: TOML, a number such as .5, or a bare word; None if ``text`` is empty."""
     try:
+        # TOML first: only TOML distinguishes lists, tables, booleans and quoted text.
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         pass
     try:
+        # TOML allows neither .5 nor 5. as a number.
         return float(text)
     except ValueError:
         return text or None
@@ -307,6 +311,7 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
     elif isinstance(value, list):
         for i, item in enumerate(value, 1):
             yield from _out_of_range(item, f"{path}[{i}]")
+    # ``type`` rather than ``isinstance``: a boolean is an ``int`` for the latter.
     elif type(value) in (int, float) and (0 < abs(value) < 1 / LARGEST or LARGEST < abs(value) < math.inf):
         yield Problem(path, value, f"must be of a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
 
@@ -353,6 +358,7 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
         fields = _section_at(kind, item["loc"][:-1]).model_fields
         return _unknown_key(path, item["input"], [field.alias or key for key, field in fields.items()])
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    # pydantic reports the whole section as the input of a missing key.
     value = None if item["type"] == "missing" else item["input"]
     choices = item.get("ctx", {}).get("expected")
     if isinstance(value, str) and choices:

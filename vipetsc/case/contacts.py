@@ -30,7 +30,7 @@ def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
 
 
 def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid: Valid) -> Iterator[Problem]:
-    """What is wrong with the laws and the stops of ``count`` sites with the clearances ``gaps`` in m."""
+    """Problems with the laws and the stops of ``count`` sites with the clearances ``gaps`` in m."""
     per_site = lists_of(contacts)
     for key, values in per_site.items():
         if len(values) != count:
@@ -53,7 +53,7 @@ def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
-    """Parameters stand with the law that takes them; a damping that grows without bound is not asked for."""
+    """Problems with parameters of laws that no site has, missing ones, and a damping that grows without bound."""
     laws = values_of_sites(contacts, "law", count) if count else [contacts.law]
     for key, parameter in PARAMETERS.items():
         values = values_of_sites(contacts, key, max(count, 1))
@@ -68,6 +68,7 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     # Without sites the values for all are checked: normal modes need no list of sites.
     names = values_of_sites(contacts, "damping", count) or [contacts.damping]
     restitutions = values_of_sites(contacts, "restitution", count) or [contacts.restitution]
+    # None, the default damping, cannot be compared with a name: text orders both.
     for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
         if name in ("exact", "flores") and restitution < LEAST_RESTITUTION:
             remedy = f"the {name} damping grows without bound towards 0; at least {LEAST_RESTITUTION}"
@@ -75,7 +76,7 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
 
 
 def _check_stops(contacts: ContactsTable, count: int, gaps: list[float]) -> Iterator[Problem]:
-    """A contact that is closed at rest has one stop, and one that is pressed does not dissipate."""
+    """Problems with contacts that are closed at rest: a second stop, or dissipation in a pressed contact."""
     restitutions = values_of_sites(contacts, "restitution", count)
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     for number, (plus, minus) in enumerate(stops, 1):
@@ -90,7 +91,7 @@ def _check_stops(contacts: ContactsTable, count: int, gaps: list[float]) -> Iter
 
 
 def _path_of(contacts: ContactsTable, key: str) -> str:
-    """The path of a key, which may stand among the lists over sites."""
+    """Path of a key, in the lists over sites if it is given there."""
     return f"contacts.each.{key}" if key in lists_of(contacts) else f"contacts.{key}"
 
 
@@ -125,6 +126,7 @@ def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
 def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
     """The law of each site of a resolved case; () if they are alike."""
     per_site = lists_of(contacts)
+    # Sides and pairs are no part of a law: the gaps and the pairs of the chain hold them.
     keys = [key for key in per_site if key not in SIDES + JOINS]
     if not keys:
         return ()
@@ -164,7 +166,7 @@ def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple
 
 
 def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
-    """What is wrong with what contacts join, in the ``cells`` (1-based) with sites."""
+    """Problems with the pairs of masses that contacts join, in the ``cells`` (1-based) with sites."""
     if any(len(lists_of(contacts).get(key, cells)) != len(cells) for key in JOINS):
         return  # as ``check_per_site`` says
 

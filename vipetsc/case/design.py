@@ -55,7 +55,7 @@ class DesignCase(CaseFile):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The section, and everything that is wrong with it or with a ``[lattice]`` beside it."""
+        """The section, and all problems with it or with ``[lattice]`` in the same file."""
         fields, problems = super().read(table)
         lattice = table.get("lattice", {})
         if isinstance(lattice, dict) and ("cell" in lattice or lattice.get("preset", "four-band") != "four-band"):
@@ -65,7 +65,7 @@ class DesignCase(CaseFile):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """What is wrong between the keys of a valid section."""
+        """Problems between the keys of a valid section."""
         if not valid("design"):
             return
         design = sections["design"]

@@ -1,8 +1,8 @@
 """Scatter of a case's numbers: the section ``[disorder]``, from which values are drawn that the resolved case holds.
 
-A resolved case has these values in place of the section: whatever is made of it does not know that they were drawn, and
-a run tells what was simulated. Each quantity has a generator of its own (Philox), keyed by the seed and its name: the
-same numbers on any number of ranks, in any order, beside any other quantity.
+A resolved case has these values in place of the section, so it states what was simulated, and no later step needs the
+draw. Each quantity has its own generator (Philox), keyed by the seed and its name: the numbers do not
+depend on the number of ranks, on the order of the draws or on the other quantities.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ class DisorderTable(Section):
     cells: dict[str, Deviation] | None = None
 
     def quantities(self) -> dict[str, Deviation]:
-        """What scatters, by name."""
+        """Deviations of the scattered quantities, by name."""
         names = type(self).model_fields.keys() - {"seed", "cells"}
         return {name: getattr(self, name) for name in type(self).model_fields if name in names and getattr(self, name)}
 
@@ -96,6 +96,7 @@ def scatter(
     if drawn:
         changed["contacts"] = _drawn_contacts(contacts, drawn, given.modulus)
     if drawn.keys() & {"masses", "springs"}:
+        # The undamped cell: [lattice.damping] stays in the table and is added to the drawn cell.
         changed["lattice"] = with_cell(table, lattice.undamped_cell(), drawn)
         # A cell of its own has no preset that would say the radius.
         if lattice.preset and "stiffness" in changed["contacts"]:
@@ -106,7 +107,7 @@ def scatter(
 def _draw(
     disorder: DisorderTable, values: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, list[float]], list[Problem]]:
-    """What is drawn of each quantity about its ``values``, and what is wrong with that."""
+    """Numbers drawn of each quantity about its ``values``, and the problems with them."""
     drawn: dict[str, list[float]] = {}
     problems: list[Problem] = []
     for name, deviation in disorder.quantities().items():
@@ -118,6 +119,7 @@ def _draw(
             problems.append(Problem(key, None, "the case has none that could scatter"))
         elif deviation.relative or deviation.absolute:  # none leaves the case as it is, to the last bit
             new = deviation.draw(about, disorder.seed, name)
+            # Negated, so that NaN, the lognormal scatter of a 0, is refused too.
             changes_sign = ~(new * about > 0) & (new != about)
             if changes_sign.any():
                 numbers = [float(f"{x:.4g}") for x in new[changes_sign]]

@@ -26,7 +26,7 @@ class DriveTable(OneDrive):
 
     @property
     def every(self) -> list[tuple[str, OneDrive]]:
-        """All drives by the path of their keys, this one first."""
+        """Drives by the path of their keys, the first drive first."""
         others = [(f"drive.more[{i}]", drive) for i, drive in enumerate(self.more or [], 1)]
         return [("drive", self), *others]
 
@@ -37,7 +37,7 @@ AnyDrive = TypeVar("AnyDrive", bound=OneDrive)
 def check_drives(
     drives: DriveTable, lattice: LatticeTable, cell: UnitCell | None, length: int | None, valid: Valid
 ) -> Iterator[Problem]:
-    """What is wrong with the keys of each drive: those of its waveform, its frequency, where it acts."""
+    """Problems with the keys of each drive: those of its waveform, its frequency, where it acts."""
     for path, drive in drives.every:
         yield from _check_place(drive, path, lattice, cell, length)
         if not valid("drive"):
@@ -54,7 +54,7 @@ def check_drives(
 
 
 def _check_keys(drive: OneDrive, path: str) -> Iterator[Problem]:
-    """Keys of other waveforms, keys that are missing, a ramp that is too long."""
+    """Problems with keys of other waveforms, keys that are missing, and a ramp that is too long."""
     given = drive.model_dump(exclude_none=True, exclude_defaults=True)
     for key in sorted(drive.foreign & given.keys()):
         yield Problem(f"{path}.{key}", None, f"belongs to another waveform than {drive.kind!r}")
@@ -67,7 +67,7 @@ def _check_keys(drive: OneDrive, path: str) -> Iterator[Problem]:
 
 
 def _check_frequency(drive: OneDrive, path: str, cell: UnitCell | None) -> Iterator[Problem]:
-    """The wave is given in one way, and its band is one of the cell's."""
+    """Problems with a wave that is given by several choices or by none, and with a band that the cell lacks."""
     choices = drive.wave_choices
     needs_band = drive.wavenumber is not None or drive.at is not None
     if len(choices) > 1 or (not choices and drive.amplitude != 0 and drive.is_sine):
@@ -79,7 +79,7 @@ def _check_frequency(drive: OneDrive, path: str, cell: UnitCell | None) -> Itera
 
 
 def _check_samples(drive: OneDrive, samples: SamplesTable, path: str) -> Iterator[Problem]:
-    """Samples are as many as their times, which grow; a wall begins at rest."""
+    """Problems with samples: their number, times that do not grow, a wall that is not at rest first."""
     times = np.array(samples.time)
     values = np.array(samples.value)
     if len(times) != len(values) or len(times) < 2:
@@ -96,7 +96,7 @@ def _check_samples(drive: OneDrive, samples: SamplesTable, path: str) -> Iterato
 def _check_place(
     drive: OneDrive, path: str, lattice: LatticeTable, cell: UnitCell | None, length: int | None
 ) -> Iterator[Problem]:
-    """The driven mass is one of the lattice's; a wall that is moved is there, and joined by linear springs."""
+    """Problems with a driven mass outside the lattice, and with a wall that is missing or not on a linear spring."""
     if drive.end is None:
         if length is not None and drive.cell > length:
             yield Problem(f"{path}.cell", drive.cell, f"outside the lattice; cells count from 1 to {length}")
@@ -134,7 +134,7 @@ def _beside_wall(cell: UnitCell, end: str, cells: int) -> Table:
 def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
     """The frequency in rad/s that a valid ``drive`` is about: as given, else that of its samples or its half-sine.
 
-    Of half a sine that is shorter than the lattice can follow, it is the top band's edge, if springs make bands.
+    For half a sine that is shorter than the lattice can follow, it is the top band's edge, if the cell has bands.
     """
     if drive.wave_choices or drive.record.frequency is None:
         return driven_wave(cell, drive)[0]
@@ -143,7 +143,7 @@ def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
 
 
 def driven_wave(cell: UnitCell, drive: OneDrive) -> tuple[float, float]:
-    """Frequency in rad/s and |group velocity| in cells/s of the wave that a valid ``drive`` makes."""
+    """Frequency in rad/s and |group velocity| in cells/s of the wave that a valid ``drive`` sends out."""
     return _wave(cell, drive.frequency, drive.wavenumber, drive.band)
 
 
@@ -170,7 +170,7 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
 
 
 def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:
-    """What is wrong with a valid drive that is to make a wave, and with a wave that is to cross the lattice."""
+    """Problems with a valid drive that sends out no wave, or one that never crosses the lattice."""
     frequency, speed = driven_wave(cell, drive)
     key = "frequency" if drive.frequency else "wavenumber" if drive.wavenumber else "band"
     if not frequency > 0:
@@ -181,7 +181,7 @@ def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Pro
 
 
 def resolve_drives(drives: DriveTable, cell: UnitCell, cells: int, frequency: float | None = None) -> DriveTable:
-    """The valid section ``drives`` of a lattice of ``cells`` cells in which every choice is made.
+    """The valid section ``drives`` of a lattice of ``cells`` cells in which every choice is resolved.
 
     ``frequency`` in rad/s is that of the first drive where the motion at t = 0 gives it.
     """

@@ -37,7 +37,7 @@ def refuse_disorder(kind: type[CaseFile], table: Table) -> list[Problem]:
 
 
 def refusals(kind: type[CaseFile], sections: Mapping[str, Any], valid: Valid) -> Iterator[Problem]:
-    """What of the ``sections`` of a case the verb of ``kind`` does not take; sections that are not given are passed."""
+    """Problems of those ``sections`` of a case that the verb of ``kind`` does not take; absent sections have none."""
     if "contacts" in sections and valid("contacts") and "unlike sites" not in kind.takes:
         yield from _unlike_sites(sections["contacts"])
 

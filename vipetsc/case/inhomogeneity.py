@@ -19,7 +19,7 @@ from vipetsc.lattice.damped import absorber, reflection
 
 QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping)")
 MOST_VARIED = 10**8  # cells that may differ: every rank holds them all
-# Cells of an absorbing end that are tried, and logarithms of what comes back of the energy along the way.
+# Cells of an absorbing end that are tried, and logarithms of the energy that comes back from it.
 LENGTHS = (10, 20, 40, 80, 160)
 LOSSES = (8.0, 10.0, 13.0, 17.0)
 
@@ -97,7 +97,7 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Prob
 
 
 def _wrong_values(name: str, column: np.ndarray) -> str:
-    """What is wrong with the values (cells,) of a quantity called ``name`` in ``Coefficients``; "" if nothing."""
+    """Problems with the values (cells,) of a quantity called ``name`` in ``Coefficients``; "" if nothing."""
     size = np.abs(column)
     if not np.all((size < LARGEST) & ((size > 1 / LARGEST) | (column == 0))):
         return f"is no number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
@@ -108,7 +108,7 @@ def _wrong_values(name: str, column: np.ndarray) -> str:
 
 
 def cell_variation(lattice: LatticeTable) -> Variation | None:
-    """What differs from the reference cell in a valid, resolved case; None if nothing may."""
+    """Quantities that differ from the reference cell in a valid, resolved case; None if nothing may differ."""
     if not (lattice.profiles or lattice.scatter or lattice.absorbing):
         return None
 
@@ -129,16 +129,18 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
         if absorbing.end != "left":
             arrays.grounding[-absorbing.cells :] += extra
         if absorbing.end != "right":
+            # The strength grows towards the end, hence the mirrored order on the left.
             arrays.grounding[: absorbing.cells] += extra[::-1]
 
     reference = Chain(lattice.unit_cell(), 2).coefficients(0, 1)
     named = zip(Coefficients._fields, arrays, reference, strict=True)
+    # Every rank holds these arrays: those that equal the reference are left out.
     differing = {name: array for name, array, uniform in named if np.any(array != uniform)}
     return Variation(**differing) if differing else None
 
 
 def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Problem]:
-    """What is wrong with what differs from a valid cell; ``driven`` are the cells (from 1) of the drives."""
+    """Problems with what differs from a valid cell; ``driven`` are the cells (from 1) of the drives."""
     if (lattice.profiles or lattice.scatter or lattice.absorbing) and lattice.cells > MOST_VARIED:
         yield Problem("lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ: every rank holds them")
         return
@@ -149,7 +151,7 @@ def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterato
 
 
 def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: Sequence[int]) -> Iterator[Problem]:
-    """Waves come to the end that absorbs, and it leaves room for the driven cells."""
+    """Problems with an absorbing end that no wave reaches, or that covers half the lattice or a driven cell."""
     if not lattice.undamped_cell().springs:
         yield Problem("lattice.absorbing", None, "no waves come to an end of a lattice without springs; leave it out")
     if lattice.ends == "periodic":
@@ -166,6 +168,7 @@ def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: S
         yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {inside[0]} is in the absorbing end")
 
 
+# Cached: each verb that reads a case resolves it, and each end that is tried costs reflections over the lobe.
 @lru_cache
 def designed_end(
     table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[tuple[float, int], ...], most: int
@@ -182,10 +185,11 @@ def designed_end(
     lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= most]
     best = np.inf
     for cells in lengths:
-        # The dashpots take exp(-loss) of a wave's energy: the integral of strength x^3 over the way there and back.
+        # The dashpots take exp(-loss) of a wave's energy: the integral of strength x^3 through the end and back.
         strengths = [table.strength] if table.strength else [2 * speed * loss / cells for loss in LOSSES]
         for strength in strengths:
             end = absorber(cell, ends, cells, strength)
+            # The drives in gaps have NaN: they send no wave.
             back = float(np.nanmax([lobe_reflection(end, *drive) for drive in drives]))
             best = min(best, back)
             if back <= table.reflection:

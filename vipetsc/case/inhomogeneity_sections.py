@@ -33,12 +33,14 @@ class Deviation(Section):
         generator = np.random.Generator(np.random.Philox(key))
         deviation = np.full(len(values), self.absolute) if self.relative is None else self.relative * np.abs(values)
         if self.distribution == "uniform":
+            # A uniform distribution of half-width h has the standard deviation h / sqrt(3).
             return values + deviation * np.sqrt(3) * generator.uniform(-1, 1, len(values))
         normal = generator.standard_normal(len(values))
         if self.distribution == "normal":
             return values + deviation * normal
         with np.errstate(all="ignore"):  # of 0 there is none: not a number
             spread = np.log1p((deviation / values) ** 2)  # variance of the logarithm
+            # - spread / 2: the mean of exp(s normal) is exp(s^2 / 2), and the mean shall be the value of the case.
             return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
 
     def __str__(self) -> str:

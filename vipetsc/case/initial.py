@@ -48,7 +48,7 @@ class InitialTable(Section):
     ``wavenumber``, ``width`` cells its standard deviation, in the middle of the ``cell``, that goes up the cells
     (``direction`` 1) or down (-1). Both have an ``amplitude``, the largest displacement of the packet's envelope or of
     the mode in m, or an ``energy`` in J. ``file``: the state in the file ``path``: of a run at ``time`` in s, of a
-    branch's ``orbit`` (from 1), the last if not told, or a state alone; cells that are not in it are at rest. Its
+    branch's ``orbit`` (from 1), the last if not given, or a state alone; cells that are not in it are at rest. Its
     ``sha256`` and ``amplitude`` are filled in.
     """
 
@@ -89,7 +89,7 @@ class Beginning(NamedTuple):
 def check_initial(
     initial: InitialTable, lattice: LatticeTable, cell: UnitCell | None, valid: Valid
 ) -> Iterator[Problem]:
-    """What is wrong with the keys of a section."""
+    """Problems with the keys of a section."""
     keys = KINDS[initial.kind]
     given = initial.model_dump(exclude_none=True, exclude={"kind"})
     taken = {*keys.needs, *keys.others, *itertools.chain(*keys.choices)}
@@ -119,7 +119,7 @@ def check_initial(
 def beginning_of(
     initial: InitialTable, lattice: LatticeTable, frequency: float | None
 ) -> tuple[Beginning | None, list[Problem]]:
-    """What follows from a valid section that moves, or what is wrong with it.
+    """Numbers that follow from a valid section with motion, or the problems with it.
 
     ``frequency`` in rad/s is the case's, if any.
     """
@@ -153,6 +153,7 @@ def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> Beg
     assert initial.band and initial.wavenumber and initial.cell
     omega = float(bloch(chain.cell, initial.wavenumber).frequency[initial.band - 1])
     if initial.energy:
+        # The energy of the packet of 1 m grows with the square of its amplitude.
         amplitude = float(np.sqrt(initial.energy / initial.packet(chain.cell).energy))
         initial = initial.model_copy(update={"amplitude": amplitude, "energy": None})
     return Beginning(initial, frequency or omega, cell=initial.cell or 1)

@@ -1,7 +1,6 @@
 """Every key of a case file: as a JSON schema for editors, and as a chapter of the manual.
 
-Types, bounds and defaults come from the sections, units and texts from ``keys.toml``: what is neither there nor here is
-no key, which a test says.
+Types, bounds and defaults come from the sections, units and texts from ``keys.toml``; a test compares the two.
 """
 
 import tomllib
@@ -42,11 +41,13 @@ def unit_and_text(name: str, key: str) -> tuple[str, str]:
 def json_schema() -> Schema:
     """The JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key."""
     of_class = {table.__name__: table for table in SECTIONS.values()}
+    # One call for all sections: a class that several sections contain is defined once.
     _, whole = models_json_schema([(table, "validation") for table in of_class.values()])
     classes: Schema = whole["$defs"]
     for name, schema in classes.items():
         for key, item in schema.get("properties", {}).items():
             unit, text = unit_and_text(name, key)
+            # pydantic's titles only repeat the keys.
             item.pop("title", None)
             if key == "wavenumber":
                 item["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
@@ -127,7 +128,7 @@ def _toml(value: Any) -> str:
 
 
 def _kind(item: Schema) -> str:
-    """What the value of a key may be, with its bounds."""
+    """Type of a key's value in words, with its bounds."""
     # Optional keys are a choice of their type and null, which TOML does not have.
     if "anyOf" in item:
         return " or ".join(_kind(choice) for choice in item["anyOf"] if choice.get("type") != "null")
@@ -149,7 +150,7 @@ def _kind(item: Schema) -> str:
 
 
 def _count(item: Schema) -> str:
-    """How many items a list has, before what they are."""
+    """Number of items of a list, in words that stand before their type."""
     low = item.get("minItems", 0)
     if low == item.get("maxItems"):
         return f"{low} "

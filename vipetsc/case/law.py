@@ -27,9 +27,9 @@ class LawTable(Section):
     ``clearance`` in m (by default the geometric mean of the sites'), ``distance`` in cells from the driven cell to the
     site (that of the leading site, without sites the burst's length, but so many that the burst is over before a wave
     is back from the site). The law reaches up to ``largest`` relative
-    displacement over clearance; between neighbouring points it is refined until no share is further than ``tolerance``
-    from a straight line over log z, or than the scatter, or the points are closer than ``finest``. At each,
-    ``samples`` runs with amplitudes up to ``jitter`` apart from it give mean and scatter. A run ends ``settle``
+    displacement over clearance; between neighbouring points it is refined until no fraction is further than
+    ``tolerance`` from a straight line over log z, or than the scatter, or the points are closer than ``finest``. At
+    each, ``samples`` runs with amplitudes up to ``jitter`` apart from it give mean and scatter. A run ends ``settle``
     lengths of the burst after the first of the slow waves reaches the site.
     """
 
@@ -113,7 +113,7 @@ class LawCase(Case):
         return cls(name="law", **changed)
 
     def warnings(self) -> list[str]:
-        """What is likely not meant about the wave; the runs are of another lattice, other times and one site."""
+        """Sentences about what is likely not meant in the wave; lattice, times and sites of the runs are others."""
         return list(wave_warnings(self.model()))
 
     def fastest(self) -> float:
@@ -129,7 +129,7 @@ class LawCase(Case):
         band, slow, _ = packet_speeds(cell, model.drive, model.drive_mass)
         end = law.distance / max(slow, SLOWEST) + law.settle * model.drive.duration
         samples = int(np.ceil(end / interval))
-        # Nothing that the site sends out comes around the ring before the end.
+        # No wave that the site sends out returns along the ring before the end.
         cells = max(int(np.ceil(law.distance + self.fastest() * samples * interval)) + 1, SHORTEST)
         _, towards = self._nearest_site()
         return OneSite(
@@ -149,7 +149,7 @@ class LawCase(Case):
         drive, cells = self.drive.cell, self.lattice.cells
         assert isinstance(self.contacts.sites, list)
         offsets = [site - drive for site in self.contacts.sites if site != drive]
-        if self.lattice.ends == "periodic":  # the shorter way around
+        if self.lattice.ends == "periodic":  # along the shorter arc of the ring
             offsets = [(offset + cells // 2) % cells - cells // 2 for offset in offsets]
 
         offset = min(offsets, key=abs, default=0)
@@ -159,6 +159,7 @@ class LawCase(Case):
 
     def _least_distance(self) -> int:
         """Cells from the driven one to the site such that the burst is over before a wave is back from there."""
+        # Half: the wave goes to the site and back while the burst lasts.
         return int(np.ceil(self.fastest() * self.model().drive.duration / 2))
 
     def _default_distance(self) -> int:
@@ -171,7 +172,7 @@ class LawCase(Case):
         return max(distance, self._least_distance())
 
     def _place_problems(self) -> list[Problem]:
-        """What is wrong with the wave of a resolved case and with the distance that it gives."""
+        """Problems with the wave of a resolved case and with the distance that it gives."""
         frequency = self.drive.frequency or 0.0
         if not waves_at(self.lattice.unit_cell(), frequency):
             return [Problem("drive.frequency", frequency, "lies in no pass band, so that nothing arrives at a site")]

@@ -56,4 +56,5 @@ class Model:
     @property
     def samples(self) -> int:
         """Number of uniform samples, the one at t = 0 included."""
+        # Where the end is a whole number of intervals, rounding must not lose the last sample.
         return int(np.floor(self.end / self.sample_interval * (1 + 1e-12))) + 1

@@ -83,7 +83,7 @@ class NfrcCase(Case):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """What is wrong between keys."""
+        """Problems between keys."""
         yield from super().check(sections, valid)
         if not valid("nfrc"):
             return
@@ -108,11 +108,11 @@ class NfrcCase(Case):
                 yield Problem("contacts.sites", sections["contacts"].sites, "name a cell with a contact")
 
     def warnings(self) -> list[str]:
-        """Nothing: what a run in time is warned of does not concern steady states."""
+        """No sentences: the warnings about runs in time do not concern steady states."""
         return []
 
     def physics(self) -> "NfrcCase":
-        """What a curve that is resumed must keep: all but the number of its points."""
+        """Case that a resumed curve must keep: all but the number of its points."""
         nfrc = self.nfrc.model_copy(update={"points": 1})
         return self.model_copy(update={"nfrc": nfrc})
 
@@ -131,7 +131,7 @@ class NfrcCase(Case):
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:
-    """There is a wave of the band at every frequency where a curve begins."""
+    """Problems with frequencies where a curve begins and the band has no wave."""
     if nfrc.source != "wave":
         return
     key, frequencies = "nfrc.range", nfrc.range[:1]

@@ -72,7 +72,7 @@ class Guards(Section):
     Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc, length of the
     correction over the step's length, angle in rad between consecutive tangents: in the chart of the step, and in that
     named ``relative``, since near grazing another chart hides the angle between two branches that cross. Residuals
-    cannot tell a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill`` points are all
+    cannot show a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill`` points are all
     within ``advance`` times the orbit's size is ended: orbits are corrected to 1e-13, and the paper's branches move by
     2e-6 in 200 points at least.
     """
@@ -92,13 +92,13 @@ class NnmTable(Section):
     ``system``: ``reduced`` (the paper's model of the cell's contact pair), ``chain`` (the lattice with its sites),
     ``own`` (``[nnm.own]``), or ``condensed`` (the lattice of any length, by harmonics of its sites alone; the
     others with the ``method`` condensed). Branches of these begin at ``start_frequency`` in rad/s, outside the pass
-    bands, with contact at ``start_sites`` (numbers of sites, from 1; negative ones move the other way), and take at
-    most ``harmonics``, as many as keep the part left out below ``truncation``. ``modes`` are linear modes (1-based,
-    lowest first). ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is where energy goes
+    bands, with contact at ``start_sites`` (numbers of sites, from 1; negative ones move in the opposite direction), and
+    take at most ``harmonics``, as many as keep the part left out below ``truncation``. ``modes`` are linear modes
+    (1-based, lowest first). ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is where energy goes
     first. ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one, are
-    stored beside those of the regions; ``compare`` corrects every fourth point with other flows; ``switch`` follows
-    the branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting`` "krylov"
-    does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a condensed
+    stored in addition to those of the regions; ``compare`` corrects every fourth point with other flows; ``switch``
+    follows the branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting``
+    "krylov" does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a condensed
     lattice so many of the largest ``multipliers`` (true: 8) are found.
     """
 
@@ -174,7 +174,7 @@ class NnmCase(CaseFile):
         return fields, problems
 
     def warnings(self) -> list[str]:
-        """What the case says that normal modes do not take."""
+        """Sentences about keys of the case that normal modes ignore."""
         restitution = self.contacts.restitution
         if restitution == 1:
             return []
@@ -182,13 +182,14 @@ class NnmCase(CaseFile):
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
-        """What is wrong between keys."""
+        """Problems between keys."""
         if not valid("lattice", "contacts", "nnm"):
             return []
         lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
-        # A system of one's own needs no lattice, whatever stands there.
+        # A system of one's own ignores the section [lattice].
         refusable = {"contacts": contacts} if nnm.system == "own" else {"contacts": contacts, "lattice": lattice}
         problems = [*_check_options(nnm), *refusals(cls, refusable, valid)]
+        # Lists over sites are refused above; checking their values too would report them twice.
         if not contacts.each:
             problems += check_per_site(contacts, 0, [], valid)
 
@@ -203,7 +204,7 @@ class NnmCase(CaseFile):
             cell, wrong = check_cell(lattice)
             problems += wrong
 
-        # The reduced model is one contact pair, wherever it stands.
+        # The reduced model is one contact pair, and needs no site.
         if nnm.system in ("chain", "condensed"):
             problems += check_sites(lattice, contacts)
             if not site_cells(lattice, contacts):
@@ -241,7 +242,7 @@ class NnmCase(CaseFile):
         return problems
 
     def physics(self) -> tuple[Any, ...]:
-        """What a branch that is resumed must keep: the system, the shooting map and the flow."""
+        """Keys that a resumed branch must keep: the system, the shooting map and the flow."""
         nnm = self.nnm
         begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation, self.krylov
         return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian, begun
@@ -267,7 +268,7 @@ class NnmCase(CaseFile):
 
 
 def _check_options(nnm: NnmTable) -> Iterator[Problem]:
-    """What is wrong with a system of one's own, and with the bounds of a branch and its steps."""
+    """Problems with a system of one's own, and with the bounds of a branch and its steps."""
     if (nnm.system == "own") != (nnm.custom is not None):
         yield Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]')
     for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
@@ -307,7 +308,7 @@ def _check_method(nnm: NnmTable) -> Iterator[Problem]:
 
 
 def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable, valid: Valid) -> Iterator[Problem]:
-    """What is wrong with the start of a lattice's motions."""
+    """Problems with the start of a lattice's motions."""
     yield from check_stiffness(contacts, True, valid)
     if not nnm.start_frequency:
         yield Problem("nnm.start_frequency", [], "name frequencies in rad/s, between the pass bands or above them")

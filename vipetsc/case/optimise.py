@@ -140,7 +140,7 @@ class OptimiseCase(CaseFile):
         options, problems = read_section(OptimiseTable, section, "optimise")
         try:
             base = _case(table)
-            # Designs are made without scatter, and run with it: both must be possible.
+            # Designs are built without scatter, and run with it: both must be possible.
             _case(table, table.get("disorder"))
         except CaseError as error:
             return {}, problems + error.problems
@@ -152,7 +152,7 @@ class OptimiseCase(CaseFile):
         return {"table": table, "options": options, "base": base}, problems
 
     def warnings(self) -> list[str]:
-        """What is likely not meant about the case to begin with."""
+        """Sentences about what is likely not meant in the case to begin with."""
         return self.base.warnings()
 
     def to_toml(self) -> str:
@@ -175,7 +175,7 @@ class OptimiseCase(CaseFile):
         return [site + 1 for site in self.base.model().chain.sites]
 
     def variables(self) -> list[Variable]:
-        """What varies, in the order in which values are given."""
+        """Variables of the search, in the order of the values of a design."""
         bounds, numbers = self.options.variables, range(1, len(self.sites) + 1)
         rows: list[tuple[list[str], Any, str, Any]] = [
             ([f"clearance {i}" for i in numbers], bounds.clearance, "m", "log"),
@@ -227,6 +227,7 @@ class OptimiseCase(CaseFile):
     def design(self, values: np.ndarray) -> Case:
         """The case with ``values`` (variable); raises CaseError if it is impossible."""
         bounds, count = self.options.variables, len(self.sites)
+        # Values carry no names: they are consumed in the order of ``variables`` and ``begin``.
         left = iter(map(float, values))
         table = with_preset(copy.deepcopy(self.table))
         contacts = table["contacts"] | {"sites": self.sites, "clearance": [*self.base.model().chain.clearances]}
@@ -254,6 +255,7 @@ class OptimiseCase(CaseFile):
         changes = {"drive": {"amplitude": float(amplitude)}}
         disorder = self.table.get("disorder")
         if sample is not None and disorder is not None:
+            # The seed depends on the sample alone, so that all designs meet the same scatter.
             changes["disorder"] = disorder | {"seed": disorder.get("seed", 0) + sample}
         return design.varied(name="design", without=("output",), **changes)
 
@@ -265,7 +267,7 @@ def _case(table: Table, disorder: Any = None) -> Case:
 
 
 def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Problem]:
-    """What is wrong between the keys of the section and the case to begin with."""
+    """Problems between the keys of the section and the case to begin with."""
     bounds = options.variables
     sites = base.model().chain.sites
     if not sites:
@@ -284,7 +286,7 @@ def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Pr
 
 
 def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator[Problem]:
-    """What is wrong with the bounds of what varies in a case with so many ``sites``."""
+    """Problems with the bounds of what varies in a case with so many ``sites``."""
     at = "optimise.variables"
     if bounds.clearance and bounds.profile:
         yield Problem(f"{at}.profile", bounds.profile, "give clearance or profile, not both")
@@ -309,7 +311,7 @@ def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator
 
 
 def _problems_of(objective: ObjectiveTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
-    """What is wrong with an objective, of a cell that stays as it is unless ``varied``."""
+    """Problems with an objective, of a cell that stays as it is unless ``varied``."""
     bands = pass_bands(base.lattice.unit_cell())
     band, part = objective.band, objective.part
 

@@ -35,13 +35,13 @@ class PredictCase(LawCase):
     takes = LawCase.takes - {"rings"}
 
     def warnings(self) -> list[str]:
-        """What is likely not meant about the waves that are composed; fields are not kept of the runs."""
+        """Sentences about what is likely not meant in the waves that are composed; fields are not kept of the runs."""
         model = self.model()
         return [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-        """What is wrong between keys."""
+        """Problems between keys."""
         yield from super().check(sections, valid)
         if valid("contacts.sites") and sections["contacts"].sites in (0, []):
             yield Problem("contacts.sites", [], "there is no site to predict; list cells or give a count")

@@ -1,4 +1,4 @@
-"""From the choices of a case file to plain numbers: presets, cell, sites, clearances, stiffness, frequency, times."""
+"""Resolution of the choices of a case file into plain numbers: cell, sites, clearances, stiffness, frequency, times."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -61,7 +61,7 @@ def with_preset(table: Table) -> Table:
 
 
 def _preset_drive(defaults: Table, given: Table) -> Table:
-    """What of a preset's drive belongs to a ``given`` one: the paper's burst, or where on a band its wave is."""
+    """Keys of a preset's drive that apply to a ``given`` one: the paper's burst, or the place of its wave on a band."""
     if given.get("amplitude") == 0:
         return {}  # the motion at t = 0 alone
     waveform = given.get("waveform", DEFAULT)
@@ -158,7 +158,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
 
 
 def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
-    """What is wrong with the loss of bands, or with dashpots that are given in its place."""
+    """Problems with the loss of bands, or with dashpots that are given in its place."""
     loss = damping.loss
     bands = {str(number) for number in range(1, cell.dofs + 1)}
     fitted = (damping.grounding, damping.springs)
@@ -173,7 +173,7 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
 
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
-    """What is wrong with where the contacts are, and with their clearances."""
+    """Problems with the cells of the contacts and with their clearances."""
     sites, clearance = contacts.sites, contacts.clearance
     count = 0 if isinstance(sites, list) else sites.count if isinstance(sites, Span) else sites
     if count > lattice.cells:  # before so many are placed
@@ -200,7 +200,7 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
 
 
 def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid) -> Iterator[Problem]:
-    """What is wrong with the sites of a run and with the law."""
+    """Problems with the sites of a run and with the law."""
     yield from check_sites(lattice, contacts)
     is_unplaced = isinstance(contacts.sites, int) and lattice.preset is None  # a count needs a preset to place it
     has_stiffnesses = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
@@ -214,7 +214,7 @@ def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid)
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
-    """The contact stiffness is given once: as a number, or by the material; a radius may stand beside the number."""
+    """The contact stiffness is given once: as a number, or by the material; a radius may be given with the number."""
     material = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
     given = [key for key, value in material.items() if value is not None]
     missing = [key for key in material if key not in given]
@@ -225,7 +225,7 @@ def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> I
 
 
 def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[str, Any]:
-    """The ``sections`` of a valid lattice run in which every choice is made, and how it begins.
+    """The ``sections`` of a valid lattice run in which every choice is resolved, and its initial motion.
 
     Raises ValueError if no end absorbs as much as is asked of it.
     """
@@ -296,6 +296,7 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
 
     interval = time.sample_interval
     if time.samples is not None:
+        # The first sample is at t = 0 and the last at the end.
         interval = end / (time.samples - 1)
     elif interval == "auto":
         interval = _round_down(np.pi / (SAMPLES_OF_HALF_PERIOD * pass_bands(cell)[-1].high))
@@ -317,4 +318,5 @@ def _round_down(value: float) -> float:
     """The largest of 1, 2 and 5 times a power of ten that is not above ``value``."""
     decade = int(np.floor(np.log10(value)))
     lead = max(m for m in (1, 2, 5) if m * 10.0**decade <= value)
+    # Read from text: 5 * 10.0**-6 is not the double nearest to 5e-6.
     return float(f"{lead}e{decade}")

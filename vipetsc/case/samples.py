@@ -1,4 +1,4 @@
-"""Samples of a drive's waveform, as they stand in a case or in a file."""
+"""Samples of a drive's waveform, from a case or from a file."""
 
 import re
 from pathlib import Path
@@ -18,7 +18,7 @@ MOST_SAMPLES = 100_000
 class SamplesTable(Section):
     """A waveform's ``value`` at each ``time``, or the ``file`` that has them: two columns of text, or a ``dataset``.
 
-    What stands in a file is filled in, with its ``sha256``.
+    The samples of a file are filled in, with its ``sha256``.
     """
 
     file: str | None = None
@@ -73,6 +73,7 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
         with h5py.File(path, "r") as file:
             rows = np.asarray(file[str(dataset)], float)
     else:
+        # utf-8-sig: editors on Windows begin files with a byte order mark, which is no number.
         lines = [re.split(r"[,;\s]+", line.strip()) for line in path.read_text(encoding="utf-8-sig").splitlines()]
         lines = [line for line in lines if line[0] and not line[0].startswith("#")]
         # A table may begin with a line of names.

@@ -25,6 +25,7 @@ def number(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     match = re.fullmatch(MULTIPLE_OF_PI, value)
+    # Other text stays as it is: the check of the type refuses it under the path of its key.
     if match is None:
         return value
     return float(match[1] or 1) * np.pi / float(match[2] or 1)
@@ -53,7 +54,7 @@ Wavenumber = Annotated[float, Field(gt=0, le=np.pi), BeforeValidator(number)]
 
 @dataclass(frozen=True)
 class Preset:
-    """One of the paper's lattices; the tables hold what a case file would say, in SI units.
+    """Lattice of the paper; the tables hold what a case file would say, in SI units.
 
     ``site_span(cells, count)`` gives the 1-based positions (first, last) between which sites are spread,
     ``clearance_span(count)`` the clearances in m of the leading and of the last site.
@@ -252,7 +253,7 @@ class AnalysisTable(Section):
 class PetscTable(Section):
     """PETSc options by name, without the leading dash, as they stand behind ``--`` on the command line.
 
-    Those of time stepping (``ts_...``) are for ``ts``; a case that has some is not made by the propagator.
+    Those of time stepping (``ts_...``) are for ``ts``; a case that has some is not simulated by the propagator.
     """
 
     model_config = ConfigDict(extra="allow")

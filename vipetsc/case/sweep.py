@@ -1,4 +1,4 @@
-"""Many cases from one: the section ``[sweep]`` of a case file, and the members it stands for."""
+"""Sweeps, which are many cases in one file: the section ``[sweep]`` of a case file, and the members it stands for."""
 
 import copy
 import hashlib
@@ -20,7 +20,7 @@ from vipetsc.case.disorder import SEED
 from vipetsc.case.schema import number
 
 MOST_MEMBERS = 1_000_000
-MOST_TRIED = 1_000  # members whose cases are made to see whether a sweep can be made
+MOST_TRIED = 1_000  # members whose cases are resolved to check a sweep before it begins
 Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
 
 
@@ -40,7 +40,7 @@ class SweepTable(Section):
 
 @dataclass(frozen=True)
 class SweepMember:
-    """One run of a sweep: its index on every axis; the resolved case, or why there is none."""
+    """Run of a sweep: its index on every axis; the resolved case, or the problems that prevent it."""
 
     index: tuple[int, ...]
     case: Case | None
@@ -59,7 +59,7 @@ class Sweep(CaseFile):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The fields, and everything that is wrong with ``[sweep]``; the members' cases are made by ``member``."""
+        """The fields, and everything that is wrong with ``[sweep]``; the members' cases are built by ``member``."""
         table = dict(table)
         section = table.pop("sweep", None)
         if not isinstance(section, dict):
@@ -113,10 +113,11 @@ class Sweep(CaseFile):
 
         def name(texts: Iterable[str]) -> str:
             digest = whole.copy()
+            # Sorted: the order of the axes in the file does not change the names of members.
             digest.update("".join(sorted(texts)).encode())
             return digest.hexdigest()[:16]
 
-        # What stands on an axis is written once; a sweep may have a million members.
+        # The values of an axis are written once; a sweep may have a million members.
         texts: list[list[str]] = []
         for axis in self.axes:
             rows = [dict(zip(axis, values, strict=True)) for values in zip(*axis.values(), strict=True)]
@@ -129,6 +130,7 @@ class Sweep(CaseFile):
         problems: list[Problem] = []
         for axis, i in zip(self.axes, index, strict=True):
             for key, values in axis.items():
+                # A copy, since members must not share a value that is a list or a table.
                 problems += put(table, key, copy.deepcopy(values[i]))
         return table, problems
 
@@ -172,7 +174,7 @@ class Sweep(CaseFile):
         return member.case
 
     def members(self, most: int = MOST_MEMBERS) -> list[SweepMember]:
-        """All members in their order, or ``most`` of them drawn.
+        """Members in their order, all of them or ``most`` drawn at random.
 
         Raises CaseError if none of these is a valid case, and if one is not because of what its disorder draws: the
         samples that are left would be of another distribution.
@@ -206,8 +208,9 @@ class Sweep(CaseFile):
 
 
 def _leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key with its value, as "a.b.c"; a range is one value."""
+    """Keys as "a.b.c" with their values; a range is one value."""
     for key, value in tree.items():
+        # The seed may be { count = n } alone, which is a range and no table.
         if isinstance(value, dict) and not value.keys() & {"log", "linear"} and path + key != SEED:
             yield from _leaves(value, f"{path}{key}.")
         else:
@@ -242,7 +245,7 @@ def _values(value: Any) -> tuple[Any, ...]:
 
 
 def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:
-    """One axis a key, or a group of keys that vary together."""
+    """Axes of a sweep, each a key or a group of keys that vary together, and the problems with the groups."""
     problems: list[Problem] = []
     group_of: dict[str, tuple[str, ...]] = {}
     for group in groups:

@@ -1,4 +1,4 @@
-"""One case file as every verb reads it."""
+"""Cases of all verbs that read one case file."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,9 +20,9 @@ VERB_CASES = (Case, Sweep, NnmCase, DesignCase, LawCase, OptimiseCase, PredictCa
 
 OF_SECTION = {kind.section: kind for kind in VERB_CASES if kind.section}
 SECTIONS: dict[str, type[Section]] = {name: table for kind in VERB_CASES for name, table in kind.sections().items()}
-"""Every section that a case file may have. A case reads those it declares, the others may stand beside them."""
+"""Sections that a case file may have. A case reads those it declares and ignores the others."""
 
-# Sections that tell that a file is of a run, or of verbs that are made of runs; normal modes read the others too.
+# Sections that mark a file as one of a run, or of verbs that consist of runs; normal modes read the others too.
 SECTIONS_OF_RUNS = {"disorder", "drive", "initial", "time", "output", "sweep", "optimise"}
 
 
@@ -30,7 +30,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
     """The cases that the verbs of the file's sections read from it, ``run`` first; the built-in one without a file.
 
     A file with ``[nnm]`` or ``[design]`` and no section of a run is not read as one. A sweep may give what a run
-    lacks: then its first possible member stands for the run. Raises CaseError with the problems of all verbs.
+    lacks: then its first possible member represents the run. Raises CaseError with the problems of all verbs.
     """
     table, source = _table(path)
     overrides = list(overrides)
@@ -40,7 +40,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
         try:
             case = kind.from_table(table, overrides, source)
             if isinstance(case, Sweep):
-                # What a run lacks the sweep may give: a member stands for it, and its problems are none.
+                # The sweep may give what a run lacks: a member replaces the run, whose problems do not count.
                 possible = [member.case for member in case.members(MOST_TRIED) if member.case]
                 cases = cases or [*possible[:1]]
                 problems = {}
@@ -63,9 +63,10 @@ def _kinds(table: Table) -> list[type[CaseFile]]:
 def disorder_of(
     path: str | Path | None, overrides: Iterable[str], cases: Iterable[CaseFile] = ()
 ) -> tuple[DisorderTable, Case, Case] | None:
-    """What scatters in a valid case file, the case without and with it; of a sweep, its first possible member's.
+    """Scatter in a valid case file, the case without and with it; for a sweep, those of its first possible member.
 
-    The sweep is taken from the ``cases`` that were read from the file, if it is among them: its members are made once.
+    The sweep is taken from the ``cases`` that were read from the file, if it is among them, so that its members are
+    resolved once.
     """
     table, _ = with_overrides(_table(path)[0], overrides)
     if "sweep" in table:

@@ -1,4 +1,4 @@
-"""What a run of a case would do that is likely not meant: one sentence each, with numbers and what helps.
+"""Warnings about a run that is likely not meant: one sentence each, with numbers and what helps.
 
 Waves are those of the first drive, at its group velocity; what contacts send into other bands may be faster.
 """
@@ -46,7 +46,7 @@ def losses(lattice: LatticeTable) -> np.ndarray:
 
 
 def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
-    """Bands whose loss is another than the one asked: by more than ``MISSED``, or by a factor of 2 somewhere."""
+    """Warnings of bands whose loss is not the one asked: by more than ``MISSED``, or by a factor of 2 somewhere."""
     off: list[str] = []
     for band, (asked, least, mean, most) in enumerate(losses(lattice), 1):
         is_off_in_mean = abs(mean - asked) > MISSED * asked + TINY
@@ -61,7 +61,7 @@ def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
 
 
 def wave_warnings(model: Model) -> Iterator[str]:
-    """Evanescent and slow waves."""
+    """Warnings of evanescent and slow waves."""
     cell, drive = model.chain.cell, model.drive
     if not model.is_driven or not cell.springs:
         return
@@ -81,7 +81,7 @@ def wave_warnings(model: Model) -> Iterator[str]:
 
 
 def length_warnings(model: Model) -> Iterator[str]:
-    """Waves that are long for the lattice; a run that ends before its drive."""
+    """Warnings of waves that are long for the lattice, and of a run that ends before its drive."""
     cell, drive, cells = model.chain.cell, model.drive, model.chain.cells
     if model.is_driven and not cell.springs:
         return
@@ -102,7 +102,7 @@ def length_warnings(model: Model) -> Iterator[str]:
 
 
 def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
-    """A wave that comes back from an end to what is measured: to the sites, else to the window or the drive."""
+    """Warnings of a wave that returns from an end to the sites, or without sites to the window or the drive."""
     chain, drive, at = model.chain, model.drive, model.drive_cell
     if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
         return
@@ -126,7 +126,7 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 
 
 def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
-    """Fields that do not resolve the waves, in the words of the analysis, so that each is said once."""
+    """Warnings of fields that do not resolve the waves, in the words of the analysis, so that each is said once."""
     chain = model.chain
     top = pass_bands(chain.cell)[-1].high
     interval = output.stride * model.sample_interval
@@ -152,7 +152,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 
 
 def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
-    """Contacts that samples, or steps of fixed length, do not see."""
+    """Warnings of contacts that samples, or steps of fixed length, do not resolve."""
     speed = model.scale * model.drive.frequency
     if not model.chain.sites or not speed:
         return
@@ -160,6 +160,7 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     # The stiffest law decides, at the speed of the undisturbed wave.
     laws = {*(model.laws or (model.contact,))}
     time = min(law.impact_time(speed, model.chain.cell.reduced_mass) for law in laws)
+    # Options of PETSc are text in a case.
     step = float(petsc.get("ts_dt", DEFAULT_STEP / model.drive.frequency))
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:
         yield (

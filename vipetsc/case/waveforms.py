@@ -22,9 +22,9 @@ RAMP_FRACTION = 0.1  # of a chirp's duration that its ramp takes, where it is no
 
 
 class WaveformRecord(NamedTuple):
-    """One waveform of a drive.
+    """Waveform of a drive: what builds and describes it, and its keys.
 
-    ``build(drive)`` makes the waveform of a resolved drive, ``describe(drive)`` says it in words. ``needs`` are the
+    ``build(drive)`` gives the waveform of a resolved drive, ``describe(drive)`` its words. ``needs`` are the
     keys without which there is none, ``takes`` the others that it has; keys of other waveforms are refused. A waveform
     whose wave is chosen by the case has no ``frequency``; of the others ``frequency(drive, highest)`` is the one in
     rad/s that they are about, at most the ``highest`` that the lattice can follow. ``ramp(drive, frequency)`` is the
@@ -86,6 +86,7 @@ def _samples_frequency(drive: "OneDrive", highest: float) -> float:
 
 
 def _impulse_frequency(drive: "OneDrive", highest: float) -> float:
+    # Half a sine lasts half a period: pi over its duration.
     return float(min(np.pi / (drive.duration or 1.0), highest))
 
 
@@ -200,7 +201,7 @@ class OneDrive(Section):
 
     @property
     def wave_choices(self) -> list[Any]:
-        """What is given of the wave: frequency, wavenumber or ``at``; more than one contradict each other."""
+        """Given choices of the wave, of frequency, wavenumber and ``at``; more than one contradict each other."""
         return [given for given in (self.frequency, self.wavenumber, self.at) if given is not None]
 
     def describe(self) -> str:
