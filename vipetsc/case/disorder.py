@@ -1,8 +1,8 @@
 """Scatter of a case's numbers: the section ``[disorder]``, from which values are drawn that the resolved case holds.
 
 A resolved case has these values in place of the section, so it states what was simulated, and no later step needs the
-draw. Each quantity has its own generator (Philox), keyed by the seed and its name: the numbers do not
-depend on the number of ranks, on the order of the draws or on the other quantities.
+draw. Each quantity has its own generator (Philox), keyed by the seed and its name: the numbers do not depend on the
+number of ranks, on the order of the draws or on the other quantities.
 """
 
 from collections.abc import Mapping, Sequence

@@ -94,12 +94,12 @@ class NnmTable(Section):
     others with the ``method`` condensed). Branches of these begin at ``start_frequency`` in rad/s, outside the pass
     bands, with contact at ``start_sites`` (numbers of sites, from 1; negative ones move in the opposite direction), and
     take at most ``harmonics``, as many as keep the part left out below ``truncation``. ``modes`` are linear modes
-    (1-based, lowest first). ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is where energy goes
-    first. ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one, are
-    stored in addition to those of the regions; ``compare`` corrects every fourth point with other flows; ``switch``
+    (1-based, lowest first). ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is where
+    energy goes first. ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one,
+    are stored in addition to those of the regions; ``compare`` corrects every fourth point with other flows; ``switch``
     follows the branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting``
-    "krylov" does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a condensed
-    lattice so many of the largest ``multipliers`` (true: 8) are found.
+    "krylov" does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a
+    condensed lattice so many of the largest ``multipliers`` (true: 8) are found.
     """
 
     system: Literal["reduced", "chain", "own", "condensed"] = "reduced"
