@@ -1,4 +1,4 @@
-"""Arguments of verbs: the ones that several verbs share. What one verb alone takes is declared beside it."""
+"""Arguments of verbs: those that several verbs take. The module of a verb declares the others."""
 
 from pathlib import Path
 from typing import Any, NamedTuple

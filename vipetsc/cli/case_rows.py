@@ -1,4 +1,4 @@
-"""What follows from a case, in words: the lattice with its ends, losses, contacts and sites, and how a run begins."""
+"""Numbers that follow from a case, in words: the lattice with its ends, losses, contacts, sites and initial motion."""
 
 import numpy as np
 
@@ -23,6 +23,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
         lattice += f", reading {case.lattice.reading}"
     bands = pass_bands(cell)
     gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in gaps(bands))
+    # Every one of a million sites may have a law: as many are named as a list shows.
     laws = model.laws[:8] or (model.contact,)
     clearances = first_few(describe_stops(model.gaps, chain.clearances))
 
@@ -39,7 +40,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
 
 
 def describe_ends(case: Case) -> str:
-    """The ends; of one that absorbs, what comes back of the energy of a wave at each drive's frequency."""
+    """Ends in words; for an absorbing end, the energy that comes back at each drive's frequency."""
     lattice = case.lattice
     absorbing = lattice.absorbing
     if absorbing is None or not (absorbing.cells and absorbing.strength):
@@ -74,7 +75,7 @@ def describe_losses(case: Case) -> str:
 
 
 def describe_initial(initial: InitialTable | None) -> str:
-    """What a run begins with; empty for a lattice at rest."""
+    """Initial motion in words; empty for a lattice at rest."""
     if initial is None:
         return ""
     if initial.kind == "file":

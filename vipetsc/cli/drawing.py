@@ -12,12 +12,12 @@ from vipetsc.parallel import on_every_rank, on_root
 
 @dataclass(frozen=True)
 class Pictures:
-    """What is drawn of the results of a verb.
+    """Pictures that a verb draws of its results.
 
     ``source`` is the name of these pictures in the registry of figures, ``file`` the one that shows that a folder holds
     results to draw (a pattern as of ``Path.glob``), ``noun`` what that file is. ``prepare`` checks folders, and
     measures what is missing in them or older than its run; without it, a file that cannot be read is found out by
-    drawing it. ``recognise`` says whether folders hold such results where one ``file`` in one folder does not tell.
+    drawing it. ``recognise`` says whether folders hold such results where one ``file`` in one folder does not decide.
     """
 
     source: str
@@ -64,6 +64,7 @@ def draw_pictures(
     # Rank 0 looks, so that all ranks judge by one time, whatever their file systems show them.
     newest = None if afresh else on_root(comm, lambda: newest_result(folders))
     drawn = on_every_rank(comm, draw_part)
+    # ``gather`` gives None on all ranks but the first.
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
 
 
@@ -72,6 +73,7 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
     from vipetsc.figures.registry import figure_names
 
     try:
+        # Names first: measuring writes files, and a wrong --fig must leave none.
         figure_names(pictures.source, names)
     except KeyError as error:
         raise FolderError(f"--fig: {error.args[0]}") from None
@@ -80,5 +82,5 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
 
 def newest_result(folders: Sequence[Path]) -> float:
-    """When the newest file of results in ``folders`` was written."""
+    """Time at which the newest file of results in ``folders`` was written."""
     return max(path.stat().st_mtime for folder in folders for path in folder.glob("*.h5"))

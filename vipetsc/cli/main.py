@@ -34,6 +34,7 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
         arguments = ["run", *arguments]  # of the built-in case
 
     options = _parser().parse_args(arguments)
+    # --list asks for an answer, which --quiet does not silence.
     is_answer = VERBS[options.verb].is_answer or getattr(options, "list", False)
     try:
         with reporting(MPI.COMM_WORLD, options, is_answer):
@@ -57,10 +58,12 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
 
+        # A verb that never looks at the request has nothing to save and ends at once.
         with StopRequest().listening(at_once=not verb.is_stoppable) as stop:
             return int(verb.call(options, MPI.COMM_WORLD, stop))
 
     except (CaseError, FolderError) as error:
+        # Every rank gets here: bad input is found on one rank and raised on all.
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT
     except StoppedError as error:

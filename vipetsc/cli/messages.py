@@ -48,6 +48,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
     """
     handlers = _stream_handlers(quiet=options.quiet, is_answer=is_answer)
     if options.log:
+        # All ranks must learn of it: those that went on would wait for rank 0 in the first collective.
         on_root(comm, lambda: _check_writable(options.log))
         if comm.rank == 0:
             handlers.append(_file_handler(options.log))
@@ -57,6 +58,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
     level = logger.level
     logger.propagate = False
     logger.setLevel(logging.DEBUG if is_verbose else logging.INFO)
+    # Progress bars write to stderr themselves: the level of their own logger switches them off.
     logging.getLogger(BAR).setLevel(logging.CRITICAL if options.quiet else logging.NOTSET)
     for handler in handlers:
         logger.addHandler(handler)
@@ -97,6 +99,7 @@ def _file_handler(path: Path) -> logging.Handler:
 
 def _check_writable(path: Path) -> None:
     try:
+        # For appending, which keeps the messages of earlier commands.
         path.open("a").close()
     except OSError as error:
         raise FolderError(f"--log {path}: {error.strerror}; name a file that can be written") from error
@@ -104,5 +107,6 @@ def _check_writable(path: Path) -> None:
 
 def _report_phase(event: str, arguments: tuple[Any, ...]) -> None:
     """Log the phase that a verb begins (a hook for audit events, which stays installed until the process ends)."""
+    # Python removes no audit hook: after the block the level silences this one.
     if event.startswith("vipetsc.") and event not in OFTEN and logger.isEnabledFor(logging.DEBUG):
         logger.debug("%s %s", event.removeprefix("vipetsc."), " ".join(map(str, arguments)))

@@ -1,4 +1,4 @@
-"""What the command line knows of a verb: one record, from which parser, completion, checks and tests take their lists.
+"""Records of verbs, from which the parser, completion, checks and tests take their lists.
 
 A ``PlainVerb`` is a function. A ``StudyVerb`` computes results of a case into a folder, and all of these run in one
 frame: the case is read, its PETSc options are checked, its warnings are printed, the folder is locked, the study
@@ -24,6 +24,7 @@ from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_root
 
+# 2 is what argparse exits with; EX_TEMPFAIL asks a batch script to queue the job again.
 DONE, FAILED, BAD_INPUT, STOPPED = 0, 1, 2, os.EX_TEMPFAIL
 
 Rows = list[tuple[str, str]]
@@ -32,7 +33,7 @@ Function = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 
 @dataclass(frozen=True, kw_only=True)
 class Verb(ABC):
-    """One verb of the command line.
+    """Verb of the command line.
 
     ``text`` is its line in the help, ``example`` a call that the help shows, without the program's name. ``results``
     is what its folder holds, for verbs that leave results of their own and go on with them. One that ``is_stoppable``
@@ -68,7 +69,7 @@ class PlainVerb(Verb):
 
 @dataclass
 class Work:
-    """What a study is given besides its case: where it leaves its results, on which ranks, and how it was asked to."""
+    """Arguments of a study besides its case: the folder of its results, the ranks, the options and the stop request."""
 
     options: argparse.Namespace
     folder: Path
@@ -95,7 +96,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a study ended, the same on all ranks.
+    """Ending of a study, the same on all ranks.
 
     ``complete``: all that was asked for is there; ``failures`` say what is not, and why, and are printed last;
     ``drawable``: the folder holds what pictures show.
@@ -131,6 +132,7 @@ class StudyVerb(Verb):
         case = on_root(comm, lambda: self.checked_case(options))
         folder = options.out or Path("runs") / f"{case.name}{self.suffix}"
         work = Work(options, folder, comm, stop)
+        # On rank 0, since warnings compute the bands of the cell.
         work.warn(on_root(comm, case.warnings))
 
         # Studies lock their folder themselves, which the same process may do again; this lock spans the pictures too.
@@ -148,6 +150,7 @@ class StudyVerb(Verb):
 
     def checked_case(self, options: argparse.Namespace) -> CaseFile:
         """The case, with PETSc options that time stepping knows; raises CaseError. Called on one rank."""
+        # Imported here: `manual` and `schema` need neither PETSc nor compiled kernels.
         from vipetsc.dynamics.options import check_options
 
         case = self.load(options) if self.load else self.case.load(options.case, options.set)

@@ -106,6 +106,7 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
             "wavenumber": kappa,
             "damping_ratio": float(point.ratio[band.number - 1]),
             "frequency": float(rate.imag),
+            # The complex rate has the decay in its negative real part.
             "decay_time": float(-1 / rate.real),
         })  # fmt: skip
     return {"damping": rows, "decay_length": {"frequency": frequency, "cells": decay_length(cell, frequency)}}
@@ -138,6 +139,7 @@ def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MP
 
     with locked(comm, folder):
         data = linear_modes.find_modes(case, options.modes, options.near or 0.0, folder, comm)
+    # The modes are on rank 0 alone, whose text is printed.
     if data is None:
         return ""
     return f"\n{linear_modes.modes_report(data)}\n  {folder / 'modes.h5'}"

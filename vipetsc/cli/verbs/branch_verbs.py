@@ -123,6 +123,7 @@ def branch_log() -> Callable[["Branch", "Point"], None]:
 
     def show(branch: "Branch", point: "Point") -> None:
         nonlocal title, last
+        # Monotonic: setting the clock back must not silence the table.
         now = time.monotonic()
         if now - last < SHOW_EVERY:
             return
@@ -137,7 +138,7 @@ def branch_log() -> Callable[["Branch", "Point"], None]:
 
 
 def branch_table(branch: "Branch") -> str:
-    """How a branch went: length, range, special points, power laws."""
+    """Summary of a branch: length, range, special points, power laws."""
     from vipetsc.modes.branches.regions import slope_laws, tongues
 
     regular = branch.regular()
@@ -169,7 +170,7 @@ def branch_table(branch: "Branch") -> str:
 
 
 def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
-    """How a curve went: length, folds, jumps of a slow sweep up and down, stable points, energy balance."""
+    """Summary of a curve: length, folds, jumps of a slow sweep up and down, stable points, energy balance."""
     from vipetsc.modes.branches.response_layout import measure, sweep_down, sweep_up
 
     options = case.nfrc
@@ -186,6 +187,7 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
 
     jumps = []
     for direction, path in (("up", sweep_up(curve)), ("down", sweep_down(curve))):
+        # Neighbouring states of the curve follow each other unless the sweep jumps.
         jumps += [f"{parameter[a]:.5g} {direction}" for a, b in itertools.pairwise(path) if abs(a - b) > 1]
     rows.append(("jumps", ", ".join(jumps) or "none"))
 

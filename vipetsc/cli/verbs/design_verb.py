@@ -32,5 +32,5 @@ VERB = StudyVerb(
     table=design_rows,
     results=SEARCH,
     pictures=Pictures(source="design", file="design.h5", noun=SEARCH.noun),
-    is_stoppable=False,  # it takes seconds, and has nothing to save on the way
+    is_stoppable=False,  # it takes seconds, and has nothing to save before its end
 )

@@ -42,6 +42,7 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     rows = [(name.replace("_version", ""), str(value)) for name, value in provenance(comm).items()]
     rows += [(check.name, check.value or f"MISSING: {check.remedy}") for check in checks]
     rows += [("native right-hand side", native_right_hand_side()), ("slepc", slepc_version())]
+    # Collective, so all ranks build the table although rank 0 alone prints it.
     hosts = comm.allgather(MPI.Get_processor_name())
     rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
 
@@ -74,6 +75,7 @@ def needs(comm: MPI.Comm) -> list[Check]:
 def check_of_module(module: str) -> Check:
     """The check of a Python module that pip installs."""
     try:
+        # Imported, not looked up: a module that is there but does not load is missing.
         version = str(getattr(importlib.import_module(module), "__version__", "yes"))
     except ImportError:
         version = None
@@ -87,6 +89,7 @@ def native_right_hand_side() -> str:
 
     try:
         compile_callback()
+    # AttributeError: PETSc hides its symbols. OSError: its library cannot be loaded.
     except (AttributeError, OSError) as error:
         return f"no: runs need PETSc's symbols ({error})"
     return "yes"

@@ -1,4 +1,4 @@
-"""The verbs ``analyse`` and ``export``: measures of runs that are there, and results in the forms of other programs."""
+"""The verbs ``analyse`` and ``export``: measures of finished runs, and results in the formats of other programs."""
 
 import argparse
 from pathlib import Path
@@ -14,7 +14,7 @@ from vipetsc.parallel import StopRequest, on_root
 
 
 def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Measure runs that are there; of a sweep, those whose fields were kept, and its ensemble."""
+    """Measure finished runs again; of a sweep, those whose fields were kept, and its ensemble."""
     from vipetsc.studies.reanalysis import reanalyse_folders
 
     with locked(comm, *existing_folders(options.path, comm)):
@@ -23,7 +23,7 @@ def analyse(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> i
 
 
 def export(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Write ``run.xdmf`` beside a run, and the curves of runs, sweeps, branches and searches as CSV files."""
+    """Write ``run.xdmf`` into the folder of a run, and curves of runs, sweeps, branches and searches as CSV."""
     with locked(comm, *existing_folders(options.path, comm)):
         for path in options.path:
             echo_paths(comm, on_root(comm, lambda path=path: write_exports(path)))  # type: ignore[misc]
@@ -32,6 +32,7 @@ def export(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 def existing_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     """The folders that those of ``paths`` that exist are or lie in."""
+    # Missing paths are left to the verb, which refuses them with a reason; there is no folder to lock.
     return on_root(comm, lambda: [path if path.is_dir() else path.parent for path in paths if path.exists()])
 
 
@@ -50,6 +51,7 @@ def write_exports(path: Path) -> list[Path]:
         # A folder of branches is the one kind with several files of curves.
         for source in branches or [path]:
             written += write_curves(source)
+    # h5py raises OSError for files that were cut off or are no HDF5.
     except (OSError, ValueError) as error:
         raise FolderError(str(error)) from error
     return written

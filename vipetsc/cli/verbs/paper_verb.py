@@ -20,8 +20,9 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     from vipetsc.paper.report import claims_table
 
     plan = paper_plan(QUICK if options.quick else FULL)
+    # Two folders by default: one holds the paper on one grid only.
     folder = options.out or Path("runs") / ("paper-quick" if options.quick else "paper")
-    # A list looks at the folder, and neither locks nor makes it.
+    # A list looks at the folder, and neither locks nor creates it.
     if options.list:
         echo(comm, on_root(comm, lambda: plan_table(plan.only(options.only), folder, comm.size)))
         return DONE

@@ -26,6 +26,7 @@ def positive(text: str) -> float:
     """A positive, finite number."""
     value = float(text)
     if not 0 < value < float("inf"):
+        # argparse prints the text of this exception; that of a ValueError it hides.
         raise argparse.ArgumentTypeError(f"{text} is not positive and finite")
     return value
 
@@ -55,7 +56,7 @@ OF_MOVIES: dict[str, Argument] = {
 
 
 def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Draw what folders hold again, from their files, or make a movie of a run."""
+    """Draw what folders hold again, from their files, or render a movie of a run."""
     pictures, folders = on_root(comm, lambda: pictures_of(options.path))
     formats = set(options.format or ())
     of_movie = {name: getattr(options, name) for name in OF_MOVIES if getattr(options, name) is not None}
@@ -64,6 +65,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         wrong = formats - {*MOVIE_FORMATS} or (options.fig and {"--fig"})
         if wrong:
             raise FolderError(f"--movie: is a gif or an mp4 of its own, without {min(wrong)}")
+        # On rank 0: the frames go into one file in their order.
         paths, missing = on_root(comm, lambda: film(pictures, folders[0], options.movie, of_movie, formats))
         echo_paths(comm, paths)
         if missing:
@@ -102,9 +104,9 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
 def film(
     pictures: Pictures, folder: Path, quantity: str, options: dict[str, Any], formats: set[str]
 ) -> tuple[list[Path], str]:
-    """Make a movie of the run in ``folder``, in ``formats``; ``options`` by their names in `Shot`; on one rank.
+    """Render a movie of the run in ``folder``, in ``formats``; ``options`` by their names in `Shot`; on one rank.
 
-    Returns the files, and which format could not be made and why. Nothing is written on bad input.
+    Returns the files, and which format could not be written and why. Nothing is written on bad input.
     """
     from vipetsc.figures import movie, movie_frames
     from vipetsc.figures.style import rc_style
@@ -121,7 +123,7 @@ def film(
             f"--rate {shot.rate:g} --width {shot.width}: at most {FASTEST:g} a second, {NARROWEST} to {WIDEST} pixels"
         )
 
-    # What was asked for by name is refused where it cannot be made; what is made by default is left out, and said.
+    # A format asked for by name is refused where it cannot be written; a default one is left out, with a message.
     has_ffmpeg = movie.ffmpeg() is not None
     missing = ""
     if "mp4" in formats and not has_ffmpeg:

@@ -1,4 +1,4 @@
-"""The verb ``predict``: several sites composed from the answer of one, beside simulations."""
+"""The verb ``predict``: several sites composed from the response of one, compared with simulations."""
 
 import xarray as xr
 
@@ -54,6 +54,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
 
 def prediction_table(data: xr.Dataset) -> str:
     """Predicted and simulated fractions of the energy at every amplitude, and how far apart they are."""
+    # Without ``predict.simulate`` nothing is simulated.
     kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
     columns = [(kind, quantity) for quantity in ("upper", "other", "dissipated") for kind in kinds]
 

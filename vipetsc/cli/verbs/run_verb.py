@@ -54,13 +54,13 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     work.report(run_table(result, faster))
     if work.comm.rank == 0:
         logger.debug("statistics %s", json.dumps(result.statistics))
-    # The run is saved; its measures are made by the command that goes on.
+    # The run is saved; the command that goes on measures it.
     work.stop.check(work.comm)
 
     # Measures of fields need a second sample: a run that fails in its first has none.
     has_fields = bool(case.output.fields) and result.statistics["samples"] > 1
     if has_fields:
-        # The linear run of its sweep tells when the wave arrives at the sites of a member.
+        # The linear run of its sweep has the time at which the wave arrives at the sites of a member.
         sweep = Path(work.options.case) if work.options.member else None
         on_root(work.comm, lambda: is_measured(work.folder) or measure_run(work.folder, sweep))
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
@@ -68,7 +68,7 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
 
 
 def run_rows(case: Case, ranks: int) -> Rows:
-    """What follows from a case of a run: bands, drive, times, samples, file size, cost on so many ``ranks``."""
+    """Numbers that follow from a case of a run: bands, drive, times, samples, file size, cost on ``ranks`` ranks."""
     from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_indices, memory_available, memory_needed
     from vipetsc.dynamics.recorder import recorded_cells, written_together
@@ -122,7 +122,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
 
 
 def run_table(result: "Result", faster: str = "") -> str:
-    """How a run ended and its numbers; ``faster``: what would have been."""
+    """Ending and statistics of a run; ``faster`` names what would have been faster."""
     numbers = result.statistics
     if numbers["engine"] == "propagator":
         method = f"{numbers['method']}, {numbers['bandwidth']} cells each way, exact to {numbers['truncation']:.1g}"
@@ -131,6 +131,7 @@ def run_table(result: "Result", faster: str = "") -> str:
         steps = f"{numbers['steps']} accepted, {numbers['rejected']} rejected ({numbers['method']})"
 
     energy = ""
+    # Without work, as in a lattice that only begins with a motion, there is nothing to relate losses to.
     if work := numbers.get("work"):
         energy = f"work {work:.6g} J, dissipated {100 * numbers['dissipated'] / work:.4g} %"
         if damped := numbers.get("dissipated_by_damping", 0.0):
@@ -167,6 +168,7 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
         raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
     try:
         measured = is_measured(folder)
+    # OSError: no HDF5 file. ValueError or KeyError: a file of another program.
     except (OSError, ValueError, KeyError) as error:
         raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
     if not measured:

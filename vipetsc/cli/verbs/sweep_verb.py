@@ -31,7 +31,7 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
 
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
-    """How many members a sweep has, and how many of those tried are no valid cases."""
+    """Number of members of a sweep, and of those tried that are no valid cases."""
     # A sweep may have a million members, of which each takes milliseconds to resolve.
     tried = plan.members(MOST_TRIED)
     impossible = sum(member.case is None for member in tried)
@@ -41,7 +41,7 @@ def sweep_rows(plan: Sweep, ranks: int) -> Rows:
 
 
 def sweep_table(result: "SweepResult") -> str:
-    """How a sweep ended: counts, time, what failed."""
+    """Ending of a sweep: counts, time, failed members."""
     complete, scaled, failed, missing = (result.count(status) for status in range(4))
     counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
     rows = [
@@ -54,15 +54,17 @@ def sweep_table(result: "SweepResult") -> str:
     else:
         rows.append(("leaves", str(result.folder / "ensemble.h5")))
 
+    # The result has statuses only; the reasons are in the index.
     failures = json.loads((result.folder / "index.json").read_text(encoding="utf-8"))["failed"]
     rows += [("failed", f"member {row['place']}: {row['reason']}") for row in failures[:MOST_FAILURES]]
     return table(rows)
 
 
 def relate_to_branches(folders: Sequence[Path]) -> None:
-    """Check that folders hold finished sweeps or branches, and lay sweeps over the branches beside them."""
+    """Check that folders hold finished sweeps or branches, and lay the sweeps over the branches."""
     from vipetsc.studies.backbone import relate_folders
 
+    # All folders are checked before a file is written into one of them.
     for folder in folders:
         if reason := outdated(folder):
             raise FolderError(reason)
@@ -72,7 +74,7 @@ def relate_to_branches(folders: Sequence[Path]) -> None:
 
 
 def begin_with_a_sweep(folders: Sequence[Path]) -> bool:
-    """Whether the first of the folders holds a sweep; the others are sweeps or branches that share its pages."""
+    """Whether the first of the folders holds a sweep; the others may be branches or sweeps for the same pages."""
     return (folders[0] / "ensemble.h5").exists()
 
 

@@ -1,4 +1,4 @@
-"""The verb ``validate``: what follows from a case, read as every verb whose section it has reads it."""
+"""The verb ``validate``: numbers that follow from a case, as each verb whose section it has reads it."""
 
 import argparse
 
@@ -45,12 +45,12 @@ def report_of(options: argparse.Namespace, ranks: int) -> str:
 
 
 def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
-    """What scatters, how, and the first values drawn, over those of the ``nominal`` case, which has no scatter."""
+    """Scattered quantities, their deviations, and the first values drawn over those of the ``nominal`` case."""
     before = values_of(nominal.lattice, nominal.contacts)
     after = values_of(drawn.lattice, drawn.contacts)
     rows = []
     for name, deviation in disorder.quantities().items():
-        # Sites move by cells; all else is scattered about a value, so that the ratio tells how far.
+        # Sites move by cells; all else is scattered about a value, so that the ratio shows how far.
         if name == "sites":
             values = f"cells {first_few([f'{cell:.5g}' for cell in after[name]])}"
         else:

@@ -1,4 +1,4 @@
-"""All verbs by their names: the records that the other modules of this folder declare."""
+"""Verbs by their names: the records that the other modules of this folder declare."""
 
 import pkgutil
 from collections.abc import Iterator
@@ -13,6 +13,7 @@ def _declared() -> Iterator[Verb]:
     # Modules are found rather than listed: a verb that is there cannot be left out of help, completion or tests.
     for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
         name = f"{__package__}.{module.name}"
+        # This module declares no verb, and is still being imported itself.
         if name != __name__:
             values = vars(import_module(name)).values()
             yield from (value for value in values if isinstance(value, Verb))
