@@ -1,4 +1,4 @@
-"""The record of what there is of the paper, from which inputs and at what cost: ``made.json``."""
+"""Record of finished figures, claims and report, of their inputs and their cost: ``made.json``."""
 
 import json
 from pathlib import Path
@@ -20,13 +20,13 @@ BuildRecord = dict[str, Any]
 
 
 def read_record(root: Path) -> BuildRecord:
-    """``made.json``, or an empty record, after which everything is made again."""
+    """Content of ``made.json``, or an empty record, after which everything is computed again."""
     empty = {"figures": {}, "cpu": {"steps": {}, "figures": 0.0, "claims": 0.0, "report": 0.0}}
     return empty | (read_json(root / RECORD) or {})
 
 
 def write_record(root: Path, record: BuildRecord) -> None:
-    """Write ``made.json`` if it holds another record."""
+    """Write ``record`` to ``made.json`` unless the file holds it already."""
     if record != read_record(root):
         write_text(root / RECORD, json.dumps(record, indent=1) + "\n")
 
@@ -36,6 +36,7 @@ def is_whole(path: Path) -> bool:
     if not path.exists():
         return False
     with path.open("rb") as file:
+        # The end alone: a file that was cut off lacks its last bytes.
         file.seek(max(path.stat().st_size - 32, 0))
         return LAST[path.suffix] in file.read()
 

@@ -34,14 +34,14 @@ class CellSearch:
 
     @property
     def out_of_phase(self) -> np.ndarray:
-        """Where (lambda, eta) host and resonator move against each other at every kappa of the second band.
+        """Mask (lambda, eta) of cells whose host and resonator move out of phase at every kappa of the second band.
 
         Wavenumbers at which either stands still (the zone's border, by symmetry) do not count.
         """
         return (self.signed_deflection >= 0).all(axis=-1) & (self.signed_deflection > 0).any(axis=-1)
 
     def cost(self, name: str) -> np.ndarray:
-        """One of ``COSTS`` over (lambda, eta); the larger the better.
+        """Cost ``name``, one of ``COSTS``, over (lambda, eta); the larger the better.
 
         ``deflection``: largest signed deflection over kappa, 1. ``group_velocity``: the sum over bands 2 to 4
         of the largest |v_g|, cells/s. ``weighted``: their product, Eq. (8).
@@ -52,10 +52,11 @@ class CellSearch:
         return costs[name]
 
     def optimum(self, name: str) -> tuple[int, int] | None:
-        """Where (lambda, eta) the cost ``name`` is best, of the cells out of phase; None if there is no such cell."""
+        """Indices (lambda, eta) of the best cost ``name`` among the cells out of phase; None if there is none."""
         if not self.out_of_phase.any():
             return None
 
+        # Minus infinity rather than a selection: the argmax then refers to the whole grid.
         cost = np.where(self.out_of_phase, self.cost(name), -np.inf)
         row, column = np.unravel_index(np.argmax(cost), cost.shape)
         return int(row), int(column)
@@ -74,7 +75,7 @@ def search_cells(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: A
         sys.audit("vipetsc.step")
         cell = four_band(reading, one_lam, one_eta)
         waves = bloch(cell, kappa)
-        # What the costs ask alone is kept: Bloch vectors of a fine grid would fill the memory.
+        # Only what the costs need is kept: Bloch vectors of a fine grid would fill the memory.
         frequency.append(waves.frequency)
         deflection.append(signed_deflection(cell, waves)[:, DRIVEN - 1])
         speed.append(np.abs(waves.group_velocity).max(axis=0))

@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 PAPER = (0.1, 0.5)  # the (lambda, eta) that the paper takes
 UNITS = {"deflection": "1", "group_velocity": "cells/s", "weighted": "cells/s"}
 BEST = ("optimum_lambda", "optimum_eta", "optimum_value")
-# Dimensions of what is known of every cell of the grid, and of every cost's best cell.
+# Dimensions of the values of every cell of the grid, and of every cost's best cell.
 GRID = "reading lambda eta"
 OPTIMUM = "reading cost"
 
@@ -86,6 +86,7 @@ def _make_search(case: DesignCase, path: Path) -> None:
         with open_netcdf(path, "search", BEST):
             return
     except (OSError, ValueError) as error:
+        # A missing file is the usual case; one that cannot be read deserves a word.
         if path.exists():
             logger.warning("vipetsc: warning: %s; made again", error)
 
@@ -93,7 +94,7 @@ def _make_search(case: DesignCase, path: Path) -> None:
 
 
 def _search(case: DesignCase) -> xr.Dataset:
-    """All of ``design.h5``."""
+    """Content of ``design.h5``."""
     options = case.design
     sys.audit("vipetsc.set-up", case.name)
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
@@ -111,6 +112,7 @@ def _search(case: DesignCase) -> xr.Dataset:
         "wavenumber": wavenumber,
         "band": bands,
         "dof": bands,
+        # Integers, since netCDF has no booleans.
         "out_of_phase": np.stack([result.out_of_phase for result in results]).astype(np.int8),
     }
     for name in ("frequency", "signed_deflection", "speed"):
@@ -133,7 +135,7 @@ def _paper_costs(reading: Reading, wavenumber: np.ndarray) -> list[float]:
 
 
 def _optima(grids: Mapping[Reading, CellSearch], values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Where each cost is largest, and the Bloch vectors there; NaN in a reading in which no cell is out of phase.
+    """Best cell of each cost, and the Bloch vectors there; NaN in a reading in which no cell is out of phase.
 
     The sizes of the dimensions are those of the coordinates in ``values``.
     """

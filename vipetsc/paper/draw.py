@@ -19,7 +19,7 @@ MANY = 2**40  # more than any count
 def draw_paper(
     plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Callable[[str], None], inputs: Mapping[str, str]
 ) -> tuple[Path, ...]:
-    """Draw the figures that are missing or made of other ``inputs``; returns the files written, on all ranks.
+    """Draw the figures that are missing or drawn from other ``inputs``; returns the files written, on all ranks.
 
     The ranks draw pictures from one count, the dearest first; none is begun after a request to stop.
     """
@@ -46,6 +46,7 @@ def draw_paper(
     spent = comm.allreduce(time.process_time() - begin)
     if drawn:
         drawn_anew = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
+        # The cost of pictures from earlier calls counts unless all were drawn again.
         earlier = 0.0 if drawn_anew else record["cpu"]["figures"]
         record["cpu"]["figures"] = spent + earlier
     on_root(comm, lambda: write_record(root, record))
@@ -64,6 +65,7 @@ def _draw_shared(drawings: Sequence[Drawing], root: Path, comm: MPI.Comm, stop: 
     try:
         written = on_every_rank(comm, lambda: draw_each(drawings, root / "figures", FORMATS, turns(), note))
     finally:
+        # Collective, and reached by all ranks: ``on_every_rank`` raises on all of them or on none.
         counter.free()
     return sorted(path for paths in comm.allgather(written) for path in paths)
 
@@ -80,6 +82,7 @@ def _drop_stale(plan: Plan, root: Path, inputs: Mapping[str, str]) -> BuildRecor
     for figure in plan.figures:
         if record["figures"].get(figure.id, {}).get("inputs") != inputs[figure.id]:
             for path in (root / "figures").glob(f"{figure.id}-*"):
+                # Before the record is written: after a kill between the two, the old record still names the old inputs.
                 path.unlink()
             record["figures"][figure.id] = {"inputs": inputs[figure.id], "pictures": []}
     write_record(root, record)

@@ -1,7 +1,7 @@
-"""The whole paper in one folder: steps made, figures drawn, claims measured, the report written.
+"""The whole paper in one folder: steps computed, figures drawn, claims measured, the report written.
 
-What is made from results is made again when the hash of its inputs changed: the steps' resolved cases, the contents of
-their results, the version of the package. ``made.json`` keeps the hashes.
+Figures, claims and report are computed again when the hash of their inputs changed: the steps' resolved cases, the
+contents of their results, the version of the package. ``made.json`` keeps the hashes.
 """
 
 import json
@@ -31,7 +31,7 @@ Announce = Callable[[str], None]
 
 @dataclass(frozen=True)
 class PaperResult:
-    """How the paper ended: ``new_steps`` made now, files ``drawn`` now, the rows of ``claims.json``.
+    """Outcome of a call: ``new_steps`` computed now, files ``drawn`` now, the rows of ``claims.json``.
 
     ``complete``: every step asked for is there, without failures; ``notes`` are warnings, and say what failed and why.
     """
@@ -52,13 +52,14 @@ def make_paper(
     stop: StopRequest | None = None,
     tell: Announce = lambda text: None,
 ) -> PaperResult:
-    """Make what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``.
+    """Compute what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``.
 
     Leaves ``<step>/`` for every step, ``figures/`` (PNG and PDF), ``claims.json`` and ``report.html``. A call that
     was stopped or killed is gone on with by the next one; one with nothing to do takes seconds.
 
-    ``only``, ids of figures and claims, makes only the steps and figures that they need; the claims are measured and
-    the report is written from all that is there. ``tell`` is called on rank 0 with what is about to be done.
+    ``only``, ids of figures and claims, restricts the steps and figures to those that they need; the claims are
+    measured and the report is written from all finished steps. ``tell`` is called on rank 0 with what is about to be
+    done.
 
     Raises FolderError if ``root`` holds the paper on another grid, or something else, or for an unknown id, CaseError
     if a case file cannot be used, StoppedError after a request to stop.
@@ -71,15 +72,16 @@ def make_paper(
 
 
 def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Announce) -> PaperResult:
-    """Make the steps and figures of ``part``, and from all of ``plan`` that is there the claims and the report."""
+    """Compute the steps and figures of ``part``, then the claims and the report from all finished steps of ``plan``."""
     notes: list[str] = []
     new_steps = make_steps(part, root, comm, stop, tell, notes)
     stop.check(comm)
 
-    # What is made from results begins when all of them are there: inputs are hashes of their contents.
+    # Figures and claims begin when all results are there: their inputs are hashes of the results.
     with noted(comm, "backbone", notes):
         on_root(comm, lambda: _relate(plan.folders(root)))
     inputs = on_root(comm, lambda: plan.inputs(root))
+    # Stays empty where drawing fails: ``noted`` reports it and goes on.
     drawn: tuple[Path, ...] = ()
     with noted(comm, "figures", notes):
         drawn = draw_paper(part, root, comm, stop, tell, inputs)
@@ -97,7 +99,7 @@ def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[C
         _ = step.text  # resolves the case, which raises
 
     def difference(text: str) -> str | None:
-        """Why ``plan.json`` with this ``text`` is of another plan; None if it is of this one."""
+        """Reason why ``plan.json`` with this ``text`` is of another plan; None if it is of this one."""
         try:
             grid = json.loads(text)["grid"]
         except (ValueError, KeyError):
@@ -118,7 +120,7 @@ def _relate(folders: Mapping[str, Path]) -> None:
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: str) -> list[dict[str, Any]]:
     """Write ``claims.json`` and ``report.html`` as far as their ``inputs`` changed; returns the claims."""
-    # The record is written last: with a kill before, what it vouches for is made again.
+    # The record is written last: after a kill before that, its files are written again.
     record = read_record(root)
     path = root / "claims.json"
     if read_json(path) is None or record.get("claims") != inputs:
@@ -165,7 +167,7 @@ def _pictures(plan: Plan, root: Path, record: BuildRecord) -> list[tuple[PaperFi
 
 
 def plan_table(plan: Plan, root: Path, ranks: int) -> str:
-    """What is done and what is left of ``plan`` in ``root``: steps with the time they need, figures, claims."""
+    """Table of what is done and left of ``plan`` in ``root``: steps with the time they need, figures, claims."""
     lines = [f"{'step':<26}{'state':<10}{'left':>9}  claims"]
     total = 0.0
     for step in plan.steps:
@@ -186,7 +188,7 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
 
 
 def _figure_state(root: Path, figure: PaperFigure, entry: BuildRecord | None, inputs: str) -> tuple[int, str]:
-    """How many pictures of a ``figure`` are there, and whether they are those of its ``inputs``.
+    """Number of existing pictures of a ``figure``, and whether they are those of its ``inputs``.
 
     ``entry`` is what is recorded of it, None if nothing is.
     """

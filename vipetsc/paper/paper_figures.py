@@ -73,12 +73,14 @@ class PaperFigure:
         for part in self.parts:
             if part.schematic:
                 for reading in READINGS:
+                    # Bound now: the picture is drawn after this loop has gone on to the next reading.
                     schematic = partial(SCHEMATICS[part.schematic], reading, *part.arguments)
                     yield Picture(f"{self.id}-{part.stem}-{reading}", schematic, part.cost)
 
             finished = [folders[step] for step in part.steps if step in folders]
             if finished:
                 for stem, make in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
+                    # Between dashes, so that no part of a longer word matches.
                     if all(f"-{word}-" in f"{stem}-" for word in part.only):
                         yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", make, part.cost)
 

@@ -1,4 +1,4 @@
-"""The plan of the verb ``paper``, in full or on coarse grids: steps, each of which makes a case file in its own folder.
+"""The plan of the verb ``paper``, in full or on coarse grids: steps, each of which computes one case in its folder.
 
 A step knows how far it has come, and the plan what figures and claims are made from.
 """
@@ -40,10 +40,10 @@ from vipetsc.studies.sweep import run_sweep
 FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"  # the note on every picture of the quick grid
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
-SEED = 2024  # of the members that are made by the other engine as well
+SEED = 2024  # of the members that the other engine simulates as well
 TS_COST = 2.5  # s of CPU time of one of them
 IN_PHASE = 10  # times as long as the other branch takes the one that goes through all tongues
-RELATION = "backbone.h5"  # beside a sweep that is laid over branches
+RELATION = "backbone.h5"  # in the folder of a sweep that is laid over branches
 
 # Steps that a claim is measured from besides those whose results its figures show.
 FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
@@ -58,7 +58,7 @@ KINDS: dict[str, type[StepCase]] = {
 
 
 class PartMaker(NamedTuple):
-    """How one rank makes a part of a step, and how on all ranks all parts take the place of earlier ones."""
+    """Functions by which one rank computes a part of a step, and all ranks replace earlier parts by the new ones."""
 
     make: Callable[[int], object]
     publish: Callable[[], None] = lambda: None
@@ -66,11 +66,11 @@ class PartMaker(NamedTuple):
 
 @dataclass(frozen=True)
 class PaperStep:
-    """One case made in ``root/<name>``: a sweep, branches or a search.
+    """Step of the paper, a case in ``root/<name>``: a sweep, branches or a search.
 
     ``kind`` of case and its ``file``, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time
     in s of a part (of a member, for sweeps) on a core of the 2020s, used until rates are measured. With ``checks``,
-    the name of another step, it makes ``sample`` of that sweep's members by the engine ``ts``.
+    the name of another step, it simulates ``sample`` of that sweep's members by the engine ``ts``.
     """
 
     name: str
@@ -99,7 +99,7 @@ class PaperStep:
         return self.case.to_toml()
 
     def results(self, root: Path) -> list[Path]:
-        """The files that pictures and claims are made from."""
+        """Files from which pictures are drawn and claims measured."""
         if isinstance(self.case, NnmCase):
             system = System.from_case(self.case)
             names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
@@ -113,7 +113,7 @@ class PaperStep:
 
     @property
     def parts(self) -> dict[int, float]:
-        """What single ranks make, by number with CPU times in s: branches by mode, the search; else nothing."""
+        """Parts that single ranks compute, by number with CPU times in s: branches by mode, the search; else none."""
         if isinstance(self.case, NnmCase):
             return {mode: self.cost * (IN_PHASE if mode == 1 else 1) for mode in self.case.nnm.modes}
         if isinstance(self.case, DesignCase):
@@ -122,7 +122,7 @@ class PaperStep:
 
     @contextmanager
     def claimed(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> Iterator[PartMaker]:
-        """Claim the folder of a step of parts on all ranks, to make what is missing, everything if ``afresh``."""
+        """Claim the folder of a step of parts on all ranks, to compute what is missing, everything if ``afresh``."""
         case = self.case
         folder = self.folder(root)
         if isinstance(case, NnmCase):
@@ -134,9 +134,9 @@ class PaperStep:
             yield PartMaker(lambda part: search_design(case, folder, MPI.COMM_SELF, force=afresh))
 
     def sweep(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
-        """Make what is missing of a sweep or prediction on all ranks, all if ``afresh``; may leave early on ``stop``.
+        """Compute what is missing of a sweep or prediction on all ranks, all if ``afresh``; a ``stop`` ends it early.
 
-        Returns warnings about what was made.
+        Returns warnings about the results.
         """
         if isinstance(self.case, PredictCase):
             predict(self.case, self.folder(root), comm, force=afresh, stop=stop)
@@ -145,12 +145,12 @@ class PaperStep:
         return run_sweep(self.case, self.folder(root), comm, force=afresh, stop=stop, progress=True).warnings
 
     def state(self, root: Path) -> str:
-        """How far the step has come: DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
+        """State of the step: DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
         folder = self.folder(root)
         if not (folder / "case.toml").exists():
             return MISSING
         if not self._is_case_of(folder):
-            # Results of this case may be on their way to replace those of the other.
+            # Results of this case may be under computation, to replace those of the other.
             return BEGUN if self._is_case_of(folder / NEW) else STALE
         if outdated(folder):
             return STALE
@@ -180,7 +180,7 @@ class PaperStep:
         return fingerprint(self.text, *(path.read_bytes() for path in paths if path.exists()))
 
     def left(self, root: Path) -> float:
-        """CPU time in s that is still needed; of a sweep, for the members not made, at the mean of those that were."""
+        """CPU time in s that is still needed; of a sweep, for its missing members, at the mean of the finished ones."""
         state = self.state(root)
         if state == DONE:
             return 0.0
@@ -196,7 +196,7 @@ class PaperStep:
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
 
     def failures(self, root: Path) -> int:
-        """How many members or branches of a step that is done failed."""
+        """Number of members or branches that failed, of a step that is done."""
         if isinstance(self.case, NnmCase):
             return int(_branch_statistics(self.results(root))["failed"])
         if isinstance(self.case, Sweep):
@@ -218,7 +218,7 @@ class PaperStep:
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps in the order in which they are made, and the figures of the paper.
+    """Steps in the order of their computation, and the figures of the paper.
 
     ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``measure`` gives the rows of ``claims.json`` from
     the folder of all steps.
@@ -287,6 +287,7 @@ def paper_plan(grid: str = FULL) -> Plan:
         file = Path(str(folder / "cases" / f"{row.get('case', name)}.toml"))
         changes = [*row.get("changes", ())]
         if grid == QUICK:
+            # Later changes win: the quick grid overrides those of the full one.
             changes += row.get("quick", ())
         if row["kind"] == "sweep":  # the figures of the paper are drawn from all sweeps together
             changes.insert(0, "output.figures=false")
@@ -338,7 +339,7 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds; None if it is not there or was cut off."""
+    """Content of a JSON file; None if it is not there or was cut off."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -346,6 +347,7 @@ def read_json(path: Path) -> Any:
 
 
 def fingerprint(*parts: str | bytes) -> str:
-    """One hash of all ``parts``, in this order."""
+    """Hash of all ``parts`` together, in this order."""
+    # Digests have one length, so that no text can move from one part to the next unseen.
     digests = [hashlib.sha256(part.encode() if isinstance(part, str) else part).hexdigest() for part in parts]
     return hashlib.sha256(" ".join(digests).encode()).hexdigest()

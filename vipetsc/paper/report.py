@@ -30,7 +30,7 @@ VERDICTS = (HOLDS, IN_PART, FAILS, UNMEASURED)
 
 
 class ReportContents(NamedTuple):
-    """What the page shows: the rows of ``claims.json``, the pictures (PNG) of every figure, numbers and versions.
+    """Contents of the page: the rows of ``claims.json``, the pictures (PNG) of every figure, numbers and versions.
 
     ``note`` is not empty for coarse grids; ``statistics`` are about the steps by name; ``cpu`` is the time in s of
     "steps" by name, "figures" and "claims".
@@ -50,6 +50,7 @@ def write_report(path: Path, contents: ReportContents) -> None:
     encoded: dict[str, str] = {}
     if path.exists():
         encoded = dict(ENCODED.findall(path.read_text(encoding="utf-8")))
+    # StrictUndefined: a misspelt name in the template raises instead of printing nothing.
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.loader = PackageLoader("vipetsc.paper", ".")
     environment.filters |= {
@@ -85,7 +86,7 @@ def write_report(path: Path, contents: ReportContents) -> None:
 
 
 def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str, str]:
-    """Width and height in pixels, a hash of the file, the data URI, ``encoded`` or made now, and its axes, packed."""
+    """Width and height in pixels, a hash of the file, the data URI, ``encoded`` before or now, and its axes, packed."""
     data = path.read_bytes()
     key = hashlib.sha256(data).hexdigest()
     with Image.open(io.BytesIO(data)) as image:
@@ -136,4 +137,5 @@ def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
 
 def by_reading(claims: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Mapping[str, Any]]]:
     """The rows of ``claims.json`` by id and reading."""
+    # ``groupby`` joins neighbours only: the rows of one claim follow each other in ``claims.json``.
     return {key: {row["reading"]: row for row in rows} for key, rows in groupby(claims, itemgetter("id"))}

@@ -1,4 +1,4 @@
-"""Making the steps of the paper that are missing: first the parts that single ranks make, then the sweeps."""
+"""Computation of the missing steps of the paper: first the parts of single ranks, then the sweeps."""
 
 import sys
 import time
@@ -24,6 +24,7 @@ def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
     except StoppedError:
         raise
     except Exception as error:
+        # A rank that failed alone left the others in a collective, where they would wait for ever.
         alone = comm.size > 1 and not getattr(error, "from_root", False)
         if alone or getattr(error, "errno", None) in DISK_FULL:
             raise
@@ -33,9 +34,9 @@ def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
 def make_steps(
     plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Callable[[str], None], notes: list[str]
 ) -> tuple[str, ...]:
-    """Make the steps that are not done or had failures, until a request to stop; returns their names.
+    """Compute the steps that are not done or had failures, until a request to stop; returns their names.
 
-    First the parts that single ranks make, of all steps together, then the sweeps one by one.
+    The parts of single ranks come first, of all steps together, then the sweeps one by one.
     """
     left = on_root(comm, lambda: plan.left(root))
     stale = on_root(comm, lambda: {step.name for step in plan.steps if step.state(root) == STALE})
@@ -70,7 +71,7 @@ def make_steps(
 
 
 class PartJob(NamedTuple):
-    """A part of a step, by number, that one rank makes; jobs are sorted by their ``cost`` in s."""
+    """A part of a step, by number, that one rank computes; jobs are sorted by their ``cost`` in s."""
 
     cost: float
     step: str
@@ -80,7 +81,7 @@ class PartJob(NamedTuple):
 def _make_parts(
     steps: Sequence[PaperStep], stale: Collection[str], root: Path, comm: MPI.Comm, stop: StopRequest, notes: list[str]
 ) -> list[str]:
-    """Make all parts of ``steps`` on single ranks, the longest first; returns the steps without failures."""
+    """Compute all parts of ``steps`` on single ranks, the longest first; returns the steps without failures."""
     cpu: dict[str, float] = {}
     reasons: dict[str, str] = {}
     with ExitStack() as claims:
@@ -108,6 +109,7 @@ def _make_parts(
         notes += [f"failed: {name}: {reason}" for name, reason in failed.items()]
 
         finished = [name for name in makers if name not in failed]
+        # ``stopped`` is the same on all ranks, so that all reach the agreement or none does.
         if not (pool.stopped or stop.agreed(comm)):
             for name in finished:
                 makers[name].publish()
@@ -116,7 +118,7 @@ def _make_parts(
 
 
 def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: bool) -> None:
-    """Add the CPU time in s that each rank spent on ``steps`` to the record; of steps made ``afresh`` only this."""
+    """Add the CPU time in s that each rank spent on ``steps`` to the record; of steps computed ``afresh`` only this."""
     spent = Counter[str]()
     for from_rank in comm.allgather(steps):
         spent.update(from_rank)

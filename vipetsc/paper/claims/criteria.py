@@ -12,7 +12,7 @@ from math import inf, isfinite
 from typing import Any, SupportsFloat
 
 HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
-ROUNDING = 1e-9  # of a measured number beside its threshold
+ROUNDING = 1e-9  # by which a measured number may miss its threshold
 LAWS = ("hertz", "bilinear")
 
 # Constants of quantities: what is counted or measured, rather than what decides.
@@ -129,6 +129,7 @@ def _criteria(rows: Sequence[Sequence[Any]]) -> tuple[Criterion, ...]:
                 Criterion(
                     quantity=quantity.replace("*", f", {law}"),
                     comparison=comparison,
+                    # TOML has no tuples, and a frozen criterion shall not hold a list.
                     threshold=tuple(threshold) if isinstance(threshold, list) else threshold,
                     unit=unit,
                     source=source,

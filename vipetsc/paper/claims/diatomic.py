@@ -98,11 +98,13 @@ def linear_content(evidence: Evidence, reading: str, result: Measurement) -> Non
     model = triple.low.case.model()
     time, content = triple.low.arrays("time", "wavenumber_content")
     fastest = max_group_velocity(model.chain.cell, OPTICAL)[2]
+    # The whole packet is in the lattice, and nothing of it has met the far end.
     free = (time >= triple.duration) & (time <= model.chain.cells / fastest)
     if free.sum() < 2:
         raise MissingEvidence("the packet reaches the far end before the drive ends, or the record is too short")
 
     distribution = content[free] / content[free].sum(axis=1, keepdims=True)
+    # Half, since energy that leaves one bin is counted again where it arrives.
     moved = 0.5 * np.abs(distribution - distribution[0]).sum(axis=1)
     result.value["contact episodes at low amplitude"] = triple.low.episodes
     result.value["largest share of the energy that changes its wavenumber"] = moved.max()
@@ -157,7 +159,7 @@ def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _reflected_fraction(triple: AmplitudeTriple, run: AnalysedMember) -> Fraction:
-    """Kinetic energy before the first site over the incident, when the reflected packet is half-way back to the drive.
+    """Kinetic energy before the first site over the incident, when the reflected packet is halfway back to the drive.
 
     The mean and the deviation are over half a burst's length about that time: the incident packet has passed then, and
     the reflected one does not stand against the end yet. What is incident is the energy of the linear run, scaled by
@@ -175,6 +177,7 @@ def _reflected_fraction(triple: AmplitudeTriple, run: AnalysedMember) -> Fractio
 def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C5: part of the packet in its own wavenumber bins before it meets a site (Fig. 4)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "partition")
+    # At the largest speed in the band, so that no part of the packet has met the site.
     arrival = triple.distance / max_group_velocity(triple.low.case.lattice.unit_cell(), OPTICAL)[2]
     first = NATIVE[0] - 1
     last = NATIVE[-1]

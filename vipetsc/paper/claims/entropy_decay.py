@@ -34,6 +34,7 @@ class EntropyDecay(AmplitudeCurve):
 
         self.points = int(np.nan_to_num(fitted("points")))
         self.r2 = fitted("r2_log_log")
+        # ``fmax`` takes the number where the other fit gave NaN.
         self.best = float(np.fmax(self.r2, fitted("r2_nonlinear")))
         self.exponent = fitted("exponent")
         self.half_width = (fitted("exponent_high") - fitted("exponent_low")) / 2
@@ -66,6 +67,7 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     abrupt = np.mean([c.growth_ratio(QUIET, 0.5) <= ABRUPT for c in spread])
     in_place = np.mean([PEAK[0] <= c.peak_amplitude <= PEAK[1] for c in spread])
     several = [c for c in spread if c.sites >= SEVERAL]
+    # Where the peak lies above, the value belongs to the rise and not to the decay.
     behind = [c.interpolate(HIGH) if c.peak_amplitude < HIGH else np.nan for c in several]
     highest = np.max(behind) if behind else None
     result.value |= {
@@ -77,6 +79,7 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     _list_fits(result, spread, "spread", "spread")
     try:
         _list_fits(result, decays(evidence, NEIGHBOURS, reading, "masked"), "neighbouring", "neighbours, masked")
+    # The numbers of the spread sites stand without this sweep.
     except (MissingEvidence, OSError, ValueError) as missing:
         result.reasons.append(str(missing).replace(f"{evidence.root}/", ""))
 

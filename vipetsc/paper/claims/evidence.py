@@ -21,7 +21,7 @@ Numbers = dict[str, SupportsFloat | None]
 
 
 class MissingEvidence(Exception):
-    """What a claim is measured from is not there; the message says what."""
+    """Missing results from which a claim is measured; the message names them."""
 
 
 @dataclass
@@ -65,7 +65,7 @@ class AnalysedMember:
 class AmplitudeCurve:
     """The measure ``name`` of ``Evidence.select`` over rising ``amplitude`` (point) in N, without failed members.
 
-    ``untouched`` (point) tells where there is no contact, ``peak`` is the index of the largest value. Raises
+    ``untouched`` (point) is true where there is no contact, ``peak`` is the index of the largest value. Raises
     MissingEvidence.
     """
 
@@ -138,6 +138,7 @@ class Evidence(ExitStack):
         """
         ensemble = self.ensemble(step)
         wanted = {"reading": reading} | wanted
+        # A case that does not name its reading has the default one.
         only = tomllib.loads(ensemble.attrs["case"]).get("lattice", {}).get("reading", "calibrated")
         swept = "reading" in ensemble.coords
         if not swept and only != reading:

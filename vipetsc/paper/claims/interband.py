@@ -114,7 +114,7 @@ def _floor(curve: AmplitudeCurve) -> float:
 
 
 def _add_scatter(evidence: Evidence, reading: str, law: str, sites: int, result: Measurement) -> None:
-    """Add mean and deviation near the maximum with clearances that scatter, if these were made; no criterion."""
+    """Add mean and deviation near the maximum with clearances that scatter, if that sweep exists; no criterion."""
     with suppress(MissingEvidence, KeyError):
         ensemble = evidence.ensemble(SCATTER)
         member = select(ensemble, reading=reading, law=law, sites=sites)
@@ -179,7 +179,7 @@ def modal_error(run: AnalysedMember) -> float:
 
 
 def split_errors(run: AnalysedMember) -> dict[str, float]:
-    """How the parts of one run (energies over time, by frequency filters) miss what they should add up to.
+    """Errors of the sums of one run's parts, which are energies over time by frequency filters.
 
     The means over the record agree for any complete split without overlap (Parseval). Over a period of the drive they
     agree where no motion straddles an edge; judged in the inner part of the record, a burst away from its ends, where

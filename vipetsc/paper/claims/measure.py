@@ -18,7 +18,7 @@ def measure_claims(root: str | Path) -> list[dict[str, Any]]:
     """C1-C17 in both readings and C18 in one, from the steps in ``root`` (scattering/, interband/, nnm-hertz/, ...).
 
     A row of ``claims.json`` is a claim in one ``reading`` of the paper's parameters. ``value`` holds named numbers,
-    None where one could not be had, the deciding ones among them under the names that stand in ``threshold``;
+    None where one could not be had, the deciding ones among them under their names in ``threshold``;
     ``uncertainty`` intervals, spreads and numbers of points by name. ``figure`` is the stem of the picture that shows
     the claim, ``files`` are what it was measured from, relative to ``root``. What cannot be measured because its files
     are missing has the verdict "not measured", and ``reason`` says what is missing.
@@ -31,7 +31,7 @@ def measure_claims(root: str | Path) -> list[dict[str, Any]]:
 
 
 def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any]:
-    """One claim, by its id, in one reading."""
+    """Row of ``claims.json`` for a claim, by its id, in one reading."""
     spec = CLAIMS[claim]
     measure = resolve_name(f"vipetsc.paper.claims.{spec.measure}")
     result = Measurement()
@@ -79,4 +79,5 @@ def rounded(numbers: Numbers) -> dict[str, float | None]:
 
 def write_claims(claims: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write ``claims`` as a list of JSON objects, whole or not at all; the same claims give the same bytes."""
+    # JSON has no NaN: ``rounded`` has replaced it by null.
     write_text(path, json.dumps(claims, indent=1, ensure_ascii=False, allow_nan=False) + "\n")

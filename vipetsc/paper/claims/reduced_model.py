@@ -190,6 +190,7 @@ def pair_motion(evidence: Evidence, run: AnalysedMember) -> tuple[np.ndarray, np
     energy = spectrum @ np.asarray(cell.masses)[pair]
     frequency = 2 * np.pi * np.fft.rfftfreq(len(velocity), interval)
     waves = waves_at(cell, model.drive.frequency)
+    # In a gap there is no driven band, so that the frequency itself divides.
     edge = model.drive.frequency
     if waves:
         edge = pass_bands(cell)[waves[0][0] - 1].high
