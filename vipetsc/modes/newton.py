@@ -17,7 +17,7 @@ class Equations(Protocol):
     """n equations in the n + 1 unknowns xi."""
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """What should vanish (n,)."""
+        """The residual (n,), which vanishes at a solution."""
 
 
 class DenseEquations(Equations, Protocol):
@@ -34,8 +34,8 @@ class BorderedNewton(ABC, Generic[E]):
     """Solves residual(xi) = 0 (size - 1,) and row . xi = value; a subclass chooses matrices and vectors.
 
     It ends at a residual of ``tolerance``, after a step below ``STEP_TOLERANCE``, where rounding allows no more, or
-    after ``max_newton`` steps. Options of PETSc have the prefix ``nnm_``. What the equations raise passes, but
-    FlowError, which makes the attempt one that has not converged.
+    after ``max_newton`` steps. Options of PETSc have the prefix ``nnm_``. An exception of the equations passes through,
+    except FlowError: the attempt has then not converged.
     """
 
     def __init__(self, size: int, max_newton: int = 7) -> None:
@@ -45,6 +45,7 @@ class BorderedNewton(ABC, Generic[E]):
         snes.setFunction(self._evaluate, self._xi.duplicate())
         snes.setJacobian(self._differentiate, jacobian)
         snes.setTolerances(max_it=max_newton)
+        # PETSc's own test would also accept a residual that has fallen by 1e-8, whatever the tolerance of the problem.
         snes.setConvergenceTest(self._test)
         self._configure(snes.getKSP())
 
@@ -54,7 +55,7 @@ class BorderedNewton(ABC, Generic[E]):
             options["snes_linesearch_type"] = "basic"
         snes.setFromOptions()
 
-        # What a solution is asked of, from one call of ``solve`` to its end.
+        # Data of one call of ``solve``: PETSc passes vectors and matrices alone to the callbacks.
         self._equations: E
         self._row: tuple[np.ndarray, float]
         self._tolerance = 0.0
@@ -70,9 +71,11 @@ class BorderedNewton(ABC, Generic[E]):
         try:
             self._snes.solve(None, self._xi)
         except FlowError as error:
+            # Raised on all ranks that solve together, so that all leave the collective solve here.
             return Attempt(False, str(error), self._history, guess, left_domain=True)
 
         reason = self._snes.getConvergedReason()
+        # On one rank the array is a view of the vector, which the next call overwrites.
         xi = self._whole(self._xi).copy()
         return Attempt(reason > 0, _REASONS.get(reason, str(reason)), self._history, xi)
 
@@ -82,19 +85,19 @@ class BorderedNewton(ABC, Generic[E]):
 
     @abstractmethod
     def _configure(self, ksp: PETSc.KSP) -> None:
-        """Choose the linear solver, before the options are looked at."""
+        """Choose the linear solver; options of PETSc, which are read afterwards, may replace it."""
 
     @abstractmethod
     def _local(self, array: np.ndarray) -> np.ndarray:
-        """What of an ``array`` (size,) belongs into this rank's part of a vector."""
+        """The part of an ``array`` (size,) that this rank's part of a vector holds."""
 
     @abstractmethod
     def _whole(self, vector: PETSc.Vec) -> np.ndarray:
-        """All of a vector."""
+        """All entries of a vector, on every rank."""
 
     @abstractmethod
     def _differentiate(self, snes: PETSc.SNES, x: PETSc.Vec, matrix: PETSc.Mat, _: PETSc.Mat) -> None:
-        """Make ``matrix`` the bordered derivative at ``x``."""
+        """Set ``matrix`` to the bordered derivative at ``x``."""
 
     def _evaluate(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         xi = self._whole(x)
@@ -109,8 +112,10 @@ class BorderedNewton(ABC, Generic[E]):
             return reasons.DIVERGED_FNORM_NAN
         if residual <= self._tolerance:
             return reasons.CONVERGED_FNORM_ABS
+        # Before the first step PETSc gives 0 for its norm.
         if iteration and step <= STEP_TOLERANCE:
             return reasons.CONVERGED_SNORM_RELATIVE
+        # The floor is for a guess that is almost exact, whose residual the first step may multiply by more than 1e3.
         if residual > 1e3 * max(self._history[0], 1e-3):
             return reasons.DIVERGED_DTOL
         return reasons.ITERATING
@@ -120,6 +125,7 @@ class DenseNewton(BorderedNewton[DenseEquations]):
     """Newton's method with a dense matrix, on one rank."""
 
     def _allocate(self, size: int) -> tuple[PETSc.Vec, PETSc.Mat]:
+        # A branch is followed by one rank alone while the others follow theirs: nothing here may be collective.
         dense = PETSc.Mat().createDense((size, size), comm=PETSc.COMM_SELF)
         dense.setUp()
         return PETSc.Vec().createSeq(size, comm=PETSc.COMM_SELF), dense
@@ -140,6 +146,7 @@ class DenseNewton(BorderedNewton[DenseEquations]):
         matrix.assemble()
 
 
+# petsc4py names the reasons as attributes of a class; messages need the name of a number.
 _REASONS = {
     value: name.lower().replace("_", " ")
     for name, value in vars(PETSc.SNES.ConvergedReason).items()

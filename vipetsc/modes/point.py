@@ -1,4 +1,4 @@
-"""One periodic orbit of a branch of nonlinear normal modes, and what its file holds of it."""
+"""One periodic orbit of a branch of nonlinear normal modes, and its quantities in the branch's file."""
 
 from dataclasses import dataclass, field
 
@@ -24,15 +24,16 @@ QUANTITIES: dict[str, tuple[str, type, str, str]] = {
 }
 
 
+# Points compare by identity: the arrays in them have no single truth value that a generated == could return.
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Point(Solution):
     """A periodic orbit on a branch.
 
     ``x`` are initial displacements (n,) in m (velocities in m/s for maps from the centre), or the unknowns of harmonic
-    balance in m; ``tangent`` is d(x, period). ``half_traces`` (n - 1,) are known of orbits shot with dense matrices,
-    ``multipliers`` (number, 2) are the largest of a lattice's and their residuals. Harmonic balance gives the ``order``
-    of the highest harmonic, the estimated ``truncation``, and ``elongations`` (places,) in m at phase 0. The others are
-    ``QUANTITIES``.
+    balance in m; ``tangent`` is d(x, period). Only orbits shot with dense matrices have ``half_traces`` (n - 1,);
+    ``multipliers`` (number, 2) are the largest ones of a lattice's orbit and their residuals. Harmonic balance gives
+    the ``order`` of the highest harmonic, the estimated ``truncation``, and ``elongations`` (places,) in m at phase 0.
+    ``QUANTITIES`` describes the other fields.
     """
 
     x: np.ndarray
@@ -63,5 +64,5 @@ class Point(Solution):
         return 1 / self.period
 
     def describe(self) -> str:
-        """Which point it is, for messages."""
+        """The point's number and energy, for messages."""
         return f"point {self.index} (E = {self.energy:.9g} J)"

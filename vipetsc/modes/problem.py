@@ -1,8 +1,8 @@
-"""What continuation asks of a method: equations with one unknown more than there are equations, and their solutions.
+"""Interface between continuation and a method: n equations in n + 1 unknowns, and their solutions.
 
-A ``Problem`` is a system together with a method (shooting, harmonic balance) whose solutions form branches. Around a
+A ``Problem`` is a system together with a method (shooting, harmonic balance) whose solutions form branches. At a
 point of a branch it gives a ``Frame``: unknowns xi of order one, in which a step is taken and corrected. Continuation,
-the location of special points and the files of branches know no more of a method than this.
+the location of special points and the files of branches use nothing else of a method.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ class ContinuationError(RuntimeError):
 
 
 class StartError(ValueError):
-    """There is no periodic orbit to begin a branch with; all ranks that seek one together find that out together."""
+    """There is no periodic orbit to begin a branch with; raised on all ranks that search for one together."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,15 +40,15 @@ class Solution:
     kind: str
 
     def describe(self) -> str:
-        """Which point it is, for messages."""
+        """The point's number, for messages."""
         return f"point {self.index}"
 
 
 @dataclass(eq=False)
 class Attempt:
-    """What Newton's method did: ``history`` of residual norms, ``reason`` why it stopped, last ``xi``.
+    """Outcome of Newton's method: ``history`` of residual norms, ``reason`` why it stopped, last ``xi``.
 
-    It ``left_domain`` where the equations could not be evaluated; ``xi`` is then the guess.
+    ``left_domain`` says that the equations could not be evaluated; ``xi`` is then the guess.
     """
 
     converged: bool
@@ -70,9 +70,9 @@ S = TypeVar("S", bound=Solution)
 class SpecialKind(Generic[S]):
     """A kind of special point: where ``test`` changes sign, by more than a ``floor`` on both sides.
 
-    ``seek`` (frame, guess, left, right) gives the point's unknowns, where equations for them are known, and raises
-    ArithmeticError where they have no solution; else the sign change is bracketed. ``finish`` (point, left, right) adds
-    what only such points are asked for.
+    ``seek`` (frame, guess, left, right) solves equations for the point's unknowns and raises ArithmeticError where they
+    have no solution; for a kind without such equations the sign change is bracketed. ``finish`` (point, left, right)
+    adds the quantities that only such points have.
     """
 
     name: str
@@ -83,7 +83,7 @@ class SpecialKind(Generic[S]):
 
 
 class Frame(Protocol[S]):
-    """Unknowns ``xi`` (n + 1,) of order one around a point of a branch, and the unit ``tangent`` there."""
+    """Unknowns ``xi`` (n + 1,) of order one at and near a point of a branch, and the unit ``tangent`` there."""
 
     xi: np.ndarray
     tangent: np.ndarray
@@ -116,7 +116,7 @@ class Problem(Protocol[S]):
     guards: frozenset[str]
 
     def frame(self, point: S, chart: str = "auto") -> Frame[S]:
-        """The unknowns around ``point``, which has a tangent, in the ``chart`` of that name where there is a choice."""
+        """The frame at ``point``, which has a tangent, in the ``chart`` of that name where there is a choice."""
 
     def first_tangent(self, start: S, direction: int) -> np.ndarray:
         """Tangent at the first point, along which the energy (or parameter) grows (``direction`` 1) or falls (-1).
@@ -128,9 +128,9 @@ class Problem(Protocol[S]):
         """Angle in rad between the tangents of two points in relative units; 0 without a tangent."""
 
     def special_kinds(self, left: S, right: S) -> Iterator[SpecialKind[S]]:
-        """What can happen on a branch between two points."""
+        """Kinds of special points that may lie between two neighbouring points of a branch."""
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """The vector over its length."""
+    """The vector divided by its length."""
     return vector / np.linalg.norm(vector)

@@ -30,8 +30,8 @@ class ContactPair:
 class SmoothSpring(NamedTuple):
     """A nonlinear spring between two masses (0-based), of elongation z = u_end - u_start; ``start`` None is the ground.
 
-    Its ``law`` is that of a spring of a cell, whose own ``start`` and ``end`` do not count here. The part k z belongs
-    into the stiffness matrix.
+    The ``law`` is a spring of a cell, whose own ``start`` and ``end`` have no meaning here. The part k z belongs into
+    the stiffness matrix.
     """
 
     start: int | None
@@ -121,6 +121,7 @@ class System:
             ContactPair(site * cell.dofs + cell.host, site * cell.dofs + cell.resonator, clearance, law)
             for site, clearance in zip(chain.sites, chain.clearances, strict=True)
         )
+        # Shooting with matrices needs a dense one; of the 40,000 masses of a whole lattice it would take 13 GB.
         stiffness = chain.stiffness_matrix()
         return cls(
             masses=chain.masses(),
@@ -133,8 +134,8 @@ class System:
     def reduced(cls, cell: UnitCell, clearance: float, law: Contact) -> Self:
         """The paper's 2-DoF model of a cell's contact pair (Sec. IV); masses are (host, resonator).
 
-        Each of the host's springs to other masses is shared between its two masses: held at its middle it
-        has twice its stiffness, and the paper takes half of the total. The resonator's likewise.
+        Each of the host's springs to other masses is divided between its two masses: held at its middle it has twice
+        its stiffness, and the paper takes half of the total. The same holds for the resonator's springs.
         """
         ground = {cell.host: 0.0, cell.resonator: 0.0}
         between = 0.0
@@ -174,6 +175,7 @@ class System:
 
     def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) without contact."""
+        # Only dense solvers give all modes.
         stiffness = self.stiffness if isinstance(self.stiffness, np.ndarray) else self.stiffness.toarray()
         squared, shapes = eigh(stiffness, np.diag(self.masses))
         # eigh leaves the signs open: the largest displacement of each mode is positive.
@@ -240,6 +242,7 @@ def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray
 
 def _is_symmetric(matrix: np.ndarray) -> bool:
     """Whether a dense or sparse matrix equals its transpose, to rounding."""
+    # ``allclose`` takes no sparse matrices.
     if issparse(matrix):
         return bool(abs(matrix - matrix.T).max() <= 1e-12 * abs(matrix).max())
     return np.allclose(matrix, matrix.T, rtol=1e-12)
@@ -253,6 +256,7 @@ def _nonlinear_springs(chain: Chain) -> Iterator[SmoothSpring]:
             continue
         for cell in range(chain.cells - spring.next_cell):
             yield SmoothSpring(cell * d + spring.start, (cell + spring.next_cell) * d + spring.end, spring)
+        # A spring within a cell is complete; one to the next cell still lacks its place at the lattice's ends.
         if not spring.next_cell:
             continue
         last = (chain.cells - 1) * d + spring.start

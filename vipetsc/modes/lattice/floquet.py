@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 
 class Monodromy:
-    """The map of variations over an ``arc``, times ``sign``, in scaled blocks; as a matrix, ``POWER`` times that."""
+    """The map of variations over an ``arc``, times ``sign``, in scaled blocks; as a PETSc matrix, its ``POWER``."""
 
     def __init__(self, arc: LatticeArc, scale: np.ndarray, sign: int) -> None:
         self.arc = arc
@@ -69,7 +69,7 @@ def with_multipliers(
 ) -> Point:
     """The ``point``, at rest at the displacement ``u`` (n,), with its ``wanted`` largest multipliers; collective.
 
-    Where SLEPc fails it has none, ``multiplier`` is NaN, and the log says why.
+    If SLEPc fails, the point has no multipliers, ``multiplier`` is NaN, and the log says why.
     """
     count = MULTIPLIERS if wanted is True else int(wanted)
     try:

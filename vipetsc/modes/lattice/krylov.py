@@ -1,7 +1,7 @@
 """Shooting for whole lattices: Newton's method with GMRES, whose products come from the linearised flow.
 
-The equations and maps are those of ``shooting``; initial values and residuals are known to all ranks, the flow and the
-vectors of Krylov's spaces are shared. Without contact the quarter map is cos(Omega T/4) on the modes of the lattice,
+The equations and maps are those of ``shooting``; every rank has all initial values and residuals, the flow and the
+vectors of Krylov's spaces are distributed. Without contact the quarter map is cos(Omega T/4) on the modes of the lattice,
 whose size is bounded from below for a breather between the bands, and contacts change it by a matrix of low rank:
 GMRES needs few products, and no preconditioner (options of PETSc begin with ``nnm_``).
 """
@@ -52,16 +52,16 @@ class Diagonal(Chart):
         return xi[:-1] * self.size, float(xi[-1] * self.period)
 
     def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Changes of (x, period) that ``changes`` (n + 1,) of the unknowns at ``xi`` make."""
+        """Changes of (x, period) that follow from ``changes`` (n + 1,) of the unknowns at ``xi``."""
         return self._scale * changes
 
     def to_unknowns(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Changes of the unknowns at ``xi`` that make the ``changes`` (n + 1,) or (n + 1, m) of (x, period)."""
+        """Changes of the unknowns at ``xi`` from which the ``changes`` (n + 1,) or (n + 1, m) of (x, period) follow."""
         return (changes.T / self._scale).T
 
 
 class KrylovEquations(Equations, Protocol):
-    """Equations whose derivative is known by its products with vectors."""
+    """Equations that give the products of their derivative with vectors, and not its matrix."""
 
     def product(self, xi: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The derivative of the residual at ``xi`` times a ``change`` of the unknowns (n,)."""
@@ -121,7 +121,7 @@ class KrylovNewton(BorderedNewton[KrylovEquations]):
 
 
 class LatticeFrame(ShootingFrame[LatticeArc]):
-    """Shooting equations of a lattice around one orbit, with products of their derivative."""
+    """Shooting equations of a lattice at and near one orbit, with products of their derivative."""
 
     problem: "LatticeShooting"
     chart: Diagonal
@@ -157,6 +157,7 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         super().__init__(system, shooting_map, tolerance)
         self.flow = LatticeFlow(chain, system.contacts[0].law, comm)
         layout = self.flow.layout
+        # The last part ends with the period, the one unknown that belongs to no cell.
         cuts = [*(layout.ranges[:, 0] * layout.dofs).tolist(), system.dofs + 1]
         self.newton = KrylovNewton(cuts, comm, max_newton)
 
@@ -172,11 +173,11 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         return self.flow.gather(arc.end)
 
     def stability(self, arc: LatticeArc) -> tuple[np.ndarray, float]:
-        """Nothing is known of an orbit's stability without its matrix (``floquet``)."""
+        """No half-traces, and NaN for the multiplier: they need the matrix of an orbit (``floquet`` does without)."""
         return np.empty(0), np.nan
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> LatticeFrame:
-        """The unknowns around any initial values and period, in the chart of lattices whatever its name."""
+        """The frame at any initial values and period, in the chart of lattices whatever the ``chart``."""
         return LatticeFrame(self, Diagonal(x, period), x, period, tangent)
 
     def relative_chart(self, x: np.ndarray, period: float) -> Diagonal:

@@ -1,10 +1,10 @@
-"""The flow of a lattice with contacts and its linearisation, shared over ranks: no matrix of the lattice's size.
+"""The flow of a lattice with contacts and its linearisation, distributed over ranks, without a matrix of its size.
 
 It is the engine of exact steps, ``dynamics.propagator``, and not Runge-Kutta stepping: between contacts a variation of
 the state moves as the state does, by P(H), and in contact a step is linearised through the few numbers by which a
 cluster of sites feels the lattice (``dynamics.propagator.tangent``). The orbit is integrated once, with its contacts
-located on all ranks from the same numbers; any number of variations then moves beside it without another search,
-in compiled code. Displacements, contacts and variations have the same bits on any number of ranks.
+located on all ranks from the same numbers; any number of variations is then propagated along it without another
+search, in compiled code. Displacements, contacts and variations have the same bits on any number of ranks.
 
 States are blocks (2 dof, owned cell), displacements in m before velocities in m/s, mass by mass as in
 ``dynamics.layout``; ``scatter`` and ``gather`` go from and to the order of ``modes.system``, cell by cell.
@@ -86,6 +86,7 @@ class LatticeFlow:
 
         engine = TangentPropagator(model, self.layout)
         largest = np.abs(start).max(axis=1, initial=0.0) if start.size else np.zeros(len(start))
+        # The same scale on all ranks, or substeps and with them the bits would depend on their number.
         self.comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
         u, v = np.split(largest, 2)
         try:
