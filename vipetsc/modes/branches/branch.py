@@ -12,9 +12,9 @@ from vipetsc.modes.problem import S
 
 @dataclass(eq=False)
 class Branch(Generic[S]):
-    """Points of a branch of one ``kind`` (``io.branch_kinds``); ``next_step`` and ``case`` allow to go on later.
+    """Points of a branch of one ``kind`` (``io.branch_kinds``); with ``next_step`` and ``case`` it can go on later.
 
-    ``dofs`` counts the displacements (or places) that a point has unknowns for. ``findings`` are sentences about the
+    ``dofs`` counts the displacements (or places) for which a point has unknowns. ``findings`` are sentences about the
     branch: jumps, retracing, return to the linear mode; ``about`` are further attributes of its file, ``extra`` further
     variables: orbits, comparisons with other flows.
     """

@@ -1,4 +1,4 @@
-"""A branch seen closer: jumps, retracing and the return to the linear mode; its orbits, by its and by other flows."""
+"""Checks of a branch: jumps, retracing and the return to the linear mode; its orbits, by its own and by other flows."""
 
 import itertools
 from collections.abc import Iterator
@@ -17,11 +17,11 @@ from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.orbit import repetitions, sample_orbit
 from vipetsc.modes.shooting.shooting import Shooting
 
-# Points between two looks whether a branch has passed on to another one.
+# Points between two checks whether a branch has passed on to another one.
 REPETITIONS_EVERY = 50
 # How far a guarded branch may pass a point, over the step to it, and still have met it.
 MET = 0.02
-# Points at most on the way to it, and steps into which the step to it is cut at least.
+# Points at most from the left point to it, and steps into which the step to it is cut at least.
 MOST_POINTS = 400
 FINER = 4
 # A branch without contact whose frequency is within this of a linear mode's has returned to it.
@@ -74,6 +74,7 @@ def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> 
         }
     )
 
+    # A guarded branch that cannot go on has not met the right point: the step is a jump, too.
     last = origin
     with suppress(ContinuationError, FlowError):
         for point in Continuation(problem, left, guarded):
@@ -101,28 +102,29 @@ def jumps(points: list[Point], problem: Shooting, control: NnmTable) -> Iterator
 
 
 def _nearest(place: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each chord is nearest to ``place``, from 0 to 1 along it; the distance there; the chords' lengths."""
+    """Positions (0 to 1) on chords that are nearest to ``place``, the distances there, and the chords' lengths."""
     chords = ends - starts
     squared = np.einsum("ij,ij->i", chords, chords)
+    # Two equal points leave a chord without a length: the floor makes its position 0 and not a NaN.
     position = np.clip(np.einsum("ij,ij->i", place - starts, chords) / np.maximum(squared, 1e-300), 0, 1)
     distance = np.linalg.norm(starts + position[:, None] * chords - place, axis=1)
     return position, distance, np.sqrt(squared)
 
 
 class BranchMonitor:
-    """Tells when a growing branch retraces itself, stands still, returns to a linear mode or passes on to another."""
+    """Finds when a growing branch retraces itself, stands still, returns to a linear mode or passes on to another."""
 
     def __init__(self, problem: Shooting, guards: Guards) -> None:
         self._problem = problem
         self._guards = guards
         self._linear = problem.system.linear_modes()[0] / (2 * np.pi)
-        # Orbits so far: shape, and the logarithms of size and period.
+        # Orbits so far: shape, and the logarithms of size and period, so that distances are relative at any energy.
         self._track = np.empty((0, problem.system.dofs + 2))
         self._touched = False
         self._repeats = False
 
     def check(self, point: Point) -> str | None:
-        """A sentence when the branch does what it should not; None otherwise."""
+        """A sentence on the first check that the branch fails at ``point``; None if it passes all."""
         size = np.abs(point.x).max()
         here = np.array([*(point.x / size), np.log(size), np.log(point.period)])
         track = self._track
@@ -137,7 +139,7 @@ class BranchMonitor:
         return sentence
 
     def _returned(self, point: Point) -> str | None:
-        """Whether the branch is back on a linear mode, after it has touched a contact."""
+        """A sentence if the branch is back on a linear mode after it has touched a contact; else None."""
         if point.episodes > 0:
             self._touched = True
             return None
@@ -147,7 +149,7 @@ class BranchMonitor:
         return f"returned to linear mode {detuning.argmin() + 1} at E = {point.energy:.6g} J (point {point.index})"
 
     def _stands_still(self, point: Point) -> str | None:
-        """Whether the latest points are one."""
+        """A sentence if the latest points are one; else None."""
         places = self._guards.standstill
         if not 0 < places <= len(self._track) - 1:
             return None
@@ -156,7 +158,10 @@ class BranchMonitor:
         return f"does not advance: {places} points up to {point.index} are one, at E = {point.energy:.9g} J"
 
     def _repeats_another(self, point: Point) -> str | None:
-        """Whether orbits are those of another branch, passed several times; once, it may be at the tip of a tongue."""
+        """A sentence if two checks in a row find orbits of another branch, passed several times; else None.
+
+        A single such orbit may lie at the tip of a tongue.
+        """
         if point.index % REPETITIONS_EVERY != 0:
             return None
         times = repetitions(self._problem, point)
@@ -167,7 +172,7 @@ class BranchMonitor:
         )
 
     def _retraces(self, point: Point, track: np.ndarray, here: np.ndarray) -> str | None:
-        """Whether the branch, ``here`` now, lies on its ``track`` of before."""
+        """A sentence if the branch, which is ``here`` now, lies on its earlier ``track``; else None."""
         if len(track) < FEWEST or not self._touched:
             return None
         starts = track[:-LATEST]
@@ -200,7 +205,7 @@ def sampled(problem: Shooting, points: list[Point]) -> Variables:
 
 
 def compare(reference: Shooting, points: list[Point], flow: Flow) -> Variables:
-    """What ``flow`` gives on every fourth of ``points``, as variables of the branch's file; NaN where it fails.
+    """Energy and frequency by ``flow`` at every fourth of ``points``, as variables of the branch's file; else NaN.
 
     The points are corrected keeping the first contact's w (or the largest displacement): at the same energy or
     frequency the comparison would be ill-posed where the branch is vertical or flat. The differences are the flow's

@@ -35,7 +35,7 @@ LAST_REACH = 2048
 
 
 class Condensed(NamedTuple):
-    """A case condensed onto contacts and springs: its motions, and the lattice or else the system that they are of."""
+    """A case condensed onto contacts and springs: its motions, and their lattice or else their system."""
 
     motions: ConservativeMotions
     chain: Chain | None
@@ -66,7 +66,7 @@ class CondensedMethod(NnmMethod):
     """Branches of ``ConservativeMotions``."""
 
     kind = CONDENSED
-    # Their states may begin runs, so that those of a branch that stopped are wanted too.
+    # Runs may begin with the states in the file: a branch that stopped or failed has them, too.
     finishes_failed = True
 
     def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
@@ -106,6 +106,7 @@ class CondensedMethod(NnmMethod):
         if self.chain is not None:
             omega = 2 * np.pi / start.period
             bands = pass_bands(self.chain.cell)
+            # In a band the breather radiates; a gap has no end above the highest band and begins at 0 below the lowest.
             low = max((band.high for band in bands if band.high < omega), default=0.0) / (2 * np.pi)
             high = min((band.low for band in bands if band.low > omega), default=np.inf) / (2 * np.pi)
             bounds = [max(low, options.frequency[0]), min(high, options.frequency[1])]
@@ -150,6 +151,7 @@ def states(motions: ConservativeMotions, points: list[Point]) -> Variables:
 def state_of(motions: ConservativeMotions, point: Point) -> dict[int, np.ndarray]:
     """Displacement (dofs,) in m at phase 0 of every cell (from 0) in which it is not negligible."""
     omega = 2 * np.pi / point.period
+    # A system has no cells: its masses stand in the file as one.
     if isinstance(motions.compliance, DenseCompliance):
         return {0: _system_state(motions, motions.compliance, point)}
     assert isinstance(motions.compliance, SeriesCompliance)
@@ -184,6 +186,7 @@ def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict
         near = _cells_near(chain, reach)
         u = compliance.field(omega, forces, near).real
         size = np.abs(u).max(axis=1)
+        # The cells at the full reach: while one of them moves, cells beyond may, too.
         rim = np.min(np.abs(np.subtract.outer(near, chain.sites)), axis=1) == reach
         if reach >= LAST_REACH or not rim.any() or size[rim].max() <= NEGLIGIBLE * size.max():
             return dict(zip(near.tolist(), u, strict=True))
@@ -193,6 +196,7 @@ def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict
 def _cells_near(chain: Chain, reach: int) -> np.ndarray:
     """Numbers of the cells within ``reach`` cells of a site."""
     near = np.unique(np.add.outer(chain.sites, np.arange(-reach, reach + 1)))
+    # On a ring the cells on both sides of a site may meet, and are then counted once.
     if chain.ends == "periodic":
         return np.unique(near % chain.cells)
     return near[(near >= 0) & (near < chain.cells)]

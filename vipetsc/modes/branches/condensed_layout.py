@@ -33,6 +33,7 @@ class CondensedLayout:
                 tangent[i, :, :width] = p.tangent[:-1].reshape(places, -1)
                 tangent_period[i] = p.tangent[-1]
 
+        # Points of one branch differ in their number of harmonics, but all have odd ones alone or none does.
         odd = all(p.order % 2 and len(p.x) <= p.order // 2 * places + places for p in points)
         orders = np.arange(count) * 2 + 1 if odd else np.arange(count)
         elongations = branch.column("elongations").reshape(len(points), places)
@@ -55,7 +56,7 @@ class CondensedLayout:
         return orbit_attributes(branch)
 
     def table(self, branch: Branch[Point]) -> Table:
-        """A branch as CSV: w1 ... are the elongations in m at phase 0."""
+        """The table of a branch for CSV: w1 ... are the elongations in m at phase 0."""
         names = ["energy", "frequency", "period", *(f"w{i + 1}" for i in range(branch.dofs))]
         names += ["harmonics", "truncation", "multiplier_max", "slope", "contacts", "region", "kind"]
         rows = []
@@ -92,5 +93,5 @@ class CondensedLayout:
         return points
 
     def dofs(self, data: xr.Dataset) -> int:
-        """Places of a motion in a file."""
+        """Number of contacts and smooth springs of the motions in a file."""
         return int(data.sizes["place"])

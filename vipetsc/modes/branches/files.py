@@ -1,4 +1,4 @@
-"""The one format of branch files: what all kinds of branches have in common, and each kind's layout within it."""
+"""The format of branch files: variables and attributes of all kinds of branches, and each kind's layout."""
 
 import json
 import sys
@@ -30,7 +30,7 @@ def write_branch(branch: Branch[Any], folder: Path, about: dict[str, Any]) -> No
 
 
 def to_dataset(branch: Branch[Any]) -> xr.Dataset:
-    """The branch as it is in its file."""
+    """The branch as the dataset of its file."""
     layout = LAYOUTS[branch.kind]
 
     # Codes are stored with their meanings, by which they are read: lists of kinds may grow.
@@ -60,6 +60,7 @@ def to_dataset(branch: Branch[Any]) -> xr.Dataset:
 
 def read_branch(path: Path) -> Branch[Any]:
     """The branch in an HDF5 file, without its ``extra``; raises OSError or ValueError if it holds none."""
+    # Opened twice: what a file must have depends on its kind, and a message about what it lacks should be right.
     with open_netcdf(path, "branch", ("tangent",)) as file:
         kind = branch_kind(file)
     layout = LAYOUTS[kind]
@@ -67,7 +68,7 @@ def read_branch(path: Path) -> Branch[Any]:
         data = file.load()
     about = data.attrs
     points = layout.points(data)
-    # A response's steps stand with its points, which were written before files had one for the branch.
+    # Files of responses have the next step at each point, and none for the branch.
     next_step = about["next_step"] if "next_step" in about else float(data["next_step"].values[-1])
     return Branch(
         name=str(about["name"]),

@@ -1,4 +1,4 @@
-"""Follow the branches of a case: one by one or shared over ranks, saved as they grow, resumed where they ended."""
+"""Follow the branches of a case, one a rank or all ranks together; save them as they grow, resume them at their end."""
 
 import logging
 import sys
@@ -38,9 +38,10 @@ Listener = Callable[[Branch[Any], Any], None]
 def claim_branches(
     case: BranchCase, folder: Path, comm: MPI.Comm, force: bool = False, resume: bool = False
 ) -> AbstractContextManager[Claim]:
-    """Claim ``folder`` for the branches of ``case``, as ``claimed``; to ``resume`` them, their ends may be others."""
+    """Claim ``folder`` for the branches of ``case``, as ``claimed``; a case to ``resume`` may end them elsewhere."""
 
     def difference(earlier: str) -> str | None:
+        # The whole case need not be the same: a branch that has used up its points is resumed with more of them.
         same = type(case).from_toml(earlier).physics() == case.physics()
         return None if same else f"--resume needs {case.kept_by_resume}"
 
@@ -49,7 +50,7 @@ def claim_branches(
 
 
 def method_of(case: BranchCase) -> type[Method[Any]]:
-    """How the branches of a ``case`` are found."""
+    """The method that finds the branches of a ``case``."""
     if isinstance(case, NfrcCase):
         return ResponseMethod
     if case.krylov:
@@ -75,14 +76,17 @@ def follow_all(
     """
     follower = partial(Follower, case, folder, provenance(comm), listener, stop, resume)
     jobs = method_of(case).jobs(case)
+    # Collective calls inside: every rank follows the same branches in the same order.
     if method_of(case).shared:
         together = follower(comm)
         branches = [branch for job in jobs for branch in together.follow(job)]
         return branches if comm.rank == 0 else []
 
+    # Neighbours in the list fall to different ranks; no rank waits for another until all are followed.
     followed: dict[int, list[Branch[Any]]] = {}
     for number in range(comm.rank, len(jobs), comm.size):
         followed[number] = follower(MPI.COMM_SELF).follow(jobs[number])
+    # ``gather`` returns None on the other ranks.
     by_number: dict[int, list[Branch[Any]]] = {}
     for of_rank in comm.gather(followed) or []:
         by_number |= of_rank
@@ -90,7 +94,7 @@ def follow_all(
 
 
 class Follower:
-    """Follows the branches of a case into a folder; ``about`` are attributes of the files, ``comm`` has who follows."""
+    """Follows the branches of a case into a folder, on the ranks ``comm``; ``about`` are attributes of the files."""
 
     def __init__(
         self,
@@ -118,8 +122,9 @@ class Follower:
         branch = self._begun(self.method.name(job))
         if not branch.complete:
             self._save(branch, lambda: self._follow(branch, job))
+        # The part below the start is in the branch's file, which is written first: a kill leaves at least one of them.
         if branch.points:
-            for suffix in ("h5", "csv"):  # of its beginning, which the whole has
+            for suffix in ("h5", "csv"):
                 half = self.folder / f"branch-{branch.name}-down.{suffix}"
                 on_root(self.comm, partial(half.unlink, missing_ok=True))
         return [branch, *self._crossing(branch)]
@@ -132,6 +137,7 @@ class Follower:
             branch.ending = str(stopped)
         except self.method.failures as error:
             branch.ending = f"failed: {error}"
+        # A branch that was stopped before its first point has nothing to say, and is begun when it is resumed.
         if branch.points or (self.method.keeps_empty and not branch.ending.startswith("stopped")):
             self.write(branch)
 
@@ -140,12 +146,13 @@ class Follower:
         on_root(self.comm, lambda: write_branch(branch, self.folder, self.about))
 
     def _follow(self, branch: Branch[Any], job: int) -> None:
-        """The branch itself, and what its file holds beyond its points."""
+        """Compute the points of a branch, and the variables of its file beyond them."""
         method = self.method
         problem = method.problem(job)
         interruptions: tuple[type[Exception], ...] = (StoppedError, *method.failures)
         try:
             start = branch.regular()[-1] if branch.points else method.start(problem, job)
+            # A branch that is resumed has its lower part already, or it would have no points.
             *before, direction = method.directions()
             if before and not branch.points:
                 self._follow_down(branch, problem, start)
@@ -161,7 +168,7 @@ class Follower:
         down = self._begun(f"{branch.name}-down")
         if not down.complete:
             self.grow(down, problem, down.regular()[-1] if down.points else start, self.method.rule, -1)
-        # From the far end towards the start the tangents point the other way.
+        # The part was followed away from the start: in the order of the branch its tangents are reversed.
         for p in reversed(down.points):
             branch.points.append(replace(p, tangent=-p.tangent, energy_tangent=-p.energy_tangent))
         branch.findings += down.findings
@@ -174,7 +181,7 @@ class Follower:
         rule_of: Callable[[Problem[Any], Any, int], StepRule[Any]],
         direction: int = 1,
     ) -> None:
-        """Continue ``branch`` from ``start`` until it ends; its special points are located on the way.
+        """Continue ``branch`` from ``start`` until it ends, and locate its special points.
 
         It is saved every ``SAVE_EVERY`` seconds. Raises ContinuationError or FlowError if it cannot go on, StoppedError
         on request; the branch holds the points so far.
@@ -185,7 +192,8 @@ class Follower:
         rule = rule_of(problem, start, max(len(regular) - 1, 0))
         points = Continuation(problem, start, rule, direction, branch.next_step or None)
         check = method.monitor(problem)
-        for point in regular:  # what watches the branch remembers it from its start
+        # The monitor compares with all earlier points; a resumed branch has to be judged as one that never stopped.
+        for point in regular:
             check(point)
         before = regular[-2] if len(regular) > 1 else None
         last = points.point
@@ -211,6 +219,7 @@ class Follower:
                     branch.findings.append(finding)
                     break
 
+                # Agreed on by all: a signal reaches ranks at different points, and they stop at the same one.
                 stopped = self.stop.agreed(self.comm) and not points.finished
                 # One rank's clock decides for all: writing is collective.
                 if stopped or self.comm.bcast(time.monotonic() - saved > SAVE_EVERY):
@@ -220,6 +229,7 @@ class Follower:
                     raise StoppedError(f"stopped on request after point {assessed.index}; resume goes on")
                 before = last
                 last = point
+        # A branch that fails or is stopped is checked as well; one that is resumed finds the same jumps again.
         finally:
             jumps = method.jumps(problem, branch.regular())
             branch.findings += [jump for jump in jumps if jump not in branch.findings]
@@ -232,6 +242,7 @@ class Follower:
         path = self.folder / f"branch-{name}.h5"
         if self.resume and on_root(self.comm, path.exists):
             try:
+                # Read by one rank: the others must not find another file, or none.
                 branch = on_root(self.comm, lambda: read_branch(path))
                 return replace(branch, case=self.case.to_toml(), about=fresh.about, extra=fresh.extra)
             except OSError as error:

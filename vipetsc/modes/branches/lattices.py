@@ -24,7 +24,7 @@ class LatticeMethod(NnmMethod):
 
     kind = ORBITS
     shared = True
-    # What all ranks meet together; anything else may be one rank's alone, and ends the program on all.
+    # All ranks raise these together; any other exception may be one rank's alone, and ends the program on all.
     failures = ContinuationError, FlowError, StartError
 
     def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
@@ -55,7 +55,7 @@ class LatticeMethod(NnmMethod):
         return linear_start(self.lattice, job, start_energy(self.options, self.system, job))
 
     def assess(self, problem: Problem[Point], point: Point) -> Point:
-        """The point with its largest multipliers, if they are asked for."""
+        """The point with its largest multipliers if ``nnm.multipliers`` asks for them."""
         wanted = self.options.multipliers
         if not wanted:
             return point

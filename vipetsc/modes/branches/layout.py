@@ -1,4 +1,4 @@
-"""What a branch file holds besides what all have in common: one layout for each kind of branch."""
+"""Contents of branch files that depend on the kind of branch: one layout for each kind."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -31,11 +31,11 @@ class Table(NamedTuple):
 
 
 class Layout(Protocol[S]):
-    """How points of one kind of branch are stored."""
+    """Storage of the points of one kind of branch."""
 
     @property
     def noun(self) -> str:
-        """What such a branch is called."""
+        """Name of such a branch in texts: branch or curve."""
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -48,17 +48,17 @@ class Layout(Protocol[S]):
         """Attributes of a branch's file that follow from its points."""
 
     def table(self, branch: Branch[S]) -> Table:
-        """A branch as CSV."""
+        """The table of a branch for CSV."""
 
     def points(self, data: xr.Dataset) -> list[S]:
         """The points of a file."""
 
     def dofs(self, data: xr.Dataset) -> int:
-        """``Branch.dofs`` of a file."""
+        """``Branch.dofs`` of the branch in a file."""
 
 
 def orbit_variables(branch: Branch[Point]) -> Variables:
-    """Variables that all branches of normal modes have: the quantities, the regions and the largest multipliers."""
+    """Variables of all branches of normal modes: the quantities, the regions and the largest multipliers."""
     data = {"region": variable("point", regions(branch).astype(np.int64), "1", REGION)}
     for name, (stored, _, units, text) in QUANTITIES.items():
         data[stored] = variable("point", quantity(branch, name), units, text)
@@ -66,14 +66,14 @@ def orbit_variables(branch: Branch[Point]) -> Variables:
 
 
 def orbit_attributes(branch: Branch[Point]) -> dict[str, Any]:
-    """Attributes that all branches of normal modes have: power laws of the slope, and tongues passed."""
+    """Attributes of all branches of normal modes: power laws of the slope, and number of tongues passed."""
     return {"next_step": branch.next_step, "fits": slope_laws(branch), "tongues": len(tongues(branch))}
 
 
 def quantities(data: xr.Dataset) -> list[dict[str, Any]]:
     """``QUANTITIES``, kind and multipliers of every point in a file of normal modes, by the fields of ``Point``."""
     columns = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
-    del columns["frequency"]  # a property
+    del columns["frequency"]  # a property of ``Point``, which follows from the period
     columns["kind"] = stored_kinds(data)
     if "multiplier" in data:
         columns["multipliers"] = _stored_multipliers(data)
@@ -81,7 +81,7 @@ def quantities(data: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _multipliers(points: list[Point]) -> Variables:
-    """The largest multipliers of the points, if any point has some."""
+    """Variables of the points' largest multipliers; none if no point has any."""
     most = max((len(p.multipliers) for p in points), default=0)
     if not most:
         return {}
@@ -99,7 +99,7 @@ def _multipliers(points: list[Point]) -> Variables:
 
 
 def _stored_multipliers(data: xr.Dataset) -> list[np.ndarray]:
-    """The multipliers of every point of a file and their residuals, those that had converged."""
+    """The converged multipliers of every point of a file, and their residuals."""
     real, imaginary, residual = (data[name].values for name in MULTIPLIERS)
     rows = np.stack([real + 1j * imaginary, residual], axis=-1)
     return [row[np.isfinite(row[:, 0])] for row in rows]

@@ -1,4 +1,4 @@
-"""What differs between kinds of branches of a case: problems, starts, and what is added to points and files."""
+"""Interface of the methods that find branches: problems, starts, and additions to points and files."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -21,11 +21,11 @@ class Crossing(NamedTuple):
 
 
 class Method(ABC, Generic[S]):
-    """How the branches of one case are found; they are numbered from 0 on by ``jobs``.
+    """A method that finds the branches of one case, which ``jobs`` numbers from 0 on.
 
-    ``kind`` is that of their files. ``shared``: all ranks follow a branch together. ``failures`` end a branch and not
-    the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_failed``: what is
-    added to the file of a whole branch is added to that of a branch that failed, too.
+    ``kind`` is the kind of their files. ``shared``: all ranks follow a branch together. ``failures`` end a branch and
+    not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_failed``: the
+    additions to the file of a whole branch are made for a branch that failed, too.
     """
 
     kind: ClassVar[str]
@@ -65,18 +65,18 @@ class Method(ABC, Generic[S]):
 
     @abstractmethod
     def rule(self, problem: Problem[S], start: S, done: int) -> StepRule[S]:
-        """Steps and end of a branch that has ``done`` regular points besides its start."""
+        """Steps and end of a branch that has ``done`` regular points after its start."""
 
     def directions(self) -> list[int]:
-        """Directions from the start in which a branch is followed, the last one last."""
+        """Directions from the start in which a branch is followed, in this order."""
         return [1]
 
     def assess(self, problem: Problem[S], point: S) -> S:
-        """A point with what its file holds beyond what continuation needs."""
+        """The point with the quantities of its file that continuation does not need."""
         return point
 
     def monitor(self, problem: Problem[S]) -> Monitor[S]:
-        """What says of every point whether its branch does what it should not."""
+        """A check of every new point: a sentence ends the branch, None lets it go on."""
         return lambda point: None
 
     def jumps(self, problem: Problem[S], points: list[S]) -> Iterator[str]:
@@ -84,10 +84,10 @@ class Method(ABC, Generic[S]):
         return iter(())
 
     def finish(self, problem: Problem[S], branch: Branch[S]) -> None:
-        """Add what a whole branch's file holds beyond its points."""
+        """Add the variables of a whole branch's file that are not of its points."""
 
     def crossings(self, branch: Branch[S]) -> Iterator[Crossing]:
-        """Branches that cross a branch, as far as the case asks for them."""
+        """The branches that cross a branch and that the case asks for."""
         return iter(())
 
     def crossing_rule(self, problem: Problem[S], start: S, done: int) -> StepRule[S]:

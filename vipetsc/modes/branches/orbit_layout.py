@@ -43,7 +43,7 @@ class OrbitLayout:
         return orbit_attributes(branch)
 
     def table(self, branch: Branch[Point]) -> Table:
-        """A branch as CSV, numbers in full precision."""
+        """The table of a branch for CSV, with numbers in full precision."""
         traces = ["half_trace"] if branch.dofs == 2 else [f"half_trace_{i + 1}" for i in range(_pairs(branch))]
         names = ["energy", "frequency", "period", *(f"x{i + 1}" for i in range(branch.dofs)), *traces]
         names += ["multiplier_max", "slope", "contacts", "region", "kind"]
@@ -64,10 +64,10 @@ class OrbitLayout:
         return points
 
     def dofs(self, data: xr.Dataset) -> int:
-        """Displacements of an orbit in a file."""
+        """Number of displacements of the orbits in a file."""
         return int(data.sizes["dof"])
 
 
 def _pairs(branch: Branch[Point]) -> int:
-    """Half-traces of an orbit; none of a lattice's."""
+    """Number of half-traces of an orbit; a whole lattice's orbit has none."""
     return len(branch.points[0].half_traces) if branch.points else branch.dofs - 1

@@ -37,7 +37,7 @@ ABOVE_LOWEST = 1.001
 
 
 class NnmMethod(Method[Point]):
-    """What branches of normal modes have in common, whatever finds them: the options of [nnm]."""
+    """Base of the methods for normal modes, with the options of [nnm] that all of them have."""
 
     case: NnmCase
 
@@ -51,11 +51,11 @@ class NnmMethod(Method[Point]):
         return guarded_steps(problem, self.options, done)
 
     def directions(self) -> list[int]:
-        """Down, up, or down first and then up."""
+        """The directions by [nnm]: down, up, or down first and then up."""
         return {"up": [1], "down": [-1], "both": [-1, 1]}[self.options.direction]
 
     def asked(self, problem: Problem[Point], branch: Branch[Point]) -> Iterator[Point]:
-        """The orbits at the energies asked for, wherever the branch passes one."""
+        """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one."""
         for energy in self.options.orbits_at:
             passed = False
             for left, right in itertools.pairwise(branch.regular()):
@@ -64,6 +64,7 @@ class NnmMethod(Method[Point]):
                 passed = True
                 try:
                     yield at_energy(problem, left, right, energy, self.options.chart)
+                # The branch itself is complete; what it lacks stands in its file as a finding.
                 except ArithmeticError as error:
                     branch.findings.append(f"the orbit of {energy:g} J after point {left.index} is not found: {error}")
             if not passed:
@@ -71,7 +72,8 @@ class NnmMethod(Method[Point]):
 
 
 def guarded_steps(problem: Problem[Point], control: NnmTable, done: int) -> GuardedSteps:
-    """Steps by [nnm] of a branch that has ``done`` points besides its start."""
+    """Steps by [nnm] of a branch that has ``done`` points after its start."""
+    # ``points`` limits the whole branch, so that one that is resumed ends where an unbroken one would.
     return GuardedSteps(problem, control.model_copy(update={"points": max(control.points - done, 0)}))
 
 
@@ -99,6 +101,7 @@ class ShootingMethod(NnmMethod):
         flow = FLOWS[options.flow](self.system)
         if options.jacobian == "differences":
             flow = FiniteDifferences(flow)
+        # The quarter map assumes u(t + T/2) = -u(t), which holds for forces that change sign with the displacement.
         name = options.map
         if name == "auto":
             name = "quarter" if self.system.odd else "half"
@@ -121,7 +124,7 @@ class ShootingMethod(NnmMethod):
         return linear_start(self.shooting, job, start_energy(self.options, self.system, job))
 
     def monitor(self, problem: Problem[Point]) -> Monitor[Point]:
-        """What says of every point whether its branch retraces itself, stands still or is another one."""
+        """The check of every new point: whether the branch retraces itself, stands still or is another one."""
         assert isinstance(problem, Shooting)
         return BranchMonitor(problem, self.options.guards).check
 
@@ -131,7 +134,7 @@ class ShootingMethod(NnmMethod):
         return jumps(points, problem, self.options)
 
     def finish(self, problem: Problem[Point], branch: Branch[Point]) -> None:
-        """Add the orbits of a branch, and what other flows make of it."""
+        """Add the orbits of a branch, and the comparison with other flows."""
         orbits = [*self._typical(branch), *self.asked(problem, branch)]
         branch.extra = sampled(self.shooting, orbits)
         for name in self.options.compare:
@@ -147,7 +150,7 @@ class ShootingMethod(NnmMethod):
         return [group[len(group) // 2] for group in groups]
 
     def crossings(self, branch: Branch[Point]) -> Iterator[Crossing]:
-        """The branches that cross at the kinds of special points asked for."""
+        """The branches that cross at the kinds of special points in ``nnm.switch``."""
         for kind in self.options.switch:
             special = [p for p in branch.points if p.kind == kind]
             for number, point in enumerate(special, 1):

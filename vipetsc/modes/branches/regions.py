@@ -70,6 +70,7 @@ def assign_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, 
     if peak is None:
         return region
     logarithm = np.log(energy[peak:])
+    # At the peak itself the differences are one-sided: it is left out below.
     exponent = np.gradient(np.log(slope[peak:]), logarithm)
     growth = np.gradient(exponent, logarithm)
     settled = np.nonzero((np.abs(growth[1:]) <= SETTLED) & (exponent[1:] >= STEEP))[0]
@@ -90,6 +91,7 @@ def _peak(energy: np.ndarray, slope: np.ndarray, first: int) -> int | None:
     None where the slope changes its sign after it, or too few points follow for an exponent.
     """
     folds = np.nonzero(np.diff(np.sign(np.diff(energy[first:]))) != 0)[0]
+    # A second difference belongs to three points: two further on, the fold is passed.
     start = first + (folds[-1] + 2 if folds.size else 0)
     tail = slope[start:]
     if len(tail) < FEWEST or not np.all(np.isfinite(tail) & (tail > 0)):
@@ -101,7 +103,7 @@ def _peak(energy: np.ndarray, slope: np.ndarray, first: int) -> int | None:
 def fit_slope(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dict[str, dict[str, float]]:
     """df/dE = factor E^exponent in regions II (its falling part), III and IV, where it is without ``doubt``.
 
-    A vertical piece of a branch has none: its exponent leaves the range of numbers, or its adjusted R^2 is none.
+    A vertical piece of a branch has no law: its factor leaves the range of numbers, or its adjusted R^2 is NaN.
     """
     laws = {}
     for number, label in ((2, "II"), (3, "III"), (4, "IV")):

@@ -14,7 +14,7 @@ from vipetsc.modes.response.steady import Measures, Response
 
 
 class Stored(NamedTuple):
-    """A measure in a file: its dimensions besides the point, units and text."""
+    """A measure in a file: its dimensions after that of the points, its units and text."""
 
     dimensions: str
     units: str
@@ -78,7 +78,7 @@ class ResponseLayout:
         return {}
 
     def table(self, branch: Branch[Response]) -> Table:
-        """A curve as CSV, without harmonics."""
+        """The table of a curve for CSV, without harmonics."""
         count = len(branch.points)
         columns = {}
         for name, stored in LAYOUT.items():
@@ -127,7 +127,7 @@ class ResponseLayout:
         return points
 
     def dofs(self, data: xr.Dataset) -> int:
-        """Sites of a curve's lattice."""
+        """Number of sites of the lattice of a curve in a file."""
         return int(data.sizes["site"])
 
 
@@ -143,7 +143,8 @@ def sweep_down(branch: Branch[Response]) -> list[int]:
 
 
 def _sweep(branch: Branch[Response], sign: int) -> Sweep:
-    """The curve as a sweep up (``sign`` 1) or down (-1) sees it."""
+    """The states of a curve for a sweep up (``sign`` 1) or down (-1)."""
+    # With the sign a sweep down is one up as well; -1 unstable perturbations mean that stability is undecided.
     stable = measure(branch, "unstable") == 0
     fold = branch.is_kind("fold")
     parameter = sign * measure(branch, branch.about["over"])
@@ -151,7 +152,8 @@ def _sweep(branch: Branch[Response], sign: int) -> Sweep:
 
 
 def _complex(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:
-    """The complex array with these parts; a sum would lose the sign of zeros, which are bits of a resumed file."""
+    """The complex array with the parts ``real`` and ``imag``, signs of zeros included."""
+    # real + 1j * imag would lose them, and with them the bits of a curve that is resumed.
     out = np.empty(real.shape, complex)
     out.real = real
     out.imag = imaginary

@@ -25,7 +25,7 @@ class ResponseMethod(Method[Response]):
 
     kind = RESPONSES
     failures = ContinuationError, FlowError, ArithmeticError, ValueError
-    keeps_empty = False  # what pictures and tables are made of has a first state
+    keeps_empty = False  # pictures and tables of curves need a first state
 
     case: NfrcCase
 

@@ -10,6 +10,7 @@ from vipetsc.modes.point import Point
 
 def stored_states(points: list[Point], cells: Sequence[int], u: np.ndarray) -> Variables:
     """Displacements ``u`` (point, cell, dof) in m of ``cells``, from 0, at phase 0."""
+    # Velocities of zero are stored because ``io.state`` reads any state alike, as displacement and velocity.
     axes = "orbit", "states/cell", "states/dof"
     return {
         "orbit": variable("orbit", np.arange(1, len(points) + 1), "1", "stored motion"),

@@ -45,6 +45,7 @@ def swept(sweep: Sweep, start: int | None = None) -> list[int]:
 
 def _neighbours_ahead(sweep: Sweep, i: int, passed: set[int]) -> list[int]:
     """Stable neighbours of state ``i`` on the curve with a larger parameter."""
+    # On a branch beyond a fold the parameter grows towards the state before: both neighbours count.
     p = sweep.parameter
     ahead = []
     for j in (i - 1, i + 1):
@@ -54,7 +55,8 @@ def _neighbours_ahead(sweep: Sweep, i: int, passed: set[int]) -> list[int]:
 
 
 def _states_across(sweep: Sweep, i: int, passed: set[int]) -> list[int]:
-    """Where a sweep may jump to from state ``i``: ends of stable steps of the curve that pass its parameter."""
+    """States to which a sweep may jump from state ``i``: ends of stable steps of the curve that pass its parameter."""
+    # A step between a stable and an unstable state leaves open where on it stability ends.
     p = sweep.parameter
     ahead = []
     for j in range(len(p) - 1):

@@ -1,9 +1,9 @@
 """Shooting for whole lattices: Newton's method with GMRES, whose products come from the linearised flow.
 
 The equations and maps are those of ``shooting``; every rank has all initial values and residuals, the flow and the
-vectors of Krylov's spaces are distributed. Without contact the quarter map is cos(Omega T/4) on the modes of the lattice,
-whose size is bounded from below for a breather between the bands, and contacts change it by a matrix of low rank:
-GMRES needs few products, and no preconditioner (options of PETSc begin with ``nnm_``).
+vectors of Krylov's spaces are distributed. Without contact the quarter map is cos(Omega T/4) on the modes of the
+lattice, whose size is bounded from below for a breather between the bands, and contacts change it by a matrix of low
+rank: GMRES needs few products, and no preconditioner (options of PETSc begin with ``nnm_``).
 """
 
 from itertools import pairwise
