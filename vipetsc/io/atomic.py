@@ -22,9 +22,10 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     Raises OSError that names ``path``.
     """
-    # Of two hosts that share the files, or two containers, processes may have the same number.
+    # Processes of two hosts with a common file system, or of two containers, may have the same number.
     aside = path.with_name(f".{path.name}.{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}.part")
     sys.audit("vipetsc.write", str(path))
+    # Renamed only when it is complete: a kill leaves the earlier file, and the temporary one for the next claim.
     try:
         yield aside
         sys.audit("vipetsc.replace", str(path))
@@ -36,7 +37,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def unwritten(path: Path, error: Exception) -> OSError:
-    """``error``, from Python or from HDF5, that names the file which could not be written, and keeps its number."""
+    """An OSError with the number of ``error``, from Python or from HDF5, that names the file that was not written."""
     number = getattr(error, "errno", None)
     in_text = re.search(r"errno = (\d+)", str(error))  # HDF5 says it in its message alone
     if not number:
@@ -46,7 +47,7 @@ def unwritten(path: Path, error: Exception) -> OSError:
 
 
 def discard(folder: Path) -> None:
-    """Remove ``folder``, if it is there; a kill leaves it whole, or under a name that begins with a dot."""
+    """Remove ``folder`` if it exists; a kill leaves it whole, or under a name that begins with a dot."""
     aside = folder.with_name(f".{folder.name}.old")
     shutil.rmtree(aside, ignore_errors=True)  # of a call that was killed
     if folder.is_dir():
@@ -70,13 +71,13 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
         file.seek(6)
         file.write(b"\3")  # version 3, in UTF-8: headers of the others numpy takes apart into tokens first
         file.seek(0, 2)
-        # Through ``write``, which says what is wrong where numpy's own way of writing to disk does not.
+        # Through ``write``, whose error has a number; numpy's own writing to disk gives none.
         for values in arrays.values():
             file.write(np.ascontiguousarray(values).data)
 
 
 def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
-    """Arrays that ``save_arrays`` wrote, or those ``wanted``; without a ``copy``, values are read where they are used.
+    """Load the arrays ``wanted``, else all, that ``save_arrays`` wrote; without a ``copy`` each is read when it is used.
 
     Raises OSError that names the file.
     """

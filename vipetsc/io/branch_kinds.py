@@ -33,6 +33,7 @@ def branch_kind(branch: xr.Dataset) -> str:
 
 def _kind_by_variables(branch: xr.Dataset) -> str:
     """Return the kind of a file without the attribute, by variables that only that kind has."""
+    # In this order: responses have harmonics, too.
     if "share" in branch:
         return RESPONSES
     if "harmonics" in branch:

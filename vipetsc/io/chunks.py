@@ -1,8 +1,8 @@
-"""The variables of ``run.h5``, and how the chunks of a run are put together in it.
+"""The variables of ``run.h5``, and their assembly from the chunks of a run.
 
-A chunk is what a run leaves between two checkpoints; each rank keeps a part of it, which names its own place: fields
-(sample, dof, cell) are of the ranges ``columns`` of the recorded cells, losses (sample, site) of the ranges ``sites``;
-``impacts`` are episodes. Rank 0's part has ``SAMPLED`` besides.
+A chunk holds the samples between two checkpoints. Each rank stores a part of it, with its position: fields (sample,
+dof, cell) belong to the ranges ``columns`` of the recorded cells, losses (sample, site) to the ranges ``sites``;
+``impacts`` are episodes. The part of rank 0 also has ``SAMPLED``.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -19,8 +19,8 @@ from vipetsc.io.atomic import Arrays
 from vipetsc.io.netcdf import tabulated
 
 # Variables of the file by name: dimensions, units, text.
-# ``SAMPLED`` and ``DAMPING`` rank 0 has of every sample; ``GIVEN`` is known from the beginning. ``LARGE`` are the
-# fields, the losses and the log of contacts, of which ranks that write together hold their own alone.
+# Rank 0 has ``SAMPLED`` and ``DAMPING`` of every sample; ``GIVEN`` exists before the first one. ``LARGE`` are the
+# fields, the losses and the log of contacts: of ranks that write together each holds only its own part.
 SAMPLED = {
     "time": ("time", "s", "time"),
     "field_time": ("field_time", "s", "time of the recorded fields"),
@@ -66,11 +66,11 @@ GIVEN = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Description of what the chunks of a run hold.
+    """Description of the contents of the chunks of a run.
 
-    ``given``: the arrays of ``GIVEN``; ``fields``: names of those that are recorded; ``together``: whether all ranks
-    write into one file that they share, instead of rank 0 alone; ``rows``: samples in a field of the whole run.
-    ``sampled``: names of what rank 0 has of every sample, from ``SAMPLED`` and ``DAMPING``.
+    ``given``: the arrays of ``GIVEN``; ``fields``: names of the recorded ones; ``together``: whether all ranks write
+    into one common file, instead of rank 0 alone; ``rows``: samples in a field of the whole run. ``sampled``: names of
+    the variables that rank 0 has of every sample, from ``SAMPLED`` and ``DAMPING``.
     """
 
     given: Arrays
@@ -81,7 +81,7 @@ class Recording:
 
 
 class Chunks(Protocol):
-    """The ``count`` chunks of a run; ``ranks(k)`` kept parts of chunk k, from which ``read`` reads arrays."""
+    """The ``count`` chunks of a run; ``ranks(k)`` have stored parts of chunk k, from which ``read`` reads arrays."""
 
     comm: MPI.Comm
     case: str
@@ -100,13 +100,13 @@ def ranges(numbers: np.ndarray) -> np.ndarray:
 
 
 def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
-    """The arrays ``names`` of rank 0, those of all chunks one after the other."""
+    """The arrays ``names`` of rank 0, all chunks one after the other."""
     chunks = [output.read(number, 0, names) for number in range(output.count)]
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
 
 
 def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """The dataset of ``GIVEN`` and of what rank 0 has of every sample, with the root ``attributes`` of the run."""
+    """The dataset of ``GIVEN`` and of all that rank 0 has of every sample, with the root ``attributes`` of the run."""
     arrays = {**joined(output, output.recording.sampled), **output.recording.given}
     if len(arrays["field_time"]) == len(arrays["time"]):
         del arrays["field_time"]  # fields are of every sample
@@ -165,7 +165,7 @@ def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
 
 
 def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
-    """Copy the losses or a field, ``name``, of all chunks to ``dataset``; each writer copies its parts."""
+    """Copy the losses or a field, ``name``, of all chunks to ``dataset``; each writer copies the parts it reads."""
     time = "field_time"
     places = "columns"
     if name == LOSSES:
@@ -176,6 +176,7 @@ def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
     for number in range(output.count):
         rows = output.read(number, 0, [time])[time].size
         for part in parts_to_copy(output, number, [name, places]):
+            # Parts have cells last, as the compiled engine fills them; the file has (sample, cell, dof).
             values = np.moveaxis(part[name], -1, 1)
             column = 0
             for start, stop in part[places].tolist():

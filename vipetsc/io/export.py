@@ -1,4 +1,4 @@
-"""Results in the forms of other programs: XDMF for ParaView, which reads ``run.h5`` itself, and curves as CSV."""
+"""Export of results to other programs: XDMF for ParaView, which reads ``run.h5`` itself, and curves as CSV."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +18,7 @@ TAIL = "</Grid></Domain></Xdmf>\n"
 
 
 def write_xdmf(folder: Path) -> Path | None:
-    """Write ``run.xdmf`` beside ``run.h5``; None for a run without fields. Raises as ``open_run``.
+    """Write ``run.xdmf`` next to ``run.h5``; None for a run without fields. Raises as ``open_run``.
 
     A regular mesh of nodes (cell, mass), and at every frame the fields as hyperslabs of the datasets in ``run.h5``.
     """
@@ -61,7 +61,7 @@ def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> 
 
 
 def has_xdmf(folder: Path) -> bool:
-    """Whether ``run.xdmf`` is there, and not older than ``run.h5``."""
+    """Whether ``run.xdmf`` exists and is not older than ``run.h5``."""
     mesh = folder / "run.xdmf"
     run = folder / "run.h5"
     return mesh.exists() and mesh.stat().st_mtime_ns >= run.stat().st_mtime_ns
@@ -80,10 +80,10 @@ def _words(values: Iterable[float]) -> str:
 
 
 def write_curves(path: Path) -> list[Path]:
-    """Write the curves of the results in ``path`` as CSV files beside them, in ``curves/``; raises as ``open_results``.
+    """Write the curves of the results in ``path`` as CSV files to ``curves/`` in their folder.
 
     Variables over the same dimensions are one table, with a row a point, their coordinates first, units in the head.
-    Fields and maps, over other dimensions than the axes of a sweep, are left out.
+    Fields and maps, over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
     """
     written = []
     with open_results(path) as data:

@@ -1,4 +1,4 @@
-"""Output folders: the one way to claim one, and the provenance that every output carries.
+"""Output folders: their claim by one command, and the provenance that every output carries.
 
 Names that begin with a dot are no results: ``.lock`` while a command works in the folder, ``.new`` for results that
 are to replace those that are there, ``.ready``, ``.moving`` and ``.*.old`` while they do, ``.*.part`` for a file being
@@ -42,9 +42,9 @@ Difference = Callable[[str], str | None]
 class FolderKind:
     """Kind of a folder of results; patterns of file names as for ``Path.glob``.
 
-    ``noun``: what messages call one result; ``results``: files that show that a folder holds some; ``companions``: what
-    else goes with them; ``marker``: the file that names what the results are of; ``free``: its section that may change
-    without making the results others.
+    ``noun``: name of one result in messages; ``results``: files that show that a folder holds results; ``companions``:
+    files that are replaced together with them; ``marker``: the file with the case of the results; ``free``: its section
+    that may change while the results stay valid.
     """
 
     noun: str
@@ -73,8 +73,8 @@ KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, PAPER)
 class Claim:
     """The right to work in an output folder; ``path`` is the folder itself.
 
-    ``folder`` is where results are to be made, ``path/.new`` while they are to replace others; ``going_on``: whether it
-    holds results of the same case.
+    Results are written to ``folder``, which is ``path/.new`` while they are to replace others; ``going_on``: whether
+    the folder holds results of the same case.
     """
 
     def __init__(self, comm: MPI.Comm, path: Path, kind: FolderKind, folder: Path, going_on: bool) -> None:
@@ -85,11 +85,12 @@ class Claim:
         self.going_on = going_on
 
     def publish(self) -> None:
-        """Let the results, which are whole, take the place of earlier ones; all ranks must call it."""
+        """Replace earlier results by the new ones, which are complete; all ranks must call it."""
 
         def swap() -> None:
             shutil.rmtree(self.path / OLD, ignore_errors=True)
             sys.audit("vipetsc.swap", str(self.path))
+            # From this rename on the new results count: the next claim finishes a swap that a kill ends.
             os.replace(self.folder, self.path / READY)
             _finish_swap(self.path, self.kind)
 
@@ -109,13 +110,13 @@ def claimed(
     resume: bool = False,
     difference: Difference | None = None,
 ) -> Iterator[Claim]:
-    """Work in the folder ``path``, alone, on results of ``kind``: begin them, or go on with those of the same case.
+    """Claim the folder ``path`` for results of ``kind``: begin them, or go on with results of the same case.
 
-    All ranks must call it. The folder is made if it is missing, and what a killed command has left in it is put in
-    order. ``text``, a resolved case, is kept in it. ``force`` begins anew: earlier results stay until new ones are
-    published; what was begun so is gone on with by the next call without ``force``. ``resume`` goes on with what is
-    there, and nothing else. ``difference`` of an earlier text is why its results are not those asked for, None if they
-    are; by default any change is a reason.
+    All ranks must call it. A missing folder is created; leftovers of a killed command are removed, and a swap that it
+    began is finished. ``text``, a resolved case, is stored in the folder. ``force`` begins anew: earlier results stay
+    until new ones are published; the next call without ``force`` goes on with the new ones. ``resume`` only goes on
+    with results that exist. ``difference`` takes an earlier text and returns the reason why its results are not the
+    wanted ones, or None if they are; by default any change is a reason.
 
     Raises FolderError if the path is a file, another process works in it, it holds anything but results of ``kind`` and
     of this case, which ``force`` allows to differ, or there is nothing to ``resume``.
@@ -129,7 +130,7 @@ def claimed(
 def _claim(
     path: Path, kind: FolderKind, text: str, force: bool, resume: bool, difference: Difference | None
 ) -> tuple[Path, bool]:
-    """The folder to work in, and whether results of the same case are there; see ``claimed``."""
+    """The folder to work in, and whether it holds results of the same case; see ``claimed``."""
     sys.audit("vipetsc.claim", str(path))
     # A swap that a kill has ended is finished first, unless the results are another verb's.
     foreign = _holds_another_kind(path, kind)
@@ -163,16 +164,17 @@ def _claim(
 
 
 def _holds_another_kind(path: Path, kind: FolderKind) -> bool:
-    """Whether ``path`` holds results of a kind other than ``kind``, in their place or on their way there."""
+    """Whether ``path`` holds results of a kind other than ``kind``, published or in a swap."""
     patterns = [pattern for other in KINDS if other is not kind for pattern in other.results]
     matches = [folder.glob(pattern) for folder in (path, path / READY, path / MOVING) for pattern in patterns]
     return any(any(files) for files in matches)
 
 
 def _remove_temporary_files(folder: Path) -> None:
-    """Remove what a killed command was writing, in ``folder`` and in the folders of its members."""
+    """Remove temporary files of a killed command from ``folder`` and from the folders of its members."""
     for temporary in [*folder.glob(".*.part"), *folder.glob("*/.*.part")]:
-        if temporary.parent == folder or not (temporary.parent / LOCK).exists():  # where nobody else is writing
+        # Another command may work on a member: its lock is in the member's folder.
+        if temporary.parent == folder or not (temporary.parent / LOCK).exists():
             temporary.unlink(missing_ok=True)
 
 
@@ -182,7 +184,7 @@ def _results(folder: Path) -> list[Path]:
 
 
 def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference | None) -> str | None:
-    """Message why results in ``folder`` are not those of ``text``; None if they are."""
+    """Message why the results in ``folder`` are not results of ``text``; None if they are."""
     earlier = (folder / kind.marker).read_text(encoding="utf-8")
     if difference:
         return difference(earlier)
@@ -216,7 +218,7 @@ def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _finish_swap(path: Path, kind: FolderKind) -> None:
-    """Put results that are ready in the place of earlier ones, from wherever a kill has ended it; remove leftovers."""
+    """Finish a swap, at whichever step a kill has ended it: replace earlier results by ready ones, remove leftovers."""
     ready = path / READY
     moving = path / MOVING
     old = path / OLD
@@ -238,7 +240,7 @@ def _finish_swap(path: Path, kind: FolderKind) -> None:
 
 
 def provenance(comm: MPI.Comm) -> dict[str, Any]:
-    """Record of versions and of when, where and how a result was made, which every output carries.
+    """Record of versions, date, host and command of a result, which every output carries.
 
     Two runs of one command differ in it.
     """
@@ -246,9 +248,9 @@ def provenance(comm: MPI.Comm) -> dict[str, Any]:
 
 
 def origin() -> dict[str, Any]:
-    """The record of ``provenance`` without the ranks, for results that one rank makes alone.
+    """The record of ``provenance`` without the ranks, for results that one rank computes alone.
 
-    PETSc options are those of its database: with those that are part of a case, which stand in it, all that were given.
+    PETSc options are those of its database. A case has its own options in its text: both together are all options.
     """
     options = PETSc.Options().getAll()
     given = " ".join(f"-{name} {value}".strip() for name, value in sorted(options.items()))

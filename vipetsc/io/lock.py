@@ -1,4 +1,4 @@
-"""Folders that one command at a time works in."""
+"""Locks on folders, in which one command at a time works."""
 
 import fcntl
 import logging
@@ -68,7 +68,7 @@ def _acquire(path: Path, created: list[Path]) -> int | None:
     """Lock the folder ``path``, which is created where it is missing; the folders ``created`` are added to the list.
 
     Returns the descriptor that holds the lock, or None where none is needed or possible: this process has it already,
-    or the file system knows no locks. Raises FolderError if another process still has it after ``PATIENCE``.
+    or the file system has no locks. Raises FolderError if another process still has it after ``PATIENCE``.
     """
     sys.audit("vipetsc.lock", str(path))
     deadline = None
@@ -98,6 +98,7 @@ def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
+            # This process holds it in an enclosing block, or the file system has no locks: work goes on without one.
             holder, _, token = os.read(descriptor, 1000).decode().strip().rpartition(" ")
             os.close(descriptor)
             if token == TOKEN or not isinstance(error, BlockingIOError):

@@ -22,7 +22,7 @@ import xarray as xr
 from vipetsc.io.atomic import atomic_write
 
 Variables = dict[str, xr.Variable]
-"""Variables by name, of which a dataset is made."""
+"""Variables of a dataset by name."""
 
 
 def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
@@ -54,7 +54,7 @@ def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
 
 
 def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
-    """Lay out ``data`` in ``file``; where several ranks share the file all must call it, and one has to ``write``."""
+    """Lay out ``data`` in ``file``; all ranks that have it open must call it, and one of them has to ``write``."""
     # Coordinates first: variables are attached to their scales.
     names = [*data.indexes, *(name for name in data.variables if name not in data.indexes)]
     for name in names:
@@ -74,7 +74,7 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
 def add_variable(
     file: h5py.File, name: Hashable, dims: Sequence[Hashable], shape: Sequence[int], dtype: Any, attributes: Any
 ) -> h5py.Dataset:
-    """An empty dataset over coordinates added before; itself a coordinate if its one dimension has its name.
+    """Add an empty dataset over coordinates added before; it is a coordinate itself if its one dimension has its name.
 
     Its group gets soft links to coordinates outside it: programs that open the group alone find them there. Raises
     ValueError if a dimension has no coordinate.
@@ -98,11 +98,11 @@ def add_variable(
 
 
 def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Dataset:
-    """The file as a flat dataset, a context manager; values are read where they are used.
+    """Open a file as a flat dataset, a context manager; values are read when they are used.
 
-    ``kind`` says what it should be, "run" or "branch", in messages; ``needs`` are variables (by path), groups and root
-    attributes without which it is no such file. Raises OSError if it cannot be opened as HDF5, ValueError if it is not
-    of this kind.
+    Messages call the file a ``kind``, as "run" or "branch"; ``needs`` are the variables (by path), groups and root
+    attributes that a file of this kind must have. Raises OSError if the file cannot be opened as HDF5, ValueError if it
+    is not of this kind.
     """
     sys.audit("vipetsc.read", str(path))
     try:
@@ -158,7 +158,7 @@ def _flat(groups: dict[str, xr.Dataset], links: Collection[PurePosixPath]) -> xr
         scales |= {node / str(name) for name, item in nodes[node].variables.items() if item.dims == (name,)}
 
     def coordinate(node: PurePosixPath, dim: Hashable) -> str:
-        """The path of the coordinate of a dimension in a group; of one without, as if it stood there."""
+        """The path of the coordinate of a dimension in a group; without a coordinate, its path in this group."""
         candidates = [group / str(dim) for group in (node, *node.parents)]
         nearest = next((path for path in candidates if path in scales), candidates[0])
         return str(nearest).strip("/")

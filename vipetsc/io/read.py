@@ -1,4 +1,4 @@
-"""Results read with xarray: a run, and the ensemble of a sweep; names are paths in the file, as in ``io.netcdf``.
+"""Reading of results with xarray: a run, the ensemble of a sweep; names are paths in the file, as in ``io.netcdf``.
 
 ``open_run`` gives ``run["velocity"]``, ``run["energy/kinetic"]``, ``run["impacts/onset"]``. ``open_ensemble`` gives
 measures over one dimension a swept axis; ``select`` picks members by the values of swept keys. Cells and sites count
@@ -22,7 +22,7 @@ Selectable = TypeVar("Selectable", xr.Dataset, xr.DataArray)
 
 
 def open_run(path: str | Path) -> xr.Dataset:
-    """The run in ``path``, a context manager: fields are read where they are sliced.
+    """Open the run in ``path``, a context manager: fields are read when they are sliced.
 
     ``encoding["source"]`` is the path. Raises OSError or ValueError as ``open_netcdf``.
     """
@@ -32,7 +32,7 @@ def open_run(path: str | Path) -> xr.Dataset:
 
 
 def open_results(path: str | Path) -> xr.Dataset:
-    """Any file of results, or of a folder the first of ``FIRST``, as ``vipetsc.open``; a context manager.
+    """Open a file of results, or the first of ``FIRST`` in a folder, as ``vipetsc.open`` does; a context manager.
 
     Names are paths in the file, units attributes of the variables, the resolved case (TOML) is ``attrs["case"]``;
     ``Case.of`` reads it. Episodes of a run have their ``impacts/onset`` as a coordinate. Raises ValueError for a folder
@@ -130,7 +130,7 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
     ``select(ensemble, law="hertz", sites=5, cycles=30)["ibtet"]``. Keys of one zipped axis have to meet in one
     member; numbers match to a relative 1e-5. Raises KeyError if a name is no coordinate, or no member has the values.
     """
-    # By dimension, since keys of a zipped axis have theirs in common: which members have all values so far.
+    # Members that have all values so far, by dimension: keys of a zipped axis have their dimension in common.
     matches: dict[str, np.ndarray] = {}
     for name, value in wanted.items():
         if name not in data.coords or data[name].ndim != 1:

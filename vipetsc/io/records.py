@@ -38,14 +38,14 @@ def _parsed(line: bytes) -> Record:
 
 
 class RecordFile:
-    """Appends records to the file ``path``, which is made with the first."""
+    """Appends records to the file ``path``, which is created with the first."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file: Any = None
 
     def append(self, record: Record) -> None:
-        """Write ``record`` behind those that are there; raises OSError that names the file."""
+        """Write ``record`` after the last one; raises OSError that names the file."""
         text = json.dumps(record).encode()
         line = memoryview(text[:-1] + CHECK % zlib.crc32(text))
         try:
@@ -99,5 +99,6 @@ def merge_records(path: Path, lines: Iterable[Line], merged: Iterable[Path]) -> 
             sources[line.path].seek(line.start)
             file.write(sources[line.path].read(line.length))
 
+    # Last: a kill before leaves some records in two files, where they count once, and loses none.
     for old in merged:
         old.unlink(missing_ok=True)

@@ -71,7 +71,7 @@ class State(NamedTuple):
         return u, v
 
     def frequency(self) -> float | None:
-        """Frequency in rad/s of an orbit, or that of a run's drive; None if it is not known."""
+        """Frequency in rad/s of an orbit, or of a run's drive; None for a state alone."""
         if self.period:
             return 2 * np.pi / self.period
         if self.case:

@@ -1,11 +1,10 @@
 """Output of a run: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
 
-While a run goes on, its samples are kept as chunks: chunk k holds those between the checkpoints k - 1 and k. A chunk
-and a checkpoint are named arrays; a rank writes its part of each into a file of its own, so nothing is sent while a
-run goes on. Every part names the cells and sites it is of, so that another number of ranks can go on with it. When the
-run has ended, ``io.chunks`` puts them together. Fields (t, cell, dof) and losses (t, site) are too large to be held
-whole: they are copied chunk by chunk, to a file of one rank or to one that all ranks share; these hold a part of the
-log each.
+During a run its samples are stored as chunks: chunk k holds the samples between the checkpoints k - 1 and k. A chunk
+and a checkpoint are named arrays; a rank writes its part of each into a file of its own, so that nothing is sent during
+a run. Every part names its cells and sites, so that another number of ranks can go on with it. When the run has ended,
+``io.chunks`` puts the parts together. Fields (t, cell, dof) and losses (t, site) are too large to be held whole: they
+are copied chunk by chunk, to a file of one rank or to a common file of all ranks; each writer holds a part of the log.
 """
 
 import json
@@ -36,7 +35,7 @@ GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has ever
 
 
 class _Contents(NamedTuple):
-    """Contents of ``run.h5`` that this rank writes, but for the fields and losses, which are copied.
+    """Contents of ``run.h5`` that this rank writes, without the fields and losses, which are copied from the chunks.
 
     ``small`` is rank 0's dataset, ``log`` this rank's part of all episodes in order.
     """
@@ -48,8 +47,8 @@ class _Contents(NamedTuple):
 class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
-    It takes the run's chunks, ``count`` of them, on all ranks of ``comm`` together, and puts them together at the end;
-    ``recording`` describes what they hold.
+    It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end;
+    ``recording`` describes their contents.
     """
 
     recording: Recording
@@ -75,7 +74,7 @@ class RunFolder:
     def _read_ending(self) -> dict[str, Any] | None:
         """The attributes on one rank, as ``ending``."""
         path = self.folder / "run.h5"
-        # Parts beside a run.h5 are those of a run that was begun anew.
+        # Parts next to a run.h5 belong to a run that was begun anew.
         if not path.exists() or any(self._parts.glob("*")):
             return None
         try:
@@ -96,11 +95,11 @@ class RunFolder:
         write_text(self.folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def room(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Room (field, sample, dof, cell) for this rank's fields of the next chunk."""
+        """Array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
         return np.empty(shape)
 
     def append(self, chunk: Arrays | None) -> None:
-        """Keep this rank's part of the next chunk, None for no part; all ranks must call it.
+        """Store this rank's part of the next chunk, None for no part; all ranks must call it.
 
         Raises OSError on all ranks if one cannot write.
         """
@@ -109,11 +108,11 @@ class RunFolder:
         self.count += 1
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """The arrays ``wanted`` of chunk ``number`` as ``rank`` kept it."""
+        """The arrays ``wanted`` of the part of chunk ``number`` that ``rank`` has stored."""
         return load_arrays(self._chunk(number, rank), wanted)
 
     def save_state(self, state: Arrays) -> None:
-        """Keep this rank's checkpoint after the last chunk, and the one before; all ranks must call it.
+        """Store this rank's checkpoint after the last chunk, and keep the one before; all ranks must call it.
 
         Raises OSError on all ranks if one cannot write.
         """
@@ -130,9 +129,9 @@ class RunFolder:
         on_every_rank(self.comm, replace_oldest)
 
     def last_state(self) -> Sequence[Arrays] | None:
-        """Go back to the last checkpoint that is complete: ``count`` becomes its, and all its parts are returned.
+        """Go back to the last complete checkpoint: set ``count`` to its chunks, and return the parts of all its ranks.
 
-        It may be of another number of ranks; None if there is no checkpoint. All ranks must call it.
+        Another number of ranks may have written it; None if there is no checkpoint. All ranks must call it.
         """
         number, size = on_root(self.comm, self._last_complete_state)
         self.count = number + 1
@@ -162,7 +161,7 @@ class RunFolder:
         return self._parts / f"state-{number:06d}-{rank}-{size}.npy"
 
     def ranks(self, number: int) -> list[int]:
-        """The ranks that kept a part of chunk ``number``."""
+        """The ranks that have stored a part of chunk ``number``."""
         return [int(path.stem.split("-")[2]) for path in self._parts.glob(f"part-{number:06d}-*.npy")]
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
@@ -232,10 +231,10 @@ class RunFolder:
 
 
 class RunMemory:
-    """Keeps a run in memory: ``dataset`` on rank 0 of ``comm``, None on the others and before its end.
+    """Holds a run in memory: ``dataset`` on rank 0 of ``comm``, None on the others and before its end.
 
-    It is used as a ``RunFolder``. Its fields are gathered whatever the case's writer is; a run that is stopped is lost.
-    They lie in memory as (t, dof, cell): on one rank the engine writes them where they stay. ``end`` are the
+    It is used as a ``RunFolder``. Fields are gathered whatever the case's writer is; a run that is stopped is lost.
+    Fields lie in memory as (t, dof, cell): on one rank the engine writes them where they stay. ``end`` are the
     displacements and velocities (cell, 2 dof) at the last sample of a run that is complete; the dataset has them as
     ``end/displacement`` and ``end/velocity``.
     """
@@ -259,19 +258,20 @@ class RunMemory:
 
     @cached_property
     def _fields(self) -> np.ndarray:
-        """All fields (field, sample, dof, cell); made when the recording is known."""
+        """All fields (field, sample, dof, cell), allocated at first use."""
+        # Not in ``begin``: the recording, which has the shape, is set after it.
         dofs = len(self.recording.given["dof"])
         cells = len(self.recording.given["cell"])
         return np.empty((len(self.recording.fields), self.recording.rows, dofs, cells))
 
     def room(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Room (field, sample, dof, cell) for this rank's fields of the next chunk."""
+        """Array (field, sample, dof, cell) for this rank's fields of the next chunk, not initialised."""
         if self.comm.size > 1:
             return np.empty(shape)
         return self._fields[:, self._rows : self._rows + shape[1]]
 
     def append(self, chunk: Arrays | None) -> None:
-        """Keep the next chunk."""
+        """Store the next chunk in memory."""
         arrays = dict(chunk or {})
         fields = [arrays.pop(name) for name in self.recording.fields if name in arrays]
         rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
@@ -282,21 +282,21 @@ class RunMemory:
         self.count += 1
 
     def ranks(self, number: int) -> list[int]:
-        """Rank 0 alone."""
+        """The ranks with a part of chunk ``number``: rank 0 alone."""
         return [0]
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """Chunk ``number`` of this rank, whole: it is in memory anyhow."""
+        """All arrays of chunk ``number``, the ``wanted`` ones among them: they are in memory anyhow."""
         return self._chunks[number]
 
     def save_state(self, state: Arrays) -> None:
-        """Nothing: a run in memory cannot be gone on with."""
+        """Do nothing: a run in memory cannot be resumed."""
 
     def last_state(self) -> None:
-        """No checkpoint."""
+        """Return None: a run in memory has no checkpoint."""
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
-        """Make the dataset; all ranks must call it."""
+        """Create the dataset; all ranks must call it."""
         if self.comm.rank == 0:
             self.dataset = chunks.small_dataset(self, attributes)
             log = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
