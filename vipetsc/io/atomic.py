@@ -77,7 +77,7 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
-    """Load the arrays ``wanted``, else all, that ``save_arrays`` wrote; without a ``copy`` each is read when it is used.
+    """Load the arrays ``wanted``, else all, that ``save_arrays`` wrote; without a ``copy`` each is read when used.
 
     Raises OSError that names the file.
     """
