@@ -1,11 +1,13 @@
 r"""Exact steps of the linear lattice, with the forces of contacts and drive collocated within them.
 
-Between its contact sites the lattice is linear, M u'' = -K u + f(t), and f acts on few masses. In the step from t_0 to
-t_0 + H, with s = (t - t_0)/H in [0, 1], variation of constants (Hochbruck and Ostermann 2010, sec. 2) gives the state
+Between its contact sites the lattice is linear, M u'' = -K u + f(t), with u the displacements, M and K the matrices of
+masses and springs, and f acts on few masses. In the step from t_0 to t_0 + H, with s = (t - t_0)/H in [0, 1], variation
+of constants (Hochbruck and Ostermann 2010, sec. 2) gives the state
 
     y(t_0 + H) = P(H) y(t_0) + integral over the step of P(H - t + t_0) (0, M^-1 f(t)) dt,   y = (u, u').
 
-**1. The propagator** (``series``, ``stencil``). With A = H^2 M^-1 K the free motion is the series
+**1. The propagator** (``series``, ``stencil``). P(H) takes a state through H of free motion, without f. With
+A = H^2 M^-1 K, whose powers bear all of H but the one with a velocity, free motion is the series
 
     u(s) = sum_m (-A)^m [u_0 s^2m / (2m)! + H u'_0 s^(2m+1) / (2m+1)!].
 
@@ -30,10 +32,11 @@ coefficients as in 1. While forces act,
 
 a Volterra equation. In substeps of length h it is collocated at eight Gauss nodes (Hairer, Norsett and Wanner 1993,
 sec. II.7): F is its interpolant through the nodes, the integrals of s^k times Lagrange's polynomials are tables, and
-Picard's iteration solves for the values at the nodes. With Hertz's law F begins and ends as the power 3/2 of time; in
-the root of the time since the onset, s = h z^2, or before the separation, s = h z (2 - z), it is smooth (Brunner 2004,
-sec. 6.2), and the nodes lie evenly in z. The last two Legendre coefficients of F at the nodes estimate the error, by
-which h is controlled. After the substep the a_i are shifted to its end, and the motion caused by F is added to them.
+Picard's iteration solves for the values at the nodes (reasons in ``collocation``). With Hertz's law F begins and ends
+as the power 3/2 of time; in the root of the time since the onset, s = h z^2, or before the separation, s = h z (2 - z),
+it is smooth (Brunner 2004, sec. 6.2), and the nodes are Gauss's in z. The last two Legendre coefficients of F at the
+nodes estimate the error, by which h is controlled. After the substep the a_i are shifted to its end, and the motion
+caused by F is added to them.
 
 **4. Changes** (``advance``). Substeps are searched for changes of a site's mode on the quintic Hermite interpolant of w
 and repeated so that they end on the first one: see ``vipetsc.contact``. Contacts that touch or are pressed at rest act
@@ -49,13 +52,14 @@ the moments mu_k = integral of F (1 - s)^k dt over the step,
 in the cells within r. Nothing else of the forces' history is needed.
 
 **6. Clusters and ranks** (``clusters``, ``stencil``). DoFs within r cells of one another, counted from any cell that
-they have a mass in, must be solved for together and form a cluster. Every rank that owns a cell within r of a cluster
-advances it, from the same numbers to the same bits, so that one exchange of ``HaloRegions`` a step is all that ranks
-must say to each other. ``engine`` weighs a step's cost against the size of its clusters. Its loop over a block of
-samples is compiled as a whole: ranks agree on requests and failures at a block's end, to which a rank that cannot
-follow its contacts goes on without them.
+they have a mass in, must be solved for together: they are a group, and on a rank that feels it a cluster. Every rank
+that owns a cell within r of a cluster advances it, from the same numbers to the same bits, so that one exchange of
+``HaloRegions`` a step is all that ranks must say to each other. ``engine`` weighs a step's cost against the size of its
+clusters. Its loop over a block of samples is compiled as a whole: ranks agree on requests and failures at a block's
+end, to which a rank that cannot follow its contacts goes on without them.
 
-**7. Dashpots.** With M u'' = -K u - C u' + f free motion has all powers of s, and with P_0 = 1, Q_0 = 0 (``rows``)
+**7. Dashpots** have the matrix C. With M u'' = -K u - C u' + f free motion has all powers of s, each with a matrix P_k
+for displacements and Q_k for velocities: with P_0 = 1, Q_0 = 0 (``rows``)
 
     u(s) = sum_k s^k/k! (P_k u_0 + Q_k H u'_0),   P_(k+1) = -Q_k H^2 M^-1 K,   Q_(k+1) = P_k - Q_k H M^-1 C.
 

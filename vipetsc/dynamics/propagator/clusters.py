@@ -1,11 +1,24 @@
-"""Contact sites and driven masses as rows of the lattice's displacements: which form a cluster, and their tables.
+"""Contact sites and driven masses as rows of the lattice's displacements: how they form clusters, and their tables.
 
 A force acts on the lattice along a DoF x = c u, a relative displacement or a mass's own (sec. 2 of the derivation in
 the package's docstring). DoFs so close that one feels the other within a step form a cluster (sec. 6). Two tables hold
 all that a step must know of the lattice around them: the rows c (-A)^m, by which ``expand_free_motion`` finds the
-Taylor series of x(s) and, since they serve both ways by Maxwell's reciprocity, ``apply_impulses`` adds what forces
-leave in the lattice (sec. 5); and the responses G of ``create_responses``, by which one DoF moves another (sec. 3).
-With dashpots (sec. 7) the rows are c P_k and c Q_k, one for each power of time.
+Taylor series of x(s) and ``apply_impulses`` adds what forces leave in the lattice (sec. 5); and the responses G of
+``create_responses``, by which one DoF moves another (sec. 3). With dashpots (sec. 7) the rows are c P_k and c Q_k, one
+for each power of time.
+
+**Notation.** M, K and C are the matrices of masses, springs and dashpots, H the step in s, t the time from its
+beginning, s = t/H, and A = H^2 M^-1 K. Powers of A bear H^2m already; ``factors`` H^(k mod 2)/k! add what the power s^k
+lacks (see ``series``).
+
+**Rows that serve both ways** (Maxwell's reciprocity). M and K are symmetric, so that (-A)^m M^-1 is: what the force on
+x leaves in every displacement, (-A)^m M^-1 c^T, is M^-1 times the row c (-A)^m, by which x is read from every
+displacement. With dashpots C is symmetric, too, and so is Q_k M^-1, the series of the inverse of M p^2 + C p + K. A
+force changes velocities alone at once; what follows is the motion from these velocities, for which the Q_k stand: no
+P_k is needed. The velocity, the derivative of sum_k Q_k s^k H/k!, has the same Q_k with the factor 1/(k-1)!.
+
+**Words.** A *group* is a set of DoFs of the whole lattice that are solved for together, as numbers (``Groups``); a
+*cluster* is such a group on a rank that feels it, with its tables (``DofTables``). They are numbered alike on the rank.
 """
 
 from typing import NamedTuple
@@ -18,15 +31,16 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
 
-# The tables' clearances are less by this fraction: ``first_onset`` takes an approach to 1e-10 of it for an onset, and
-# the sum by which a site is judged unable to touch is rounded.
+# The tables' clearances are the sites' times 1 less this: ``first_onset`` takes an approach to 1e-10 of a clearance for
+# an onset, and the sum by which a site is judged unable to touch is rounded.
 NEARLY_TOUCHING = 1e-9
 
 
 class Groups(NamedTuple):
-    """Groups of ``contact_dofs``: the ``numbers`` (dof,) of group g are ``first[g]`` to ``first[g + 1]``.
+    """Groups of ``contact_dofs``: those of group g are ``numbers[first[g] : first[g + 1]]``.
 
-    In each group the sites' numbers come first, in their own order, then -1 for the first drive, -2 for the second.
+    In each group the sites' numbers come first, in their own order, then -1 for the first drive, -2 for the second:
+    the sign tells drives from sites, however many sites there are.
     """
 
     numbers: np.ndarray
@@ -36,13 +50,16 @@ class Groups(NamedTuple):
 class DofTables(NamedTuple):
     """The contact DoFs of a rank, cluster by cluster, and the tables by which they and the lattice move each other.
 
-    ``column`` (dof,) is the first column in the halo of the cells that a DoF reaches, ``owned`` (dof, cell) says which
-    of the rank's cells they are, -1 for cells of other ranks. ``table`` (dof,) numbers its rows in ``rows`` (table,
-    mass, cell, term) and the masses there in ``inverse_masses`` (table, mass, cell) in 1/kg; ``factors`` (2 term,) are
-    H^(k mod 2)/k!. With dashpots rows are (table, 2 mass, cell, 2 term), ``factors`` 1/k! and then H/k!. ``clearance``
-    (dof,) in m is the lesser of a site's two, inf for a driven mass. A cluster has so many ``sites`` (cluster,), which
-    come before its driven masses. The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``; ``ledger`` lists those
-    whose energy the rank's part of the state holds.
+    The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``: its sites, ``sites[c]`` of them, and then its driven
+    masses. A DoF's rows span ``StepSeries.width`` cells. ``column`` (dof,) is the first of these among the columns of
+    the halo, ``owned`` (dof, cell) their numbers among the rank's cells, -1 for cells of other ranks. ``clearance``
+    (dof,) in m is the lesser of a site's two, inf for a driven mass.
+
+    DoFs that have equal rows share a table: ``table`` (dof,) numbers it in ``rows`` (table, mass, cell, term) and in
+    ``inverse_masses`` (table, mass, cell) in 1/kg. ``factors`` (2 term,) are H^(k mod 2)/k!. With dashpots ``rows`` are
+    (table, 2 mass, cell, 2 term), those of P_k before those of Q_k, and ``factors`` 1/k! and then H/k!.
+
+    ``ledger`` lists the DoFs whose energy is kept in the rank's part of the state.
     """
 
     column: np.ndarray
@@ -60,10 +77,10 @@ class DofTables(NamedTuple):
 def contact_dofs(model: Model) -> np.ndarray:
     """The DoFs on which forces act: relative displacements of the sites, then displacements of driven masses.
 
-    The array (dof,) can be indexed by a site's number or, from the end, by -n for the n-th drive. ``cell`` is a DoF's
-    first cell, ``last`` its last one, the same or the next; ``form`` (cell, mass) are the weights c of the
-    displacements there, of one cell where no contact joins cells; ``clearance`` in m is the lesser of a site's two, inf
-    for a driven mass.
+    The array (dof,) can be indexed by a site's number or, from the end, by -n for the n-th drive: drives come last, in
+    reverse. ``cell`` is a DoF's first cell and ``last`` its last one, the same or the next. ``form`` (cell, mass) are
+    the weights c of the displacements in these cells: one cell if no contact of the lattice joins cells, else two.
+    ``clearance`` in m is the lesser of a site's two, inf for a driven mass.
     """
     lattice = model.chain
     drives = model.drives[::-1]
@@ -74,9 +91,12 @@ def contact_dofs(model: Model) -> np.ndarray:
     dofs = np.zeros(len(sites) + len(drives), fields)
     dofs["cell"] = [*lattice.sites, *(drive.cell for drive in drives)]
 
+    # ``pairs`` is empty where all sites join the masses of the cell's own pair: one row for all.
     pairs = lattice.pairs or [(lattice.cell.host, lattice.cell.resonator, 0)]
     host, resonator, joins = np.broadcast_to(np.array(pairs, np.int64), (len(sites), 3)).T
-    # Ground has the number -1, and so the last row, of zeros.
+
+    # A site's w is the second mass's displacement, in the next cell if it ``joins`` cells, less the host's. Ground has
+    # the number -1, and so the last row, of zeros.
     unit = np.eye(lattice.cell.dofs + 1)[:, :-1]
     dofs["form"][sites, joins] = unit[resonator]
     dofs["form"][sites, 0] -= unit[host]
@@ -84,13 +104,17 @@ def contact_dofs(model: Model) -> np.ndarray:
     dofs["last"] = dofs["cell"]
     dofs["last"][sites] += joins
 
+    # ``gaps`` is empty where the clearances of every site are equal on both sides.
     gaps = np.min(model.gaps, axis=1) if model.gaps else lattice.clearances
     dofs["clearance"] = [*gaps, *[np.inf] * len(drives)]
     return dofs
 
 
 def group_dofs(model: Model, reach: int) -> Groups:
-    """Groups of ``contact_dofs`` of which each is within ``reach`` cells of another, in the lattice's order."""
+    """Divide ``contact_dofs`` into groups, in the lattice's order.
+
+    DoFs within ``reach`` cells of each other are in one group, and so are those that are in one with a third.
+    """
     lattice = model.chain
     dofs = contact_dofs(model)
     numbers = np.append(np.arange(len(lattice.sites)), np.arange(-len(model.drives), 0))
@@ -107,7 +131,9 @@ def group_dofs(model: Model, reach: int) -> Groups:
         group[group == group.max()] = 0
 
     first = np.append(0, np.cumsum(np.bincount(group)))
-    return Groups(numbers[np.lexsort((np.abs(numbers), numbers < 0, group))], first)
+    # By group, then sites before drives, then by their own count: the last key of lexsort counts most.
+    by_group = np.lexsort((np.abs(numbers), numbers < 0, group))
+    return Groups(numbers[by_group], first)
 
 
 def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: Layout) -> Groups:
@@ -118,6 +144,7 @@ def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: La
     for turn in turns:
         near |= (dofs["last"] + turn >= layout.start - reach) & (dofs["cell"] + turn < layout.stop + reach)
 
+    # A group is near if one of its DoFs is; a rank without cells has no group, though its place is near some.
     sizes = np.diff(groups.first)
     selected = np.logical_or.reduceat(near, groups.first[:-1]) & (layout.owned > 0)
     return Groups(groups.numbers[np.repeat(selected, sizes)], np.append(0, np.cumsum(sizes[selected])))
@@ -128,30 +155,33 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     numbers = groups.numbers
     all_dofs = contact_dofs(model)
     dofs = all_dofs[numbers]
-    joined = dofs["form"].shape[1]
+    # Cells that a form has weights for: 2 if contacts join cells, else 1.
+    span = dofs["form"].shape[1]
 
-    # DoFs of equal form share their rows where the cells around them have equal rows.
-    ends = np.stack([dofs["cell"], dofs["last"] % layout.cells][:joined], axis=1)
-    forms = dofs["form"].reshape(len(dofs), joined * layout.dofs)
-    examples = series.representatives(ends.ravel()).reshape(ends.shape)
-    kinds, table = np.unique(np.hstack([examples, forms]), axis=0, return_inverse=True)
-    cells = kinds[:, :joined].astype(np.int64)
-    forms = kinds[:, joined:].reshape(len(kinds), joined, layout.dofs)
+    # DoFs of equal form share a table where their cells have equal rows, those of one representative.
+    form_cells = np.stack([dofs["cell"], dofs["last"] % layout.cells][:span], axis=1)
+    weights = dofs["form"].reshape(len(dofs), span * layout.dofs)
+    representatives = series.representatives(form_cells.ravel()).reshape(form_cells.shape)
+    kinds, table = np.unique(np.hstack([representatives, weights]), axis=0, return_inverse=True)
+    cells = kinds[:, :span].astype(np.int64)
+    forms = kinds[:, span:].reshape(len(kinds), span, layout.dofs)
 
-    firsts = dofs["cell"] - series.reach
+    # Masses around a representative are those around all DoFs of its table; beyond an end of the lattice none is used.
     masses = np.zeros((len(kinds), layout.dofs, series.width))
     for i, cell in enumerate(cells[:, 0].tolist()):
-        first = cell - series.reach
-        masses[i] = model.chain.coefficients(first, first + series.width).masses.T
+        leftmost = cell - series.reach
+        masses[i] = model.chain.coefficients(leftmost, leftmost + series.width).masses.T
 
     # Sites and drives of the rank's ledger, in its order, by their place in ``numbers``.
     places = np.full(len(all_dofs), -1)
     places[numbers] = np.arange(len(numbers))
     ledger = places[[*(-1 - i for i in layout.drives), *layout.sites]]
 
+    leftmost_cells = dofs["cell"] - series.reach
+    column = halo.add(leftmost_cells, series.width)
     return DofTables(
-        column=halo.add(firsts, series.width),
-        owned=_owned_cells(firsts, series.width, layout),
+        column=column,
+        owned=_owned_cells(leftmost_cells, series.width, layout),
         table=table,
         rows=_form_rows(cells, forms, series),
         factors=series.factors(),
@@ -164,39 +194,45 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     )
 
 
-def _owned_cells(firsts: np.ndarray, count: int, layout: Layout) -> np.ndarray:
-    """Local numbers (dof, count) of so many cells from each of ``firsts`` (dof,) on, -1 where nothing is owned."""
-    cells = firsts[:, None] + np.arange(count)
+def _owned_cells(leftmost: np.ndarray, count: int, layout: Layout) -> np.ndarray:
+    """Local numbers (dof, count) of the ``count`` cells from ``leftmost`` (dof,) on, -1 for a cell of another rank."""
+    cells = leftmost[:, None] + np.arange(count)
     if layout.periodic:
         cells = cells % layout.cells
     return np.where((cells >= layout.start) & (cells < layout.stop), cells - layout.start, -1)
 
 
 def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.ndarray:
-    """Rows c (-A)^m as in ``DofTables`` of the ``forms`` c (table, end, mass) in the ``cells`` (table, end)."""
-    tables, joined, masses = forms.shape
+    """Rows c (-A)^m as in ``DofTables`` of the ``forms`` c (table, k, mass), k = 0, 1 the first and the next cell.
+
+    ``cells`` (table, k) are these cells, or representatives of them.
+    """
+    tables, span, masses = forms.shape
+    # With dashpots rows for velocities beside those for displacements, and twice as many powers.
     halves = 1 + series.is_damped
     rows = np.zeros((tables, halves * masses, series.width, halves * series.terms))
 
     band = 2 * series.reach + 1
-    for end in range(joined):
-        for row, form, mass_rows in zip(rows, forms[:, end], series.rows(cells[:, end]), strict=True):
+    for k in range(span):
+        for row, form, mass_rows in zip(rows, forms[:, k], series.rows(cells[:, k]), strict=True):
             part = series.cut(mass_rows, -series.reach, band).astype(float)
             # The rows of a mass in the next cell lie one cell further on.
-            row[:, end : end + band] += np.einsum("i,imjc->jcm", form, part)
+            row[:, k : k + band] += np.einsum("i,imjc->jcm", form, part)
     return rows
 
 
 def create_responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
-    """Create the motion (dof, dof, term) of each DoF after an impulse on each of its cluster, times H.
+    """Create the motion (dof, source, term) of each DoF after a unit impulse on each DoF of its cluster, times H.
 
     An impulse on DoF l leaves the velocities M^-1 c_l^T, on which the rows of DoF i act: see ``Cluster.response``.
+    Sources are counted within the cluster; columns beyond a smaller cluster's size are zero.
     """
     all_dofs = contact_dofs(model)
     cells = all_dofs["cell"][groups.numbers]
     masses = model.chain.cell.dofs
 
-    # What DoFs take from velocities: (table, mass, cell, term).
+    # What DoFs take from velocities: (table, mass, cell, term). The factors are those of the odd powers; with dashpots
+    # of all but the zeroth, since Q_0 = 0.
     if series.is_damped:
         rows = tables.rows[:, -masses:, :, 1:]
         factors = tables.factors[2 * series.terms + 1 :] * series.interval
@@ -206,21 +242,21 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
     # One cell more, of zeros, stands for all that are not reached.
     rows = np.pad(rows, [(0, 0), (0, 0), (0, 1), (0, 0)])
 
-    # The velocities after a unit impulse: (table, end, mass).
-    _, examples = np.unique(tables.table, return_index=True)
-    forms = all_dofs["form"][groups.numbers[examples]]
-    ends = np.arange(forms.shape[1])
-    velocities = tables.inverse_masses[:, :, series.reach + ends].swapaxes(1, 2) * forms
+    # The velocities after a unit impulse: (table, cell of the form, mass). One DoF of each table shows its form.
+    _, first_dofs = np.unique(tables.table, return_index=True)
+    forms = all_dofs["form"][groups.numbers[first_dofs]]
+    form_cells = np.arange(forms.shape[1])
+    velocities = tables.inverse_masses[:, :, series.reach + form_cells].swapaxes(1, 2) * forms
 
     sizes = np.diff(groups.first)
     response = np.zeros((len(cells), max(sizes, default=0), rows.shape[-1]))
     for j in range(response.shape[1]):
-        # The j-th DoF of every cluster that has so many is the source.
+        # The j-th DoF is the source, in every cluster that has more than j.
         targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
         sources = np.repeat(groups.first[:-1], sizes)[targets] + j
 
         # Columns of the target's rows in which the cells of the source lie.
-        columns = series.reach + (cells[sources] - cells[targets])[:, None] + ends
+        columns = series.reach + (cells[sources] - cells[targets])[:, None] + form_cells
         if model.chain.ends == "periodic":
             columns = columns % model.chain.cells
         columns = np.where((columns >= 0) & (columns < series.width), columns, series.width)
@@ -232,12 +268,13 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
         pairs, which = np.unique(pairs, axis=0, return_inverse=True)
         responses = np.zeros((len(pairs), rows.shape[-1]))
         for out, (target, source, *pair_columns) in zip(responses, pairs.tolist(), strict=True):
-            for end, column in enumerate(pair_columns):
-                out += velocities[source, end] @ rows[target, :, column]
+            for k, column in enumerate(pair_columns):
+                out += velocities[source, k] @ rows[target, :, column]
         response[targets, j] = (factors * responses)[which]
     return response
 
 
+# Not a ``kernel`` of ``vipetsc.compiled``, since it makes arrays.
 @njit(error_model="numpy")
 def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a site may reach its clearance.
@@ -246,6 +283,7 @@ def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.
     beginning of the step.
     """
     _, masses, width, terms = dofs.rows.shape
+    # With dashpots there is a row for each mass's velocity, too, as there is in ``columns``.
     if masses == columns.shape[0]:
         return _expand_damped_motion(dofs, c, columns, taylor)
 
@@ -254,18 +292,19 @@ def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.
     may_touch = False
     for i in range(dofs.first[c], dofs.first[c + 1]):
         rows = dofs.rows[dofs.table[i]]
-        first = dofs.column[i]
+        leftmost = dofs.column[i]
         even[:] = 0.0
         odd[:] = 0.0
         for j in range(masses):
             for k in range(width):
-                u = columns[j, first + k]
-                v = columns[masses + j, first + k]
+                u = columns[j, leftmost + k]
+                v = columns[masses + j, leftmost + k]
                 row = rows[j, k]
                 for m in range(terms):
                     even[m] += u * row[m]
                     odd[m] += v * row[m]
 
+        # The sum of all |a_k| bounds |x| in the whole step, 0 <= s <= 1.
         bound = 0.0
         for m in range(terms):
             taylor[i, 2 * m] = even[m] * dofs.factors[2 * m]
@@ -280,15 +319,15 @@ def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.
 def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion as ``expand_free_motion`` does, in a lattice with dashpots."""
     _, rows, width, terms = dofs.rows.shape
-    # By powers of time: what displacements make, what velocities make.
+    # For each power of time: the sum over displacements, and that over velocities.
     total = np.empty((2, terms))
     may_touch = False
     for i in range(dofs.first[c], dofs.first[c + 1]):
-        first = dofs.column[i]
+        leftmost = dofs.column[i]
         total[:] = 0.0
         for j in range(rows):
             for k in range(width):
-                x = columns[j, first + k]
+                x = columns[j, leftmost + k]
                 row = dofs.rows[dofs.table[i], j, k]
                 for m in range(terms):
                     total[2 * j // rows, m] += x * row[m]
@@ -303,11 +342,12 @@ def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: 
 
 @njit(error_model="numpy")
 def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
-    """Add to the owned cells ``out`` (2 mass, cell) what forces within the step leave there at its end.
+    """Add to the owned cells ``out`` (2 mass, cell) the motion that forces within the step have caused at its end.
 
     Row i of ``moments`` (dof, 2 term) belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt.
     """
     masses, width, terms = dofs.rows.shape[1:]
+    # With dashpots: see ``expand_free_motion``.
     if masses == out.shape[0]:
         _apply_damped_impulses(dofs, first, moments, out)
         return
@@ -334,7 +374,10 @@ def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.nda
 
 @njit(error_model="numpy")
 def _apply_damped_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
-    """Add what forces leave as ``apply_impulses`` does, in a lattice with dashpots."""
+    """Add the motion that forces have caused as ``apply_impulses`` does, in a lattice with dashpots.
+
+    Only the rows of velocities count: see **Rows that serve both ways** in the module's docstring.
+    """
     rows, width, terms = dofs.rows.shape[1:]
     masses = rows // 2
     for i in range(moments.shape[0]):

@@ -1,4 +1,4 @@
-"""Collocation of the forces in a substep of a cluster, and what they leave: motion, error estimate, moments.
+"""Collocation of the forces in a substep of a cluster; the motion, error estimate and moments that follow.
 
 While forces act on a cluster's DoFs, the motion of each is its free motion plus integrals of all forces times the
 responses G (sec. 3 of the derivation in the package's docstring). Over a substep every force is replaced by its
@@ -6,6 +6,26 @@ interpolant through eight nodes, by which the integrals become sums with the tab
 the nodes is a small system of equations that ``collocate`` solves by Picard's iteration. ``update_taylor`` then carries
 the free motion of all DoFs to the substep's end, ``error_ratio`` judges the interpolant, and ``accumulate_moments``
 adds the forces to the moments by which the step will move the lattice (sec. 5).
+
+**Notation.** H is the linear step in s, s the position in it in units of H; a substep has its ``length`` in these units
+and nodes of one of three kinds, ``substep.kind``: plain ones, or ones that crowd where a force of Hertz begins or ends
+(``nodes``). A DoF is the relative displacement w of a contact site or the displacement of a driven mass; those on which
+a force acts in a substep are ``trial.active``: the sites in contact, ``trial.closed``, and the masses whose drive is
+on. A ``Cluster`` holds what has been taken, a ``Trial`` a substep that may still be thrown away.
+
+**Picard's iteration** puts the motion at the nodes into the force law, the forces into the integrals, and so on. With a
+contact of stiffness k on a mass m each sweep leaves 0.006 (h omega)^2 of the error, omega^2 = k/m, h the substep's
+length in s (0.006 is the spectral radius of the tables' double integral): it contracts up to h omega = 12, and in the
+substeps that the error estimate allows, of h omega = 1 to 2, ten sweeps or so reach rounding. Newton's method would
+need fewer, but in each the law's derivatives and the solution of a linear system of 8 equations for each active DoF.
+
+**Moments.** The integrals of a force times powers of the lag to the substep's end are sums over the nodes with Gauss's
+weights. They are those of the interpolant, a polynomial of degree 7 in the nodes' variable z, as long as the product's
+degree is at most 15: up to the 8th power with plain nodes, up to the 3rd with the others, where the lag is quadratic in
+z. For higher powers, which the response multiplies by its high, small terms, they err as Gauss's rule does.
+
+Whether a function is a ``kernel`` or ``inlined``, put in place of its calls, matters for speed alone: see
+``vipetsc.compiled``.
 """
 
 import numpy as np
@@ -18,32 +38,45 @@ from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
 
+# Sweeps beyond which a substep is cut instead: so many suffice up to h omega = 8, where the error is far from small
+# enough. Any limit of some tens serves.
 MOST_SWEEPS = 60
 # Picard's iteration has converged when motion at the nodes changes by less than this, relative as in ``_replace``.
 CONVERGED = 1e-15
-# ... or by less than this, if another sweep no longer changes it by less: what is left is rounding.
+# It has also converged when the change is below this and no smaller than in the sweep before: that is rounding.
 STAGNANT = 1e-13
-# Responses smaller than this, relative to the first one, are left out.
+# A response's terms smaller than this, relative to its first one, are left out.
 SMALLEST_RESPONSE = 1e-18
-# Fraction of the estimated error (interpolation of the force) that the end of a substep is left with.
+# Error at a substep's end over that of the force's last two Legendre coefficients, taken from above. Gauss's rule
+# integrates these two exactly, so that the end errs by later, smaller coefficients only: on a linear contact and on one
+# of Hertz by 2e-4 of the two or less, wherever that is above rounding. The hundredfold margin is for other forces.
 SUPERCONVERGENCE = 0.02
+# Binomial coefficients binom(p, k), p down, k across, of all powers of s that a series may have.
 BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
 
 
 @kernel
 def _force_on_site(contacts: np.ndarray, i: int, w: float, rate: float) -> float:
-    """Force in N on the relative displacement of site ``i``, beyond the load that a pressed one has at rest."""
-    return -(contact_force(contacts, i, w, rate)[0] - contacts[i].preload)
+    """Force in N that moves the relative displacement w of site ``i``.
+
+    ``contact_force`` is that on the host. It pushes the other mass the opposite way, and w is the other mass's
+    displacement less the host's: so the sign. The load of a contact that is pressed at rest, ``preload``, is balanced
+    there by static loads: only what the force differs from it moves w.
+    """
+    on_host, _ = contact_force(contacts, i, w, rate)
+    return -(on_host - contacts[i].preload)
 
 
 @kernel
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
     """Put w, w', w'' of every site at the present position, where the series is ``taylor``, into ``out`` (site, 3)."""
+    # A record in an array of one: compiled code can change it in place.
     state = cluster.state[0]
     sites = cluster.contacts.size
     h = cluster.interval
 
     # The series is that of the free motion from here on: forces have had no time to change w and w', but add to w''.
+    # They are put into a workspace; ``drives`` has a row for every DoF, so that the number i serves for it, too.
     forces = cluster.trial.sums.forces[: cluster.taylor.shape[0]]
     for i in range(sites):
         out[i, 0] = taylor[i, 0]
@@ -61,39 +94,43 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
 
 @inlined
 def has_all_powers(cluster: Cluster) -> bool:
-    """Whether responses have all powers of time, not odd ones alone: whether there are dashpots."""
+    """Whether responses have all powers of time, not odd ones alone: whether there are dashpots.
+
+    A series has 2 n coefficients, a response its n odd ones, or with dashpots the 2 n - 1 after the zeroth.
+    """
     return 2 * cluster.response.shape[2] > cluster.taylor.shape[1]
 
 
 @kernel
 def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
-    """Fill (node k, node) with what DoF ``j``'s force at node k adds to w, w' of DoF ``i``; whether it reaches it.
+    """Fill ``to_w`` and ``to_v`` (node k, node) with what a unit force of DoF ``j`` at node k adds to w, w' of ``i``.
 
     With the substep's length d, the term g s^p of the response adds g d^(p + 1) to w and p g d^p/H to w', times the
-    tables' integrals of the powers p and p - 1.
+    tables' integrals of the powers p and p - 1. Returns whether ``j`` moves ``i`` at all.
     """
     to_w[:] = 0.0
     to_v[:] = 0.0
     reaches = False
     all_powers = has_all_powers(cluster)
+    # d^p of the term at hand, and the factor to the next one's.
     power = substep.length
     ratio = substep.length if all_powers else substep.length * substep.length
     # Terms fall with m as those of the fastest mode's sine do, with dashpots as those of its exponential function.
     size = 1.0
-    turned = cluster.omega_max_h * substep.length
+    radians = cluster.omega_max_h * substep.length
     for m in range(cluster.response.shape[2]):
         p = m + 1 if all_powers else 2 * m + 1
         g = cluster.response[i, j, m]
         if g != 0.0:
             reaches = True
-            by_w = g * power * substep.length
-            by_v = g * power * p / cluster.interval
+            w_factor = g * power * substep.length
+            v_factor = g * power * p / cluster.interval
             for k in range(NODES):
                 for node in range(NODES):
-                    to_w[k, node] += by_w * cluster.nodes.powers[substep.kind, p, k, node]
-                    to_v[k, node] += by_v * cluster.nodes.powers[substep.kind, p - 1, k, node]
+                    to_w[k, node] += w_factor * cluster.nodes.powers[substep.kind, p, k, node]
+                    to_v[k, node] += v_factor * cluster.nodes.powers[substep.kind, p - 1, k, node]
         power *= ratio
-        size *= turned / (p + 1) if all_powers else turned**2 / ((2 * m + 2) * (2 * m + 3))
+        size *= radians / (p + 1) if all_powers else radians**2 / ((2 * m + 2) * (2 * m + 3))
         if size < SMALLEST_RESPONSE:
             break
     return reaches
@@ -101,7 +138,10 @@ def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.
 
 @inlined
 def _prepare_nodes(cluster: Cluster, trial: Trial, substep: Substep) -> None:
-    """Fill what does not change while forces are iterated: free motion, drives' forces, responses at the nodes."""
+    """Fill what does not change while forces are iterated: free motion, drives' forces, responses at the nodes.
+
+    All but the drives' forces goes into the workspace ``trial.sums``.
+    """
     state = cluster.state[0]
     h = cluster.interval
     sums = trial.sums
@@ -124,7 +164,10 @@ def _prepare_nodes(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 
 @inlined
 def _move(contacts: np.ndarray, trial: Trial) -> float:
-    """Move the active DoFs at the nodes by the forces there; the largest change, inf if a motion is not finite."""
+    """Move the active DoFs at the nodes by the forces there.
+
+    Returns the largest change as ``_replace`` measures it, inf if a motion is not finite.
+    """
     active = trial.active
     sums = trial.sums
     w = sums.w
@@ -147,17 +190,20 @@ def _move(contacts: np.ndarray, trial: Trial) -> float:
 
 @kernel
 def _replace(contacts: np.ndarray, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
-    """Put the motion of DoF ``i`` at the nodes into ``trial``; largest change of a site's, inf if it is not finite.
+    """Put the motion ``w``, ``v`` of DoF ``i`` at the nodes into ``trial``; returns the largest change of a site's.
 
-    Displacements change relative to the site's clearance, velocities to themselves and the approach velocity.
+    A change of w is divided by the site's clearance, one of w' by the sum of |w'| and the contact's approach velocity.
+    It is inf if the motion is not finite, and 0 for a driven mass, whose force does not depend on its motion.
     """
     change = 0.0
     for node in range(NODES):
+        # ``not ... <`` is true of NaN as well.
         if not abs(w[node]) + abs(v[node]) < np.inf:
             return np.inf
         if i < contacts.size:
             site = contacts[i]
             change = max(change, abs(w[node] - trial.w[i, node]) / site.scale)
+            # Never 0/0: a contact begins only at a speed above zero, or has a reference speed (``contact.law.hold``).
             change = max(change, abs(v[node] - trial.v[i, node]) / (abs(v[node]) + abs(site.approach)))
         trial.w[i, node] = w[node]
         trial.v[i, node] = v[node]
@@ -166,9 +212,11 @@ def _replace(contacts: np.ndarray, i: int, w: np.ndarray, v: np.ndarray, trial: 
 
 @kernel
 def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
-    """Solve for the force and motion of the ``active`` DoFs at the nodes of a substep; whether the iteration converged.
+    """Solve for the force and motion of the active DoFs at the nodes of a substep; whether the iteration converged.
 
-    Picard's iteration, which begins with the forces that ``trial`` holds: those of the substep before are near.
+    Picard's iteration, which begins with the forces that ``trial`` holds: those of the substep before are near. On
+    return the motion at the nodes is exactly that which the forces in ``trial`` cause; the law, put to that motion,
+    would give forces that differ by the last change, which is rounding.
     """
     contacts = cluster.contacts
     _prepare_nodes(cluster, trial, substep)
@@ -184,7 +232,7 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
             for node in range(NODES):
                 trial.force[i, node] = _force_on_site(contacts, i, trial.w[i, node], trial.v[i, node])
 
-    # Forces that diverged are no beginning for a shorter substep.
+    # The shorter substep that is tried next must not begin with forces that diverged.
     trial.force[: contacts.size] = 0.0
     return False
 
@@ -193,43 +241,50 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
 def update_taylor(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """Put the series of all DoFs' free motion after a substep, in which the forces of ``trial`` acted, into ``trial``.
 
-    After the substep's end the term g s^p of a response adds g times the sum over k of binom(p, k) mu_(p - k) s^k, mu_k
-    the moments of the force about the end.
+    After the substep's end the term g s^p of a response adds g times the sum over k of binom(p, k) mu_(p - k) s^k: mu_k
+    is the integral over the substep of the force times the k-th power of the lag, the time to the substep's end, in
+    units of H. (``Cluster.moments`` are in N s, about the end of the step.)
     """
     moments = trial.sums.moments
+    # Row m: what the m-th term of a response makes of the moments.
     series = trial.sums.series
     dofs, _, terms = cluster.response.shape
-    by = 1 if has_all_powers(cluster) else 2
+    # From one power in a response to the next.
+    stride = 1 if has_all_powers(cluster) else 2
     coefficients = cluster.taylor.shape[1]
 
     shift(cluster.taylor, substep.length, trial.taylor)
     for source in trial.active:
         moments[:] = 0.0
         for node in range(NODES):
+            # The integrand of mu_k at this node, times the node's weight: k = 0 first, then times the lag.
             amount = substep.length * cluster.nodes.weight[substep.kind, node] * trial.force[source, node]
             lag = substep.length * (1.0 - cluster.nodes.position[substep.kind, node])
             for k in range(coefficients):
                 moments[k] += amount
                 amount *= lag
 
-        # The powers p = by m + 1 of the response, expanded once for all DoFs that it moves.
+        # The powers p = stride m + 1 of the response, expanded once for all DoFs that it moves.
         for m in range(terms):
-            for k in range(by * m + 2):
-                series[m, k] = BINOMIALS[by * m + 1, k] * moments[by * m + 1 - k]
+            for k in range(stride * m + 2):
+                series[m, k] = BINOMIALS[stride * m + 1, k] * moments[stride * m + 1 - k]
         for i in range(dofs):
             for m in range(terms):
                 g = cluster.response[i, source, m]
                 if g != 0.0:
-                    for k in range(by * m + 2):
+                    for k in range(stride * m + 2):
                         trial.taylor[i, k] += g * series[m, k]
 
 
 @kernel
 def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
-    """Estimated error of a substep over the allowed one, by the forces' last two Legendre coefficients.
+    """Estimated error of a substep of ``length`` over the allowed one, by the forces' last two Legendre coefficients.
 
-    Two, since every other one of a force that is symmetric about the middle vanishes. By the first term of the response
-    a force's error becomes one of velocity: ``rtol`` times the approach velocity and ``atol`` are allowed.
+    Both count, for in a force that is symmetric about the substep's middle every other coefficient vanishes. The error
+    of a force becomes one of the site's velocity by the first term g_ii s of the site's own response, the sum of
+    H^2/mass over the site's masses. The first term of another site's response is no larger, the same sum over the
+    masses that the two share; later terms bear higher powers of the length. Allowed are ``rtol`` times the approach
+    velocity plus ``atol``.
     """
     worst = 0.0
     for i in trial.closed:
@@ -247,18 +302,20 @@ def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
 
 @kernel
 def accumulate_moments(cluster: Cluster, trial: Trial, substep: Substep) -> None:
-    """Add a substep's forces to the moments about the step's end, and their work to the energies."""
+    """Add a substep's forces to ``Cluster.moments``, and to the energies what drives did and what sites dissipated."""
     h = cluster.interval
     position = cluster.state[0].position
     for i in trial.active:
         for node in range(NODES):
             duration = h * substep.length * cluster.nodes.weight[substep.kind, node]
-            # A drive's work; of a contact only what it dissipates.
-            power = trial.force[i, node] * trial.v[i, node]
             if i < cluster.contacts.size:
-                power = contact_force(cluster.contacts, i, trial.w[i, node], trial.v[i, node])[1]
+                # The elastic part of a contact's work comes back: its energy counts only what is lost.
+                _, power = contact_force(cluster.contacts, i, trial.w[i, node], trial.v[i, node])
+            else:
+                power = trial.force[i, node] * trial.v[i, node]
             cluster.energy[i] += duration * power
 
+            # Integrals over the step of F (1 - s)^k: k = 0 first, then times what remains of the step.
             remaining = 1.0 - position - substep.length * cluster.nodes.position[substep.kind, node]
             amount = duration * trial.force[i, node]
             for k in range(cluster.moments.shape[1]):

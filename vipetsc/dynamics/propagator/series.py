@@ -6,6 +6,19 @@ docstring). ``StepSeries`` cuts it off where the remainder is below the toleranc
 is left out into ``truncation``, a bound on the relative error of a step. Cells far from the ends and from cells that
 differ share one set of rows; others get their own (sec. 8). The kernels below evaluate and shift such a series and find
 the first time at which a site, moving freely, meets its clearance (sec. 2).
+
+**Notation.** M, K and C are the lattice's matrices of masses, springs and dashpots; H is the step in s;
+A = H^2 M^-1 K; P = P(H) takes the state at a step's beginning to that at its end in free motion. A *term* is a power
+(-A)^m, which moves displacements by s^2m/(2m)! and velocities by H s^(2m+1)/(2m+1)!: one for two powers of time.
+
+**Scaling.** H^2m is in the rows already, which are those of (-A)^m. What is left for ``factors`` is 1/k! for the power
+s^k, and one more H where it multiplies a velocity: H^(k mod 2)/k!.
+
+**The remainder** after n terms (``_remainder``). With theta = omega_max H, and displacements u measured as omega u, the
+power s^k adds at most theta^k/k! to a state of unit amplitude. Kept are k < 2n, and in the velocity, the series'
+derivative, k < 2n - 1. The first power left out is 2n - 1, each later one is at most theta/(2n) times the one before,
+and their sum is at most theta^(2n-1)/(2n-1)! times 1/(1 - theta/(2n)). That factor is at most 1 + theta as long as
+theta <= 2n - 1, which holds wherever the bound is below 1.
 """
 
 from collections.abc import Iterator
@@ -23,7 +36,8 @@ from vipetsc.contact.law import gap_of
 from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, local_recursion, power_rows
 from vipetsc.lattice.chain import Chain
 
-# More than the engine's longest step, omega H = 3.2, needs at its finest tolerance, 1e-15: 15.
+# The engine's longest step, omega H = 3.2, needs 15 terms at its finest tolerance, 1e-15; so many reach omega H = 8.
+# Longer steps, which the engine refuses, are cut off here, and ``truncation`` has the larger remainder.
 MOST_TERMS = 24
 # Cells whose rows are computed together: they take about 100 kB each, too much for all cells at once.
 BATCH = 64
@@ -37,10 +51,10 @@ SMALL_ENTRY = 1e-3
 class StepSeries:
     """Series of the motion of ``chain`` over a step of ``interval`` H in s, to a relative ``tolerance``.
 
-    Rows are arrays (..., term, dof, cell): what a displacement's coefficients take from the displacements around
-    it; the same rows, times H, give those of the velocities. With dashpots (..., 2 term, 2 dof, cell): what the
-    coefficient of each power of time takes from displacements and from H times velocities. A chain must have
-    at least ``width`` cells.
+    Rows are arrays (..., term, dof, cell): what the term (-A)^m of a displacement takes from every displacement in the
+    cells around it, for an even power of time; the same rows times H say what the next, odd power takes from the
+    velocities. With dashpots rows are (..., 2 term, 2 dof, cell), one for each power of time: what it takes from
+    displacements (P_k, the first dof) and from H times velocities (Q_k). A chain must have at least ``width`` cells.
     """
 
     chain: Chain
@@ -49,7 +63,7 @@ class StepSeries:
 
     @cached_property
     def bounds(self) -> Bounds:
-        """What no cell exceeds."""
+        """The largest frequency, damping and matrix entries of any cell."""
         return bounds_of(self.chain)
 
     @property
@@ -65,22 +79,27 @@ class StepSeries:
     @cached_property
     def terms(self) -> int:
         """Number of powers of K in the series, the zeroth included; with dashpots half the powers of time."""
-        # A quarter of the tolerance; ``reach`` takes half of it, the entries that ``interior`` drops have the last one.
+        # The tolerance is divided: a quarter is for the remainder, half for what ``reach`` leaves out, and the last
+        # quarter for the small entries that ``interior`` drops, which only a test holds to it.
         return next((m for m in range(2, MOST_TERMS) if self._remainder(m) <= self.tolerance / 4), MOST_TERMS)
 
     def _remainder(self, terms: int) -> float:
-        """Largest velocity that the series of so many terms leaves out, of one of unit velocity amplitude."""
+        """Bound on what ``terms`` terms leave out of a state of unit amplitude: see the module's docstring."""
+        # The first power of time that the velocity's series leaves out.
         k = 2 * terms - 1
         return self.omega_max_h**k / factorial(k) * (1 + self.omega_max_h)
 
     @property
     def _outermost(self) -> int:
-        """Distance in cells that no power in the series reaches."""
+        """Distance in cells that no power in the series reaches: each of them is a product with K or C, a cell more."""
         return (1 + self.is_damped) * self.terms + 1
 
     @cached_property
     def _zeroth(self) -> np.ndarray:
-        """The zeroth power's rows (1, dof, dof, cell) over all cells within ``_outermost``."""
+        """The zeroth power's rows (1, dof, dof, cell) over all cells within ``_outermost``.
+
+        Those of displacements alone, with dashpots, too: ``power_rows`` begins with P_0 = 1 and adds Q_0 = 0 itself.
+        """
         n = self.chain.cell.dofs
         rows = np.zeros((1, n, n, 2 * self._outermost + 1), np.longdouble)
         rows[..., self._outermost] = np.eye(n)
@@ -116,23 +135,24 @@ class StepSeries:
             return self._interior_magnitudes
         return self._magnitudes(power_rows(self._zeroth, self.terms, self.bounds.recursion(self.interval))[0])
 
-    def _beyond(self, distance: int) -> float:
+    def _sum_beyond(self, distance: int) -> float:
         """Largest sum of P's magnitudes over the cells further away than ``distance``."""
         is_beyond = np.abs(np.arange(-self._outermost, self._outermost + 1)) > distance
         left_out = float(self._largest_magnitudes.sum(axis=1)[:, is_beyond].sum(axis=1).max())
         if self.chain.variation is None:
             return left_out
-        # What cells beyond would change in the rows counts once more: sec. 8.
+        # Rows are computed as if the cells beyond were the reference cell. What that changes in them is at most what is
+        # left out, since it took a way out there and back: sec. 8.
         return 2 * left_out
 
     @cached_property
     def reach(self) -> int:
         """Distance in cells beyond which the propagator's entries sum to less than half the tolerance."""
-        return next(r for r in range(1, self._outermost + 1) if self._beyond(r) <= self.tolerance / 2)
+        return next(r for r in range(1, self._outermost + 1) if self._sum_beyond(r) <= self.tolerance / 2)
 
     @property
     def width(self) -> int:
-        """Cells that a mass reaches, or a contact: it may have a mass in the next cell."""
+        """How many cells the rows of a DoF span: its own, the reach on both sides, one more if contacts join cells."""
         return 2 * self.reach + 1 + self.chain.is_joined
 
     @cached_property
@@ -141,24 +161,32 @@ class StepSeries:
         within = slice(self._outermost - self.reach, self._outermost + self.reach + 1)
         dropped = np.where(self.interior() == 0.0, self._interior_magnitudes[:, :, within], 0.0)
         small = float(dropped.sum(axis=(1, 2)).max())
-        return self._beyond(self.reach) + small + self._remainder(self.terms)
+        return self._sum_beyond(self.reach) + small + self._remainder(self.terms)
 
     def rows(self, cells: ArrayLike) -> Iterator[np.ndarray]:
         """Rows (dof, term, dof, cell) of the masses of each of ``cells``, over all cells within ``_outermost`` of it.
 
-        Computed in batches, to the same bits in any. Cells beyond an end of the chain get zeros; those of a periodic
-        chain count on beyond it.
+        Near an end, cells beyond it get zeros. A cell whose reach ends before the end gets the rows that it would have
+        in an endless chain, as all of a periodic chain do: its neighbours are numbered on beyond the last cell, and
+        what it takes from them, beyond its reach, is left out in the end. Rows are computed in batches, and do not
+        depend on which cells a batch holds.
         """
         cells = np.asarray(cells, np.int64)
         distances = np.arange(-self._outermost, self._outermost + 1)
         for batch in np.split(cells, range(BATCH, len(cells), BATCH)):
             neighbours = batch[:, None] + distances
-            exists = (neighbours >= 0) & (neighbours < self.chain.cells) | ~self._is_near_end(batch)[:, None]
+            is_inside = (neighbours >= 0) & (neighbours < self.chain.cells)
+            exists = is_inside | ~self._is_near_end(batch)[:, None]
+            # One cell more than the reach: the spring that enters the leftmost cell is stored with the cell before.
             recursion = local_recursion(self.chain, self.interval, batch, exists, self.reach + 1)
             yield from power_rows(np.repeat(self._zeroth, len(batch), axis=0), self.terms, recursion)
 
     def cut(self, rows: np.ndarray, first: int, count: int) -> np.ndarray:
-        """The part of ``rows`` over ``count`` cells from the one ``first`` cells away on, zero where they end."""
+        """The columns of ``rows`` of ``count`` cells: that ``first`` cells after the row's own (< 0: before), and on.
+
+        Columns that ``rows`` do not have are zero.
+        """
+        # Padded by ``count`` on both sides, where the row's own cell has the column ``_outermost`` + ``count``.
         begin = first + self._outermost + count
         return np.pad(rows, [(0, 0), (0, 0), (0, 0), (count, count)])[..., begin : begin + count]
 
@@ -172,12 +200,16 @@ class StepSeries:
 
     def _is_near_end(self, cells: ArrayLike) -> np.ndarray:
         """Whether an end lies within the reach of each of ``cells``."""
-        beyond = np.asarray(cells) - self.reach
-        return ((beyond < 0) | (beyond >= self.chain.cells - 2 * self.reach)) & (self.chain.ends != "periodic")
+        leftmost = np.asarray(cells) - self.reach
+        rightmost = leftmost + 2 * self.reach
+        return ((leftmost < 0) | (rightmost >= self.chain.cells)) & (self.chain.ends != "periodic")
 
     @cached_property
     def _differing_before(self) -> np.ndarray:
-        """How many cells differ from the reference cell before each one, from ``reach`` + 1 before the first on."""
+        """Entry i counts the cells before cell i - ``reach`` - 1 that differ from the reference cell.
+
+        How many of a window of cells differ is then a difference of two entries.
+        """
         near = self.reach + 1
         differs = self.chain.differs.astype(int)
         differs = np.pad(differs, near, mode="wrap") if self.chain.ends == "periodic" else np.pad(differs, near)
@@ -189,7 +221,8 @@ class StepSeries:
         is_far = ~self._is_near_end(cells)
         if self.chain.variation is None:
             return is_far
-        return is_far & (self._differing_before[cells + 2 * self.reach + 3] == self._differing_before[cells])
+        window = 2 * (self.reach + 1) + 1
+        return is_far & (self._differing_before[cells + window] == self._differing_before[cells])
 
     def representatives(self, cells: ArrayLike) -> np.ndarray:
         """For each of ``cells`` the first one of them that has the same rows."""
@@ -207,7 +240,10 @@ class StepSeries:
         return cells
 
     def own_rows(self) -> tuple[int, int]:
-        """How many cells have rows of their own since cells differ, and how many tables these are."""
+        """How many cells do not share the interior's rows, those near an end too, and how many tables they need.
+
+        (0, 0) in a lattice in which no cell differs.
+        """
         if self.chain.variation is None:
             return 0, 0
         cells = np.arange(self.chain.cells)
@@ -225,6 +261,7 @@ class StepSeries:
         p = np.zeros((2 * n, 2 * n, rows.shape[-1]), np.longdouble)
 
         # The velocity is the derivative by t: each coefficient times its power, one power lower, over H.
+        # Not by ``is_damped``: where only cells that differ have dashpots, the interior's rows are those without.
         if rows.shape[1] > self.terms:
             p[:n] = np.einsum("m,imjc->ijc", inverse, rows)
             p[n:] = np.einsum("m,imjc->ijc", inverse[:-1], rows[:, 1:]) / h
@@ -277,12 +314,47 @@ def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
 
 
 @kernel
-def first_onset(series: np.ndarray, site: Any, length: float) -> float:
-    """First s in [0, length] at which w comes within rounding of a clearance of the ``site`` and grows; 2 if none does.
+def _onset_on_side(series: np.ndarray, site: Any, side: float, curvature: float, length: float) -> float:
+    """First s in [0, length] at which w is on the clearance of one ``side`` and grows; 2 if there is none.
 
-    |w''| has a bound over the whole length, so that a parabola bounds |w| from above: up to where that meets the
-    clearance nothing can have happened.
+    ``curvature`` bounds |w''| over the length, so that a parabola bounds w towards this side: up to where that
+    meets the clearance nothing can have happened.
     """
+    tolerance = LANDED_W * site.scale
+    clearance = gap_of(site, side)
+    # No stop on this side.
+    if clearance == np.inf:
+        return 2.0
+
+    s = 0.0
+    while s <= length:
+        w, rate = evaluate(series, s)
+        gap = clearance - side * w
+        closing = side * rate
+        if gap < 0.5 * tolerance and closing > 0.0:
+            # A Newton step, where the curvature changes it by less than the tolerance.
+            newton = gap / closing
+            if curvature * newton * newton < tolerance:
+                s = max(s + newton, 0.0)
+            return s
+
+        # The root of curvature/2 d^2 + closing d = gap, without cancellation. The gap is taken larger by the
+        # tolerance: so far beyond the clearance an onset is still met. Without curvature a site that does not close
+        # never meets it: the step is then infinite, or NaN if the site rests, and both end the loop.
+        gap += tolerance
+        root = np.sqrt(max(closing * closing + 2.0 * curvature * gap, 0.0))
+        step = 2.0 * gap / (closing + root) if closing > 0.0 else (root - closing) / curvature
+        s += max(step, ROUNDING)
+    return 2.0
+
+
+@kernel
+def first_onset(series: np.ndarray, site: Any, length: float) -> float:
+    """First s in [0, length] at which w comes within rounding of a clearance of the ``site`` and grows.
+
+    2 if none does: more than any length, since the whole step has the length 1.
+    """
+    # On 0 <= s <= length the sum of |a_k| length^k bounds |w|, that of k (k - 1) |a_k| length^(k-2) bounds |w''|.
     bound = 0.0
     curvature = 0.0
     scale = 1.0
@@ -291,31 +363,12 @@ def first_onset(series: np.ndarray, site: Any, length: float) -> float:
         if k >= 2:
             curvature += k * (k - 1) * abs(series[k]) * scale / (length * length)
         scale *= length
+
+    # Most sites keep away from both clearances: no search.
     tolerance = LANDED_W * site.scale
     if bound < min(site.clearance, site.clearance_minus) - tolerance:
         return 2.0
 
-    first = 2.0
-    for side in (1.0, -1.0):
-        clearance = gap_of(site, side)
-        if clearance == np.inf:
-            continue
-        s = 0.0
-        while s <= length:
-            w, rate = evaluate(series, s)
-            gap = clearance - side * w
-            closing = side * rate
-            if gap < 0.5 * tolerance and closing > 0.0:
-                # A Newton step, where the curvature changes it by less than the tolerance.
-                newton = gap / closing
-                if curvature * newton * newton < tolerance:
-                    s = max(s + newton, 0.0)
-                first = min(first, s)
-                break
-            # The root of curvature/2 d^2 + closing d = gap, without cancellation. The gap is taken larger by the
-            # tolerance: so far beyond the clearance an onset is still met.
-            gap += tolerance
-            root = np.sqrt(max(closing * closing + 2.0 * curvature * gap, 0.0))
-            step = 2.0 * gap / (closing + root) if closing > 0.0 else (root - closing) / curvature
-            s += max(step, ROUNDING)
-    return first
+    plus = _onset_on_side(series, site, 1.0, curvature, length)
+    minus = _onset_on_side(series, site, -1.0, curvature, length)
+    return min(plus, minus)

@@ -22,8 +22,9 @@ COUNTS = ("substeps", "rejected", "landings", "switches")
 SUBSTEP_STATE = np.dtype(
     [(name, float) for name in ("begin", "position", "length")] + [(name, np.int64) for name in COUNTS]
 )
-"""Where a cluster stands: the time in s at which the step begins; the position in the step and the length of the next
-substep, both in units of H; counts of substeps tried, of those rejected, of landings and of switches of a mode."""
+"""Where a cluster stands, a record in an array, so that compiled code can change it: the time in s at which the step
+begins; the position in the step and the length of the next substep, both in units of H; counts of substeps tried, of
+those rejected, of landings and of switches of a mode."""
 
 HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
 """A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
@@ -52,8 +53,9 @@ class Sums(NamedTuple):
 
     At the nodes: ``free_w`` and ``free_v`` (dof, node) of the free motion; ``to_w`` and ``to_v`` (dof, source, node of
     the source, node) of a unit force, for pairs that ``reaches`` (dof, source) marks; ``w`` and ``v`` (node,) of one
-    DoF. Besides, ``forces`` (dof,) at one time, ``moments`` (2 term,) of one DoF's force, their ``series`` (2 term,
-    2 term), and Bernstein coefficients ``bernstein`` (2, 6) of w.
+    DoF. Besides, ``forces`` (dof,) at one time, ``moments`` (2 term,) of one DoF's force about the substep's end, what
+    each term of a response makes of them in powers of s, ``series`` (2 term, 2 term), and Bernstein coefficients
+    ``bernstein`` (2, 6) of w.
     """
 
     free_w: np.ndarray
@@ -72,8 +74,9 @@ class Sums(NamedTuple):
 class Trial(NamedTuple):
     """A substep that has been computed but not yet taken.
 
-    Forces act on the DoFs ``active``, of which those ``closed`` are sites. ``force`` in N, ``w`` in m and ``v`` in m/s
-    (dof, node) are those at its nodes; ``taylor`` and ``site_motion`` are as in ``Cluster``, at its end.
+    Forces act on the DoFs ``active``: first the sites in contact, ``closed``, then masses whose drive is on. ``force``
+    in N, ``w`` in m and ``v`` in m/s (dof, node) are those at its nodes; ``taylor`` and ``site_motion`` are
+    as in ``Cluster``, at its end.
     """
 
     active: np.ndarray
