@@ -2,7 +2,7 @@
 
 Kinetic energy in space and time, wavenumber content, dispersion (of the whole record, and of the cells before and
 after the first site), wavenumber partition and entropy (wavelets over the cells), energies of the pass bands and
-gaps, the inter-band targeted energy transfer, and the energies of the linear modes. The measures themselves stand in
+gaps, the inter-band targeted energy transfer, and the energies of the linear modes. The measures themselves are in
 ``vipetsc.spectra``.
 """
 
@@ -86,7 +86,7 @@ def analyse(
 
     Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
-    estimated from the group velocity: half the burst and the way to the site. ``options`` are the case's where none
+    estimated from the group velocity: half the burst and the time to the site. ``options`` are the case's where none
     are given. What the run cannot give (no sites, a single cell) is left out and named in the attribute ``left_out``;
     what the samples and cells that were kept do not resolve is named in the list ``warnings`` as well.
     """
@@ -119,7 +119,7 @@ def analyse(
 
 
 def describe_options(options: AnalysisTable) -> str:
-    """The ``options`` that results depend on, as they stand in the attribute ``analysis`` of a file."""
+    """The ``options`` that results depend on, as text for the attribute ``analysis`` of a file."""
     return json.dumps(options.model_dump(exclude={"memory"}))
 
 
@@ -157,6 +157,7 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     contents = []
     total = []
     wavenumber = np.zeros(0)
+    # Blocks hold whole rows of the map, so that no mean is cut in two.
     for rows in spectra.blocks(-(-nt // samples), 8 * samples * cells * dofs, record.memory):
         velocity = np.asarray(record.weighted[rows.start * samples : rows.stop * samples])
         energy = spectra.kinetic_energy(velocity, record.masses)
@@ -172,6 +173,7 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     if "kinetic" in measures:
         values["kinetic_energy"] = np.concatenate(kinetic)
         if "bands" in measures and nt > 1:
+            # The total of the bands comes from the same pass through the field.
             values["bands/total"] = np.concatenate(total)
     if contents:
         values["wavenumber"] = wavenumber
@@ -229,6 +231,7 @@ def _windows(record: VelocityRecord) -> dict[str, slice]:
         low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
         lower = slice(0, low)
         upper = slice(high, len(record.cells))
+        # The wave may go down the cells: before and after are in its direction.
         drive_below = record.model.drive_cell < record.site
         windows["dispersion_before"] = lower if drive_below else upper
         windows["dispersion_after"] = upper if drive_below else lower

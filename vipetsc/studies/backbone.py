@@ -79,6 +79,7 @@ def log_slope(energy: np.ndarray, branch_energy: np.ndarray, slope: np.ndarray, 
     inside = (region == VIBRO_IMPACT) & np.isfinite(slope) & (slope > 0)
     if not inside.any():
         raise ValueError("the branch has no region III; follow it to higher energy")
+    # A branch turns back at its folds; interpolation needs rising energies.
     order = np.argsort(branch_energy[inside])
     x = np.log(branch_energy[inside][order])
     y = np.log(slope[inside][order])
@@ -87,7 +88,7 @@ def log_slope(energy: np.ndarray, branch_energy: np.ndarray, slope: np.ndarray, 
 
 @dataclass(frozen=True)
 class Initiation:
-    """What the linear wave needs to touch the first site: ``amplitude`` in N, ``energy`` (drive's work) in J.
+    """Initiation of contact at the first site by the linear wave: ``amplitude`` in N, ``energy`` (drive's work) in J.
 
     ``onset`` in N touches any site; it is lower where sites behind the first have smaller clearances.
     """
@@ -161,7 +162,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
 
 
 def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
-    """Write ``backbone.h5`` beside the ensemble: a group a curve; returns its path, None if there is no such curve."""
+    """Write ``backbone.h5`` in the folder of the ensemble, a group a curve; returns its path, None without curves."""
     if "ibtet" not in ensemble or bool(ensemble["ibtet"].isnull().all()):
         return None
 
@@ -201,7 +202,7 @@ def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
 
 
 def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], folder: Path) -> xr.Dataset | str:
-    """One curve aligned with the branch that suits it best, or why there is none."""
+    """Curve aligned with the branch that suits it best, or the reason why there is none."""
     same_law = [slope for slope in slopes if slope.attrs["law"] == case.contacts.law]
     if not same_law:
         return f"no branch of the law {case.contacts.law}"
@@ -228,13 +229,13 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
 
 
 def _sources(folder: Path, branches: Sequence[Path]) -> dict[str, str]:
-    """SHA-256 of the files that ``backbone.h5`` is made from, by folder."""
+    """SHA-256 of the files from which ``backbone.h5`` is computed, by folder."""
     files = {folder.name: folder / "ensemble.h5"} | {branch.name: branch / BRANCH for branch in branches}
     return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
 
 
 def is_related(folder: Path, branches: Sequence[Path]) -> bool:
-    """Whether ``folder/backbone.h5`` is what this version makes of the sweep and the ``branches`` as they are now."""
+    """Whether ``folder/backbone.h5`` is of this version and of the sweep and the ``branches`` as they are now."""
     with suppress(OSError), open_netcdf(folder / "backbone.h5", "relation") as file:  # none, or one that was cut off
         if file.attrs.get("vipetsc_version") == vipetsc.__version__:
             return bool(json.loads(file.attrs.get("sources", "{}")) == _sources(folder, branches))

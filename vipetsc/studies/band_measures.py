@@ -44,6 +44,7 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
     energy = spectra.part_energies(record.weighted, record.masses, record.interval, parts.edges, stride, record.memory)
     span = _span(record)
     total = energy[:, span.first : span.last].sum(axis=0)
+    # The energy at an instant without motion has no fractions.
     moving = total > 0
 
     times = {
@@ -75,13 +76,14 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
 
 
 def _span(record: VelocityRecord) -> AveragingSpan:
-    """From the wave's arrival at the first site to the record's end, without the ends of the record."""
+    """Samples from the wave's arrival at the first site to the record's end, without the ends of the record."""
     samples = len(record.time)
     if record.site is None:
         after = int(np.searchsorted(record.time, record.model.drive.duration))
         first = min(after, samples - 1)
         reason = "the drive ends (the lattice has no sites)"
     else:
+        # The nearest cell, since the one of the site may not have been kept.
         at = int(np.argmin(np.abs(record.cells - record.site)))
         first = spectra.front_arrival(spectra.kinetic_energy(record.weighted[:, at], record.masses))
         reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"

@@ -20,7 +20,7 @@ from vipetsc.case import Model
 from vipetsc.lattice import ToneBurst, WaveCompliance, bloch
 from vipetsc.studies.response import DECAY, SiteResponse, fastest_wave, in_contact, self_response, unit_phase
 
-WIDTH = 14  # of the burst's line, half of what is followed around a frequency
+WIDTH = 14  # of the burst's line, half of what is followed about a frequency
 WIDEST = 0.45  # of the drive's frequency, the most of that half: what is followed reaches neither 0 nor 2 Om
 WAVENUMBERS = 181  # from 0 to pi, at which the bands are sampled for their edges
 WEAK = 0.35  # over clearance: weaker waves lose as much at a site in contact as a driven wave of this amplitude
@@ -46,7 +46,7 @@ class Composed(NamedTuple):
 class Arriving(NamedTuple):
     """Envelopes (site, time) in m of what arrives at the sites, and where these are in contact.
 
-    ``first`` is c around the drive's frequency, ``third`` c3 around three times it, ``on`` tells of contact.
+    ``first`` is c about the drive's frequency, ``third`` c3 about three times it, ``on`` is true during contact.
     """
 
     first: np.ndarray
@@ -57,8 +57,8 @@ class Arriving(NamedTuple):
 class Network:
     """The sites of a ``model`` and the linear lattice between them; solved once for all amplitudes.
 
-    Around a frequency lie the frequencies ``offset`` in rad/s, whose transform is over ``time`` in s, twice as long as
-    the run. Arrays (site, site, offset) have the site that sends first.
+    The frequencies ``offset`` in rad/s are relative to the middle of a line; their transform is over ``time`` in s,
+    twice as long as the run. Arrays (site, site, offset) have the site that sends first.
     """
 
     def __init__(self, model: Model) -> None:
@@ -157,7 +157,7 @@ class Network:
         return np.asarray(np.fft.ifft(np.fft.ifftshift(spectrum, axes=-1)) * np.exp(self.decay * self.time))
 
     def _sent(self, between: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """What ``source`` (site, time) sends to every site while the run goes on."""
+        """Waves (site, time) that arrive at every site from ``source`` (site, time) while the run goes on."""
         arriving = self._backward(np.einsum("jkt,jt->kt", between, self._forward(source)))
         return np.where(self.during, arriving, 0)
 
@@ -170,6 +170,7 @@ class Network:
 
         size = right.size
         operator = LinearOperator((size, size), left, dtype=complex)
+        # The tolerance is well below CLOSE, at which the outer iteration ends.
         x, _ = gmres(operator, right.ravel(), guess.ravel(), tol=1e-5, atol=0.0, restart=40, maxiter=5)
         return np.asarray(x).reshape(right.shape)
 
@@ -230,5 +231,5 @@ class Network:
                 z = np.sqrt(np.maximum(passing, 0) / self.third.power_per_area) / self.clearance[k]
                 fraction = np.minimum(site.at(np.maximum(z, WEAK)).lost, 1) * on[k]
                 total += float((passing * fraction).sum())
-                passing = passing * (1 - fraction) + emitted[k] / 2  # half of it goes either way
+                passing = passing * (1 - fraction) + emitted[k] / 2  # half of it in each direction
         return total

@@ -1,4 +1,4 @@
-"""Whether both engines give the same: a sample of a sweep's members by ``ts``, beside those of the sweep."""
+"""Comparison of both engines: a sample of a sweep's members by ``ts`` against those of the sweep."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
     """``count`` members of ``sweep`` for the engine ``ts``, on as many of its curves over the amplitude.
 
     Curves are drawn from ``seed``, and of the amplitudes, cut into ``count`` equal parts, one in each: few members go
-    from no contact to hard contact. They stand on one axis. Raises StopIteration if the amplitude does not vary.
+    from no contact to hard contact. They lie on one axis. Raises StopIteration if the amplitude does not vary.
     """
     random = np.random.default_rng(seed)
     number = np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
@@ -31,7 +31,7 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
     amplitude = ((np.arange(count) + random.random(count)) * curves.shape[1] / count).astype(int)
     chosen = np.sort(random.permutation(curves)[np.arange(count), amplitude])
 
-    # Every key in one group of ``zip``: the members stand on one axis.
+    # Every key in one group of ``zip``: the members lie on one axis.
     section = sweep.options.model_dump() | {"fields": False, "zip": [[key for axis in sweep.axes for key in axis]]}
     for axis, indices in zip(sweep.axes, np.unravel_index(chosen, sweep.shape), strict=True):
         for key, values in axis.items():
@@ -40,7 +40,7 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
 
 
 def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
-    """By how much the members of the ``sample`` differ from those of the ``sweep`` (folders), the loudest last.
+    """Differences of the members of the ``sample`` from those of the ``sweep`` (folders), the loudest last.
 
     A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample) and whether they are the ``same`` number,
     ``differences`` by measure and the ``largest``, and whether the member ``agrees``: none above that of ``COMPARED``.
@@ -60,6 +60,7 @@ def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
 
 def _compared(first: xr.Dataset, second: xr.Dataset) -> dict[str, Any]:
     """A row of ``agreement``: one member by both engines."""
+    # A member that failed has -1, which is no number of contacts.
     episodes = [int(np.nan_to_num(member["contact_episodes"].item(), nan=-1)) for member in (first, second)]
     differences: dict[str, float] = {}
     for name in COMPARED:

@@ -63,20 +63,20 @@ FIT = {
 
 
 class LinearSource(NamedTuple):
-    """What a scaled member was scaled from: the ``name`` of a linear run, measured for the first ``site`` (cell)."""
+    """Source of a scaled member: the ``name`` of a linear run, measured for the first ``site`` (cell)."""
 
     name: str
     site: int
 
 
 class Results:
-    """What the records of the sweep ``plan`` in ``folder`` hold, those of other versions and sweeps left out.
+    """Content of the records of the sweep ``plan`` in ``folder``, without those of other versions and sweeps.
 
     ``status`` (member): how each ended, an index of ``STATUS``; ``reasons`` of those that failed by number; ``tables``
     (member, or member and a list, padded with NaN) of what was measured by name, for the first of equal members;
     ``errors`` the largest that is said of each; ``used`` tolerances, engines and options of the analysis; ``linear``
-    runs by name; ``lines`` where the records stand. ``first`` (member) is the number of the first member that is equal.
-    ``warnings`` by number are about the members, ``damaged`` names lines that could not be used.
+    runs by name; ``lines`` the places of the records. ``first`` (member) is the number of the first member that is
+    equal. ``warnings`` by number are about the members, ``damaged`` names lines that could not be used.
     """
 
     def __init__(self, plan: Sweep, folder: Path) -> None:
@@ -108,6 +108,7 @@ class Results:
         sources: dict[int, LinearSource] = {}
         for path in self.files:
             for record, line in read_records(path, self.damaged.append):
+                # Another version may simulate and measure otherwise: its members count as missing.
                 if record["vipetsc_version"] != vipetsc.__version__:
                     continue
                 if "envelope" in record:
@@ -204,7 +205,7 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     """Write ``ensemble.h5`` from the ``results`` of a sweep, with ``warnings`` about them, whole or not at all.
 
     A dimension for every axis, named after its first key, with a coordinate for every key; NaN where a member
-    failed. The file depends on the members alone, not on when or on how many ranks they were made.
+    failed. The file depends on the members alone, not on when or on how many ranks they were simulated.
     """
     sys.audit("vipetsc.merge", str(results.folder))
     plan = results.plan
@@ -214,7 +215,7 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     positions = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
     numbers = results.first[results.status == FAILED]
     about = origin() | {"format_version": FORMAT_VERSION}
-    # Sorted, since the file must not depend on the order in which members were made.
+    # Sorted, since the file must not depend on the order in which members were simulated.
     about |= {name: sorted(values) for name, values in results.used.items()}
     about |= {
         "case": plan.to_toml(),
@@ -241,7 +242,7 @@ def _coordinates(plan: Sweep) -> Variables:
 
 
 def _member_variables(results: Results) -> Variables:
-    """How every member ended, and its name."""
+    """Variables of how every member ended, and its name."""
     plan = results.plan
     dims = _dimensions(plan)
     flags = {"flag_values": np.arange(MISSING, dtype=np.int8), "flag_meanings": " ".join(STATUS[:MISSING])}
@@ -318,6 +319,7 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     """The entries of ``FIT`` for one curve over ``amplitude`` in N, a fit from its peak on; NaN where there is none."""
     row = dict.fromkeys(FIT, np.nan)
     valid = np.isfinite(curve)
+    # The sign of the amplitude is a phase of the drive: the size orders the curve.
     order = np.argsort(np.abs(amplitude[valid]), kind="stable")
     x = np.abs(amplitude[valid])[order]
     y = curve[valid][order]

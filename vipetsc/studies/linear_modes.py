@@ -46,6 +46,7 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
     _check(case, count, near)
     matrices = LatticeMatrices(chain, comm)
     modes = modes_near(matrices, count, near)
+    # Freed here, on all ranks together: garbage collection would come on each rank at its own time.
     matrices.destroy()
     parts = comm.gather(modes.shapes)
     written: list[xr.Dataset] = []
@@ -89,7 +90,7 @@ def _check(case: Case, count: int, near: float) -> None:
 
 
 def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:
-    """In which band modes (mode, cell, dof) are, and in which cells."""
+    """Bands, cells and kinds of modes with ``frequency`` (mode) and ``shape`` (mode, cell, dof), by name."""
     energy = np.sum(shape**2 * chain.masses().reshape(shape.shape[1:]), axis=2)
     end = max(int(END * chain.cells), 1)
     left = energy[:, :end].sum(axis=1)
@@ -121,7 +122,7 @@ def _band_of(bands: Sequence[Band], frequency: float) -> int:
 
 
 def _place(chain: Chain, cell: int, at_ends: float) -> str:
-    """Where a mode in a gap is: its energy is largest in ``cell`` (from 0), the part ``at_ends`` of it at the ends."""
+    """Place of a mode in a gap whose energy is largest in ``cell`` (from 0), with the part ``at_ends`` at the ends."""
     if chain.ends != "periodic" and at_ends > 0.5:
         return "edge"
     sites = np.array(chain.sites, int)

@@ -121,7 +121,7 @@ class LinearRun(NamedTuple):
 
 
 def measured(analysis: xr.Dataset) -> Record:
-    """What the ensemble takes from an ``analysis``: ``MEASURES`` and what is said of them.
+    """Values that the ensemble takes from an ``analysis``: ``MEASURES`` and their attributes.
 
     ``parts`` of the frequency axis by name, ``errors`` by the samples left out, the options of the ``analysis``.
     """
@@ -161,7 +161,7 @@ def is_proportional(case: Case) -> bool:
 
 
 def factor(case: Case) -> float:
-    """By how much the wave of ``case`` is larger than that of its linear run."""
+    """Ratio of the wave of ``case`` to that of its linear run."""
     return abs(case.drive.amplitude) if is_proportional(case) else 1.0
 
 

@@ -100,6 +100,7 @@ def _history(run: xr.Dataset, record: VelocityRecord, parts: ModalParts) -> dict
         transfer[c] -= parts.driven_change(state, record.model.drives, time[clusters.bounds[c]])
 
     stored = (run["energy/kinetic"] + run["energy/spring"]).values[np.searchsorted(run["time"].values, time[rows])]
+    # 1e-300, since a lattice that never moved has no energy to divide by.
     error = np.abs(by_part.sum(axis=0) - stored).max() / max(stored.max(), 1e-300)
     record.attributes["bands/modal_energy"] |= {"modal_stride": record.options.modal_stride, "error": error}
     names = list(parts.parts.names)

@@ -1,4 +1,4 @@
-"""The runs that a design is judged by: made over teams of ranks, measured, recorded as they come."""
+"""The runs by which a design is judged: simulated by teams of ranks, measured, and recorded as they end."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -30,10 +30,10 @@ ANALYSED = {"ibtet": Analysed("bands", "ibtet"), "entropy": Analysed("entropy", 
 
 
 class ObjectiveRuns:
-    """Makes ``recorded`` runs of designs in ``folder`` on the ranks of ``comm``, and judges designs by them.
+    """Computes ``recorded`` runs of designs in ``folder`` on the ranks of ``comm``, and judges designs by them.
 
     The record of a run by the hash of its case: its ``values``, or why it failed (``reason``).
-    All ranks must make one.
+    All ranks must construct one.
     """
 
     def __init__(self, plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
@@ -47,6 +47,7 @@ class ObjectiveRuns:
 
     def runs(self, design: Case) -> dict[tuple[float, int], Case]:
         """The runs of a ``design`` by amplitude in N and number of the disorder's sample; raises CaseError."""
+        # A dictionary names each amplitude once and keeps the order, which is the same on all ranks.
         amplitudes: dict[float, None] = {}
         for objective in self.plan.options.objective:
             amplitudes |= dict.fromkeys(self._amplitudes(objective))
@@ -58,18 +59,19 @@ class ObjectiveRuns:
         return objective.amplitudes or [self.amplitude]
 
     def make(self, runs: Iterable[Case]) -> None:
-        """Make those ``runs`` that have no record; all ranks must call it. Raises StoppedError on all."""
+        """Simulate those ``runs`` that have no record; all ranks must call it. Raises StoppedError on all."""
         cases: dict[Key, Case] = {case_id(case): case for case in runs}
+        # With failures: a design that fails is a bad one, and the search goes on.
         self.recorded.make(cases, lambda name: {"values": self._measure(cases[name])}, failures=True)
 
     def _measure(self, case: Case) -> dict[str, Any]:
-        """What is measured of a run, by its whole team."""
+        """Values measured of a run, by its whole team."""
         data, result = self.recorded.run_in_memory(case)
         objectives = self.plan.options.objective
         return on_root(self.recorded.team, lambda: measured(data, result.statistics, objectives))
 
     def losses(self, design: Case) -> tuple[list[float], str]:
-        """How far a ``design`` whose runs were made is from each goal, small is good; NaN if one failed, and why."""
+        """Losses of a ``design`` whose runs are recorded, small for a good one; NaN if a run failed, and the reason."""
         objectives = self.plan.options.objective
         records = {key: self.recorded.records[case_id(run)] for key, run in self.runs(design).items()}
         for (amplitude, _), record in records.items():
@@ -89,12 +91,12 @@ class ObjectiveRuns:
         return losses, ""
 
     def values(self, run: Case) -> dict[str, Any]:
-        """What was measured of a ``run`` that has a record; nothing of one that failed."""
+        """Values measured of a ``run`` that has a record; none of one that failed."""
         return dict(self.recorded.records[case_id(run)].get("values", {}))
 
 
 def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[ObjectiveTable]) -> dict[str, Any]:
-    """What the ``objectives`` ask of a ``run``, by their names, and what is measured of every run.
+    """Values of a ``run`` that the ``objectives`` need, by their names, and those that every run has.
 
     ``upper_share_at_end``, ``bands`` (pass band): energy at the end over the work; ``transmitted``: that beyond the
     last site; ``dissipated``, ``episodes``, ``ibtet`` and ``entropy`` where they are asked for.

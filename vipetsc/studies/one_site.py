@@ -14,10 +14,10 @@ fractions sum to 1, to the ledger's accuracy, since the drive works as without a
 given z, the fractions do not depend on the clearance. Hertz's does through its stiffness kc D^(1/2): the law is that of
 one clearance, by default the geometric mean of the sites'.
 
-**Refinement.** z = 1, then two points an octave; the point in the middle (in log z) of two is made, and if T, R, U or
-the dissipated fraction lies further from the line between them than the tolerance and than its scatter, or T falls from
-1 between them, both halves are treated likewise, until they are finer than asked for. Mean and deviation at z are those
-of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
+**Refinement.** z = 1, then two points an octave; the point in the middle (in log z) of two is computed, and if T, R, U
+or the dissipated fraction lies further from the line between them than the tolerance and than its scatter, or T falls
+from 1 between them, both halves are treated likewise, until they are finer than asked for. Mean and deviation at z are
+those of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
 """
 
 import itertools
@@ -58,7 +58,7 @@ def make_law(
 ) -> ScatteringLaw:
     """Take the scattering law of ``case`` on all ranks of ``comm``, and leave ``law.h5`` in ``folder``.
 
-    Runs that are there are not made again: a law that was stopped or killed goes on, to the same bits on any number of
+    Recorded runs are not simulated again: a law that was stopped or killed goes on, to the same bits on any number of
     ranks. ``force`` begins anew, ``resume`` needs one to go on with.
 
     Raises FolderError if the folder holds anything but this law, RuntimeError if a run does not come out, StoppedError
@@ -66,9 +66,11 @@ def make_law(
     """
     with claimed(comm, folder, LAW, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "law.h5"
+        # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.
         if not on_root(comm, path.exists):
             runs = ScatteringRuns(case, claim.folder, comm, stop or StopRequest())
             errors = refine(runs, progress)
+            # Before law.h5 is written: a folder with its result is complete, a kill before that leaves the records.
             runs.recorded.finish()
             on_root(comm, lambda: write_netcdf(path, runs.dataset(errors)))
 
@@ -77,7 +79,7 @@ def make_law(
 
 
 class ScatteringRuns:
-    """The runs of a law, ``recorded`` by their z. All ranks of ``comm`` must make one."""
+    """The runs of a law, ``recorded`` by their z. All ranks of ``comm`` must construct one."""
 
     def __init__(self, case: LawCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
         self.case = case
@@ -95,11 +97,11 @@ class ScatteringRuns:
 
     @property
     def records(self) -> dict[Any, Record]:
-        """What was recorded of the runs, by z."""
+        """Records of the runs, by z."""
         return self.recorded.records
 
     def make(self, points: Iterable[float], progress: bool = False) -> None:
-        """Make the runs with a site at ``points`` that are missing; raises RuntimeError if one fails. Collective."""
+        """Simulate the missing runs with a site at ``points``; raises RuntimeError if one fails. Collective."""
         self.recorded.make(points, self._scattered, what="runs of the law", progress=progress)
 
     def amplitude(self, z: float) -> float:
@@ -115,7 +117,7 @@ class ScatteringRuns:
         since_burst = setting.end - drive.duration
         late = (speed * setting.towards > 0) & (np.abs(speed) * since_burst < setting.distance)
 
-        # The run is made twice: its last sample in all cells and all samples of the site fit where all would not.
+        # The run is simulated twice: its last sample in all cells and all samples of the site fit where all would not.
         motion = PairMotion.of(self.ring.run_at_site(1.0, with_site=False), self.cell)
         w, rate = motion.displacement[:, 0], motion.velocity[:, 0]
         return {
@@ -158,16 +160,17 @@ class ScatteringRuns:
         }
 
     def jittered(self, z: float) -> list[float]:
-        """The runs that stand for the point ``z``; none for z = 1, which nothing touches."""
+        """The runs that represent the point ``z``; none for z = 1, where nothing is touched."""
         if z <= 1:
             return []
         options = self.case.law
+        # Narrower near the onset, so that all runs of a point touch.
         width = min(options.jitter, (z - 1) / 10)
         spread = np.linspace(-1, 1, options.samples) if options.samples > 1 else np.zeros(1)
         return [*dict.fromkeys((z * (1 + width * spread)).tolist())]
 
     def outcomes(self, z: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Mean and deviation of what the runs at the point ``z`` make of the wave, by name."""
+        """Mean and deviation over the runs at the point ``z`` of the wave's fractions and times, by name."""
         untouched = {"energy": self.reference}
         records = [self.records[run] for run in self.jittered(z)] or [untouched]
         rows = [self._outcome(record) for record in records]
@@ -181,7 +184,7 @@ class ScatteringRuns:
         return mean, deviation
 
     def _outcome(self, record: Record) -> dict[str, Any]:
-        """What one run makes of the wave by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
+        """Fractions and times of one run by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
         band = self.setting.band
         share = (np.array(record["energy"]) - self.reference) / self.arrived
         # The reference holds the whole wave: against it nothing is left where nothing is touched, and T = 1 there.
@@ -254,7 +257,7 @@ class ScatteringRuns:
 
 
 def refine(runs: ScatteringRuns, progress: bool = False) -> dict[float, float]:
-    """Make the points of the law: the distance of each from the line between the neighbours it came between (NaN)."""
+    """Compute the points of the law; returns the distance of each from the line between its neighbours (NaN: first)."""
     options = runs.case.law
     intervals = max(int(np.ceil(np.log(options.largest) / np.log(STEP))), 1)
     first = np.geomspace(1, options.largest, 1 + intervals).tolist()

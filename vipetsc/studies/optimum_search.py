@@ -1,7 +1,7 @@
 """The best design for an objective, or the front of two: a case with ``[optimise]`` in, ``optimum.h5`` out.
 
-Rank 0 asks the sampler for designs and tells it their losses in that order; all ranks make the runs. What a run came
-to is recorded at once, so a search that was stopped or killed asks and tells as before, and goes on.
+Rank 0 asks the sampler for designs and reports their losses in that order; all ranks simulate the runs. The result of
+a run is recorded at once, so a search that was stopped or killed repeats the same exchange and goes on.
 """
 
 import sys
@@ -110,7 +110,7 @@ class OptimumSearch:
         return [run for design in self.asked for run in design.runs]
 
     def tell_and_ask(self) -> bool:
-        """Judge the designs whose runs were made, tell the sampler, and ask for more; whether there are any."""
+        """Judge the designs whose runs are recorded, report to the sampler, and ask for more; whether there are any."""
         for design in self.asked:
             design.losses = [np.nan] * len(self.plan.options.objective)
             if design.case:
@@ -169,7 +169,7 @@ def run_search(
     """
     with claimed(comm, folder, OPTIMUM, plan.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "optimum.h5"
-        # One that was cut off is made again, from the records of its runs.
+        # A file that was cut off is written again, from the records of its runs.
         if not on_root(comm, lambda: is_whole(path, [])):
             _search(plan, claim.folder, comm, stop or StopRequest(), progress)
         claim.publish()
@@ -234,7 +234,7 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
         return Nsga2(point, options.step, options.seed, options.population or POPULATION)
 
     variables = plan.variables()
-    # Whole numbers need a least deviation, or the search would stand still on one of them.
+    # Whole numbers need a least deviation, or the search would stay at one of them.
     steps = np.array([1 / (v.high - v.low) if v.kind == "whole" else 0.0 for v in variables])
     # Of clearances, what the row of sites has in common is searched first.
     clearances = np.array([v.name.startswith("clearance") for v in variables])
@@ -283,7 +283,7 @@ def _write(search: OptimumSearch, folder: Path) -> None:
 
 
 def _design_values(search: OptimumSearch) -> dict[str, Any]:
-    """What varies, and all designs with what came of them, by name in ``LAYOUT``."""
+    """Variables, and all designs with their results, by name in ``LAYOUT``."""
     designs = search.designs
     variables = search.plan.variables()
     objectives = search.plan.options.objective
@@ -329,7 +329,7 @@ def _comparison_values(search: OptimumSearch, cases: Sequence[Case]) -> dict[str
 
 
 def _curve_values(search: OptimumSearch) -> dict[str, Any]:
-    """What was measured of the compared designs over the amplitude, by name in ``LAYOUT``."""
+    """Values of the compared designs over the amplitude, by name in ``LAYOUT``."""
     curves = _curves(search)
     measured = [[search.objective.values(run) for run in runs] for runs in curves.values()]
     bands = len(search.plan.base.lattice.unit_cell().masses)

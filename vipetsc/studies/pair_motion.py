@@ -11,7 +11,7 @@ from vipetsc.lattice import UnitCell
 
 
 class PairMotion(NamedTuple):
-    """How the resonators move against the hosts of the recorded cells.
+    """Motion of the resonators relative to the hosts of the recorded cells.
 
     ``displacement`` (time, cell) is w in m, resonator less host, ``velocity`` (time, cell) its rate in m/s, at ``time``
     in s.
@@ -42,6 +42,6 @@ def largest_between(times: np.ndarray, w: np.ndarray, rate: np.ndarray) -> float
     """Largest |w| at or between samples at ``times``, from the cubic through ``w`` with slopes ``rate``."""
     curve = CubicHermiteSpline(times, w, rate)
     extrema = curve.derivative().roots(extrapolate=False)
-    # A piece on which w stands still has NaN for its root.
+    # A piece on which w is constant has NaN for its root.
     candidates = np.concatenate([times, extrema[np.isfinite(extrema)]])
     return float(np.abs(curve(candidates)).max())

@@ -19,7 +19,7 @@ Job = TypeVar("Job", bound=Hashable)
 
 
 class Ending(IntEnum):
-    """How a job ended; where the ranks of a team differ, the largest counts."""
+    """Ending of a job; where the ranks of a team differ, the largest counts."""
 
     DONE = 0
     FAILED = 1
@@ -28,14 +28,14 @@ class Ending(IntEnum):
 
 
 class JobEnd(NamedTuple):
-    """How a job ended, and why it did so if it was not done."""
+    """Ending of a job, and the reason if it was not done."""
 
     ending: Ending
     reason: str = ""
 
 
 class TeamReport(NamedTuple):
-    """What one rank tells the others when it draws no more jobs: how its last job ended, and how many it counts."""
+    """Report of one rank to the others when it draws no more jobs: the end of its last job, and how many it counts."""
 
     last: JobEnd
     done: int
@@ -106,6 +106,7 @@ class TaskPool:
                 last = JobEnd(Ending.STOPPED)
                 break
             if number == block_end:
+                # One rank draws for its team, whose ranks must work on the same job.
                 number = self.team.bcast(drawn.draw(block) if leads else None)
                 block_end = min(number + block, len(jobs))
             if number >= len(jobs):
@@ -149,6 +150,7 @@ class TaskPool:
             failure = error
             end = self._judge(error)
 
+        # Non-blocking: a rank whose job failed must be able to give up waiting for its team.
         met = self.team.Ibarrier()
         since = time.monotonic()
         while not met.Test():

@@ -2,7 +2,7 @@
 
 Runs: the linear lattice under 1 N (onset, work, energies by band); one site in an infinite lattice (``studies.ring``)
 at ``predict.points`` amplitudes, dense near the onset (``studies.response``); then, to compare, the case itself at
-every amplitude. What a run came to is recorded at once. ``studies.composition`` composes the sites. Energies of bands
+every amplitude. The result of a run is recorded at once. ``studies.composition`` composes the sites. Energies of bands
 are those of linear modes at the last sample, over the drive's work.
 """
 
@@ -54,16 +54,16 @@ LAYOUT["simulated/contact_episodes"] = ("amplitude", "1", "contact episodes; NaN
 
 
 class Job(NamedTuple):
-    """A run to be made: its ``kind``, and its amplitude in N or, of the one site, its z."""
+    """A run to be simulated: its ``kind``, and its amplitude in N or, of the one site, its z."""
 
     kind: str
     at: float
 
 
 class Records(NamedTuple):
-    """What the runs of a prediction came to: the ``linear`` one, those of one ``site`` by z, those to compare with.
+    """Records of the runs of a prediction: the ``linear`` one, those of one ``site`` by z, those to compare with.
 
-    ``largest`` is the largest z for which the site's were made.
+    ``largest`` is the largest z of the runs of one site.
     """
 
     linear: Record
@@ -84,16 +84,17 @@ def predict(
 ) -> xr.Dataset:
     """Predict ``case`` on all ranks of ``comm``, and leave ``prediction.h5`` in ``folder``; its content on all ranks.
 
-    Runs that are there are not made again; ``force`` begins anew, ``resume`` needs some to go on with. Raises
+    Recorded runs are not simulated again; ``force`` begins anew, ``resume`` needs some to go on with. Raises
     FolderError if the folder holds anything but this prediction, RuntimeError if a run that it needs does not come
     out, StoppedError on a request to ``stop``.
     """
     with claimed(comm, folder, PREDICTION, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "prediction.h5"
+        # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.
         if not on_root(comm, path.exists):
             runs = PredictionRuns(case, claim.folder, comm, stop or StopRequest(), progress)
             records = runs.make_all()
-            about = provenance(comm)  # collective, so not within the writing, which rank 0 does alone
+            about = provenance(comm)
             runs.recorded.finish()
             on_root(comm, lambda: write_netcdf(path, composed(case, records).assign_attrs(about)))
 
@@ -132,7 +133,7 @@ class PredictionRuns:
         self.progress = progress
 
     def make_all(self) -> Records:
-        """The records of all runs, those that are missing made now. Collective; raises RuntimeError if one fails."""
+        """The records of all runs; the missing ones are simulated now. Collective; raises RuntimeError if one fails."""
         # The linear run comes first: it says which z the amplitudes reach, and so which runs of one site are needed.
         linear = self.make([Job(LINEAR, 1.0)])[0]
         amplitudes = amplitudes_of(self.case, linear)
@@ -144,7 +145,7 @@ class PredictionRuns:
         return Records(linear, site, members, largest)
 
     def make(self, jobs: Sequence[Job], largest: float = 0.0) -> list[Record]:
-        """The records of ``jobs``, those that are missing made now. Collective; raises RuntimeError if one fails.
+        """The records of ``jobs``; the missing ones are simulated now. Collective; raises RuntimeError if one fails.
 
         ``largest`` is the largest z of the one site's runs, whose sums are over bins up to it.
         """
@@ -174,7 +175,7 @@ class PredictionRuns:
         return {"reached": reached, "work": statistics["work"], "bands": self._band_energies(run)}
 
     def _site(self, z: float, largest: float) -> Record:
-        """One site under a burst that reaches ``z`` clearances: sums over its time in contact."""
+        """Record of one site under a burst that reaches ``z`` clearances: sums over its time in contact."""
         burst, peak = self._burst
         clearance = self.ring.setting.clearance
         amplitude = self.ring.amplitude(z, peak)
@@ -260,7 +261,7 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
 def _predicted(
     network: Network, response: SiteResponse, amplitudes: np.ndarray, linear: Record, driven: int
 ) -> dict[str, np.ndarray]:
-    """What is predicted at every amplitude, by its name in ``LAYOUT``; ``driven`` is the drive's band from 0."""
+    """Predicted values at every amplitude, by their names in ``LAYOUT``; ``driven`` is the drive's band from 0."""
     onset = 1 / max(linear["reached"])
     untouched = np.array(linear["bands"]) / linear["work"]
     rows: dict[str, list[Any]] = {"bands": [], "dissipated": [], "z": [], "change": []}
@@ -288,7 +289,7 @@ def _predicted(
 
 
 def _simulated(members: Sequence[Record], driven: int) -> dict[str, np.ndarray]:
-    """What was simulated at every amplitude, by its name in ``LAYOUT``."""
+    """Simulated values at every amplitude, by their names in ``LAYOUT``."""
     work = np.array([member["work"] for member in members])
     bands = np.array([member["bands"] for member in members]) / work[:, None]
     measured = {

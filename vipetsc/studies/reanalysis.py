@@ -1,4 +1,4 @@
-"""The measures of runs already made, of one or of all members of a sweep whose fields were kept, taken anew."""
+"""New analyses of finished runs: of one run, or of all members of a sweep whose fields were kept."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress

@@ -1,7 +1,7 @@
-"""Runs of a study, made by teams of ranks and recorded as they come: a study that was stopped or killed goes on.
+"""Runs of a study, simulated by teams of ranks and recorded as they end: a stopped or killed study goes on.
 
-Every study that makes many runs has one ``RecordedRuns``: the scattering law, a prediction, a search for an optimum,
-and a sweep, whose records stand in ``members.jsonl`` and are read by ``studies.ensemble``.
+Every study with many runs has one ``RecordedRuns``: the scattering law, a prediction, a search for an optimum,
+and a sweep, whose records are in ``members.jsonl`` and are read by ``studies.ensemble``.
 """
 
 import time
@@ -28,7 +28,7 @@ FAILURES = (RuntimeError, ArithmeticError)
 
 
 class RecordPaths:
-    """Where the records called ``name`` stand in ``folder``: a file for each rank, until all are merged into one."""
+    """Files of the records called ``name`` in ``folder``: one for each rank, until all are merged into one."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
@@ -48,16 +48,16 @@ class RecordPaths:
         return sorted(self.folder.glob(f"{self.name}-*.jsonl"))
 
     def existing(self) -> list[Path]:
-        """All files that are there; of two records of one run the later in this order counts."""
+        """Existing files; of two records of one run the later in this order counts."""
         merged = [self.merged] if self.merged.exists() else []
         return merged + self.by_rank()
 
 
 class RecordedRuns:
-    """Runs made by teams of ``ranks`` of ``comm``, and their records called ``name`` in ``folder``.
+    """Runs simulated by teams of ``ranks`` of ``comm``, and their records called ``name`` in ``folder``.
 
     ``team`` are the ranks that work on a run together with this one; the first of them appends its record. ``records``
-    are the records by key, on all ranks: those that are there, once they are ``read``, and those that are made after
+    are the records by key, on all ranks: those in the files, once they are ``read``, and those added after
     that. ``failures`` are the exceptions that a single run may end in.
     """
 
@@ -80,6 +80,7 @@ class RecordedRuns:
 
     def read(self) -> "RecordedRuns":
         """Take the records that are there as ``records``, on all ranks; returns itself. Collective."""
+        # Rank 0 reads for all ranks, which must agree on the runs that are missing.
         self.records = on_root(self.comm, lambda: {key: record for key, (record, _) in self._read().items()})
         return self
 
@@ -92,13 +93,13 @@ class RecordedRuns:
         progress: bool = False,
         failures: bool = False,
     ) -> None:
-        """Make the records of those ``keys`` that have none by ``work``, which all ranks of a team call. Collective.
+        """Compute the records of those ``keys`` that have none by ``work``, which all ranks of a team call. Collective.
 
         The record of a run that fails is its ``reason`` if ``failures`` may be; else RuntimeError is raised on all
         ranks. Raises OSError on all, and there is no record, if memory or disk is short or if it was no failure
         of the run itself: it may succeed the next time. Raises StoppedError on all if some rank got a request to stop.
         """
-        # A key that is asked for twice is made once; the order stays, on all ranks the same.
+        # A key that is given twice is computed once; the order stays, the same on all ranks.
         missing = [key for key in dict.fromkeys(keys) if key not in self.records]
         recorded: dict[Key, Record] = {}
         failed: list[str] = []
@@ -143,7 +144,7 @@ class RecordedRuns:
         return completed(simulate(case, output, self.team, stop=self.stop))
 
     def run_in_memory(self, case: Case) -> tuple[xr.Dataset, Result]:
-        """What a run of ``case`` by the team holds, empty on all ranks but its first, and how it ended.
+        """Dataset of a run of ``case`` by the team, empty on all ranks but its first, and how it ended.
 
         Raises as ``simulate``.
         """
@@ -176,7 +177,7 @@ class RecordedRuns:
 
 
 def run_in_memory(case: Case, team: MPI.Comm, stop: StopRequest) -> tuple[xr.Dataset, Result]:
-    """What a run of ``case`` by all ranks of ``team`` holds, empty on all but the first, and how it ended.
+    """Dataset of a run of ``case`` by all ranks of ``team``, empty on all but the first, and how it ended.
 
     Raises StoppedError if the run was stopped, RuntimeError if it failed.
     """

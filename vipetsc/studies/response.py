@@ -1,9 +1,9 @@
-"""How one site responds to a wave: contact force and energies, by the driven wave's amplitude at the moment.
+"""Response of one site to a wave: contact force and energies, by the driven wave's amplitude at the moment.
 
 A burst meets a site in a lattice so long that nothing returns. With w the relative displacement of the contact pair,
 w_0 that of the lattice without contacts and g(omega) the response of w to a pair of opposite forces at the infinite
-lattice, the contact's force is f = (w - w_0)/g at every frequency. Around the drive's frequency Om,
-w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), around 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds the clearance D,
+lattice, the contact's force is f = (w - w_0)/g at every frequency. Near the drive's frequency Om,
+w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), near 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds the clearance D,
 contact goes on until the last one ends, at the z = |c|/D that the run shows (``release``). Meanwhile all of it is taken
 for a function of z, averaged over bins of log z, over the burst's rise and fall and over runs of several amplitudes.
 What a whole burst loses and gives to other bands then comes out right by a factor. Both the factor and the release are
@@ -20,9 +20,9 @@ from vipetsc.lattice import Band, Chain, UnitCell, WaveCompliance, bloch, pass_b
 
 LOWEST = 0.15  # z of the first of the bins
 BINS = 40
-DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that nothing comes round
+DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that no response is folded back
 TINY = 1e-300  # in place of zero in a divisor
-# Half-widths of the lines around Om and 3 Om, over Om: what is not the signal's own line is cut off.
+# Half-widths of the lines at Om and 3 Om, over Om: frequencies outside the signal's own line are cut off.
 FIRST_LINE = 0.3
 THIRD_LINE = 0.4
 # Forces are followed up to this many times the top band's edge: above, g falls as 1/omega^2 and (w - w_0)/g is noise.
@@ -58,6 +58,7 @@ def in_contact(z: np.ndarray, release: np.ndarray) -> np.ndarray:
     """Whether sites (site, time) are in contact: from z > 1 until z < ``release`` (site)."""
     on = np.zeros(z.shape, bool)
     state = np.zeros(len(z), bool)
+    # Instant by instant: between release and 1 the state before decides.
     for i, now in enumerate(z.T):
         state = np.where(state, now >= release, now > 1)
         on[:, i] = state
@@ -87,7 +88,7 @@ class SiteRun:
 class Burst:
     """The linear wave at a site: ``time`` in s (uniform), relative displacement ``w`` in m and what follows from it.
 
-    Over the frequencies ``omega`` in rad/s stand the response ``g`` in m/N and the ``linear`` spectrum; ``c`` (time) is
+    The response ``g`` in m/N and the ``linear`` spectrum are over the frequencies ``omega`` in rad/s; ``c`` (time) is
     the envelope at the frequency ``drive``.
     """
 
@@ -174,12 +175,12 @@ class Burst:
         return powers
 
     def _rate(self) -> np.ndarray:
-        """Factor (omega) of a spectrum that makes it that of the time derivative."""
+        """Factor (omega) that turns a spectrum into that of the time derivative."""
         return np.asarray(1j * (self.omega - 1j * self.decay))
 
 
 class ContactState(NamedTuple):
-    """What a site in contact does, over the shape of z; ``into`` has the bands as first axis. See ``SiteResponse``."""
+    """State of a site in contact, over the shape of z; ``into`` has the bands as first axis. See ``SiteResponse``."""
 
     fundamental: np.ndarray
     third: np.ndarray
@@ -188,7 +189,7 @@ class ContactState(NamedTuple):
 
 
 class BurstState(NamedTuple):
-    """What holds over a whole burst, over its largest z: factors of loss and of bands (band, ...), and release."""
+    """Values for a whole burst, over its largest z: factors of loss and of bands (band, ...), and release."""
 
     lost: np.ndarray
     into: np.ndarray
@@ -196,7 +197,7 @@ class BurstState(NamedTuple):
 
 
 class SiteResponse(NamedTuple):
-    """What a site in contact does at z = exp(``x``): all arrays over ``x``.
+    """Response of a site in contact at z = exp(``x``): all arrays over ``x``.
 
     ``fundamental`` is f1/c and ``third`` f3 (c*/|c|)^3/|c| in N/m (complex). ``lost`` and ``into`` (band, x) are powers
     over that of a travelling wave of the same |c|: what is dissipated, and what goes to every band but its own, scaled
@@ -251,6 +252,7 @@ class SiteResponse(NamedTuple):
         totals = np.array([record["totals"] for record in records]).T / wave.power_per_area
         composed = table @ squares.T
         factor = np.where(composed > 0, np.maximum(totals, 0) / np.maximum(composed, TINY), 1.0)
+        # ``into`` is 0 in the driven band, so no factor follows from the sums.
         factor[1 + wave.band] = 1.0
         return cls(
             x=x,
@@ -264,7 +266,7 @@ class SiteResponse(NamedTuple):
         )
 
     def at(self, z: np.ndarray) -> ContactState:
-        """What a site in contact does at ``z``."""
+        """State of a site in contact at ``z``."""
         x = np.log(np.maximum(z, LOWEST))
         return ContactState(
             fundamental=self._interpolated(x, self.fundamental),
@@ -278,7 +280,7 @@ class SiteResponse(NamedTuple):
         return np.asarray(np.interp(x, self.x, values.real) + 1j * np.interp(x, self.x, values.imag))
 
     def over_bursts(self, largest: np.ndarray) -> BurstState:
-        """What holds over bursts with these ``largest`` z (site)."""
+        """Factors and release of bursts with these ``largest`` z (site)."""
         x = np.log(np.maximum(largest, 1e-9))
         factors = np.array([np.interp(x, self.peaks, row) for row in self.factor])
         return BurstState(lost=factors[0], into=factors[1:], release=np.interp(x, self.peaks, self.release))

@@ -1,12 +1,12 @@
-"""One site in a lattice that is infinite while a run lasts: the geometry that the law and the prediction share.
+"""The ring, a lattice with one site that is infinite while a run lasts: the geometry of the law and the prediction.
 
 The lattice is a ring of N cells, driven at one, with the site d cells on. The burst lasts T_b; v is the speed of its
 slow waves (all but 1e-3 of the energy in its band is faster), V the largest group velocity of any band. A run ends at
 t_e = d/v + s T_b (s = ``law.settle``): at d/v + T_b the slow waves' end has passed, what is left of the time is for
-contacts to die away. No wave returns around the ring: what the drive sends the other way reaches the site from behind
-after (N - d)/V, what leaves the site is back after N/V more than the way to it, so N >= d + V t_e makes the ring
-infinite. The drive works as without a site if the burst is over before a wave is back from it (d >= V T_b/2). The drive
-is in the midst of the lattice, not at a wall. ``LawCase.one_site`` chooses N, d and t_e.
+contacts to die away. No wave returns along the ring: what the drive sends in the other direction reaches the site from
+behind after (N - d)/V, what leaves the site is back N/V after the wave's arrival there, so N >= d + V t_e makes the
+ring infinite. The drive works as without a site if the burst is over before a wave is back from it (d >= V T_b/2). The
+drive is in the midst of the lattice, not at a wall. ``LawCase.one_site`` chooses N, d and t_e.
 """
 
 import xarray as xr
@@ -16,7 +16,7 @@ from vipetsc.studies.recorded_runs import RecordedRuns
 
 
 class Ring:
-    """Runs of ``case`` on the ring, made by the teams of ``recorded``; ``setting`` holds its sizes and times."""
+    """Runs of ``case`` on the ring, simulated by the teams of ``recorded``; ``setting`` holds its sizes and times."""
 
     def __init__(self, case: LawCase, recorded: RecordedRuns) -> None:
         self.case = case

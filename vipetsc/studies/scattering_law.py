@@ -15,7 +15,7 @@ from vipetsc.studies.linear_run import LinearRun
 FORWARD, BACKWARD = 0, 1  # directions: from the drive to the site and on, and the other
 LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency is judged
 NEAR = 5  # cells from the site within which energy counts as near it
-FLAT = 0.1  # of the efficiency, which its scatter does not tell apart
+FLAT = 0.1  # of the efficiency: smaller differences are within its scatter
 BROAD = 0.05  # half the width in log z over which it is averaged: a design has to bear as much
 LISTED = (1.01, 1.1, 1.5, 3.0, 10.0, 30.0, 100.0)  # values of z in the printed table
 
@@ -47,7 +47,7 @@ LAYOUT = {
 
 
 class ScatteringOutcome(NamedTuple):
-    """What one site makes of a wave, arrays over z; shares of the energy that arrives in the drive's band.
+    """Outcome of a wave at one site, arrays over z; fractions of the energy that arrives in the drive's band.
 
     ``share`` (..., band, direction) is what leaves by band, forward (0) and backward (1): in the drive's band these are
     ``transmitted`` and ``reflected``; ``upper`` is all of the bands above. ``dissipated`` and ``contact``, held by a
@@ -108,7 +108,7 @@ class ScatteringLaw:
         )
 
     def at(self, z: ArrayLike) -> ScatteringOutcome:
-        """What becomes of a wave at ``z`` (any shape): linear in log z between the points, T = 1 below the first.
+        """Outcome of a wave at ``z`` (any shape): linear in log z between the points, T = 1 below the first.
 
         Above the last point the last one holds.
         """
@@ -133,7 +133,7 @@ class ScatteringLaw:
         return ScatteringOutcome(*map(between, values))
 
     def efficiency(self) -> np.ndarray:
-        """U/(1-T) (point), both averaged over 5 % of z either way; 0 where 1-T is below 2 % somewhere there."""
+        """U/(1-T) (point), both averaged over 5 % of z on both sides; 0 where 1-T is below 2 % somewhere there."""
         neighbourhood = np.exp(np.linspace(-BROAD, BROAD, 41))[:, None] * self.z
         outcome = self.at(neighbourhood)
         lost = 1 - outcome.transmitted
@@ -141,7 +141,7 @@ class ScatteringLaw:
         return np.where(lost.min(axis=0) > LEAST, mean_efficiency, 0.0)
 
     def matched(self) -> tuple[float, float]:
-        """Where upper bands get the most of what the drive's wave loses: z*, and T there.
+        """Point z* at which upper bands get the most of what the drive's wave loses, and T there.
 
         The efficiency U/(1-T) is flat: of the points within 10 % of its best the one with the largest T, which leaves
         most for further sites. Raises ValueError if no upper band gets anything.

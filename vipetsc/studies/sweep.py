@@ -1,4 +1,4 @@
-"""Every member of a sweep, over all ranks: linear runs first, then the longest; resumes, and goes on past failures."""
+"""Sweeps over all ranks: linear runs first, then the longest members; resumes, and goes on past failures."""
 
 import json
 import re
@@ -25,15 +25,15 @@ from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, 
 from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name
 from vipetsc.studies.sweep_runs import SweepRuns
 
-MOST_SURVEYED = 10_000  # members whose cases are made beforehand, for their linear runs and what they will cost
+MOST_SURVEYED = 10_000  # members whose cases are resolved beforehand, for their linear runs and what they will cost
 
 
 @dataclass(frozen=True)
 class SweepResult:
-    """How a sweep ended: ``status`` (member), an index of ``studies.ensemble.STATUS``.
+    """Outcome of a sweep: ``status`` (member), an index of ``studies.ensemble.STATUS``.
 
     ``newly_made`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
-    rank worked on members. ``warnings`` are sentences about records made again and about the members' results.
+    rank worked on members. ``warnings`` are sentences about lost results and about the members.
     """
 
     status: np.ndarray
@@ -50,7 +50,7 @@ class SweepResult:
 
     @property
     def resumable(self) -> bool:
-        """Whether it was stopped before every member was made or had failed."""
+        """Whether it was stopped before every member was complete or had failed."""
         return self.count(MISSING) > 0
 
     def count(self, status: int) -> int:
@@ -68,12 +68,12 @@ def run_sweep(
     stop: StopRequest | None = None,
     progress: bool = False,
 ) -> SweepResult:
-    """Make every member of ``plan`` in ``folder``, then ``ensemble.h5`` and ``index.json``.
+    """Simulate every member of ``plan`` in ``folder``, then write ``ensemble.h5`` and ``index.json``.
 
-    Members that are complete and made by this version are not made again, so a sweep that was killed goes on where
+    Complete members of this version are not simulated again, so a sweep that was killed goes on where
     it was; ``force`` begins anew and replaces the sweep in the folder when the new one has ended, ``resume`` needs one
     to go on with. A member that fails is recorded with its reason and the others go on. All ranks of
-    ``comm`` make members, ``[sweep] ranks`` of them together each.
+    ``comm`` work, ``[sweep] ranks`` of them together on each member.
 
     Raises CaseError if no member is a valid case (of those drawn, where they are many), FolderError if the folder holds
     anything but this sweep.
@@ -91,7 +91,7 @@ def run_sweep(
 
 
 def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> SweepResult:
-    """Make what is missing of the members in ``folder``, on all ranks, and put together what is there."""
+    """Simulate the missing members in ``folder`` on all ranks, and assemble the results."""
     begin = time.perf_counter()
     sys.audit("vipetsc.plan", plan.name)
     runs = SweepRuns(plan, folder, comm, stop)
@@ -125,6 +125,7 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
         return status, [*dict.fromkeys([*survey.results.damaged, *survey.lost, *warnings])]
 
     status, warnings = on_root(comm, put_together)
+    # MPI has a limited number of communicators, and a process may run many sweeps.
     runs.recorded.team.Free()
     return SweepResult(status, newly_made, seconds, busy, folder, warnings)
 
@@ -144,7 +145,7 @@ class NeededRun(NamedTuple):
 
 
 class DrawnMember(NamedTuple):
-    """A missing member whose ``case`` was made beforehand; ``linear`` is the name of its linear run."""
+    """A missing member whose ``case`` was resolved beforehand; ``linear`` is the name of its linear run."""
 
     number: int
     case: Case
@@ -152,9 +153,9 @@ class DrawnMember(NamedTuple):
 
 
 class _Survey(NamedTuple):
-    """What there is of a sweep, the numbers of the ``missing`` members, and sentences about what is ``lost``.
+    """State of a sweep: its results, the numbers of the ``missing`` members, and sentences about what is ``lost``.
 
-    Of the missing members, if they are many, as many are ``drawn`` as can stand for the others. They show what a member
+    Of the missing members, if they are many, as many are ``drawn`` as can represent the others. They show what a member
     costs, and the linear runs that are ``needed``, by name.
     """
 
@@ -176,7 +177,7 @@ class _Survey(NamedTuple):
                 costs.append(contacts + 1e-3 * float(member.case.time.end))
         # One that was not drawn costs what the last one before it does that was: its neighbour in the sweep.
         nearest = np.searchsorted(numbers, self.missing, "right") - 1
-        # Stable, so that equal ones stay in their order and every call makes them alike.
+        # Stable, so that equal ones stay in their order, the same in every call.
         dearest_first = np.argsort(-np.array(costs)[nearest], kind="stable")
         return list(self.missing[dearest_first].tolist())
 
@@ -191,6 +192,7 @@ def _survey(plan: Sweep, folder: Path) -> _Survey:
             whole = is_whole(folder / name / "run.h5", lost) and is_whole(folder / name / "analysis.h5", lost)
             absent[number] |= not whole
 
+    # Equal members are one run.
     missing = np.unique(results.first[absent])
     tried = missing
     if len(missing) > MOST_SURVEYED:
@@ -251,7 +253,7 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
     path = folder / "index.json"
     text = json.dumps(index, indent=1, default=int) + "\n"
     current = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
-    # The index comes last: with it and nothing made since, the ensemble is that of these members.
+    # The index comes last: with it and no member simulated since, the ensemble is that of these members.
     if not count[STATUS[MISSING]]:
         lost: list[str] = []
         if afresh or not current or not is_whole(folder / "ensemble.h5", lost):
@@ -264,7 +266,7 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
 
 
 def _failed_member(results: Results, number: int) -> dict[str, Any]:
-    """Where in the sweep a member that failed stands, its name and the reason."""
+    """Place in the sweep of a member that failed, its name and the reason."""
     return {
         "place": np.unravel_index(number, results.plan.shape),
         "id": results.ids[number],

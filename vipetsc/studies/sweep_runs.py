@@ -42,9 +42,9 @@ ANALYSED = {"entropy": ("entropy",), "transfer": ("bands", "modal")}
 class SweepRuns:
     """The members of the sweep ``plan`` and its linear runs, ``recorded`` in ``folder``.
 
-    All ranks of ``comm`` must make one; all ranks of a team work on each run together. Members whose fields are kept
-    have folders ``<id>/`` with ``run.h5`` and ``analysis.h5`` besides. ``linear`` are the linear runs this rank has so
-    far by name, or why one did not come out.
+    All ranks of ``comm`` must construct one; all ranks of a team work on each run together. Members whose fields are
+    kept have folders ``<id>/`` with ``run.h5`` and ``analysis.h5`` besides. ``linear`` are the linear runs this rank
+    has so far by name, or why one did not come out.
     """
 
     def __init__(self, plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
@@ -100,7 +100,7 @@ class SweepRuns:
         on_root(self.recorded.team, lambda: self._append(number, SCALED if quiet else COMPLETE, record))
 
     def _linear_of(self, case: Case, name: str, site: int) -> LinearRun:
-        """The linear run ``name`` of ``case``, made if it is missing, with measures for the first ``site``.
+        """The linear run ``name`` of ``case``, simulated if it is missing, with measures for the first ``site``.
 
         It has none where members keep their fields: they are measured themselves.
         """
@@ -191,7 +191,7 @@ def _with_everything(case: Case, fields: list[str]) -> Case:
 
 
 def measures_of(plan: Sweep) -> set[str]:
-    """What ``analyse`` is asked for of a member: what its pictures show if its fields are kept."""
+    """Measures that ``analyse`` takes of a member: those that its pictures show if its fields are kept."""
     asked = WHOLE if plan.options.fields else ANALYSED
     return {measure for name in plan.options.measures for measure in asked[name]}
 

@@ -1,4 +1,4 @@
-"""What is measured: the velocity that a run kept, in memory or in its file, with what its case says of it."""
+"""Input of the measures: the velocity that a run kept, in memory or in its file, and numbers of its case."""
 
 import tomllib
 from collections.abc import Iterable
@@ -27,7 +27,7 @@ def options_of(run: xr.Dataset, folder: Path | None = None, overrides: Iterable[
 
 
 class VelocityRecord:
-    """What the measures need of a run, and what they add to their values: attributes, and what is left out.
+    """Velocity, axes and masses of a run for its measures, which add attributes and what is left out.
 
     ``masses`` (dof) of the reference cell in kg, ``velocity`` (t, cell, dof) in m/s and ``weighted`` the same times
     sqrt(m/m_reference) of each mass, so that its energies by the reference cell's masses are those of the masses there
@@ -76,6 +76,7 @@ class VelocityRecord:
         if top == 0:
             self.left_out.append("dispersion, bands, ibtet: a lattice without springs has no bands")
             names |= {"dispersion", "bands"}
+        # The Nyquist limit: the top band would appear at lower frequencies.
         if self.interval * top >= np.pi:
             text = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
             self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
