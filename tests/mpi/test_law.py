@@ -7,7 +7,7 @@ from mpi4py import MPI
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
-from tests.unit.test_law import COARSE, case
+from tests.verify.test_law import COARSE, case
 from vipetsc.parallel import on_root
 from vipetsc.studies.one_site import make_law
 

@@ -7,7 +7,7 @@ from mpi4py import MPI
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
-from tests.unit.test_nfrc import case
+from tests.verify.test_nfrc import case
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import on_root
 

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.unit.test_prediction import small
+from tests.verify.test_prediction import small
 from vipetsc.parallel import on_root
 from vipetsc.studies.prediction import predict
 

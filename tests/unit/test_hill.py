@@ -12,8 +12,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.unit.test_floquet import case
-from tests.unit.test_nfrc import case as forced
-from tests.unit.test_nfrc import start_of
+from tests.verify.test_nfrc import case as forced
+from tests.verify.test_nfrc import start_of
 from vipetsc.case import CaseError, NnmCase
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
