@@ -66,7 +66,7 @@ class Contact:
     """An elastic ``law`` f(x) with its ``stiffness`` kc, and a ``restitution`` r in [0, 1]; 1 conserves energy.
 
     f = kc x^n for spheres in elastic contact (``hertz``, n = 3/2), a linear stop (``bilinear``, n = 1) and any
-    ``power`` n = ``exponent``; kc in N/m^n.
+    ``power`` n; kc in N/m^n. ``exponent`` is n, which the law ``power`` takes and the others set themselves.
 
     ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
     smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded. ``factor`` names the damping c in
@@ -82,6 +82,11 @@ class Contact:
     exponent: float | None = field(
         default=None, metadata=parameter("power", "", "of the law power: n in F = k x^n", least=1, most=10)
     )
+
+    def __post_init__(self) -> None:
+        # So that ``exponent`` is a number for whoever computes with a law, not only for the law that takes it.
+        if self.law in ONSET_EXPONENTS:
+            object.__setattr__(self, "exponent", ONSET_EXPONENTS[self.law])
 
     def __str__(self) -> str:
         about = f"restitution {self.restitution:g}, effective {self.effective_restitution:.3f}"
