@@ -133,6 +133,13 @@ def test_short_arcs_are_not_missed():
         assert (start + end) / 2 % (2 * np.pi) == pytest.approx(2 * np.pi - 0.3, abs=1e-4)
 
 
+def test_an_arc_that_ends_exactly_with_the_period_is_not_missed():
+    theta = np.linspace(0, 2 * np.pi, 64, endpoint=False) + 0.3
+    motion = np.stack([np.cos(theta), -np.sin(theta), -np.cos(theta)], axis=1)
+    ((start, end),) = arcs(motion, motion[0, 0])
+    assert (start, end) == (pytest.approx(2 * np.pi - 0.6), pytest.approx(2 * np.pi))
+
+
 def test_a_contact_that_never_separates():
     z = np.array([[3.0, 1.0]], complex)
     series = SiteForces([(CONSERVATIVE[0], 1.0)]).series(z, OMEGA)

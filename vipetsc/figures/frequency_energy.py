@@ -1,4 +1,19 @@
-"""Frequency-energy plots of branches, with grazing inset, slope and phase portraits (paper, Fig. 11)."""
+"""Frequency-energy plots of branches, with grazing inset, slope and phase portraits (Fig. 11 of the paper).
+
+The paper is J. R. Tempelman, A. F. Vakakis, K. H. Matlack, Phys. Rev. E 108, 044214 (2023). Its parameters have two
+*readings*, printed and calibrated (to its figures), which the case key ``lattice.reading`` names.
+
+A *branch* is a curve of periodic orbits, its points in the order in which continuation found them: several may have one
+energy. *Regular* points end the steps of the continuation. Special points lie between them: where the energy or the
+frequency turns back (folds), where an orbit just touches a contact (grazing), and the other kinds of ``MARKS``.
+
+On a k:1 internal *resonance* one mode moves k times while the other moves once. There a branch makes a *tongue*: it
+leaves its trend and comes back, with an energy fold at the tip. The files have k at energy folds.
+
+*Regions* of the energy (``modes.branches.regions``): I no contact, II grazing, III vibro-impact, IV the smooth limit,
+where the clearance is negligible; 0 where there are only smooth springs. *Flows* are time integrators: the files may
+compare points of a branch with orbits that other flows than its own have found.
+"""
 
 import tomllib
 from collections.abc import Sequence
@@ -17,7 +32,7 @@ from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, note, 
 from vipetsc.io.netcdf import open_netcdf
 
 NEEDS = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
-UNSTABLE = 1.0 + 1e-6  # Floquet multipliers above are not those of a stable orbit
+UNSTABLE = 1.0 + 1e-6  # with a Floquet multiplier of a larger modulus an orbit is unstable, beyond rounding
 MARKS = {
     "fold-energy": ("o", "energy fold"),
     "fold-frequency": ("s", "frequency fold"),
@@ -29,6 +44,7 @@ HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
 MOST_MARKS = 12  # with more special points, tongues are labelled by their resonance instead, at their highest fold
 FINE = 8  # points of the curve drawn for each step of a branch
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
+LEAST_DIFFERENCE = 1e-17  # shown in place of 0, which a logarithmic axis has not: below all rounding
 
 # Heights of the panels of a column, in units of 1.55 inches.
 FREQUENCY_HEIGHT = 1.5
@@ -36,16 +52,16 @@ OTHER_HEIGHT = 1.0
 PORTRAITS_HEIGHT = 0.95
 INCHES = 1.55
 
-# Of the inset on grazing, in fractions of the axes: lower left corners that it may take, its size, room for its labels.
+# The inset on grazing, in fractions of the axes: where its lower left corner may be, its size, and room for its labels.
 CORNERS = ((0.55, 0.1), (0.55, 0.5), (0.1, 0.1))
 INSET = (0.41, 0.36)
 MARGIN = 0.09
 
 
 def backbone(paths: Sequence[Path]) -> Figure:
-    """Draw frequency, slope and portraits of regions I-IV of the branches in ``paths``; one column a branch.
+    """Draw frequency, slope, differences of flows and phase portraits of the branches in ``paths``, a column each.
 
-    Raises OSError or ValueError for a file that holds none.
+    Raises OSError or ValueError for a file that holds no branch.
     """
     branches = [_read(path) for path in paths]
     if not all(branch.sizes["point"] for branch in branches):
@@ -70,7 +86,7 @@ def backbone(paths: Sequence[Path]) -> Figure:
         upper, *lower = column.subfigures(len(page_heights), 1, squeeze=False, height_ratios=page_heights)[:, 0]
         panels = upper.subplots(len(heights), 1, sharex=True, height_ratios=heights)
 
-        # The limits come first: the inset looks for room in them.
+        # The energies' limits come first: the inset looks for room between them.
         energy = branch["energy"].values
         panels[0].set(xscale="log", xlim=(energy.min(), energy.max()))
         for axes, draw_panel in zip(panels, draw_panels, strict=True):
@@ -80,8 +96,8 @@ def backbone(paths: Sequence[Path]) -> Figure:
         panels[0].set_title(f"({tag}) {heading}")
         panels[-1].set(xlabel="energy (J)")
         _label_narrow_energies(panels[-1], energy)
-        for page in lower:
-            portraits(page, branch)
+        for part in lower:
+            portraits(part, branch)
     return figure
 
 
@@ -94,7 +110,7 @@ def _read(path: Path) -> xr.Dataset:
 
 
 def _holds(branch: xr.Dataset, beginning: str) -> bool:
-    """Return whether the name of any variable of ``branch`` begins so."""
+    """Return whether the name of any variable of ``branch`` has this ``beginning``."""
     return any(str(name).startswith(beginning) for name in branch.variables)
 
 
@@ -114,7 +130,7 @@ def _heading(branch: xr.Dataset, with_law: bool) -> str:
 
 
 def _label_narrow_energies(axes: Axes, energy: np.ndarray) -> None:
-    """Label an axis of less than a decade, on which matplotlib's logarithmic labels are none or crowd together."""
+    """Label an axis of less than a decade, where matplotlib's logarithmic axes have no labels or too many."""
     if energy.max() >= 10 * energy.min():
         return
     very_narrow = energy.max() < 3 * energy.min()
@@ -124,7 +140,7 @@ def _label_narrow_energies(axes: Axes, energy: np.ndarray) -> None:
 
 
 def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw frequency over energy; unstable parts coloured, special points marked, grazing in the inset."""
+    """Draw frequency over energy: few special points are marked, with an inset on grazing; else tongues labelled."""
     energy = branch["energy"].values
     frequency = branch["frequency"].values
     kind = branch["kind"].values
@@ -134,9 +150,9 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
 
     if few_marks:
         for name, (mark, label) in MARKS.items():
-            at = kind == name
-            if at.any():
-                axes.plot(energy[at], frequency[at], mark, ms=3, label=label, **HOLLOW)
+            is_marked = kind == name
+            if is_marked.any():
+                axes.plot(energy[is_marked], frequency[is_marked], mark, ms=3, label=label, **HOLLOW)
     else:
         axes.margins(y=0.08)
         for order in LABELLED_TONGUES:
@@ -151,28 +167,31 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
         axes.legend(loc="upper left", fontsize=5.5, bbox_to_anchor=(0, 0.93))
         _grazing_inset(axes, branch, touched[0])
     else:
+        # A branch that rises leaves the lower right free, a constant frequency does not, and tongues may not.
         lower_right_is_free = np.ptp(frequency) > 0 and (few_marks or not touched.size)
         axes.legend(loc="lower right" if lower_right_is_free else "best", fontsize=5.5)
 
 
 def _label_tongue(axes: Axes, branch: xr.Dataset, order: int) -> None:
-    """Write "order:1" above the highest point of that tongue, if the branch has it."""
+    """Write "k:1" for k = ``order`` above the fold of this tongue with the highest frequency, if the branch has one."""
     k = branch["resonance"].values
 
-    # Folds behind the first of a higher resonance that have this k are between tongues.
+    # Tongues are expected in the order of k. Folds with this k that come after a fold with a higher one are no
+    # tips of this tongue: they lie on the way from one tongue to the next.
     higher = np.nonzero(k > order)[0]
     end = higher[0] if higher.size else len(k)
     tongue = branch.isel(point=(k == order) & (np.arange(len(k)) < end))
     if tongue.sizes["point"]:
         tip = tongue.isel(point=int(np.argmax(tongue["frequency"].values)))
-        at = float(tip["energy"]), float(tip["frequency"])
-        note(axes, f"{order}:1", at, (1, 3), fontsize=5.5, color=style.GREY, ha="center")
+        position = float(tip["energy"]), float(tip["frequency"])
+        note(axes, f"{order}:1", position, (1, 3), fontsize=5.5, color=style.GREY, ha="center")
 
 
 def slope(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw |df/dE| over energy at the regular points where contacts act, at all without contact.
+    """Draw |df/dE| over energy at regular points: those with contact, or all of a branch that has no contact anywhere.
 
-    Where several states of the branch have one energy, all but that of the lowest frequency are pale.
+    Where several states of the branch have one energy, all but that of the lowest frequency are pale. The pale line
+    joins the points shown, also across those that are left out.
     """
     _shade(axes, branch)
     shown = branch["kind"].values == "regular"
@@ -194,42 +213,44 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
 
 
 def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw how far other flows are from the branch at the same amplitude: frequency (full), energy (open marks)."""
+    """Draw how far orbits of other flows are from the branch at one amplitude: frequency full, energy open marks."""
     paths = [str(name) for name in branch.variables if str(name).startswith("flows/")]
     flows = list(dict.fromkeys(path.split("/")[1] for path in paths))
     if not flows:
         annotate_empty(axes, "no other flow was compared")
         return
 
+    # One colour for each of the three flows that there are.
     for name, colour in zip(flows, (style.VERMILION, style.GREEN, style.PURPLE), strict=False):
         energy = branch[f"flows/{name}/energy"]
         for key, face in (("frequency", colour), ("energy", "white")):
-            difference = np.maximum(np.abs(branch[f"flows/{name}/{key}_difference"].values), 1e-17)
+            difference = np.maximum(np.abs(branch[f"flows/{name}/{key}_difference"].values), LEAST_DIFFERENCE)
             look = {"ms": 2.2, "mec": colour, "mfc": face, "mew": 0.5}
             axes.loglog(energy, difference, "o", label=f"{name}: {key}", **look)
     axes.set(ylabel="relative difference", ylim=(None, 10.0))  # room for the legend
     axes.legend(fontsize=5.5, ncols=2, loc="upper right")
 
 
-def portraits(page: SubFigure, branch: xr.Dataset) -> None:
-    """Draw phase portraits of the stored orbits of regions I-IV: the first two masses."""
+def portraits(part: SubFigure, branch: xr.Dataset) -> None:
+    """Draw the first two masses of the first four orbits stored, which begin with one of every region there is."""
     if "orbits/number" not in branch:
-        annotate_empty(page.subplots(), "no orbits stored")
+        annotate_empty(part.subplots(), "no orbits stored")
         return
 
     orbits = branch.isel(orbit=slice(4))
     regular = branch.isel(point=branch["kind"].values == "regular")
-    grid = page.subplots(1, orbits.sizes["orbit"], sharey=True, squeeze=False)[0]
+    grid = part.subplots(1, orbits.sizes["orbit"], sharey=True, squeeze=False)[0]
     for k, axes in enumerate(grid):
         energy = orbits["orbits/energy"].values[k]
         _draw_orbit(axes, orbits["orbits/displacement"].values[k], orbits["orbits/velocity"].values[k])
 
+        # Orbits are stored without their regions: that of the regular point with the nearest energy is theirs.
         nearest = int(np.abs(np.log(regular["energy"] / energy)).argmin())
         region = REGIONS[int(regular["region"][nearest])]
         axes.set_title(f"{region}\n{energy:.2g} J", loc="center", fontsize=7)
         axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
     grid[0].set_ylabel(r"$\dot u$/max")
-    page.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
+    part.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
 
 
 def _draw_orbit(axes: Axes, u: np.ndarray, v: np.ndarray) -> None:
@@ -244,8 +265,9 @@ def _draw_orbit(axes: Axes, u: np.ndarray, v: np.ndarray) -> None:
 def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Return energies and frequencies, ``FINE`` for each step: cubic Hermite curves through points and tangents.
 
-    Both are logarithms there, over their range; the chord's length is the parameter. Where a contact grazes a curve
-    ends and the next begins: the branch may have a corner.
+    The curves are those of ln E and ln f, each over its range, and their parameter is the length of the chord. Where a
+    contact grazes, the branch may have a corner: one curve ends there and the next begins with a tangent of its own.
+    Branches of less than three points, or without tangents, come back as they are.
     """
     energy = branch["energy"].values
     frequency = branch["frequency"].values
@@ -270,11 +292,12 @@ def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit tangents (step, 2) at the begin and the end of every step, in logarithms over ``scale``."""
+    """Return unit tangents (step, 2) at the beginning and the end of every step, in logarithms over ``scale``."""
     energy = branch["energy"].values
     frequency = branch["frequency"].values
 
-    # The file has dT/ds and df/dE, so df/ds = -f^2 dT/ds, and dE/ds = (df/ds) / (df/dE).
+    # The file has dT/ds and df/dE, so df/ds = -f^2 dT/ds, and dE/ds = (df/ds) / (df/dE). This is 0/0 at a frequency
+    # fold and where the branch is linear: such tangents are left to ``_completed``.
     rate = -branch["tangent_period"].values * frequency**2
     with np.errstate(divide="ignore", invalid="ignore"):
         tangents = np.column_stack([rate / branch["slope"].values / energy, rate / frequency])
@@ -282,7 +305,7 @@ def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray)
     tangents[~np.isfinite(tangents).all(axis=1) | ~tangents.any(axis=1)] = np.nan
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
 
-    # Tangents of a branch point one way all along it; the points are listed that way or the opposite one.
+    # All tangents point in the direction in which the branch was followed; the points may be listed in the other one.
     tangents *= np.sign(np.nansum(tangents[:-1] * unit_chord)) or 1.0
 
     # At a grazing point the tangent is that of one side: neither step takes it.
@@ -294,22 +317,23 @@ def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray)
 
 
 def _completed(tangent: np.ndarray, other: np.ndarray, unit_chord: np.ndarray) -> np.ndarray:
-    """Return the ``tangent`` at one end of every step; where it is NaN, such that the step is a parabola or straight.
+    """Return the ``tangent`` at one end of every step, completed where it is NaN.
 
-    ``other`` is that at the other end: a parabola's two tangents have the chord as their mean.
+    With the tangent ``other`` of the other end the step is a parabola, whose two tangents have the chord as their mean;
+    without, it is straight.
     """
     by_other = np.where(np.isnan(other), unit_chord, 2 * unit_chord - other)
     return np.where(np.isnan(tangent), by_other, tangent)
 
 
 def lowest(branch: xr.Dataset) -> np.ndarray:
-    """Return whether (point) no other state of the branch has the energy of a point and a lower frequency."""
+    """Return for each point (point,) whether its frequency is the lowest that the branch has at its energy."""
     energy = branch["energy"].values
     frequency = branch["frequency"].values
     order = np.argsort(energy)
     ranks = np.searchsorted(energy[order], energy)
 
-    # Each step of the branch is a line over energy, below which the points between its ends may lie.
+    # Each step of the branch is a straight line over energy; points of these energies above it are not the lowest.
     least = frequency[order].copy()
     for i, (rank, next_rank) in enumerate(pairwise(ranks)):
         between = slice(min(rank, next_rank) + 1, max(rank, next_rank))
@@ -320,25 +344,26 @@ def lowest(branch: xr.Dataset) -> np.ndarray:
 
 
 def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
-    """Draw the branch, blue where stable, vermilion where not, grey where that is not known."""
+    """Draw the whole branch in blue; over it vermilion where it is unstable, grey where multipliers are not known."""
     energy, frequency = smooth(branch)
     multiplier = branch["multiplier_max"].values
     stable_label = "stable" if np.any(multiplier <= UNSTABLE) else None
     axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label=stable_label)
 
     parts = ((multiplier > UNSTABLE, style.VERMILION, "unstable"), (np.isnan(multiplier), style.GREY, "not known"))
-    for at, colour, label in parts:
-        if len(energy) > len(at):
-            # The points of a step belong to the part if both of its ends do.
-            at = np.append(np.repeat(at[:-1] & at[1:], FINE), at[-1])
-        if at.any():
-            axes.plot(energy, np.where(at, frequency, np.nan), color=colour, lw=1.3 * width, zorder=3, label=label)
+    for is_part, colour, label in parts:
+        if len(energy) > len(is_part):
+            # The curve has been smoothed: the points of a step belong to the part if both of its ends do.
+            is_part = np.append(np.repeat(is_part[:-1] & is_part[1:], FINE), is_part[-1])
+        if is_part.any():
+            axes.plot(energy, np.where(is_part, frequency, np.nan), color=colour, lw=1.3 * width, zorder=3, label=label)
 
 
 def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     """Draw the neighbourhood of grazing, point ``first``, in the corner where it covers least of the branch.
 
-    It reaches to where the frequency has grown by a tenth, or the folds are passed.
+    It reaches to where the frequency is a tenth above that of the last energy fold, or of grazing if there is no fold,
+    but at least three points further than grazing.
     """
     energy = branch["energy"].values
     frequency = branch["frequency"].values
@@ -348,6 +373,7 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     last = min(max(last, first + 3), len(energy) - 1)
     near = branch.isel(point=slice(max(first - 1, 0), last + 1))
 
+    # The corner with the least points of the drawn curve behind the inset.
     in_pixels = axes.transData.transform(np.column_stack(smooth(branch)))
     curve = axes.transAxes.inverted().transform(in_pixels)
     covered = []
@@ -366,7 +392,7 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
 
 
 def _shade(axes: Axes, branch: xr.Dataset) -> None:
-    """Shade regions as bands of energy; none where there is no region III (internal resonances)."""
+    """Shade regions as bands of energy, if there is a III: where internal resonances go on, region II has no end."""
     energy = branch["energy"].values
     region = branch["region"].values
     if np.any(region == 3):

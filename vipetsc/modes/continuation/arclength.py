@@ -1,26 +1,46 @@
-"""Pseudo-arclength continuation as an iterator over points; the caller owns the loop."""
+"""Pseudo-arclength continuation as an iterator over points; the caller owns the loop.
+
+A method (``modes.problem.Problem``) has n equations H = 0 in n + 1 unknowns, whose solutions form a branch: a curve.
+Around the last point it gives a *frame*: the unknowns ``xi`` (n + 1,), scaled to order one by a *chart*, those of the
+point itself, and the unit tangent t of the branch there. A step of the arclength s predicts xi + s t, and Newton's
+method corrects the prediction to the solution xi_new of
+
+    H(xi_new) = 0,    t . (xi_new - xi) = s,
+
+so that the correction is orthogonal to the tangent (Keller 1977, reference in ``modes``). The arclength is in the units
+of the chart. The frame's ``measures`` turn a solution into a point of the branch with its energy, frequency and so on.
+
+*Guards* bound what may change from one point to the next (``continuation.guards``): the correction over the step, the
+angle between tangents, contacts, half-traces of Floquet multipliers. The *strain* of a guard is the change over its
+bound, that of a step the largest of these: above 1 a step is refused, since it may have jumped to another branch.
+
+A *step rule* decides what follows after each attempt. ``GuardedSteps`` is the rule for normal modes, by the section
+[nnm] of a case file; other kinds of branches bring their own.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol
 
 import numpy as np
 
 from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.continuation.guards import GUARDED, strain
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, Problem, S, Solution
+from vipetsc.modes.problem import Attempt, ContinuationError, Problem, S
 
-S_contra = TypeVar("S_contra", bound=Solution, contravariant=True)
-
-
-# Strain of the guards at which the next step aims, Newton steps that need no shorter one, and its largest growth.
+# These numbers decide how many points lie on a branch, not its course: each point solves the equations and keeps the
+# guards. None is sharp. On the out-of-phase branch of the paper's reduced model up to 10 kJ (176 points, 21 attempts in
+# vain) each may be changed by a quarter or more, and the Newton steps of all points together change by 13 % at most.
+#
+# Strain at which the step after an accepted one aims (at 1, nearly twice as many steps are refused), Newton steps up to
+# which the next step need not be shorter, and its largest growth.
 AIM = 0.7
 EASY = 5
 MOST_GROWTH = 2
 # Factor of a step where Newton's method fails.
 FAILED_FACTOR = 0.4
-# Where a guard is strained: the strain aimed at, and bounds of the factor.
+# Where a guard refuses a step: the strain at which its repetition aims, and bounds of the factor.
 AIM_AGAIN = 0.8
 LEAST_FACTOR = 0.1
 MOST_FACTOR = 0.7
@@ -37,7 +57,10 @@ class Geometry(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Whether a step is accepted, the arclength of the next one (or of the next attempt), and why it is not."""
+    """Whether a step is accepted, and the arclength of the next ``step``, or of the next attempt if it is not.
+
+    Of a step that is not accepted, ``why`` says the reason, and ``remedy`` names keys of the case file that may help.
+    """
 
     accepted: bool
     step: float
@@ -48,7 +71,9 @@ class Verdict(NamedTuple):
 class StepRule(Protocol[S]):
     """How long steps are, and where a branch ends.
 
-    ``points`` at most are computed; a step below ``smallest_step`` ends the branch with the error ``stuck``.
+    One run computes ``points`` at most, without the start; ``points_key`` is the key of the case file that says how
+    many. A step below ``smallest_step`` ends the branch with a ContinuationError, whose text ``stuck`` gives. ``chart``
+    is the name of the chart for ``Problem.frame``; "" where the problem offers no choice.
     """
 
     points: int
@@ -64,17 +89,22 @@ class StepRule(Protocol[S]):
         """What follows after a step from the point ``before`` to ``after`` that has converged."""
 
     def end(self, point: S) -> tuple[S, str] | None:
-        """The last point of the branch and how it ended, if it ends at ``point``; else None."""
+        """The last point of the branch and how it ended, if it ends at ``point``; else None.
+
+        The last point may differ from ``point``, as where a rule moves it to the end of a range that it has passed.
+        """
 
     def stuck(self, last: S, attempt: Attempt | None, verdict: Verdict) -> str:
         """Why no step leads on from the ``last`` point."""
 
 
 class GuardedSteps:
-    """Steps of a branch of normal modes by [nnm]: as long as its guards are strained to 70 % of their bounds.
+    """Steps of a branch of normal modes by [nnm], of such length that the most strained guard comes to ``AIM``.
 
-    Strain grows with the step, so that its inverse scales the next one; a step at most doubles, and is shortened where
-    Newton's method needs more than five iterations.
+    Guarded changes are proportional to short steps: angles and half-traces change at a rate along the branch, and a
+    correction, of second order, is taken over the step. (Of those that are not, only being out of bounds counts.) The
+    next step is therefore the last one times ``AIM`` over its strain. It at most doubles, and is shorter than the last
+    one where Newton's method needed more than ``EASY`` steps.
     """
 
     points_key = "nnm.points"
@@ -100,12 +130,13 @@ class GuardedSteps:
         if size <= 1.0:
             effort = max(size / AIM, after.newton / EASY, 1 / MOST_GROWTH)
             return Verdict(True, min(after.step / effort, self.control.largest_step))
+
         # A strain that does not fall in proportion to the step must not keep the attempts from ending.
         factor = min(max(AIM_AGAIN / size, LEAST_FACTOR), MOST_FACTOR)
         return Verdict(False, after.step * factor, *GUARDED[guard])
 
     def end(self, point: Point) -> tuple[Point, str] | None:
-        """The point itself where it has left the range of energies or of frequencies."""
+        """The point itself, where it has left the range of energies or of frequencies."""
         low, high = self.control.energy
         if not low <= point.energy <= high:
             return point, f"left the energy range {low:g} to {high:g} J"
@@ -115,7 +146,7 @@ class GuardedSteps:
         return None
 
     def stuck(self, last: Point, attempt: Attempt | None, verdict: Verdict) -> str:
-        """Where, why, and which option to turn."""
+        """A sentence that says where and why no step was short enough, and which keys of the case file may help."""
         residuals = "none"
         if attempt is None:
             verdict = self.no_step
@@ -129,15 +160,21 @@ class GuardedSteps:
 
 
 class Continuation(Generic[S]):
-    """Iterates over the points of a branch, from ``start`` in the direction of growing or falling energy.
+    """Iterates over the points of a branch that follow ``start``; the start itself is not among them.
 
-    Of the section [nnm], ``control``, it takes the ``chart`` (``auto``: grazing near a contact at the arc's start, else
-    relative), the steps in units of the chart, the ``guards``, and where the branch ends: outside ``energy`` (J),
-    outside ``frequency`` (Hz) or after ``points`` points; other kinds of branches have rules of their own. Each point
-    is yielded when it has been accepted; ``ending`` says in a sentence how the branch ended, ``finished`` whether it
-    left its range, and ``passed`` is the latest point before it was put on the end of a range. The whole state is the
-    last point and the next step: a stored branch can be resumed. Raises ContinuationError if the step falls below the
-    smallest or the tangent at the start is degenerate.
+    ``control`` is a step rule, or the section [nnm] of a case: it gives the ``chart`` (``auto``: grazing near a contact
+    at the arc's start, else relative), the steps in units of the chart, the ``guards``, and where the branch ends:
+    outside ``energy`` (J), outside ``frequency`` (Hz) or after ``points`` points. A start without a tangent is left
+    towards growing energy (``direction`` 1) or falling energy (-1); one with a tangent is left along it, and
+    ``direction`` is not used.
+
+    Each point is yielded when it has been accepted. ``point`` is the last one; ``passed`` is the same point as it was
+    before the rule's ``end`` may have moved it to the end of a range. ``ending`` says in a sentence how the branch
+    ended, and ``finished`` whether it did so by the rule's ``end``.
+
+    The whole state is the last point and the next ``step``: a stored branch can be resumed, and ``points``
+    then counts from there. Raises ContinuationError if the step falls below the smallest or the tangent at the start is
+    degenerate.
     """
 
     def __init__(
@@ -180,16 +217,17 @@ class Continuation(Generic[S]):
             predicted = frame.xi + self.step * frame.tangent
             attempt = frame.correct(predicted, self.step)
             if attempt.converged:
-                direction = frame.tangent_at(attempt.xi)
-                point = replace(frame.measures(attempt, direction), index=last.index + 1, step=self.step)
-                verdict = self.rule.judge(
-                    before=last,
-                    after=point,
-                    geometry=Geometry(
-                        corrector=float(np.linalg.norm(attempt.xi - frame.xi - self.step * frame.tangent)) / self.step,
-                        turn=float(np.arccos(min(direction @ frame.tangent, 1.0))),
-                    ),
+                tangent = frame.tangent_at(attempt.xi)
+                point = replace(frame.measures(attempt, tangent), index=last.index + 1, step=self.step)
+
+                # Of the cosine only rounding above 1 is cut off: the tangent is on the side of the frame's, so it is
+                # not negative.
+                correction = attempt.xi - frame.xi - self.step * frame.tangent
+                geometry = Geometry(
+                    corrector=float(np.linalg.norm(correction)) / self.step,
+                    turn=float(np.arccos(min(tangent @ frame.tangent, 1.0))),
                 )
+                verdict = self.rule.judge(before=last, after=point, geometry=geometry)
             else:
                 verdict = self.rule.not_converged(self.step, attempt)
 
@@ -201,5 +239,8 @@ class Continuation(Generic[S]):
 
 
 def _rule(problem: Any, control: Any) -> Any:
-    """The rule itself, or that of a table [nnm], which goes with points that are orbits."""
+    """The step rule that ``control`` is, or ``GuardedSteps`` by a section [nnm].
+
+    Such a section is only given with a problem whose points are orbits, which types cannot say: hence Any.
+    """
     return GuardedSteps(problem, control) if isinstance(control, NnmTable) else control
