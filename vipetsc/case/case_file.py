@@ -139,7 +139,7 @@ class CaseFile(Section):
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
-        """The fields besides ``name``, and everything wrong with the sections they come from."""
+        """The fields other than ``name``, and all problems with the sections they come from."""
         fields: dict[str, Any] = {}
         problems: list[Problem] = []
         for key, field in cls.model_fields.items():

@@ -119,7 +119,7 @@ def _references(item: Any) -> Iterator[str]:
 
 
 def _toml(value: Any) -> str:
-    """A default as it stands in a case file."""
+    """A default in TOML, as a case file would give it."""
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     if isinstance(value, bool):

@@ -238,8 +238,9 @@ class AnalysisTable(Section):
 
     ``band_stride``: samples between those at which energies above the pass bands are taken; ``snapshot_stride`` and
     ``cell_stride``: of the snapshots (500 at most) and of the cells whose entropy is taken. ``modal_stride``: samples
-    between those, besides the ones around contacts, at which the energies of the linear modes are taken. ``pixels``:
-    most rows and columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most that.
+    between those, in addition to those before and after contacts, at which the energies of the linear modes are taken.
+    ``pixels``: most rows and columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most
+    that.
     """
 
     band_stride: int = Field(10, ge=1)

@@ -50,7 +50,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
     """Call the verb with a request to stop at hand, and report bad input; returns the exit code."""
     verb = VERBS[options.verb]
     try:
-        # Refused rather than ignored: a result is that of its case file, and these would not stand in it.
+        # Refused rather than ignored: a result is that of its case file, which would not name these options.
         if petsc and not verb.takes_petsc_options:
             raise CaseError([Problem(f"-{name}", None, f"{verb.name} takes no PETSc options") for name in petsc])
         if petsc:
@@ -73,7 +73,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
 
 
 def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
-    """The parser of all verbs; ``complete`` tells a shell how arguments are completed, by their names or flags."""
+    """The parser of all verbs; ``complete`` holds how a shell completes arguments, by their names or flags."""
     parser = Parser(
         prog="vipetsc",
         description="Waves in phononic lattices with vibro-impacts. Without a verb: the built-in four-band case.",

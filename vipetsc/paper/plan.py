@@ -1,6 +1,6 @@
 """The plan of the verb ``paper``, in full or on coarse grids: steps, each of which computes one case in its folder.
 
-A step knows how far it has come, and the plan what figures and claims are made from.
+A step has its state, and the plan the inputs of figures and claims.
 """
 
 import hashlib
@@ -220,7 +220,7 @@ class PaperStep:
 class Plan:
     """Steps in the order of their computation, and the figures of the paper.
 
-    ``grid`` is "full" or "quick"; ``note`` stands on every picture; ``measure`` gives the rows of ``claims.json`` from
+    ``grid`` is "full" or "quick"; ``note`` is printed on every picture; ``measure`` gives the rows of ``claims.json`` from
     the folder of all steps.
     """
 
@@ -266,7 +266,7 @@ class Plan:
     def inputs(self, root: Path) -> dict[str, str]:
         """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
         steps = {step.name: step.name + step.identity(root) for step in self.steps if step.state(root) == DONE}
-        # The note stands on every picture, and another version may draw or measure otherwise.
+        # The note is printed on every picture, and another version may draw or measure otherwise.
         version = (vipetsc.__version__, self.note)
         inputs: dict[str, str] = {}
         for figure in self.figures:

@@ -7,8 +7,9 @@ what the others, and the ends, send back. f1 = Phi1(|c|/D) c closes the system: 
 and once more with that of what comes out, until it stays.
 
 Third harmonics f3 = Phi3(z) |c| (c/|c|)^3 of the sites add with their phases; a site in contact is stiff to those of
-others: f3 has -c3/g besides. They press on contacts: z = (|c| + |c3|)/D. Of what the upper bands carry past a site in
-contact, the fraction is lost that a driven wave of that amplitude loses. Waves that are not harmonics add by energies.
+others: f3 has the term -c3/g too. They press on contacts: z = (|c| + |c3|)/D. The energy that the upper bands carry
+past a site in contact loses the fraction that a driven wave of that amplitude loses. Waves that are not harmonics add
+by energies.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
 """The runs of the scattering law: one site in an infinite lattice, ever finer in z; a case in, ``law.h5`` out.
 
 ``studies.ring`` has the geometry: a lattice that is infinite while a run lasts. Waves need not have separated in space
-at the end: Bloch amplitudes tell band and direction of each at an instant (``spectra.directions``), and are constant
+at the end: Bloch amplitudes give band and direction of each at an instant (``spectra.directions``), and are constant
 once the last contact has ended.
 
 **Fractions.** E0 (band, direction) are the energies of the run without a site under 1 N, E those of a run under the

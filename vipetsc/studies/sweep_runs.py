@@ -43,7 +43,7 @@ class SweepRuns:
     """The members of the sweep ``plan`` and its linear runs, ``recorded`` in ``folder``.
 
     All ranks of ``comm`` must construct one; all ranks of a team work on each run together. Members whose fields are
-    kept have folders ``<id>/`` with ``run.h5`` and ``analysis.h5`` besides. ``linear`` are the linear runs this rank
+    kept have folders ``<id>/`` with ``run.h5`` and ``analysis.h5`` too. ``linear`` are the linear runs this rank
     has so far by name, or why one did not come out.
     """
 

@@ -68,7 +68,7 @@ def follow_branches(
         if has_branches:
             claim.publish()
 
-    # Branches are known on rank 0 alone; all ranks must agree on how the verb ends.
+    # Only rank 0 has the branches; all ranks must agree on how the verb ends.
     failures = [f"{branch.name}: {branch.ending}" for branch in branches if branch.ending.startswith("failed")]
     return Outcome(drawable=has_branches, failures=comm.bcast(failures))
 

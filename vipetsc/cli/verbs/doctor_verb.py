@@ -22,7 +22,7 @@ MODULES = ("scipy", "matplotlib", "jinja2", "numba", "pydantic", "tqdm", "tomli_
 
 
 class Check(NamedTuple):
-    """Something that the program needs: what there is of it, None if it is missing, and how to get it."""
+    """Requirement of the program: its version, None if it is missing, and how to get it."""
 
     name: str
     value: str | None
@@ -56,7 +56,7 @@ def needs(comm: MPI.Comm) -> list[Check]:
     from petsc4py import PETSc
 
     scalar = np.dtype(PETSc.ScalarType)
-    parallel: str | None = "under mpirun"  # one rank cannot tell: the MPI build of Debian is loaded there alone
+    parallel: str | None = "under mpirun"  # one rank cannot decide: the MPI build of Debian is loaded there alone
     if comm.size > 1:
         parallel = "yes" if h5py.get_config().mpi else None
     return [
