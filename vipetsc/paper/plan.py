@@ -220,8 +220,8 @@ class PaperStep:
 class Plan:
     """Steps in the order of their computation, and the figures of the paper.
 
-    ``grid`` is "full" or "quick"; ``note`` is printed on every picture; ``measure`` gives the rows of ``claims.json`` from
-    the folder of all steps.
+    ``grid`` is "full" or "quick"; ``note`` is printed on every picture; ``measure`` gives the rows of ``claims.json``
+    from the folder of all steps.
     """
 
     grid: str
