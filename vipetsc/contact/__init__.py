@@ -1,7 +1,7 @@
-r"""What touches: the force of a contact, the search for its changes, landing on them, the log of impacts.
+r"""Contacts: the force of a contact, the search for its changes, landing on them, the log of impacts.
 
 A site is a pair of masses, host and resonator, with the relative displacement w = u_resonator - u_host and a
-clearance D on both sides. ``law`` holds the compiled force, ``search`` the guaranteed root search and the way onto a
+clearance D on both sides. ``law`` holds the compiled force, ``search`` the guaranteed root search and the landing on a
 root, ``changes`` the changes of a site's mode within a step, ``tracker`` the modes and the log.
 
 **Law.** With the indentation x = sigma w - D on the side sigma = +1 or -1, the force on the host is

@@ -59,7 +59,7 @@ class ModeChange(NamedTuple):
 
 
 class Extremes(NamedTuple):
-    """Of a contact in a step: largest indentation in m, largest and smallest force in N, positive when it pushes."""
+    """Extremes of a contact in a step: indentation in m, largest and smallest force in N, positive when it pushes."""
 
     indentation: float
     force: float
@@ -137,6 +137,7 @@ def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: fl
                 else:
                     c[k] = form.factor * 5.0 * (b[k + 1] - b[k]) / h + form.offset
             position = first_upcrossing_after_start(c[: 6 - form.order], form.tolerance)
+            # Strictly: of changes at one time the first site's is landed on, and the others land with it.
             if position < first.position:
                 first = ModeChange(position, i, function)
     return first
@@ -174,7 +175,7 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
             largest = force
             best = k / _INTERVALS
 
-    # Golden sections around the largest of the samples.
+    # Golden sections between the neighbours of the largest sample.
     low = max(best - 1.0 / _INTERVALS, 0.0)
     high = min(best + 1.0 / _INTERVALS, 1.0)
     for _ in range(_SECTIONS):

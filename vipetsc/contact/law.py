@@ -49,7 +49,7 @@ the smallest |w'_minus| in m/s, whether g is kept from becoming negative; the re
 
 def elastic_records(laws: Sequence[Contact]) -> np.ndarray:
     """Parameters (law,) of dtype ``ELASTIC`` of the elastic laws of ``laws``."""
-    # Sites have few different laws, and a factor costs gamma functions: each law is asked once.
+    # Sites have few different laws, and a factor costs gamma functions: it is computed once for each law.
     rows = {law: _elastic_row(law) for law in dict.fromkeys(laws)}
     return np.array([rows[law] for law in laws], ELASTIC)
 
@@ -86,7 +86,7 @@ def create_contacts(
 
 
 def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: float) -> None:
-    """Let the sites ``which`` act without changes of mode: no loss, and touching at w = 0 or pressed there.
+    """Make the sites ``which`` permanent, without changes of mode: no loss, and touching at w = 0 or pressed there.
 
     ``laws`` (site,) are those of all ``sites``; ``speed`` in m/s is that of relative motion, for what is small
     compared with it.
@@ -157,6 +157,7 @@ def impact_time(site: Any, speed: float) -> float:
         depth = (inertia * speed**law.speed_exponent / law.stiffness) ** (1.0 / (law.exponent + 1.0))
         return law.duration_factor * depth / speed
 
+    # Newton's method from beyond the turning point comes down on it: the energy of a hardening force is convex.
     energy = 0.5 * site.reduced_mass * speed * speed
     depth = 1.0
     while elastic_energy(law, depth) < energy:
@@ -166,6 +167,7 @@ def impact_time(site: Any, speed: float) -> float:
         step = (elastic_energy(law, depth) - energy) / elastic_force(law, depth)
         depth -= step
 
+    # With x = depth sin(phase) the integrand stays finite where the speed falls to zero.
     width = 0.5 * np.pi / PHASES
     total = 0.0
     for k in range(PHASES):

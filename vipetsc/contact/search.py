@@ -1,8 +1,8 @@
 """The guaranteed search for the first root of a polynomial in Bernstein form, and the landing on one of a trajectory.
 
 Method and references: the package's docstring. The trajectory is known at the end of a step only, and each engine takes
-its own kind of step. What they share is the safeguarded Newton iteration on the switching function at the end of the
-repeated step. (``vipetsc.modes.shooting.landing`` keeps a bracket instead: it lands to the rounding of the time, where
+its own kind of step. Both use the safeguarded Newton iteration on the switching function at the end of the repeated
+step. (``vipetsc.modes.shooting.landing`` keeps a bracket instead: it lands to the rounding of the time, where
 a residual no longer halves.)
 """
 
@@ -20,7 +20,7 @@ _DEPTH = 64
 NEWTON_STEPS = 8
 MOST_ATTEMPTS = 16
 
-# What the last attempt was: on the change; to be repeated at the new length; to be searched again; given up.
+# Outcomes of an attempt: on the change; to be repeated at the new length; to be searched again; given up.
 LANDED, RETRY, SEARCH, MISSED = range(4)
 
 
@@ -53,7 +53,7 @@ def evaluate(b: np.ndarray, s: float, room: np.ndarray) -> float:
 def _bisect(c: np.ndarray, room: np.ndarray) -> float:
     """Root in [0, 1] of a polynomial that turns from negative to positive once."""
     low, high = 0.0, 1.0
-    # Halved until the interval is one rounding unit of 1.
+    # 53 halvings: the interval is then one rounding unit of 1.
     for _ in range(53):
         s = 0.5 * (low + high)
         if evaluate(c, s, room) > 0.0:

@@ -181,8 +181,9 @@ class ImpactTracker:
     def begin(self, motion: np.ndarray) -> np.ndarray:
         """Close the sites that begin beyond their clearance at t = 0; returns their indices.
 
-        ``motion`` (site, 2) has w and w' of all numbered sites. When these contacts began is not known: w'_minus is the
-        speed with which two masses alone come to w at w' without loss: mu (w'_minus^2 - w'^2)/2 is the elastic energy.
+        ``motion`` (site, 2) has w and w' of all numbered sites. The onsets of these contacts lie before the run:
+        w'_minus is the speed with which two masses alone come to w at w' without loss, so that
+        mu (w'_minus^2 - w'^2)/2 is the elastic energy.
         """
         sites = self.contacts
         tracked = self.tracks.sites
@@ -219,7 +220,7 @@ class ImpactTracker:
 
     @property
     def counts(self) -> np.ndarray:
-        """How often the limits of the contact law acted on each site, of dtype ``COUNTS``."""
+        """Number of times that each limit of the contact law acted on each site, of dtype ``COUNTS``."""
         return self.tracks.sites["counts"]
 
     def contact_time(self) -> float:

@@ -1,4 +1,4 @@
-"""What a run will cost, said before it is made: which engine makes it, how many contacts to expect, CPU time.
+"""Cost of a run, estimated before it begins: its engine, the number of contacts to expect, CPU time.
 
 Models of CPU time fitted to the paper's lattices on one core, within a factor of two or so there; on another machine
 both engines are off by one factor, and how they compare stays. Contacts are those of the linear wave: where waves
@@ -41,13 +41,13 @@ class Seconds(NamedTuple):
 
     @property
     def total(self) -> float:
-        """Both together."""
+        """Time with and without contacts together."""
         return self.linear + self.contacts
 
 
 @dataclass(frozen=True)
 class Cost:
-    """The ``engine`` that makes a run, and a note on it; contact ``episodes``; CPU times in s.
+    """The ``engine`` that simulates a run, and a note on it; contact ``episodes``; CPU times in s.
 
     The ``note`` says why it is not the engine asked for, or how many cells have rows of their own.
 
@@ -64,7 +64,7 @@ class Cost:
 
     @property
     def faster(self) -> str:
-        """Where ``ts`` is to make what the propagator could: how much faster that is, in words; else empty."""
+        """Sentence on how much faster the propagator is where ``ts`` is to simulate what it could; else empty."""
         if self.engine != "ts" or self.propagator is None or self.seconds < 1.5 * self.propagator:
             return ""
         ratio = self.seconds / self.propagator
@@ -72,7 +72,7 @@ class Cost:
 
 
 def estimate(case: Case, ranks: int = 1) -> Cost:
-    """The cost of a run of ``case`` on so many ranks; every site is taken to meet the linear wave of the drive."""
+    """The cost of a run of ``case`` on so many ranks; every site is assumed to meet the linear wave of the drive."""
     model = case.model()
     kind, note = select_engine(case, model)
     episodes = expected_episodes(model)
@@ -95,14 +95,14 @@ def estimate(case: Case, ranks: int = 1) -> Cost:
 
 
 def _runge_kutta_seconds(model: Model, episodes: float, ranks: int) -> Seconds:
-    """What ``ts`` takes for ``model`` with so many contact episodes."""
+    """CPU time of ``ts`` for ``model`` with so many contact episodes."""
     step = STEP + MASS * model.chain.cells * model.chain.cell.dofs / ranks
     steps_per_sample = max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
     return Seconds(SAMPLED_STEPS * model.samples * steps_per_sample * step, EPISODE_STEPS * episodes * step)
 
 
 def _propagator_seconds(model: Model, series: StepSeries, episodes: float, ranks: int) -> tuple[Seconds, str | None]:
-    """What the propagator takes, and a note on cells with rows of their own, if there are any."""
+    """CPU time of the propagator, and a note on cells with rows of their own, if there are any."""
     steps = model.samples * round(model.sample_interval / series.interval)
     differing, tables = series.own_rows()
     numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1) / ranks
@@ -118,7 +118,7 @@ def _propagator_seconds(model: Model, series: StepSeries, episodes: float, ranks
 def expected_episodes(model: Model) -> float:
     """Contact episodes if each site meets the drive's linear wave: two a cycle while |w| is above the clearance.
 
-    The wave's largest displacement is ``model.scale``; the Bloch wave states what part of it |w| is.
+    The wave's largest displacement is ``model.scale``; the ratio of |w| to it is that of the Bloch wave.
     """
     cell = model.chain.cell
     drive = model.drive
@@ -131,6 +131,7 @@ def expected_episodes(model: Model) -> float:
         shape = bloch(cell, kappa).vectors[:, band - 1]
         largest = max(largest, abs(shape[cell.resonator] - shape[cell.host]) / np.abs(shape).max())
     gaps = np.min(model.gaps, axis=1) if model.gaps else np.asarray(model.chain.clearances)
+    # Beads that touch have no clearance: any wave closes them.
     z = model.scale * largest / np.maximum(gaps, 1e-300)
 
     # The fraction of a burst in which its envelope sin^2 is above 1/z.

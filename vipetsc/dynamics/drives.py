@@ -1,6 +1,6 @@
-"""Compiled drives: the records of what acts on a lattice, the force at a time, the times at which it is not smooth.
+"""Compiled drives: their records, the force at a time, the times at which it is not smooth.
 
-Which piece of a waveform is on is no function of time alone: within a step it is continued beyond its end, so that no
+The active piece of a waveform is no function of time alone: within a step it is continued beyond its end, so that no
 kink lies inside; engines end their steps on the ``breaks`` and select the pieces anew.
 """
 
@@ -32,7 +32,7 @@ class Drives(NamedTuple):
 
 
 def create_drives(drives: Sequence[Drive], numbers: Sequence[int]) -> Drives:
-    """The record of those of ``drives`` with the ``numbers``, -1 of one that there is not; all are off."""
+    """The record of the ``drives`` with the ``numbers``, where -1 stands for no drive; all are off."""
     tables = [np.zeros(0, PIECE)]
     rows = np.zeros(len(numbers), DRIVE)
     for row, number in zip(rows, numbers, strict=True):
@@ -79,8 +79,9 @@ def drive_force(drives: Drives, i: int, t: float) -> float:
 
 @kernel
 def select_piece(drives: Drives, i: int, t: float) -> float:
-    """Turn on the piece of drive ``i`` that begins last until the time t in s; when the next one begins, or its end."""
+    """Turn on the latest piece of drive ``i`` at time t in s; return when the next one begins, or the drive's end."""
     drive = drives.rows[i]
+    # A burst has no pieces to turn on: its formula holds up to its end.
     if drive.first >= drive.last or t >= drive.duration:
         drive.piece = -1
         return drive.duration if t < drive.duration else np.inf
@@ -107,6 +108,7 @@ def drive_end(drives: Drives, i: int, begin: float, interval: float, position: f
     if drive.first >= drive.last:
         return (drive.duration - begin) / interval
     t = begin + position * interval
+    # A step that ends on a break reaches it to rounding only; without the margin the old piece would stay on.
     end = select_piece(drives, i, t + ROUNDED * (interval + abs(t)))
     return (end - begin) / interval if end < np.inf or drive.piece >= 0 else -1.0
 

@@ -56,6 +56,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     eps.setOperators(matrices.stiffness, matrices.mass)
     eps.setProblemType(eps.ProblemType.GHEP)
     eps.setWhichEigenpairs(eps.Which.TARGET_MAGNITUDE)
+    # The shifted matrix would be singular if the frequency were exactly that of a mode.
     eps.setTarget(square - SHIFT * matrices.largest)
     _solve_directly(eps.getST())
 

@@ -137,7 +137,7 @@ class Energies:
     """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drives, dissipated.
 
     The work begins with the energy of the initial state. ``dissipated`` is that of contacts; that of dashpots is
-    ``balanced`` where it is what the other energies leave, which then no residual tells anything of.
+    ``balanced`` where it is computed as the remainder of the other energies: the residual then has no meaning.
     """
 
     kinetic: np.ndarray
@@ -162,7 +162,7 @@ class Energies:
 class EnergyMeter:
     """Measures the energies of a distributed state.
 
-    They are summed as integers, whose sums do not depend on their order: multiples of ``unit`` in J, a power of two
+    Energies are summed as integers, whose sums do not depend on their order: multiples of ``unit`` in J, a power of two
     far below the run's energy scale, and a finer remainder. From ``largest`` in J on the sums saturate.
     """
 

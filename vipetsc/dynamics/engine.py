@@ -1,4 +1,4 @@
-"""What every engine offers to a simulation."""
+"""Interface of the engines that advance a lattice in time."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ class StalledError(RuntimeError):
 
 
 class FillResult(NamedTuple):
-    """How far an engine came: ``samples`` taken, whether it was ``stopped`` on request, why it stalled, if it did."""
+    """Progress of an engine: ``samples`` taken, whether it was ``stopped`` on request, why it ``stalled`` or None."""
 
     samples: int
     stopped: bool = False
@@ -39,7 +39,7 @@ class Engine(ABC):
 
     @abstractmethod
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
-        """An engine for ``model`` at rest at t = 0, on all ranks, which looks at requests to ``stop``."""
+        """Create an engine for ``model`` at rest at t = 0, on all ranks; it ends early on a request to ``stop``."""
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
@@ -55,9 +55,9 @@ class Engine(ABC):
 
     @abstractmethod
     def fill(self, samples: Samples) -> FillResult:
-        """Go on through ``samples`` and take them with ``take_sample``; all ranks come equally far.
+        """Advance through ``samples`` and take them with ``take_sample``; all ranks come equally far.
 
-        A stop on request is at a sample, and as soon as that costs little.
+        A stop on request is at a sample, as soon as that costs little.
         """
 
     @abstractmethod
@@ -66,15 +66,15 @@ class Engine(ABC):
 
     @abstractmethod
     def statistics(self) -> dict[str, Any]:
-        """What the engine did, summed over ranks; all must call it."""
+        """Statistics of the engine's work, summed over ranks; all must call it."""
 
     @abstractmethod
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """All that a resumed run needs to go on with the same bits: this rank's cells and sites, and common values."""
+        """The data that a resumed run needs for the same bits: this rank's cells and sites, and common values."""
 
     @abstractmethod
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go back to a checkpoint, given what each rank that wrote it kept, in their order, however many."""
+        """Go back to a checkpoint, given the parts of all ranks that wrote it, in order; their number may differ."""
 
     @abstractmethod
     def destroy(self) -> None:

@@ -1,4 +1,4 @@
-"""The motion that a run begins with: each rank's own cells, what touches, the energy that the lattice is given."""
+"""Initial motion of a run: each rank's own cells, the motion of all sites, the energy of the state."""
 
 from typing import Any
 
@@ -64,7 +64,7 @@ def _fields(model: Model, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_fields(initial: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """The fields of the file that ``initial`` names, which must still be the one that the case was resolved with."""
+    """The fields of the file that ``initial`` names; its hash must be that with which the case was resolved."""
     path = str(initial.path)
 
     def check() -> None:
@@ -76,6 +76,7 @@ def _read_fields(initial: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
             remedy = f"its SHA-256 is {digest}, not the case's {initial.sha256}: it has changed since"
             raise CaseError([Problem("initial.path", path, remedy)])
 
+    # Hashed once, by one rank; read by each, which keeps its own cells only and sends none.
     on_root(layout.comm, check)
     state = on_every_rank(layout.comm, lambda: State.read(path, initial.time, initial.orbit))
     return state.on(layout.start, layout.stop)

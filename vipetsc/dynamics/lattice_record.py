@@ -1,4 +1,4 @@
-"""A rank's part of the lattice as compiled kernels see it: sizes, and tables of masses, springs, sites and drives."""
+"""A rank's part of the lattice for compiled kernels: sizes, and tables of masses, springs, sites and drives."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -30,12 +30,11 @@ SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int6
 class Shape(NamedTuple):
     """Sizes and indices of a rank's part of the lattice; an index is -1 where the rank has no such thing.
 
-    ``owned`` and ``ghosted`` count the state's components without and with ghosts, ``exchange`` tells whether ghosts
+    ``owned`` and ``ghosted`` count the state's components without and with ghosts; ``exchange`` says whether ghosts
     must be fetched, ``paired`` whether contacts join other masses than the cell's pair. ``left_ghost`` and
-    ``right_ghost`` are the first components of the neighbouring cells,
-    ``left_free`` and ``right_free`` tell whether the lattice has a free end there. ``work``, ``dissipated`` and
-    ``damping`` are the components of the first drive's work, of the energies that the first site and the first cell's
-    dashpots have dissipated.
+    ``right_ghost`` are the first components of the neighbouring cells; ``left_free`` and ``right_free`` say whether the
+    lattice has a free end there. ``work``, ``dissipated`` and ``damping`` are the components of the first drive's work,
+    of the energies that the first site and the first cell's dashpots have dissipated.
     """
 
     cells: int

@@ -28,10 +28,10 @@ class Layout:
 
     Cells come in equal blocks, the first ranks have one more where they do not divide; a rank may be empty. ``ranges``
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
-    ``size`` components; that of the first owned site's dissipated energy is ``dissipated``. ``sites`` are
-    the numbers of those it owns, ``contacts`` of all that act on its masses. A cell has ``rows`` components
-    and ``ghost_rows`` as a ghost: with ``dashpots``, of an engine that integrates what these dissipate, one and its
-    velocities more in a damped lattice.
+    ``size`` components; the component of the first owned site's dissipated energy is ``dissipated``. ``sites`` are the
+    numbers of the owned sites, ``contacts`` of all sites that act on its masses. A cell has ``rows`` components, and
+    ``ghost_rows`` as a ghost. With ``dashpots``, for an engine that integrates their dissipation, a damped lattice has
+    one more component a cell, and velocities in the ghosts.
     """
 
     def __init__(self, model: Model, comm: MPI.Comm, dashpots: bool = False) -> None:
@@ -73,6 +73,7 @@ class Layout:
         cells = np.asarray(cells, np.int64)
         rank = np.searchsorted(self.ranges[:, 1], cells, side="right")
         start, stop = self.ranges[rank].T
+        # PETSc reads the indices as its own type, of 32 or 64 bits by its configuration.
         mass_offsets = np.multiply.outer(stop - start, np.arange(2 * self.dofs))
         return ((self.offsets[rank] + cells - start)[:, None] + mass_offsets).astype(PETSc.IntType)
 
@@ -80,12 +81,13 @@ class Layout:
         """A zero state with ghosts for the neighbouring cells, in ``array`` if one is given."""
         indices = self.state_indices([cell for cell in self.neighbours() if cell is not None])
         indices = indices[:, : self.ghost_rows].ravel()
+        # One array holds owned components and ghosts, so that compiled code reads both without a copy.
         if array is None:
             array = np.zeros(self.size + indices.size)
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
     def losses(self, y: np.ndarray) -> np.ndarray:
-        """What the ``contacts`` have dissipated in J in the part ``y`` of the state; 0 of those of other ranks."""
+        """Energies in J that the ``contacts`` have dissipated, from the part ``y`` of the state; 0 for other ranks'."""
         losses = np.zeros(len(self.contacts))
         losses[np.isin(self.contacts, self.sites)] = y[self.dissipated : self.size]
         return losses
@@ -111,7 +113,7 @@ class Layout:
         return {"cells": cells, "work": works, "losses": losses}
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]], y: np.ndarray) -> None:
-        """Fill this rank's part ``y`` of the state, given the checkpoints of all ranks that there were."""
+        """Fill this rank's part ``y`` of the state from the checkpoints of all ranks that wrote one."""
         motion = y[: self.rows * self.owned].reshape(self.rows, self.owned)
         at = 0
         for checkpoint in checkpoints:  # one after the other: no rank holds all cells

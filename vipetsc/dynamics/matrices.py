@@ -1,4 +1,4 @@
-"""The lattice's stiffness and mass as PETSc matrices shared over ranks.
+"""The lattice's stiffness and mass as PETSc matrices distributed over ranks.
 
 Degrees of freedom are ordered cell by cell; a rank owns the rows of its cells, the same as in ``dynamics.layout``, and
 assembles them from the couplings that the stencil of the right-hand side has. A row of the matrix sums K_ij u_j with
@@ -32,6 +32,7 @@ class LatticeMatrices:
         self.comm = comm
         self.rows = chain.cells * chain.cell.dofs
         self.start, self.stop = cell_cuts(chain.cells, comm.size)[comm.rank : comm.rank + 2]
+        # Before any assembly: a count beyond the index type would wrap around unseen.
         self._check_indices()
         self.stiffness = self._matrix(on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop)))
 

@@ -1,4 +1,4 @@
-"""How much memory a run needs, said before any of it is allocated."""
+"""Memory that a run needs, estimated before any of it is allocated."""
 
 import os
 import resource
@@ -20,7 +20,7 @@ from vipetsc.io.store import GATHER_LIMIT
 STAGES = {"2a": 2, "3bs": 4, "5f": 6, "5dp": 7, "5bs": 8, "6vr": 9, "7vr": 10, "8vr": 13}
 STATES_BESIDE_STAGES = 4.6
 PROPAGATOR_STATES = 3.0
-# Copies of a chunk on the rank that keeps it, and besides on rank 0 while those of all are gathered.
+# Copies of a chunk on the rank that keeps it, and further ones on rank 0 while the chunks of all are gathered.
 COPIES = 2
 GATHERED = 3
 # Bytes of one sample's energies; of a site on every rank, and on the one that owns it.
@@ -38,8 +38,8 @@ REMEDIES = {
 def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) -> dict[str, float]:
     """Bytes that a run of ``model`` by ``engine`` takes on the fullest of ``ranks``, by the key that they grow with.
 
-    The engine's states; sites; a chunk of fields and losses, on rank 0 a gathered one of all cells; all samples'
-    energies. What a process begins with comes besides.
+    The parts are the engine's states, the sites, a chunk of fields and losses (on rank 0 gathered from all cells), and
+    the energies of all samples. The memory with which a process begins is not included.
     """
     chain = model.chain
     owned = -(-chain.cells // ranks)
@@ -109,9 +109,9 @@ def check_indices(model: Model) -> None:
 
 
 def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm) -> None:
-    """Raise CaseError on all ranks where one has less memory left than the run needs; all must call it.
+    """Raise CaseError on all ranks if one has less memory left than the run needs; all must call it.
 
-    Also where PETSc's indices do not count the state.
+    The same error is raised if PETSc's indices cannot count the components of the state.
     """
     check_indices(model)
     sample = 8 * len(output.fields) * model.chain.cell.dofs * len(recorded_cells(output, model.chain.cells))

@@ -26,7 +26,8 @@ scatter_begin, scatter_end = _scatters = [
 
 
 def petsc_library() -> ctypes.CDLL:
-    """The PETSc that petsc4py is linked to: its extension module's handle also finds PETSc's symbols."""
+    """The PETSc library to which petsc4py is linked."""
+    # The handle of the extension module also finds PETSc's symbols; a library found by name might be another PETSc.
     return ctypes.CDLL(PETSc.__file__)
 
 

@@ -1,8 +1,8 @@
-"""What watches a run, block by block of samples, without changing it: the contract, and the observers of every run.
+"""Observers of a run, which see it block by block of samples without changing it: interface, and those of every run.
 
 ``guard`` ends a run whose state is no solution any more, ``ledger`` keeps the error of the energy balance, ``progress``
-tells how far it is, ``recorder`` (a module of its own) keeps what is written. A further observer is a subclass of
-``Observer``, which ``simulate`` is given.
+reports how far it is, ``recorder`` (a module of its own) stores its samples. A further observer is a subclass of
+``Observer``, passed to ``simulate``.
 """
 
 import sys
@@ -29,7 +29,7 @@ LEDGER_PER_RTOL, LEAST_LEDGER, MOST_LEDGER = 100.0, 1e-8, 1e-4
 
 
 class RunawayError(RuntimeError):
-    """The state is no solution any more from the ``sample`` of a block on; says why."""
+    """The state is no solution any more from the ``sample`` of a block on; the message says why."""
 
     def __init__(self, reason: str, sample: int) -> None:
         super().__init__(reason)
@@ -38,7 +38,7 @@ class RunawayError(RuntimeError):
 
 @dataclass(frozen=True)
 class Setup:
-    """What a run is made of: the case, its model in the lattice's own terms, and who does what on which cells."""
+    """Parts of a run: the case and its model, the partition of cells, the engine, the energy meter and the output."""
 
     case: Case
     model: Model
@@ -55,8 +55,8 @@ class Observer:
     samples; whenever some observer is ``due``, and when the run is stopped on request, ``flush`` of all and then
     ``checkpoint`` of all; at the end ``finish`` and ``statistics``.
 
-    A subclass has a ``name``, which a checkpoint knows it by, and may want blocks of at most ``longest`` samples: with
-    1 it sees the state at every sample. It must not change the state, and what it raises it must raise on all ranks.
+    A subclass has a ``name``, its prefix in checkpoints, and may want blocks of at most ``longest`` samples: with 1 it
+    sees the state at every sample. It must not change the state, and what it raises it must raise on all ranks.
     """
 
     name: ClassVar[str]
@@ -64,11 +64,11 @@ class Observer:
     saved: ClassVar[tuple[str, ...]] = ()  # numbers among its attributes that a checkpoint keeps
 
     def begin(self, setup: Setup) -> None:
-        """Make ready for a run from t = 0 on."""
+        """Prepare for a run from t = 0 on."""
         self.setup = setup
 
     def observe(self, block: Block) -> None:
-        """Look at the next samples; raises RunawayError to end the run before one of them."""
+        """Process the next samples; raises RunawayError to end the run before one of them."""
 
     @property
     def due(self) -> bool:
@@ -76,19 +76,19 @@ class Observer:
         return False
 
     def flush(self) -> None:
-        """Hand what was kept since the last checkpoint to the run's output."""
+        """Pass the data collected since the last checkpoint to the run's output."""
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """What a resumed run needs to go on with the same bits, the same on all ranks, however many there are then."""
+        """The data with which a resumed run goes on to the same bits; equal on all ranks, whose number may change."""
         return {key: np.array(getattr(self, key)) for key in self.saved}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from what ``checkpoint`` gave; the engine is there already."""
+        """Go on from the data of ``checkpoint``; the engine has been restored before."""
         for key in self.saved:
             setattr(self, key, state[key].item())
 
     def finish(self, stopped: bool) -> None:
-        """Come to an end; a run ``stopped`` on request is gone on with from the checkpoint just made."""
+        """End the observation; a run ``stopped`` on request will be resumed from the checkpoint just written."""
 
     def statistics(self) -> dict[str, Any]:
         """Numbers for ``summary.json`` and the attributes of ``run.h5``; those of rank 0 count."""
@@ -126,7 +126,7 @@ class Guard(Observer):
 
 
 class Ledger(Observer):
-    """Keeps the largest residual in J of the energy balance; there is none where dashpots get what it leaves."""
+    """Keeps the largest residual in J of the energy balance; NaN where the dashpots' energy is its remainder."""
 
     name = "ledger"
     saved = ("worst", "most_work", "work", "dissipated", "dissipated_by_damping")
@@ -138,6 +138,7 @@ class Ledger(Observer):
         self.work = float(energies.work[-1])
         self.dissipated = float(energies.dissipated[-1])
         self.dissipated_by_damping = float(energies.dissipated_by_damping[-1])
+        # ``np.maximum`` keeps a NaN, which ``max`` would lose.
         self.worst = float(np.maximum(self.worst, np.abs(energies.residual).max()))
         self.most_work = max(self.most_work, float(np.abs(energies.work).max()))
 
@@ -164,7 +165,7 @@ class Ledger(Observer):
 
 
 class ProgressReport(Observer):
-    """Tells on stderr of rank 0 how far the lattice's time is."""
+    """Reports the lattice's time on stderr of rank 0."""
 
     name = "progress"
 

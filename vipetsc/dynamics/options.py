@@ -1,4 +1,4 @@
-"""PETSc options of a case: checked, and set for as long as its engine is made."""
+"""PETSc options of a case: checked, and set while its engine is created."""
 
 import ctypes
 from collections.abc import Iterator, Mapping
@@ -18,7 +18,7 @@ def options_of(case: CaseFile | None) -> dict[str, str]:
 
 
 def with_database(case: Case) -> Case:
-    """``case`` with the options of ``ts`` that stand in PETSc's database, where a script has put them."""
+    """The ``case`` with the options of ``ts`` in PETSc's database, where a script has put them."""
     database = PETSc.Options().getAll()
     names = [name for name in database if name.startswith("ts_") and not only_looks(name)]
     given = {name: database[name] or "true" for name in names} | options_of(case)
@@ -32,6 +32,7 @@ def petsc_options(options: Mapping[str, str]) -> Iterator[None]:
     earlier = {name: value for name, value in database.getAll().items() if name in options}
     for name, value in options.items():
         database[name] = value
+    # The database is the process's own: options of one case must not reach the engine of the next.
     try:
         yield
     finally:
@@ -42,7 +43,7 @@ def petsc_options(options: Mapping[str, str]) -> Iterator[None]:
 
 
 def check_options(case: CaseFile | None) -> None:
-    """Raise CaseError for options of ``case`` that Runge-Kutta stepping does not know, or whose value PETSc refuses."""
+    """Raise CaseError for options of ``case`` that Runge-Kutta stepping does not have, or whose value PETSc refuses."""
     options = options_of(case)
     if not options:
         return
@@ -65,7 +66,7 @@ def _is_refused(options: Mapping[str, str]) -> bool:
 
 
 def _problems(options: Mapping[str, str]) -> list[tuple[str, str]]:
-    """What is wrong with ``options`` once a time stepper has read them; raises PETSc.Error if it cannot."""
+    """Errors in ``options``, by name, after a time stepper has read them; raises PETSc.Error if it cannot."""
     ts = PETSc.TS().create(PETSc.COMM_SELF)
     ts.setType(PETSc.TS.Type.RK)
     problems = []

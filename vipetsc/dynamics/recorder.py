@@ -1,4 +1,4 @@
-"""What is kept of a run: the observer ``recorder``, which hands it to the run's output in chunks."""
+"""The observer ``recorder``, which collects fields, energies and episodes and passes them to the output in chunks."""
 
 import sys
 from dataclasses import fields
@@ -23,20 +23,20 @@ ENERGIES = {field.name: f"energy/{field.name}" for field in fields(Energies) if 
 
 
 def recorded_cells(output: OutputTable, cells: int) -> range:
-    """Cells (0-based) whose fields are kept, of so many."""
+    """Cells (0-based) whose fields are recorded, of a lattice with so many ``cells``."""
     first, last = output.window or (1, cells)
     return range(first - 1, last, output.every)
 
 
 def written_together(model: Model, output: OutputTable, ranks: int) -> bool:
-    """Whether each of the ``ranks`` writes the fields of its own cells into the file that all share."""
+    """Whether each of the ``ranks`` writes the fields of its own cells into one common file."""
     sample_bytes = len(output.fields) * model.chain.cell.dofs * 8 * len(recorded_cells(output, model.chain.cells))
     large = sample_bytes * -(-model.samples // output.stride) > GATHER_LIMIT
     return ranks > 1 and (output.writer == "parallel" or (output.writer == "auto" and large))
 
 
 def chunk_samples(sample_bytes: int) -> int:
-    """Samples in a chunk, of each of which a rank keeps so many bytes of fields."""
+    """Number of samples in a chunk, if a rank stores ``sample_bytes`` of fields for each."""
     return min(max(CHUNK_BYTES // max(sample_bytes, 1), 1), CHUNK_SAMPLES)
 
 
@@ -47,7 +47,7 @@ class Recorder(Observer):
     saved = ("episodes", "deepest")
     episodes = 0
     deepest = 0.0  # indentation in m
-    end = np.inf  # time in s beyond which what engines come to in a block is no solution
+    end = np.inf  # time in s of a failure: engines finish their block, whose later part is no solution
 
     def begin(self, setup: Setup) -> None:
         super().begin(setup)
@@ -79,7 +79,7 @@ class Recorder(Observer):
         self._begin_chunk()
 
     def _begin_chunk(self) -> None:
-        """Make room for a chunk of samples."""
+        """Allocate the arrays of a chunk of samples."""
         n = self._length
         self._held = self._rows = self._number = 0
         self._sums = np.zeros((n, ENERGY_SUMS, 2), np.int64)
@@ -89,7 +89,7 @@ class Recorder(Observer):
         self._fields = self.setup.output.room(self._shape)
 
     def room(self, number: int, most: int) -> Samples:
-        """Room for the samples from ``number`` on: for as many as the chunk still takes, and at ``most`` so many."""
+        """Arrays for the samples from ``number`` on: as many as fit in the chunk, and ``most`` at most."""
         meter = self.setup.meter
         output = self.setup.case.output
         here = slice(self._held, self._held + most)
@@ -129,16 +129,16 @@ class Recorder(Observer):
         return self._held == self._length
 
     def flush(self, last: bool = False) -> None:
-        """The samples kept so far and this rank's closed episodes become a chunk.
+        """Write the samples collected so far and this rank's closed episodes as a chunk.
 
-        Fields, losses and episodes are those of a rank's own cells and sites, or on rank 0 of all, as ``io.chunks``
-        says; of episodes that are still open, in the ``last`` one. Rank 0's has times and energies besides.
+        Fields, losses and episodes are those of a rank's own cells and sites, or on rank 0 of all (see ``io.chunks``);
+        the ``last`` chunk has the episodes that are still open, too. The chunk of rank 0 also has times and energies.
         """
         sys.audit("vipetsc.flush")
         comm = self.setup.layout.comm
         output = self.setup.output
         episodes = self.setup.engine.take_episodes(unfinished=last)
-        # Beyond a failure what engines come to in a block is no solution.
+        # Engines finish the block in which a run fails: episodes after the failure are no solution.
         episodes = episodes[episodes["onset"] <= self.end]
 
         chunk = self._gather(episodes)
@@ -181,11 +181,11 @@ class Recorder(Observer):
             self.flush(last=True)
 
     def statistics(self) -> dict[str, Any]:
-        """Contact episodes logged."""
+        """Number of contact episodes logged, and the deepest indentation in m."""
         return {"episodes": self.episodes, "deepest_indentation": self.deepest}
 
     def warnings(self) -> list[str]:
-        """Sites that nothing reached; indentations for which there is no theory of contact."""
+        """Sentences on sites without contact, and on indentations beyond the range of Hertz's theory."""
         sites = len(self.setup.model.chain.sites)
         radius = self.setup.case.contact_radius
         if sites and not self.episodes:
@@ -198,7 +198,7 @@ class Recorder(Observer):
 
 
 def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:
-    """What is known before a run: the numbers of ``recorded`` cells, masses and sites, and where cells differ."""
+    """The arrays of ``GIVEN``: numbers of ``recorded`` cells, masses and sites, and properties of differing cells."""
     chain = model.chain
     given = {
         "cell": recorded + 1,

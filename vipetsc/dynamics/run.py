@@ -1,4 +1,4 @@
-"""A case in, a result out: the loop over a run's samples."""
+"""Simulation of a case: the loop over a run's samples, from the case to the result."""
 
 import sys
 import time
@@ -37,7 +37,7 @@ COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
 
 
 class Failure(NamedTuple):
-    """Why a run ends before its end, and the ``time`` in s at which it does."""
+    """The reason for which a run fails, and the ``time`` in s at which it does."""
 
     reason: str
     time: float
@@ -45,7 +45,7 @@ class Failure(NamedTuple):
 
 @dataclass(frozen=True)
 class Result:
-    """How a run ended.
+    """Result of a run.
 
     ``complete``: the whole case was simulated; ``resumable``: it was stopped and can go on from its last
     checkpoint; neither: it failed, and ``run.h5`` holds the samples up to the last good one. ``sentence`` says
@@ -79,11 +79,11 @@ def simulate(
     case
         A resolved case.
     folder
-        Output folder. An unfinished run of the same case in it is gone on with, to the same bits; one that has ended
-        is not made again. ``force`` begins anew and replaces the run in the folder when the new one has ended,
-        ``resume`` needs one to go on with. A ``RunMemory`` keeps the run in memory.
+        Output folder. An unfinished run of the same case in it is resumed, to the same bits; one that has ended is not
+        simulated again. ``force`` begins anew and replaces the run in the folder when the new one has ended;
+        ``resume`` requires an unfinished run. A ``RunMemory`` holds the run in memory.
     comm
-        The ranks that share the lattice; those of a ``RunMemory`` are its own.
+        The ranks over which the lattice is distributed; a ``RunMemory`` has its own.
     stop
         A request that ends the run at one of the next samples.
     progress
@@ -94,13 +94,13 @@ def simulate(
     Raises
     ------
     CaseError
-        If the run needs more memory than there is, or PETSc does not know its options.
+        If the run needs more memory than there is, or PETSc does not have its options.
     FolderError
         If the folder cannot be used as asked: it holds anything else, or another process works in it.
     OSError
         If a file cannot be written, on all ranks.
     """
-    # In a script under mpirun, a rank that raises would leave the others waiting; whose hook is there already stays.
+    # In a script under mpirun a rank that raises would leave the others waiting; a hook of the script's own stays.
     if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
         install_abort_hook()
     if isinstance(folder, RunMemory) and resume:
@@ -111,6 +111,7 @@ def simulate(
     kind, refusal = select_engine(case, model)
     check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
 
+    # The guard first: the others see only samples that it accepts.
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
@@ -120,6 +121,7 @@ def simulate(
 
     with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
         output = RunFolder(claim.folder, comm)
+        # A run that a kill has ended between its file and its publication is published now.
         ended = output.ending()
         result = result_of(ended, False, output.folder) if ended else simulation.make(output)
         if not result.resumable:
@@ -141,7 +143,7 @@ def result_of(attributes: Mapping[str, Any], resumable: bool, folder: Path | Non
 
 @dataclass(frozen=True)
 class Simulation:
-    """What is to be simulated: the case and its model, the engine and why it is not the one asked for, who looks on."""
+    """A simulation: the case and its model, the engine and why it is not the one asked for, the observers."""
 
     case: Case
     model: Model
@@ -213,7 +215,8 @@ class Run:
             observer.begin(setup)
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go on after a checkpoint, given what each rank that wrote it kept, however many."""
+        """Go on after a checkpoint, given the parts of all ranks that wrote it; their number may differ."""
+        # The engine first: observers may ask it for its time.
         self.setup.engine.restore(checkpoints)
         state = checkpoints[0]
         self.samples = int(state["samples"])
@@ -223,7 +226,7 @@ class Run:
             observer.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
     def advance(self) -> tuple[str, str]:
-        """Go to the end, or to where the run stops or fails: how it ended, and a sentence about it."""
+        """Advance to the end, or until the run stops or fails; returns how it ended, and a sentence about it."""
         setup = self.setup
         engine = self.setup.engine
         total = setup.model.samples
@@ -248,7 +251,7 @@ class Run:
         return COMPLETE, f"complete: {total} samples to t = {self.last:.6g} s"
 
     def _observe(self, samples: Samples, filled: FillResult) -> tuple[Block, Failure | None]:
-        """Let the observers look at what the engine has filled: the block of good samples, and what ends the run."""
+        """Show the filled samples to the observers; returns the block of good ones, and a failure that ends the run."""
         failure = None
         if filled.stalled:
             failure = Failure(f"stalled: {filled.stalled}", self.setup.engine.time)
@@ -265,13 +268,14 @@ class Run:
         return block, failure
 
     def block(self, samples: Samples, count: int) -> Block:
-        """The first ``count`` of ``samples`` as observers see them; all ranks must call it."""
+        """The block of the first ``count`` of ``samples``, with energies of all ranks; all ranks must call it."""
         energies = self.setup.meter.total(samples.sums[:count], samples.work[:count])
         times = np.arange(samples.number, samples.number + count) * self.setup.model.sample_interval
         return Block(samples.number, times, energies, samples, self.setup.engine.state)
 
     def checkpoint(self) -> None:
-        """Write what a resumed run needs."""
+        """Write the checkpoint from which a run is resumed."""
+        # Chunks before the state: a kill between them leaves a chunk that the last complete state does not count.
         with log.RECORDER:
             for observer in self.observers:
                 observer.flush()

@@ -1,4 +1,4 @@
-"""What is taken of the state at every sample: room that an engine fills in compiled code, and what observers see."""
+"""Samples of the state: arrays that an engine fills in compiled code, and the blocks that observers see."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from vipetsc.dynamics.lattice_record import LatticeRecord
 
 
 class Samples(NamedTuple):
-    """Room for consecutive samples of a rank, the first of which has the ``number``; empty arrays take nothing.
+    """Arrays for consecutive samples of a rank, the first of which has the ``number``; empty arrays take nothing.
 
     Energies: ``sums`` (sample, energy, 2) as ``measure`` gives them, ``work`` (sample, drive) of all drives and
     ``losses`` (sample, owned site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose
@@ -42,7 +42,7 @@ class Samples(NamedTuple):
 
 @njit(error_model="numpy")
 def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
-    """Put the rank's part ``y`` of the state, ghosts up to date, in as sample ``k``; False if it is not finite."""
+    """Store the rank's part ``y`` of the state, ghosts up to date, as sample ``k``; False if it is not finite."""
     shape = samples.lattice.shape
     drives = samples.lattice.drives
     number = samples.number + k
@@ -51,13 +51,14 @@ def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
     for i in range(drives.rows.size):
         drive = drives.rows[i]
         samples.work[k, drive.number] = y[shape.work + i]
-        # The state's work is that of the force k U; the spring to a moving wall holds what the wall does besides.
+        # The state's work is that of the force k U; the further work of a moving wall is stored in its spring.
         if drive.stiffness > 0.0:
             energy = wall_energy(drives, i, number * samples.interval, y[drive.target - shape.dofs * shape.cells])
             samples.work[k, drive.number] += energy
             add_energy(samples.sums[k], energy, samples.unit)
     samples.losses[k] = y[shape.dissipated : shape.owned]
 
+    # By the number in the run, not in the block: blocks may begin anywhere, and a resumed run records the same samples.
     if number % samples.stride == 0:
         _record_fields(y, number, samples)
     return samples.sums[k, :, 0].max() < LARGEST and np.abs(samples.work[k]).max() < np.inf
@@ -65,7 +66,7 @@ def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
 
 @kernel
 def _record_fields(y: np.ndarray, number: int, samples: Samples) -> None:
-    """Keep the fields of the sample with the ``number``, which the stride divides."""
+    """Record the fields of the sample with the ``number``, which the stride divides."""
     shape = samples.lattice.shape
     row = number // samples.stride - (samples.number + samples.stride - 1) // samples.stride
     for i in range(samples.fields.shape[0]):

@@ -1,4 +1,4 @@
-"""Contact sites as compiled code sees them: where each acts on a rank's part of the state, its law and its stops.
+"""Records of contact sites for compiled code: the components of the state on which each acts, its law and its stops.
 
 A site whose masses are in cells of two ranks is followed by both, from the same numbers to the same bits; the one that
 owns the site's cell logs it and has what it dissipates in its ledger.
@@ -32,7 +32,7 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     sites = create_contacts(laws, gaps, masses, model.scale)
 
     least = gaps.min(axis=1)
-    # Beads that touch or are pressed part and meet all the time: their force has its kink, and no change is landed on.
+    # Beads that touch or are pressed part and meet all the time: no change is landed on, and the force has a kink.
     permanent = (least < 0) | ((least == 0) & joins_next_cell & (sites["damping"] == 0))
     hold(sites, laws, permanent, speed=model.scale * model.drive.frequency)
     return sites

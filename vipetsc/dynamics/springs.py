@@ -179,7 +179,7 @@ def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: i
 
 @kernel
 def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
-    """Add the energies of those parts in the cells from ``first`` on, and in a spring to a wall on the left."""
+    """Add energies of springs beyond their linear parts, in the cells from ``first`` on and to a wall on the left."""
     for s in range(lattice.nonlinear.size):
         coupling = lattice.nonlinear[s]
         for i in range(energies.size):

@@ -28,7 +28,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, i: Any) -> Any:
-    """Where element ``i`` of a contiguous array begins."""
+    """Address of element ``i`` of a contiguous array."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [i]), _DOUBLES.as_pointer())
 
