@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from tests.conftest import put_members
 from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.disorder import Deviation
+from vipetsc.case.disorder import Deviation, with_cell
+from vipetsc.case.schema import SpringTable
 from vipetsc.case.verb_cases import disorder_of
 from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import open_ensemble, over_samples
-from vipetsc.lattice import pass_bands
+from vipetsc.lattice import Spring, UnitCell, pass_bands
 from vipetsc.studies.linear_run import linear_name
 
 BASE = {"name": "small", "lattice": {"preset": "four-band", "cells": 40}, "drive": {"cycles": 4}}
@@ -206,3 +207,14 @@ def test_statistics_are_those_of_the_samples(tmp_path):
     with Files() as files:
         (curve,) = transfer_curves(Sweeps([ensemble], files))
     assert curve.data["ibtet"].values[:6] == pytest.approx(found["mean"].values[:6])
+
+
+def test_a_cell_with_scattered_masses_keeps_all_of_its_springs():
+    """Whatever a spring may have, a further term of its force among it."""
+    numbers = {field.name: 0.5 + i for i, field in enumerate(fields(Spring)) if isinstance(field.default, float)}
+    assert {"damping", "quadratic", "cubic"} <= numbers.keys()
+    springs = Spring(0, 0, 3.0, next_cell=True, **numbers), Spring(0, 1, 4.0)
+    cell = UnitCell(masses=(1.0, 2.0), springs=springs, host=0, resonator=1)
+    table = with_cell({"cells": 5}, cell, {"masses": [1.1, 2.2]})["cell"]
+    assert table["masses"] == [1.1, 2.2]
+    assert tuple(SpringTable(**spring).spring() for spring in table["springs"]) == springs

@@ -6,6 +6,7 @@ number of ranks, on the order of the draws or on the other quantities.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,9 +17,11 @@ from vipetsc.case.contacts import lists_of, values_of_sites
 from vipetsc.case.inhomogeneity_sections import Deviation
 from vipetsc.case.schema import CONTACTS, LatticeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.lattice import UnitCell
+from vipetsc.lattice import Spring, UnitCell
 
 SEED = "disorder.seed"
+# What a spring may have besides its stiffness: its dashpot and the terms of its nonlinear force.
+SPRING_PARAMETERS = tuple(field.name for field in fields(Spring) if isinstance(field.default, float))
 
 
 class DisorderTable(Section):
@@ -157,7 +160,10 @@ def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) 
     springs: list[Table] = []
     for spring, value in zip(cell.springs, stiffness, strict=True):
         table = {"start": spring.start + 1, "end": spring.end + 1, "stiffness": value, "next_cell": spring.next_cell}
-        table |= {key: getattr(spring, key) for key in ("damping", "quadratic", "cubic") if getattr(spring, key)}
+        # Whatever else the spring has goes with it: a parameter left behind would change the lattice without a word.
+        for key in SPRING_PARAMETERS:
+            if parameter := getattr(spring, key):
+                table[key] = parameter
         springs.append(table)
 
     cell_table: Table = {"masses": drawn.get("masses", list(cell.masses)), "springs": springs}

@@ -1,7 +1,7 @@
 """The compiled force of a spring that is not linear, beyond its linear part: the twin of ``vipetsc.lattice.Spring``.
 
-Time stepping, energies and normal modes ask these kernels; a further kind of spring has its parameters and its formulas
-here and there, and nowhere else.
+Time stepping, energies and normal modes ask these kernels. A further term of the force has its parameter and formulas
+in these two files, and its keys in the sections of cases.
 """
 
 from collections.abc import Sequence
