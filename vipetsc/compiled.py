@@ -1,4 +1,4 @@
-"""Compiled kernels, kept between runs until what they are made of changes: ``njit`` and ``cfunc`` as in numba.
+"""Compiled kernels, kept between runs until their sources change: ``njit`` and ``cfunc`` as in numba.
 
 Numba's own cache looks at the file of a kernel alone: a kernel that calls a changed one of another file, or uses a
 constant of it, would go on with the old code. Here the folder of the cache bears a hash of the kernel's file, of the

@@ -65,7 +65,7 @@ class EntropyCurve(NamedTuple):
 class Facet(NamedTuple):
     """The configurations of an ``ensemble`` on one page; the members of each are a row over rising amplitude.
 
-    ``name`` tells the facet from others in a file's name.
+    ``name`` identifies the facet in a file's name.
     """
 
     ensemble: xr.Dataset
@@ -78,7 +78,7 @@ class Facet(NamedTuple):
         return [average for average in AVERAGES if any(EntropyCurve.of(row, average) for row in self.rows)]
 
     def row_title(self, row: xr.Dataset) -> str:
-        """Return what tells a configuration from others of its facet: "5 sites"."""
+        """Return the label of a configuration within its facet: "5 sites"."""
         parts = []
         for name in axes_of(self.ensemble):
             if name not in (*FACETS, AMPLITUDE):

@@ -79,7 +79,7 @@ def _axis(axes: Axes, name: str) -> dict[str, Any]:
     """Describe the axis ``name`` ("x" or "y"): limits, scale and label."""
     low, high = getattr(axes, f"get_{name}lim")()
 
-    # Of axes that share a scale the outer one has the label, or else the figure.
+    # Of axes with a common scale the outer one has the label, or else the figure.
     shared = getattr(axes, f"get_shared_{name}_axes")().get_siblings(axes)
     labels = [getattr(other, f"get_{name}label")() for other in (axes, *shared)]
     figure_label = getattr(axes.figure, f"_sup{name}label")

@@ -16,7 +16,7 @@ MOST_ROWS = 16  # sites with a row of their own
 MOST_MARKERS = 2000  # episodes with a marker of their own
 MAP_ROWS = 150
 MAP_COLUMNS = 300
-MOST_LABELS = 12  # of sites beside a map
+MOST_LABELS = 12  # of sites next to a map
 SPEEDS = "viridis_r"
 
 
@@ -24,7 +24,7 @@ class Episodes(NamedTuple):
     """Contact episodes of a run (episode), and the sites (site) where they may be.
 
     ``site`` counts from 1; ``side`` is 1 or -1; ``onset`` in s, ``speed`` of the approach in m/s,
-    ``loss`` in J, 0 where it is not known; ``cells`` from 1; ``span`` is the first and the last time of the run.
+    ``loss`` in J, 0 where it is missing; ``cells`` from 1; ``span`` is the first and the last time of the run.
     """
 
     site: np.ndarray
@@ -55,7 +55,7 @@ class Episodes(NamedTuple):
 
     @property
     def rows(self) -> np.ndarray:
-        """The heights (site) in the panels, which share the axis of sites."""
+        """The heights (site) in the panels, which have a common axis of sites."""
         return np.arange(1, len(self.cells) + 1)
 
     @property
@@ -138,7 +138,7 @@ def _draw_speed_map(axes: Axes, episodes: Episodes) -> None:
 
 
 def _label_sites(axes: Axes, episodes: Episodes, every: int) -> None:
-    """Label the axis of time, and that of sites, which all panels share: the cells of every ``every``-th site."""
+    """Label the axis of time, and the common one of sites: the cells of every ``every``-th site."""
     shown = episodes.rows[::every]
     axes.set_yticks(shown, [f"{cell}" for cell in episodes.cells[shown - 1]])
     axes.set(xlabel="Time (s)", ylabel="Contact site (cell)", xlim=episodes.span)

@@ -90,6 +90,6 @@ def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
 
 
 def _draw_curve(axes: Axes, x: np.ndarray, curve: LawCurve, colour: str, dashes: str = "-", label: str = "") -> None:
-    """Draw a curve with its scatter, one deviation either way."""
+    """Draw a curve with its scatter, one deviation up and down."""
     axes.plot(x, curve.value, color=colour, ls=dashes, lw=1.0, label=label or None)
     axes.fill_between(x, curve.value - curve.scatter, curve.value + curve.scatter, color=colour, alpha=0.25, lw=0)

@@ -13,14 +13,14 @@ from vipetsc.figures import panels, style
 COLOURS = style.GREY, style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.YELLOW
 LEAST = 1e-4  # of the largest energy, at the end or in transfers, below which a gap is not drawn
 MOST_ROWS = 24  # sites of a matrix; of more, the ones that moved most
-MOST_TICKS = 6  # of sites beside the raster of impacts
+MOST_TICKS = 6  # of sites next to the raster of impacts
 SEVERAL = "several"  # sites in contact between the same samples
 
 
 class MovedEnergies(NamedTuple):
     """Energies (row, part) in J that each site moved into the parts of the spectrum; in the last column what it lost.
 
-    ``labels`` (row) are cells, or ``SEVERAL`` for episodes that cannot be told apart by site.
+    ``labels`` (row) are cells, or ``SEVERAL`` for episodes that cannot be separated by site.
     """
 
     labels: list[str]

@@ -40,7 +40,7 @@ class Shot(NamedTuple):
 class CheckedShot(NamedTuple):
     """A shot that a run allows: a ``window`` of its recorded cells and the ``time`` (frame) in s.
 
-    ``has_waves``: whether waves can be told apart, which takes displacement and velocity of cells side by side.
+    ``has_waves``: whether waves can be separated, which takes displacement and velocity of cells side by side.
     """
 
     window: slice
@@ -60,7 +60,7 @@ class MovieFrames(NamedTuple):
     """The content of frames: ``wave`` (frame, curve, cell), ``waves`` (frame, wavenumber, band) in J.
 
     ``time`` (frame) in s; ``cells`` (cell) from 1; ``wave`` is the energy in J of the bands by cell or the velocity in
-    m/s of the host; ``wavenumber`` in rad/cell, empty if waves cannot be told apart; ``flash`` (frame, site), the light
+    m/s of the host; ``wavenumber`` in rad/cell, empty if waves cannot be separated; ``flash`` (frame, site), the light
     of impacts at the cells ``sites``: 1 for one since the frame before, fading then. Where cells differ ``cell`` has
     the means of those shown, and masses are their own.
     """

@@ -99,7 +99,7 @@ def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
     for i, name in enumerate(branch["way"].values.astype(str)):
         label, colour = ENERGIES[name]
         fraction = branch["share"].values[:, i]
-        # Of a finite lattice only the losses are known: no wave leaves it.
+        # Of a finite lattice only the losses are computed: no wave leaves it.
         if np.isfinite(fraction).any():
             axes.plot(parameter, fraction, color=colour, lw=0.6, ls="--")
             axes.plot(parameter, np.where(stable, fraction, np.nan), color=colour, lw=1.4, label=label)

@@ -1,4 +1,4 @@
-"""Panels that figures share: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
+"""Panels of several figures: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

@@ -47,7 +47,7 @@ def prediction(data: xr.Dataset) -> Figure:
     for axes in grid[1]:
         axes.set_xlabel("Amplitude (N); dotted: first contact")
 
-    # A prediction without simulated runs beside it has no error.
+    # A prediction without simulated runs to compare with has no error.
     rms = data.attrs.get(f"rms_{name}")
     if rms is not None:
         transferred.set_title(f"{title}: rms {rms:.3f} decades")

@@ -79,7 +79,7 @@ def branch(paths: Sequence[Path]) -> Figure:
         with open_netcdf(path, "branch") as file:
             kinds.append(branch_kinds.branch_kind(file))
 
-    # Folders that share a page may hold branches of one name and several kinds; the first one decides what is shown.
+    # Folders on one page may hold branches of one name and several kinds; the first one decides what is shown.
     same = [path for path, kind in zip(paths, kinds, strict=True) if kind == kinds[0]]
     return BRANCH_FIGURES[kinds[0]](same)
 
@@ -157,7 +157,7 @@ def draw(
     Parameters
     ----------
     source
-        What is in the folders: "run" (one folder), "sweep" (branches may stand beside), "branches" (of the same
+        Contents of the folders: "run" (one folder), "sweep" (perhaps with branches), "branches" (of the same
         names, side by side), "design", "optimum", "law" or "prediction" (one folder).
     names
         Figures, by default all.
@@ -224,7 +224,7 @@ def _sweep_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files:
 
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
-    """Yield one drawing a branch of the first folder, beside the branches of its name in the other folders."""
+    """Yield one drawing a branch of the first folder, next to the branches of its name in the other folders."""
     for spec, first in itertools.product(specs, sorted(folders[0].glob("branch-*.h5"))):
         paths = [folder / first.name for folder in folders if (folder / first.name).exists()]
         stem = first.stem

@@ -28,7 +28,7 @@ REFINE = 10  # points of a phase portrait drawn for each sample
 
 
 def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
-    """Draw kinetic energy (J) of every cell over time with the sites marked, beside the wavenumber content."""
+    """Draw kinetic energy (J) of every cell over time with the sites marked, next to the wavenumber content."""
     if analysis is None or analysis.sizes.get("time", 0) < 2:
         return empty_figure("Kinetic energy: needs the analysis of a run with two samples or more")
 
@@ -67,7 +67,7 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     if analysis is None or not measured:
         return empty_figure("Dispersion: needs the analysis of a run that recorded two cells or more")
 
-    # Of all cells together only where they are not told apart by a site.
+    # Spectra of all cells together only where there are none before and after a site.
     model = Case.of(run).model()
     cell = model.chain.cell
     parts = [name for name in measured if name != "dispersion"]

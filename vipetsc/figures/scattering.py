@@ -129,7 +129,7 @@ def entropy_maps(series: AmplitudeSeries) -> Figure:
         panels.mark_sites(axes, member.run, style.GREY)
         axes.label_outer()
 
-        # The line shares the colours' limits, so that the colour bar is its axis too.
+        # The line has the limits of the colours, so that the colour bar is its axis too.
         over = axes.twinx()
         time = member.analysis["entropy/snapshot"].values
         history = member.analysis["entropy/history"].values

@@ -24,7 +24,7 @@ NOTE = 0.165  # height in inches of the strip that a line of a note takes below 
 LETTERS = 19  # of a note on an inch
 SCREEN = 200  # dots per inch of a PNG, so that a page can hold many; a PDF's maps have more
 
-# Okabe and Ito (2008): told apart with every kind of colour vision.
+# Okabe and Ito (2008): distinguishable with every kind of colour vision.
 BLACK = "#000000"
 ORANGE = "#E69F00"
 SKY = "#56B4E9"
@@ -136,8 +136,8 @@ def draw_each(
     Parameters
     ----------
     turns
-        Rising numbers, the next one asked for when a picture is done: every ``size``-th from a rank on shares
-        the work evenly, a counter that all ranks draw from shares it by what it costs.
+        Rising numbers, the next one asked for when a picture is done: every ``size``-th from a rank on divides
+        the work evenly, a counter that all ranks draw from divides it by cost.
     note
         A line of text below every picture, above the figure's label.
     keep
@@ -156,6 +156,6 @@ def draw_each(
             for path in paths:
                 written.append(save(figure, path, note))
 
-        # Asked for only now: a counter that ranks share must not give a number to a rank that is still drawing.
+        # Asked for only now: a counter of all ranks must not give a number to a rank that is still drawing.
         turn = next(turns, None)
     return written

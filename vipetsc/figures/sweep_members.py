@@ -104,7 +104,7 @@ class DrivenWave(NamedTuple):
 class AmplitudeSeries(NamedTuple):
     """One configuration at a low, a medium and a high amplitude; ``wave`` is the linear one at the drive's frequency.
 
-    ``suffix`` tells it from others of the sweeps; its ``title`` has reading, sites, wavenumber and what else varies.
+    ``suffix`` is its part of file names; its ``title`` has reading, sites, wavenumber and what else varies.
     """
 
     suffix: str
@@ -130,7 +130,7 @@ class AmplitudeSeries(NamedTuple):
         return figure, grid
 
     def snapshot_times(self) -> np.ndarray:
-        """Return four times in s, from the linear wave: half way to the first site, at it, past the last, near the end.
+        """Return four times in s, from the linear wave: midway to the first site, at it, past the last, near the end.
 
         The packet's middle leaves the driven cell when half the burst is over.
         """
@@ -250,7 +250,7 @@ def reading_of(ensemble: xr.Dataset) -> str:
 
 
 def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collection[str] | None = None) -> str:
-    """Return what tells ``member`` (or a row of them) from others of the ensemble in a file's name; no amplitude.
+    """Return the text that distinguishes ``member`` (or a row of them) in a file's name, without the amplitude.
 
     The sweep's name if it is to be ``named``, the reading, and whatever else has several values; of the axes only
     ``dims``, by default all.
@@ -262,7 +262,7 @@ def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collecti
         parts.append(reading_of(ensemble))
 
     for name in axes(ensemble):
-        # Sweeps of one reading or wavenumber are drawn beside others, so these are always named.
+        # Sweeps of one reading or wavenumber are drawn next to others, so these are always named.
         tells = name in ("reading", "wavenumber") or ensemble.sizes[name] > 1
         if name == AMPLITUDE or not tells or (dims is not None and name not in dims):
             continue

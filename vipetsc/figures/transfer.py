@@ -61,7 +61,7 @@ def nine_panels(member: MemberRun) -> Figure:
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
     _draw_space_time(upper, member, tags)
 
-    # Both segments to one scale, each with the mark that it has beside the space-time map.
+    # Both segments to one scale, each with the mark that it has next to the space-time map.
     spectra = panels.below_cutoff(member.analysis, cell, list(SEGMENTS))
     norm = panels.log_norm(*spectra.values())
     maps = middle.subplots(1, 2, sharey=True)
@@ -82,7 +82,7 @@ def nine_panels(member: MemberRun) -> Figure:
 
 
 def _draw_space_time(page: SubFigure, member: MemberRun, tags: Iterator[str]) -> None:
-    """Draw kinetic energy of all frequencies beside that of each pass band, to one scale; segments marked."""
+    """Draw kinetic energy of all frequencies next to that of each pass band, to one scale; segments marked."""
     run = member.run
     energy = member.analysis["kinetic_energy"]
     fields = member.analysis[FIELD]

@@ -1,4 +1,4 @@
-"""Inter-band transfer over the amplitude (paper, Fig. 9), beside a branch (Figs. 12, S7, S8), and its regimes."""
+"""Inter-band transfer over the amplitude (paper, Fig. 9), next to a branch (Figs. 12, S7, S8), and its regimes."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -127,7 +127,7 @@ def _page(reading: str, page_curves: Sequence[TransferCurve], points: Sequence[T
         logarithmic.set(title=f"({tag}.2) {law.capitalize()}, {reading}", xscale="log", yscale="log")
         logarithmic.legend(loc="upper right")
 
-    # The limits of all columns, once all is drawn: they share their axes.
+    # The limits of all columns, once all is drawn: their axes are common.
     grid[0, 0].set_ylim(0, None)
     grid[1, 0].set_ylim(None, 6.0)
     return figure
@@ -261,7 +261,7 @@ class ContactMotion(NamedTuple):
 
 
 def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer trajectories of one embedded contact cell, for every law and reading, beside the transfer curve."""
+    """Offer trajectories of one embedded contact cell, for every law and reading, next to the transfer curve."""
     folders: dict[str, list[Path]] = {}
     for member in transfer_members(sweeps):
         run = member.run
@@ -275,12 +275,12 @@ def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
 
 
 def _settings(case: Case) -> str:
-    """Return what regimes of one page share: law, reading, number of sites and cycles."""
+    """Return the settings common to all regimes of one page: law, reading, number of sites and cycles."""
     return f"{case.contacts.law}-{Labels.of(case).page_stem}"
 
 
 def _regimes(folders: Sequence[Path], files: Files, curves_by_site: Mapping[tuple[Any, ...], TransferCurve]) -> Figure:
-    """Draw the transfer over the amplitude with the members numbered, and the portrait of each beside it."""
+    """Draw the transfer over the amplitude with the members numbered, and the portrait of each next to it."""
     motions = [ContactMotion.of(files.get(folder, MemberRun.open)) for folder in folders]
     motions.sort(key=lambda motion: motion.case.drive.amplitude)
     case = motions[0].case

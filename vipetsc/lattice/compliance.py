@@ -99,7 +99,7 @@ class Stretch(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Solution of a loaded lattice, and the ``waves`` that its stretches are made of.
+    """Solution of a loaded lattice, and the ``waves`` of which its stretches consist.
 
     ``unknowns`` (omega, unknown, load): displacements of the loaded cells, then the amplitudes of each stretch.
     """
@@ -112,7 +112,7 @@ class _Solution(NamedTuple):
 class WaveCompliance:
     """Compliance of the sites of ``chain``, from Bloch waves; ``infinite``: its cells go on beyond both ends.
 
-    Relative displacements w = u_resonator - u_host of the contact pairs are made by pairs of opposite forces, and by
+    Relative displacements w = u_resonator - u_host of the contact pairs follow from pairs of opposite forces, and by
     forces on single masses at the ``points``, which are (cell, mass) from 0. At omega = 0 forces on a lattice that is
     free to move must sum to zero.
     """
@@ -344,7 +344,7 @@ class WaveCompliance:
         raise ValueError(f"cell {cell + 1} is not one of the lattice's {self.chain.cells}")
 
     def _place(self, cell: int, stretch: Stretch) -> int | None:
-        """Which cell of a ``stretch`` a ``cell`` is, from 1; of one without a beginning, up to 0. None: not in it."""
+        """Position of a ``cell`` in a ``stretch``, from 1; up to 0 in one without a beginning; None outside."""
         cells = self.cells
         if stretch.left is None:
             return 1 - (cells[0] - cell) if cell < cells[0] else None
@@ -364,7 +364,7 @@ def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _propagating_channel(factor: np.ndarray, direction: int, wavenumber: float) -> int:
-    """Which wave of ``factor`` (2r,) going in a ``direction`` does not decay and has the ``wavenumber`` in (0, pi)."""
+    """Number of the wave of ``factor`` (2r,) in a ``direction`` that does not decay, with ``wavenumber`` in (0, pi)."""
     half = len(factor) // 2
     channels = range(half) if direction > 0 else range(half, 2 * half)
 

@@ -30,7 +30,7 @@ PHASES = 32
 
 
 class Parameter(NamedTuple):
-    """A number that one elastic ``law`` takes besides its stiffness.
+    """A number that one elastic ``law`` takes in addition to its stiffness.
 
     It is a field of ``Contact`` and the key of that name in ``[contacts]``. ``unit`` and ``text`` describe the key in
     the manual; a case file may give values from ``least`` to ``most``.

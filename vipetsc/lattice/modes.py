@@ -23,7 +23,7 @@ from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Waveform
 
 MOST_DOFS = 4000  # of a lattice with ends whose modes are computed: a square matrix of this size
-CLOSE = 1e-3  # modes nearer than this fraction of the largest Om^2 are made orthogonal one by one
+CLOSE = 1e-3  # modes nearer than this fraction of the largest Om^2 are orthogonalised one by one
 EPS = float(np.finfo(float).eps)
 ORTHONORMAL = 2e-13  # error of the norm of any field in all modes up to which they are accepted
 AT_REST = 1e-13  # squared frequencies below this fraction of the largest are those of a shift in common
@@ -190,7 +190,7 @@ def mode_frequency(chain: Chain, number: int) -> float:
 def mode_shape(chain: Chain, number: int) -> np.ndarray:
     """Displacement (cell, dof) in m of mode ``number`` (from 1, lowest first), the largest 1 m.
 
-    Of a wave that a ring carries both ways, the standing one that is largest at cell 1 has the lower number.
+    Of the two modes of a wave on a ring, the one that is largest at cell 1 has the lower number.
     """
     shape = _ring_shape(chain, number) if chain.ends == "periodic" else _standing_shape(chain, number)
     return np.asarray(shape / shape.flat[np.argmax(np.abs(shape))])
@@ -275,7 +275,7 @@ class _BandFactor:
 def _near_diagonal(matrix: csc_matrix) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues, lowest first, and vectors of a symmetric banded ``matrix``, by inverse iteration.
 
-    Vectors of eigenvalues closer than ``CLOSE`` are made orthogonal to one another, which does not make sure that all
+    Vectors of eigenvalues closer than ``CLOSE`` are orthogonalised against one another, which does not ensure that all
     are: the caller has to check. It takes a fifth of the time of a dense solution.
     """
     n = matrix.shape[0]

@@ -62,7 +62,7 @@ class Parts:
         return cls(edges=np.array([*edges, np.inf]), names=(*names, "above"), bands=(*inside, ()))
 
     def above(self, frequency: float) -> np.ndarray:
-        """Which parts (part) are pass bands above the one driven at ``frequency`` (rad/s)."""
+        """Whether each of the parts (part) is a pass band above the one driven at ``frequency`` (rad/s)."""
         driven = int(np.searchsorted(self.edges, frequency, side="right")) - 1
         return np.array([bool(b) and i > driven for i, b in enumerate(self.bands)])
 
@@ -142,7 +142,7 @@ class _Cosines(NamedTuple):
 
 
 def _looks_like(wave: Any, steps: int) -> Any:
-    """The cosine (half waves in the record) that ``wave`` cannot be told from at ``steps`` + 1 even times."""
+    """The cosine (half waves in the record) that equals ``wave`` at ``steps`` + 1 even times."""
     return steps - np.abs(wave % (2 * steps) - steps)
 
 
@@ -189,7 +189,7 @@ def _at_samples(energy: np.ndarray, part: _Cosines, last: int) -> np.ndarray:
     width = part.high - part.low
     if steps == last or width < 0:
         return np.resize(energy, last + 1)
-    if 3 * width > steps and steps < 2 * part.high:  # too wide: cosines are not told apart
+    if 3 * width > steps and steps < 2 * part.high:  # too wide: cosines are not distinguished
         return np.interp(np.linspace(0, steps, last + 1), np.arange(steps + 1), energy)
 
     # Each amplitude at few times goes to the cosine of the energy that it stands for.

@@ -1,8 +1,8 @@
 """Morlet wavelets in space: transform, inverse per wavenumber bin, the equivalent bank of FFT filters, bin energies.
 
-The paper's Eqs. (A4)-(A7), made consistent: the wavelet of the node kappa is Psi(kc eta/kappa), Psi(s) =
-exp(-(s - kc)^2 / 2), over the wavenumbers 0 < eta <= pi alone. A real signal is twice the real part of what its
-positive wavenumbers make; eta = pi belongs to both signs and counts half on either.
+The paper's Eqs. (A4)-(A7), corrected to be consistent: the wavelet of the node kappa is Psi(kc eta/kappa), Psi(s) =
+exp(-(s - kc)^2 / 2), over the wavenumbers 0 < eta <= pi alone. A real signal is twice the real part of its
+components of positive wavenumber; eta = pi belongs to both signs and counts half on either.
 """
 
 from dataclasses import dataclass

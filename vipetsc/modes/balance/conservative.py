@@ -35,7 +35,7 @@ PHASE_ROUNDING = 1e-9
 
 
 class HarmonicFrame:
-    """Unknowns around a motion: harmonics over their largest ``size`` in m, and the frequency over its ``omega``.
+    """Unknowns at and near a motion: harmonics over their largest ``size`` in m, and the frequency over its ``omega``.
 
     Its ``balance`` and ``shift`` are those of the step: the number of harmonics stays within it.
     """
@@ -67,7 +67,7 @@ class HarmonicFrame:
         return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """What should vanish (n,), over the size."""
+        """The residual (n,), which vanishes at a solution, over the size."""
         if not np.all(np.isfinite(xi)) or not 0.5 < xi[-1] < 2:
             raise FlowError("Newton left the domain: the frequency is off by a factor")
         return self.balance.residual(*self.motion(xi), self.shift) / self.size
@@ -92,7 +92,7 @@ class HarmonicFrame:
         return unit(np.linalg.solve(border, np.append(np.zeros(len(xi) - 1), 1.0)))
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The motion that an attempt has converged to, where ``direction`` is the branch's unit tangent if known."""
+        """The motion that an attempt has converged to, where ``direction`` is the branch's unit tangent or empty."""
         balance, xi = self.balance, attempt.xi
         x, omega = self.motion(xi)
         series = balance.series(x, omega)
@@ -185,7 +185,7 @@ class ConservativeMotions:
         return min(order, self.control.harmonics)
 
     def frame(self, point: Point, chart: str = "auto") -> HarmonicFrame:
-        """The unknowns around a motion, with the harmonics that motions near it need; there is one ``chart``."""
+        """The frame at a motion, with the harmonics that motions near it need; there is one ``chart``."""
         balance = self.balance(self.order_near(point))
         x = self.resized(point.x, balance)
         frame = HarmonicFrame(self, balance, x, 2 * np.pi / point.period, float(np.abs(x).max()))

@@ -5,7 +5,7 @@ M u'' + K u + sum_j b_j f_j = p with the elongations z_j = b_j . u has the perio
     Z_k + G(k Om) F_k(Z) = Z_k^linear,    G(omega) = b^T (K - omega^2 M)^-1 b,    k = 0..K,
 
 exact but for the harmonics beyond K, whatever the number of degrees of freedom: ``Compliance`` gives G. The forces and
-their derivatives are ``SiteForces``. What is left out is -G(k Om) F_k for k > K; F_k is known up to 2K, falls as
+their derivatives are ``SiteForces``. What is left out is -G(k Om) F_k for k > K; F_k is computed up to 2K, falls as
 k^-(n + 1) for a contact with the exponent n, and G as k^-2, so that its size is estimated
 (``HarmonicBalance.truncation``).
 
@@ -41,7 +41,7 @@ DETUNING = 1e-15
 
 
 class Compliance(Protocol):
-    """What is needed of ``lattice.compliance``: G (frequencies, pairs, pairs) in m/N, real or complex."""
+    """Interface of ``lattice.compliance``: G (frequencies, pairs, pairs) in m/N, real or complex."""
 
     def at(self, omegas: np.ndarray) -> np.ndarray:
         """G at frequencies in rad/s, which may be complex."""

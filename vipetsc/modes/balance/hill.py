@@ -55,7 +55,7 @@ class Line(NamedTuple):
     logs: np.ndarray
 
     def zeros_beyond(self) -> int:
-        """The number of zeros to the right of the line; -1 if it cannot be told."""
+        """The number of zeros to the right of the line; -1 if it is undecided."""
         turned = -float(self.logs[-1].imag) / np.pi
         return round(turned) if abs(turned - round(turned)) < 0.25 else -1
 
@@ -133,7 +133,7 @@ class Hill:
         return Line(positions, np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0))
 
     def unstable(self, series: ForceSeries) -> int:
-        """How many perturbations grow faster than ``least`` Om, two for a complex pair; -1 if that cannot be told."""
+        """Number of perturbations that grow faster than ``least`` Om, two for a complex pair; -1 if it is undecided."""
         return self._line(series, self.least).zeros_beyond()
 
     def fastest(self, series: ForceSeries) -> complex | None:
@@ -145,7 +145,7 @@ class Hill:
         return None if zeros is None else 0j
 
     def _beyond(self, series: ForceSeries, growth: float) -> list[complex] | None:
-        """lambda/Om of all that grow faster than ``growth`` Om; None if they cannot be told or are not all found."""
+        """lambda/Om of all that grow faster than ``growth`` Om; None if undecided or if not all are found."""
         line = self._line(series, growth)
         count = line.zeros_beyond()
         if count < 0:

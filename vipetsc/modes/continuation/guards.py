@@ -1,6 +1,6 @@
-"""Guards: what may not change too much from point to point, or a branch jumps to another arc unseen.
+"""Guards: bounds on changes from point to point, without which a branch jumps to another arc unseen.
 
-Both arcs satisfy the equations to rounding, so that no residual tells them apart; neighbouring tongues of internal
+Both arcs satisfy the equations to rounding, so that no residual distinguishes them; neighbouring tongues of internal
 resonances differ in half-traces, contacts and direction.
 """
 
@@ -12,7 +12,7 @@ from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Problem
 
-# What a guard holds down, for messages, and where it is set.
+# The change that a guard limits, for messages, and the key with its bound.
 GUARDED = {
     "half_trace": ("the half-trace changes too much", "nnm.guards.half_trace"),
     "contacts": ("more than one contact appears or goes", "nnm.guards.contacts"),
@@ -26,7 +26,7 @@ ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
 
 
 class Strain(NamedTuple):
-    """How far a step strains the ``guard`` that it strains most; 1 is the bound."""
+    """Largest change in a step over the bound of its ``guard``; 1 is the bound."""
 
     size: float
     guard: str
@@ -48,7 +48,7 @@ def strain(
     for guard, change in changes.items():
         bound = getattr(control.guards, guard, 1.0) or np.inf  # 0 switches a guard off
         size = change / bound
-        if np.isnan(size):  # no change that can be told is within a bound
+        if np.isnan(size):  # a change that cannot be computed counts as beyond any bound
             size = np.inf
         if guard in ALL_OR_NOTHING and size <= 1:
             size = 0.0

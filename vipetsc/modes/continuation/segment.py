@@ -100,7 +100,7 @@ class Segment(Generic[S]):
         if turn is None:
             return []
         parts: tuple[Segment[S], ...] = ()
-        with suppress(ArithmeticError):  # whether there are two is not known, so that none is missed
+        with suppress(ArithmeticError):  # there may be no second point, and then none is missed
             parts = self.split(turn)
         return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
 
@@ -156,7 +156,7 @@ class Segment(Generic[S]):
 
 
 def _turn(*values: tuple[float, float]) -> float | None:
-    """Where a value turns between the last two of three places, if it may cross zero there, by a parabola."""
+    """Turning point of a value between the last two of three places, by a parabola, if it may cross zero there."""
     (x0, z), (x1, a), (x2, b) = values
     bend = ((b - a) / (x2 - x1) - (z - a) / (x0 - x1)) / (x2 - x0)
     slope = (b - a) / (x2 - x1) - bend * (x2 - x1)

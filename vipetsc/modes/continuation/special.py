@@ -1,4 +1,4 @@
-"""Special points between two points of a branch: which can happen is the problem's, where they are is located here."""
+"""Location of special points between two points of a branch; their kinds are defined by the problem."""
 
 from vipetsc.modes.continuation.segment import Segment
 from vipetsc.modes.point import Point

@@ -58,7 +58,7 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
 def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Crossing | None:
     """The crossing seen by the map of that name, or None if it has no second null direction there.
 
-    What its smallest singular value is, is appended to ``singular``.
+    A text with the smallest singular value is appended to ``singular``.
     """
     problem = Shooting(old.flow, MAPS[name], old.tolerance)
     x, period = _re_expressed(old, point, problem)

@@ -4,7 +4,7 @@ With the contacts condensed (``balance``) the harmonics Z of the relative displa
 
     Z_k + G(k Om) F_k(Z) = a delta_k1 w(Om),
 
-w being what the force (1 N) or the wave (1 clearance of the first site) alone would make at the sites. Unknowns are Z
+where w is the motion of the sites by the force (1 N) or the wave (1 clearance of the first site) alone. Unknowns are Z
 over that clearance and the parameter, the amplitude a or the frequency Om over a scale; a curve of solutions is
 followed by pseudo-arclength (``continuation``), folds in the parameter are located on it.
 
@@ -39,7 +39,7 @@ SAMPLES_A_HARMONIC = 16
 
 
 class Measures(NamedTuple):
-    """What is measured of a steady state (``branches.response_layout`` has units and texts).
+    """Measures of a steady state (``branches.response_layout`` has units and texts).
 
     ``fractions`` (4,) of the energy that comes in are transmitted, reflected, at higher harmonics, and lost;
     ``harmonics`` (site, order) complex in m; ``unstable`` perturbations grow, the fastest at ``growth`` over Om.
@@ -71,7 +71,7 @@ class Response(Solution):
 
     @property
     def measured(self) -> Measures:
-        """The measures, which a state on its way into a file has."""
+        """The measures, which every state has before it is written to a file."""
         assert self.measures is not None
         return self.measures
 
@@ -84,7 +84,7 @@ class LinearMotion(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """What a curve goes over, "amplitude" or "frequency", the value of the other one, and the parameter's unit."""
+    """Parameter of a curve, "amplitude" or "frequency", the value of the other one, and the parameter's unit."""
 
     over: str
     fixed: float
@@ -92,7 +92,7 @@ class Parameter(NamedTuple):
 
 
 class SteadyFrame:
-    """Steady states around one of them: unknowns and tangent are its own; ``shift`` is its compliance's."""
+    """Steady states at and near one state, with its unknowns and tangent, and the ``shift`` of its compliance."""
 
     def __init__(self, equations: "SteadyEquations", xi: np.ndarray, tangent: np.ndarray) -> None:
         self.equations = equations
@@ -109,7 +109,7 @@ class SteadyFrame:
         return point.tangent
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """What should vanish (n,), over the clearance."""
+        """The residual (n,), which vanishes at a steady state, over the clearance."""
         return self.equations.residual(xi, self.shift)
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
@@ -123,7 +123,7 @@ class SteadyFrame:
         return self.solve(guess, self.tangent, self.tangent @ predicted)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method for the state with row . xi = value; what cannot be evaluated has not converged."""
+        """Newton's method for the state with row . xi = value; not converged where there is nothing to evaluate."""
         equations = self.equations
         try:
             return equations.newton.solve(self, guess, row, value, equations.tolerance)
@@ -138,7 +138,7 @@ class SteadyFrame:
         return np.asarray(direction / np.linalg.norm(direction))
 
     def measures(self, attempt: Attempt, direction: np.ndarray) -> Response:
-        """The state that an attempt has converged to; what is stored of it is measured once it is accepted."""
+        """The state that an attempt has converged to, without measures, which are computed once it is accepted."""
         return Response(xi=attempt.xi, tangent=direction)
 
 
@@ -167,7 +167,7 @@ class SteadyEquations(ABC):
         return (fixed, p * scale) if over == "amplitude" else (p * scale, fixed)
 
     def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """What is to be zero (n,), over the clearance."""
+        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance."""
         omega, amplitude = self.drive(xi[-1])
         if not omega > 0:
             raise FlowError("the frequency is not positive")
@@ -189,12 +189,12 @@ class SteadyEquations(ABC):
         return np.column_stack([jacobian, column * self.parameter.scale / self.clearance])
 
     def _drive_term(self, omega: float, amplitude: float, shift: np.ndarray) -> np.ndarray:
-        """The residual's part that the drive makes (n,), in m: the residual at rest."""
+        """The part (n,) of the residual that is due to the drive, in m: the residual at rest."""
         rest = np.zeros(self.balance.size)
         return self.balance.residual(rest, omega, shift, amplitude * self.linear_motion(omega).harmonics)
 
     def frame(self, point: Response, chart: str = "auto") -> SteadyFrame:
-        """The unknowns around a state; there is one ``chart``."""
+        """The frame at a state; there is one ``chart``."""
         return SteadyFrame(self, point.xi, point.tangent)
 
     def first_tangent(self, start: Response, direction: int) -> np.ndarray:
@@ -281,7 +281,7 @@ class SteadyStates(SteadyEquations):
         return LinearMotion(z, wave)
 
     def measured(self, xi: np.ndarray) -> Measures:
-        """What the file holds of a state."""
+        """The measures of a state for its file."""
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
         z = self.balance.unpack(x)

@@ -29,7 +29,7 @@ class TurningSteps:
         self.smallest_step = states.options.smallest_step
 
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
-        """Half the step."""
+        """The verdict on a failed attempt: half the step."""
         residuals = attempt.residuals or "none"
         return Verdict(False, step / 2, f"Newton's method ended with {attempt.reason} (residuals {residuals})")
 
@@ -56,7 +56,7 @@ class TurningSteps:
         return last, f"reached the end of nfrc.range, {bound * scale:g}"
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
-        """Where, why, and which key to turn."""
+        """Message where and why the curve cannot go on, and which key to change."""
         omega, amplitude = self.states.drive(last.xi[-1])
         remedy = "raise nfrc.harmonics or nfrc.max_newton, or lower nfrc.smallest_step"
         return (

@@ -1,6 +1,6 @@
 """Charts: unknowns xi (n + 1,) of order one in place of the initial values x (n,) and the period of an orbit.
 
-A chart is made around a point of the branch. It encodes (x, period) as xi, decodes it, and gives d(x, period)/d xi
+A chart belongs to a point of the branch. It encodes (x, period) as xi, decodes it, and gives d(x, period)/d xi
 (n + 1, n + 1); ``size`` is the unit of initial values. ``logarithmic`` is not needed by any other room: the case key
 ``nnm.chart`` offers it to users, to compare charts with.
 """
@@ -19,7 +19,7 @@ SMALLEST_ROOT = 1e-9
 
 
 class Chart(ABC):
-    """Unknowns around initial values and period of one orbit."""
+    """Unknowns for initial values and period at and near one orbit."""
 
     size: float
     period: float
@@ -60,7 +60,7 @@ class DenseChart(Chart):
 class Relative(DenseChart):
     """Initial values over the largest one, period over its value; gaps over their clearance.
 
-    Where an arc starts at rest, the resonator's displacement gives way to w = u_resonator - u_host over
+    Where an arc starts at rest, the resonator's displacement is replaced by w = u_resonator - u_host over
     max(|w|, D), or else a large common motion would hide the changes of w that make and break contacts.
     """
 

@@ -38,7 +38,7 @@ SMALLEST_ERROR = 1e-12
 
 
 class Stepper(NamedTuple):
-    """What a step reads and writes: rates at its ``stages`` (STAGES, rows, 1 + m), states at its ``start`` and ``end``.
+    """Arrays of a step: rates at its ``stages`` (STAGES, rows, 1 + m), states at its ``start`` and ``end``.
 
     Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian. The 2n
     rows are padded to a multiple of 8, so that sums over stages have no remainder. Those are done on ``flat``: stages,

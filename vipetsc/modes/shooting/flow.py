@@ -34,7 +34,7 @@ class CompiledSystem(NamedTuple):
 
 
 class FlowStep(NamedTuple):
-    """What a step of a system leaves for the search.
+    """Result of a step of a system, for the search of contact changes.
 
     ``side`` (contacts,) of closed contacts, 1 or -1, 0 for open ones; ``start`` and ``end`` (contacts, 3) hold
     w, w' and w'' at both ends.

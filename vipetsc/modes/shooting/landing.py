@@ -29,7 +29,7 @@ class Change(NamedTuple):
     """The change of a ``contact`` to or from a ``side``, and an attempt to end a step of ``length`` s on it.
 
     The gap sign w - offset rises through zero between the lengths ``low`` and ``high``; an ``extremum`` is landed on
-    where that gap is largest. ``attempts`` were made at it. Without a change, ``contact`` is -1.
+    where that gap is largest. ``attempts`` counts those at this change. Without a change, ``contact`` is -1.
     """
 
     contact: int
@@ -109,7 +109,7 @@ def _slope(c: Coefficients, x: float) -> float:
 
 @kernel
 def _bisect(c: Coefficients, low: float, high: float, sign: float) -> float:
-    """Where the polynomial turns positive between low and high; given a ``sign``, where its slope no longer has it."""
+    """Root between low and high, where the polynomial turns positive; given a ``sign``, where its slope loses it."""
     for _ in range(60):
         middle = 0.5 * (low + high)
         if middle in (low, high):
@@ -133,7 +133,7 @@ def _extremum(c: Coefficients, position: float) -> float:
 
 @njit
 def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
-    """Where ``sign`` times the slope (5,) on [low, 1] turns positive, 2 if it does not; restricts it to [there, 1]."""
+    """Position at which ``sign`` times the slope (5,) on [low, 1] turns positive, or 2; cuts the slope there."""
     turn = first_upcrossing_after_start(sign * slope, 0.0)
     if turn > 1.0:
         return turn
@@ -147,7 +147,7 @@ def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
 
 @njit(_nrt=True)  # makes arrays, also where it is called from kernels
 def first_rise(c: Coefficients) -> tuple[float, int]:
-    """Where a gap that starts at or below zero first rises through it: position in the step, outcome."""
+    """Position in the step at which a gap that starts at or below zero first rises through it, and the outcome."""
     margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))  # above the interpolant's error
     b1 = c[0] + c[1] / 5.0  # Bernstein coefficients bound the gap
     b2 = c[0] + (4.0 * c[1] + c[2]) / 10.0

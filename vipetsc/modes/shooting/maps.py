@@ -1,11 +1,11 @@
-"""Which arc of a periodic orbit is integrated: from a section to a section, over a fraction of the period."""
+"""Arcs of a periodic orbit that are integrated: from a section to a section, over a fraction of the period."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class ShootingMap:
-    """Where an arc starts and ends, and what fraction of the period it takes.
+    """Sections at which an arc starts and ends, and the fraction of the period that it takes.
 
     ``rest`` is v = 0, ``centre`` is u = 0. An odd system's symmetric orbit goes from rest to the centre in a
     quarter period; any reversible one from rest to rest in a half.

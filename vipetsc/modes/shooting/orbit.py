@@ -1,4 +1,4 @@
-"""What is asked of one shot orbit: its samples, its resonance, and whether it repeats a shorter one."""
+"""Properties of one shot orbit: its samples, its resonance, and whether it repeats a shorter one."""
 
 from typing import Protocol
 
@@ -26,7 +26,7 @@ class ShotOrbits(Protocol):
         """The arc from initial values ``x``."""
 
     def residual(self, arc: Arc) -> np.ndarray:
-        """What should vanish at the arc's end (n,)."""
+        """The residual (n,) at the arc's end, which vanishes for an orbit."""
 
     def jacobian(self, arc: Arc) -> np.ndarray:
         """Derivative (n, n + 1) of the residual with respect to initial values and period."""
@@ -53,7 +53,7 @@ def sample_orbit(problem: ShotOrbits, point: Point, samples: int = 400) -> tuple
 
 
 def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
-    """How often the contacts' relative motion (all displacements without contacts) passes zero in half a period.
+    """Number of zeros in half a period of the contacts' relative motion (without contacts, of all displacements).
 
     On a tongue of a k:1 internal resonance, mode two moves k times while mode one moves once.
     """

@@ -1,7 +1,7 @@
 """Periodic orbits as solutions of boundary value problems over a part of their period, by PETSc's SNES.
 
 Newton's method works in the unknowns xi (n + 1,) of a chart (``charts``), in place of initial values x (n,) and the
-period. ``Shooting`` has the matrix of the flow's sensitivities; a lattice without one shares ``ShootingEquations``.
+period. ``Shooting`` has the matrix of the flow's sensitivities; a lattice without one uses ``ShootingEquations``, too.
 """
 
 from abc import ABC, abstractmethod
@@ -22,22 +22,22 @@ from vipetsc.modes.shooting.orbit import resonance
 from vipetsc.modes.shooting.stability import half_traces, multipliers
 from vipetsc.modes.system import System
 
-# Half-traces of one system cross +-1 tangentially along narrow tongues, to rounding: crossings below are not told.
+# Half-traces of one system cross +-1 tangentially along narrow tongues, to rounding: crossings below are not reported.
 LEAST_CROSSING = 1e-6
 # Singular values of the Jacobian below this fraction of the largest leave the tangent open.
 DEGENERATE = 1e-12
 
 
 class AnyArc(Protocol):
-    """What every flow's arc tells of the orbit."""
+    """Interface of the arcs of all flows: the quantities of the orbit."""
 
     @property
     def duration(self) -> float:
-        """Its length in s."""
+        """Length of the arc in s."""
 
     @property
     def episodes(self) -> int:
-        """Contact episodes in it."""
+        """Number of contact episodes in the arc."""
 
     @property
     def closed(self) -> float:
@@ -48,9 +48,9 @@ A = TypeVar("A", bound=AnyArc)
 
 
 class ShootingFrame(Generic[A]):
-    """The shooting equations in the unknowns of a ``chart`` around one orbit.
+    """The shooting equations in the unknowns of a ``chart`` at one orbit.
 
-    ``tangent`` (n + 1,) is d(x, period) along the branch, where it is known.
+    ``tangent`` (n + 1,) is d(x, period) along the branch, empty where there is none yet.
     """
 
     tangent: np.ndarray
@@ -79,7 +79,7 @@ class ShootingFrame(Generic[A]):
         return self.problem.arc(*self.chart.decode(xi))
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """What should vanish at the arc's end (n,), over the chart's unit."""
+        """The residual (n,) at the arc's end, which vanishes for an orbit, over the chart's unit."""
         return self.problem.residual(self.arc(xi)) / self.chart.size
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
@@ -95,7 +95,7 @@ class ShootingFrame(Generic[A]):
         """The unit tangent at a solution, on the side of the frame's own."""
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent if known."""
+        """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent or empty."""
         problem, chart = self.problem, self.chart
         x, period = chart.decode(attempt.xi)
         arc = problem.arc(x, period)
@@ -173,10 +173,10 @@ class ShootingEquations(ABC, Generic[A]):
 
     @abstractmethod
     def stability(self, arc: A) -> tuple[np.ndarray, float]:
-        """Half-traces of an orbit and the largest modulus of its multipliers, as far as they are known."""
+        """Half-traces of an orbit, and the largest modulus of its multipliers; empty and NaN without a matrix."""
 
     def residual(self, arc: A) -> np.ndarray:
-        """What should vanish at the arc's end (n,): displacements in m or velocities in m/s."""
+        """The residual (n,) at the arc's end, which vanishes for an orbit: displacements in m or velocities in m/s."""
         return self.end(arc)[self.zero]
 
     def end_rate(self, arc: A) -> np.ndarray:
@@ -198,10 +198,10 @@ class ShootingEquations(ABC, Generic[A]):
 
     @abstractmethod
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> ShootingFrame[A]:
-        """The unknowns around any initial values and period; ``tangent`` may be empty."""
+        """The frame at any initial values and period; ``tangent`` may be empty."""
 
     def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[A]:
-        """The unknowns around an orbit; the chart ``auto`` is grazing if it starts near a touch, else relative."""
+        """The frame at an orbit; the chart ``auto`` is grazing if the orbit starts near a touch, else relative."""
         if chart == "auto":
             at_rest = self.map.start == "rest"
             chart = "grazing" if at_rest and near_grazing(self.system, point.x) else "relative"
@@ -242,7 +242,7 @@ class ShootingEquations(ABC, Generic[A]):
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
 
     def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
-        """A fold of the energy with the resonance whose tongue it begins or ends, where that can be told."""
+        """The ``fold`` of the energy; a subclass may add the resonance whose tongue it begins or ends."""
         return fold
 
 
@@ -309,7 +309,7 @@ class Shooting(ShootingEquations[Arc]):
         return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
-        """The unknowns of the ``chart`` of that name around any initial values and period."""
+        """The frame at any initial values and period, in the ``chart`` of that name."""
         return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, _or_empty(tangent))
 
     def relative_frame(self, x: np.ndarray, period: float) -> DenseFrame:
@@ -370,7 +370,7 @@ class Shooting(ShootingEquations[Arc]):
 
 
 class HalfTraceAbove:
-    """How far half-trace ``number`` (from 0) of a point is above a ``level``."""
+    """Distance of half-trace ``number`` (from 0) of a point above a ``level``."""
 
     def __init__(self, number: int, level: float) -> None:
         self.number = number
