@@ -91,7 +91,7 @@ def _attempt(function: Callable[[], T]) -> _Attempt:
 
 
 def _value_or_raise(attempt: _Attempt) -> Any:
-    """The value of an ``attempt`` that all ranks know of; raises its error on all of them."""
+    """The value of an ``attempt`` that all ranks have; raises its error on all of them."""
     if attempt.error is not None:
         attempt.error.from_root = True  # type: ignore[attr-defined]  # rank 0 raises it too, and reports it for all
         raise attempt.error

@@ -123,7 +123,7 @@ class SteadyFrame:
         return self.solve(guess, self.tangent, self.tangent @ predicted)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method for the state with row . xi = value; not converged where there is nothing to evaluate."""
+        """Newton's method for the state with row . xi = value; not converged after an ArithmeticError."""
         equations = self.equations
         try:
             return equations.newton.solve(self, guess, row, value, equations.tolerance)
