@@ -70,9 +70,12 @@ def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     attempt = _attempt(function)
     wait_for_all(comm)
     errors = [error for error in comm.allgather(attempt.error) if error is not None]
-    if errors:
-        attempt = _Attempt(value=None, error=errors[0])
-    return _value_or_raise(attempt)
+    if not errors:
+        return _value_or_raise(attempt)
+    # A second name: the attempt, whose traceback holds the open files of ``function``, has to outlive the error that is
+    # raised, since HDF5 crashes where it frees a file that a full disk kept it from closing.
+    agreed = _Attempt(value=None, error=errors[0])
+    return _value_or_raise(agreed)
 
 
 class _Attempt(NamedTuple):
