@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 import pytest
 
+from vipetsc.io import lock
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, FolderError, claimed
 from vipetsc.io.lock import PATIENCE, locked
@@ -260,6 +261,23 @@ def test_a_command_waits_for_a_process_that_ends_and_says_so(run, tmp_path, capl
     assert folder.exists() != folder_is_new  # created by the other, removed by it, and again by this one
     (told,) = caplog.messages
     assert f"{folder}: process {process.pid} on {os.uname().nodename} is working in it; waiting up to 5 s" in told
+
+
+def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_again(tmp_path, monkeypatch):
+    folder = tmp_path / "new"
+    try_to_lock = lock._try_to_lock
+    removed = []
+
+    def remove_once(path):
+        if not removed:
+            path.rmdir()
+            removed.append(path)
+        return try_to_lock(path)
+
+    monkeypatch.setattr(lock, "_try_to_lock", remove_once)
+    with locked(MPI.COMM_SELF, folder):
+        assert (folder / ".lock").exists()
+    assert removed == [folder] and not folder.exists()
 
 
 def test_a_command_waits_no_longer_than_it_says_for_a_process_that_stays(run, caplog, monkeypatch):

@@ -76,8 +76,10 @@ def _acquire(path: Path, created: list[Path]) -> int | None:
         # Inside the loop, because a holder that ends removes the folder if it created it and left nothing there.
         created += [folder for folder in (path, *path.parents) if not folder.exists()]
         path.mkdir(parents=True, exist_ok=True)
-
-        descriptor, holder = _try_to_lock(path)
+        try:
+            descriptor, holder = _try_to_lock(path)
+        except FileNotFoundError:
+            continue  # a holder that ended just now has removed the folder again
         if holder is None:
             return descriptor
 
@@ -106,8 +108,16 @@ def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
             return None, holder or "another process"
 
         # A holder that ended after the file was opened has removed it: a lock on a file without name is none.
-        if (path / LOCK).exists() and os.path.samestat(os.fstat(descriptor), (path / LOCK).stat()):
+        if _is_file(descriptor, path / LOCK):
             os.ftruncate(descriptor, 0)
             os.write(descriptor, f"process {os.getpid()} on {platform.node()} {TOKEN}\n".encode())
             return descriptor, None
         os.close(descriptor)
+
+
+def _is_file(descriptor: int, path: Path) -> bool:
+    """Whether the open file of a ``descriptor`` is the one of that name."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
