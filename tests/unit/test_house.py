@@ -82,3 +82,14 @@ def test_every_chapter_is_in_the_index_and_every_link_leads_somewhere():
         for target in re.findall(r"\]\((?!https:)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
     assert (ROOT.parent / "README.md").read_text(encoding="utf-8").count("\n") <= 150
+
+
+def test_no_two_classes_have_one_name():
+    """A name means one thing in the whole package; a private class may repeat one."""
+    places = {}
+    for file, text in SOURCES.items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(file)
+
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}

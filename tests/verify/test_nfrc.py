@@ -23,7 +23,7 @@ from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.response_layout import measure, sweep_down, sweep_up
-from vipetsc.modes.branches.sweeps import Sweep, swept, with_stable_folds
+from vipetsc.modes.branches.sweeps import ParameterSweep, swept, with_stable_folds
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
@@ -241,7 +241,7 @@ def test_sweeps_jump_between_stable_states(tmp_path):
     p = [0.5, 0.8, 1.0, 0.9, 0.7, 0.6, 0.8, 1.0, 1.2, 1.15, 1.05, 0.95]
     stable = np.array([1, 1, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1], bool)
     fold = np.isin(np.arange(12), (2, 5))
-    up = Sweep(np.array(p), size=0.1 * np.arange(12), stable=with_stable_folds(stable, fold))
+    up = ParameterSweep(np.array(p), size=0.1 * np.arange(12), stable=with_stable_folds(stable, fold))
     assert swept(up) == [0, 1, 2, 8]
     assert swept(up._replace(parameter=-up.parameter), start=8) == [8, 7, 6, 5, 0]
 

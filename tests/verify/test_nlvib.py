@@ -18,7 +18,7 @@ from vipetsc.lattice import Contact
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import Hill
-from vipetsc.modes.response.steady import LinearMotion, Parameter, SteadyEquations
+from vipetsc.modes.response.steady import ContinuationParameter, LinearMotion, SteadyEquations
 
 K, STOP, GAP, FORCE, OFFSET, LAST = np.array([[1.0, -1.0], [-1.0, 2.0]]), 100.0, 1.0, 0.1, 10.0, 101
 C = 0.03 * K
@@ -39,7 +39,7 @@ class Example(SteadyEquations):
         self.compliance = Damped()
         forces = SiteForces([(Contact("bilinear", STOP), GAP + OFFSET)])
         balance = HarmonicBalance(self.compliance, forces, LAST, odd=False, cosines=False)
-        over = Parameter("frequency", fixed=1.0, scale=0.15)
+        over = ContinuationParameter("frequency", fixed=1.0, scale=0.15)
         super().__init__(balance, GAP, over, tolerance=1e-12, max_newton=12)
 
     def linear_motion(self, omega):

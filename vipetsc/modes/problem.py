@@ -1,8 +1,8 @@
 """Interface between continuation and a method: n equations in n + 1 unknowns, and their solutions.
 
-A ``Problem`` is a system together with a method (shooting, harmonic balance) whose solutions form branches. At a
-point of a branch it gives a ``Frame``: unknowns xi of order one, in which a step is taken and corrected. Continuation,
-the location of special points and the files of branches use nothing else of a method.
+A ``PeriodicProblem`` is a system together with a method (shooting, harmonic balance) whose solutions form branches. At
+a point of a branch it gives a ``Frame``: unknowns xi of order one, in which a step is taken and corrected.
+Continuation, the location of special points and the files of branches use nothing else of a method.
 """
 
 from collections.abc import Callable, Iterator
@@ -104,7 +104,7 @@ class Frame(Protocol[S]):
         """The point that an attempt has converged to, where ``direction`` is the unit tangent."""
 
 
-class Problem(Protocol[S]):
+class PeriodicProblem(Protocol[S]):
     """Equations whose solutions form branches.
 
     ``has_half_traces`` says whether points have the half-traces of their multipliers, ``guards`` which changes from

@@ -48,7 +48,7 @@ REAL = 1e-7  # |Im lambda| over Om of what is no complex pair is nearer to 0 or 
 LARGEST_LOG = 300.0  # of a determinant, which overflows beyond
 
 
-class Line(NamedTuple):
+class ContourLine(NamedTuple):
     """D along Re lambda = const: Im lambda/Om from 0 to 1/2 as ``positions``, and log D with its turns added up."""
 
     positions: np.ndarray
@@ -115,7 +115,7 @@ class Hill:
         moved = np.linalg.solve(inner, _plus_one(g, jacobian[np.ix_(rows, ~rows)], 0.0))
         return jacobian[np.ix_(~rows, ~rows)] - jacobian[np.ix_(~rows, rows)] @ moved
 
-    def _line(self, series: ForceSeries, growth: float) -> Line:
+    def _line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om, so finely that no turn of it is missed."""
         count = max(COARSE, int(0.5 / growth) if self.finite else 0) + 1
         positions = np.linspace(0, 0.5, count)
@@ -130,7 +130,7 @@ class Hill:
             positions = np.insert(positions, wide + 1, middles)
 
         turned = np.cumsum(np.angle(values[1:] / values[:-1]))
-        return Line(positions, np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0))
+        return ContourLine(positions, np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0))
 
     def unstable(self, series: ForceSeries) -> int:
         """Number of perturbations that grow faster than ``least`` Om, two for a complex pair; -1 if it is undecided."""

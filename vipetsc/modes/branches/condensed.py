@@ -24,7 +24,7 @@ from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Problem
+from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.system import System
 
 # A field is left out below this fraction of its largest value.
@@ -87,7 +87,7 @@ class CondensedMethod(NnmMethod):
         """The equations of the case."""
         return self.motions
 
-    def start(self, problem: Problem[Point], job: int) -> Point:
+    def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
         """The motion of a linear mode at a small energy, or of a start frequency with contact at the start sites."""
         if self.system is not None and not self.options.start_frequency:
             system = self.system
@@ -100,7 +100,7 @@ class CondensedMethod(NnmMethod):
         signs[np.abs(numbers) - 1] = np.sign(numbers)
         return self.motions.from_gap(self.options.start_frequency[job], signs)
 
-    def rule(self, problem: Problem[Point], start: Point, done: int) -> StepRule[Point]:
+    def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Guarded steps; a branch that begins in a gap ends where it leaves it."""
         options = self.options
         if self.chain is not None:
@@ -113,7 +113,7 @@ class CondensedMethod(NnmMethod):
             options = options.model_copy(update={"frequency": bounds})
         return guarded_steps(problem, options, done)
 
-    def assess(self, problem: Problem[Point], point: Point) -> Point:
+    def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
         """The point with its largest multiplier by Hill's method, and with those of Floquet if they are asked for."""
         motions = self.motions
         omega = 2 * np.pi / point.period
@@ -134,7 +134,7 @@ class CondensedMethod(NnmMethod):
         flow = LatticeFlow(chain, law, self.comm)
         return with_multipliers(flow, system, self.motions.forces.odd, point, u, self.options.multipliers)
 
-    def finish(self, problem: Problem[Point], branch: Branch[Point]) -> None:
+    def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
         """Add the states at phase 0 of the first and the last point, and of those asked for."""
         points = [branch.points[0], *self.asked(problem, branch), branch.regular()[-1]]
         branch.extra = states(self.motions, points)

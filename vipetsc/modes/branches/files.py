@@ -14,11 +14,15 @@ from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed_layout import CondensedLayout
 from vipetsc.modes.branches.kinds import kinds_of
-from vipetsc.modes.branches.layout import Layout
+from vipetsc.modes.branches.layout import BranchLayout
 from vipetsc.modes.branches.orbit_layout import OrbitLayout
 from vipetsc.modes.branches.response_layout import ResponseLayout
 
-LAYOUTS: dict[str, Layout[Any]] = {ORBITS: OrbitLayout(), CONDENSED: CondensedLayout(), RESPONSES: ResponseLayout()}
+LAYOUTS: dict[str, BranchLayout[Any]] = {
+    ORBITS: OrbitLayout(),
+    CONDENSED: CondensedLayout(),
+    RESPONSES: ResponseLayout(),
+}
 
 
 def write_branch(branch: Branch[Any], folder: Path, about: dict[str, Any]) -> None:

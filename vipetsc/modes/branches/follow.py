@@ -19,12 +19,12 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.files import read_branch, write_branch
 from vipetsc.modes.branches.lattices import LatticeMethod
-from vipetsc.modes.branches.method import Method
+from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.continuation.arclength import Continuation, StepRule
 from vipetsc.modes.continuation.special import locate
-from vipetsc.modes.problem import Problem
+from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 
 # Seconds between two writings of a growing branch.
@@ -163,7 +163,7 @@ class Follower:
             raise
         method.finish(problem, branch)
 
-    def _follow_down(self, branch: Branch[Any], problem: Problem[Any], start: Any) -> None:
+    def _follow_down(self, branch: Branch[Any], problem: PeriodicProblem[Any], start: Any) -> None:
         """Begin a branch with its part below the start, from the far end on."""
         down = self._begun(f"{branch.name}-down")
         if not down.complete:
@@ -176,9 +176,9 @@ class Follower:
     def grow(
         self,
         branch: Branch[Any],
-        problem: Problem[Any],
+        problem: PeriodicProblem[Any],
         start: Any,
-        rule_of: Callable[[Problem[Any], Any, int], StepRule[Any]],
+        rule_of: Callable[[PeriodicProblem[Any], Any, int], StepRule[Any]],
         direction: int = 1,
     ) -> None:
         """Continue ``branch`` from ``start`` until it ends, and locate its special points.
@@ -251,17 +251,17 @@ class Follower:
 
     def _crossing(self, branch: Branch[Any]) -> list[Branch[Any]]:
         """The branches that cross ``branch`` at the kinds of special points asked for."""
-        crossings = []
-        for name, start in self.method.crossings(branch):
-            crossing = self._begun(name)
-            crossings.append(crossing)
-            if not crossing.complete:
-                self._save(crossing, partial(self._cross, crossing, start))
-        return crossings
+        branches = []
+        for crossing in self.method.crossings(branch):
+            other = self._begun(crossing.name)
+            branches.append(other)
+            if not other.complete:
+                self._save(other, partial(self._cross, other, crossing))
+        return branches
 
-    def _cross(self, crossing: Branch[Any], start: Callable[[], tuple[Problem[Any], Any]]) -> None:
-        """Follow a branch that crosses another one."""
-        sys.audit("vipetsc.switch", crossing.name)
-        problem, first = start()
-        begin = crossing.regular()[-1] if crossing.points else first
-        self.grow(crossing, problem, begin, self.method.crossing_rule)
+    def _cross(self, branch: Branch[Any], crossing: CrossingBranch) -> None:
+        """Follow a ``branch`` that crosses another one."""
+        sys.audit("vipetsc.switch", branch.name)
+        problem, first = crossing.start()
+        begin = branch.regular()[-1] if branch.points else first
+        self.grow(branch, problem, begin, crossing.rule)

@@ -13,7 +13,7 @@ from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import ContinuationError, FlowError, Problem, StartError
+from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, StartError
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System
@@ -48,20 +48,20 @@ class LatticeMethod(NnmMethod):
         """The shooting equations of the lattice."""
         return self.lattice
 
-    def start(self, problem: Problem[Point], job: int) -> Point:
+    def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
         """The orbit of a linear mode at a small energy, or a breather of a start frequency."""
         if self.options.start_frequency:
             return self.lattice.breather(self.options.start_frequency[job])
         return linear_start(self.lattice, job, start_energy(self.options, self.system, job))
 
-    def assess(self, problem: Problem[Point], point: Point) -> Point:
+    def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
         """The point with its largest multipliers if ``nnm.multipliers`` asks for them."""
         wanted = self.options.multipliers
         if not wanted:
             return point
         return with_multipliers(self.lattice.flow, self.system, self.lattice.map.quarter, point, point.x, wanted)
 
-    def finish(self, problem: Problem[Point], branch: Branch[Point]) -> None:
+    def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
         """Add the states at phase 0 of the first and the last point."""
         points = [branch.points[0], branch.regular()[-1]]
         cells = self.lattice.flow.chain.cells

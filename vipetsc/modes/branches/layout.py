@@ -30,7 +30,7 @@ class Table(NamedTuple):
         return "\n".join(",".join(row) for row in [self.names, *self.rows]) + "\n"
 
 
-class Layout(Protocol[S]):
+class BranchLayout(Protocol[S]):
     """Storage of the points of one kind of branch."""
 
     @property

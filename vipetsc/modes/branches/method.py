@@ -8,16 +8,21 @@ from mpi4py import MPI
 
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.continuation.arclength import StepRule
-from vipetsc.modes.problem import ContinuationError, FlowError, Problem, S
+from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, S
 
 Monitor = Callable[[S], str | None]
 
 
-class Crossing(NamedTuple):
-    """A branch that crosses another one: its name, and the problem and first point to be found when it is followed."""
+class CrossingBranch(NamedTuple):
+    """A branch that crosses another one.
+
+    ``start`` finds its problem and first point when it is followed; ``rule(problem, first, done)`` gives the steps and
+    the end of one that has ``done`` regular points after its start.
+    """
 
     name: str
-    start: Callable[[], tuple[Problem[Any], Any]]
+    start: Callable[[], tuple[PeriodicProblem[Any], Any]]
+    rule: Callable[[PeriodicProblem[Any], Any, int], StepRule[Any]]
 
 
 class Method(ABC, Generic[S]):
@@ -56,40 +61,36 @@ class Method(ABC, Generic[S]):
         """The name of a branch."""
 
     @abstractmethod
-    def problem(self, job: int) -> Problem[S]:
+    def problem(self, job: int) -> PeriodicProblem[S]:
         """The equations of a branch."""
 
     @abstractmethod
-    def start(self, problem: Problem[S], job: int) -> S:
+    def start(self, problem: PeriodicProblem[S], job: int) -> S:
         """The first point of a branch."""
 
     @abstractmethod
-    def rule(self, problem: Problem[S], start: S, done: int) -> StepRule[S]:
+    def rule(self, problem: PeriodicProblem[S], start: S, done: int) -> StepRule[S]:
         """Steps and end of a branch that has ``done`` regular points after its start."""
 
     def directions(self) -> list[int]:
         """Directions from the start in which a branch is followed, in this order."""
         return [1]
 
-    def assess(self, problem: Problem[S], point: S) -> S:
+    def assess(self, problem: PeriodicProblem[S], point: S) -> S:
         """The point with the quantities of its file that continuation does not need."""
         return point
 
-    def monitor(self, problem: Problem[S]) -> Monitor[S]:
+    def monitor(self, problem: PeriodicProblem[S]) -> Monitor[S]:
         """A check of every new point: a sentence ends the branch, None lets it go on."""
         return lambda point: None
 
-    def jumps(self, problem: Problem[S], points: list[S]) -> Iterator[str]:
+    def jumps(self, problem: PeriodicProblem[S], points: list[S]) -> Iterator[str]:
         """Sentences about jumps between points."""
         return iter(())
 
-    def finish(self, problem: Problem[S], branch: Branch[S]) -> None:
+    def finish(self, problem: PeriodicProblem[S], branch: Branch[S]) -> None:
         """Add the variables of a whole branch's file that are not of its points."""
 
-    def crossings(self, branch: Branch[S]) -> Iterator[Crossing]:
+    def crossings(self, branch: Branch[S]) -> Iterator[CrossingBranch]:
         """The branches that cross a branch and that the case asks for."""
         return iter(())
-
-    def crossing_rule(self, problem: Problem[S], start: S, done: int) -> StepRule[S]:
-        """Steps and end of a branch that crosses another one."""
-        raise NotImplementedError

@@ -12,13 +12,13 @@ from vipetsc.case.nnm import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, jumps, sampled
-from vipetsc.modes.branches.method import Crossing, Method, Monitor
+from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.continuation.arclength import GuardedSteps, StepRule
 from vipetsc.modes.continuation.special import at_energy
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Problem
+from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.flow import Flow
 from vipetsc.modes.shooting.maps import MAPS
@@ -46,7 +46,7 @@ class NnmMethod(Method[Point]):
         self.options = case.nnm
         self.locates = case.nnm.locate
 
-    def rule(self, problem: Problem[Point], start: Point, done: int) -> StepRule[Point]:
+    def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Guarded steps to the end of the ranges."""
         return guarded_steps(problem, self.options, done)
 
@@ -54,7 +54,7 @@ class NnmMethod(Method[Point]):
         """The directions by [nnm]: down, up, or down first and then up."""
         return {"up": [1], "down": [-1], "both": [-1, 1]}[self.options.direction]
 
-    def asked(self, problem: Problem[Point], branch: Branch[Point]) -> Iterator[Point]:
+    def asked(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> Iterator[Point]:
         """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one."""
         for energy in self.options.orbits_at:
             passed = False
@@ -71,7 +71,7 @@ class NnmMethod(Method[Point]):
                 branch.findings.append(f"the branch has no orbit of {energy:g} J")
 
 
-def guarded_steps(problem: Problem[Point], control: NnmTable, done: int) -> GuardedSteps:
+def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int) -> GuardedSteps:
     """Steps by [nnm] of a branch that has ``done`` points after its start."""
     # ``points`` limits the whole branch, so that one that is resumed ends where an unbroken one would.
     return GuardedSteps(problem, control.model_copy(update={"points": max(control.points - done, 0)}))
@@ -119,21 +119,21 @@ class ShootingMethod(NnmMethod):
         """The shooting equations of the case."""
         return self.shooting
 
-    def start(self, problem: Problem[Point], job: int) -> Point:
+    def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
         """The orbit of a linear mode at a small energy."""
         return linear_start(self.shooting, job, start_energy(self.options, self.system, job))
 
-    def monitor(self, problem: Problem[Point]) -> Monitor[Point]:
+    def monitor(self, problem: PeriodicProblem[Point]) -> Monitor[Point]:
         """The check of every new point: whether the branch retraces itself, stands still or is another one."""
         assert isinstance(problem, Shooting)
         return BranchMonitor(problem, self.options.guards).check
 
-    def jumps(self, problem: Problem[Point], points: list[Point]) -> Iterator[str]:
+    def jumps(self, problem: PeriodicProblem[Point], points: list[Point]) -> Iterator[str]:
         """Sentences about jumps between points."""
         assert isinstance(problem, Shooting)
         return jumps(points, problem, self.options)
 
-    def finish(self, problem: Problem[Point], branch: Branch[Point]) -> None:
+    def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
         """Add the orbits of a branch, and the comparison with other flows."""
         orbits = [*self._typical(branch), *self.asked(problem, branch)]
         branch.extra = sampled(self.shooting, orbits)
@@ -149,14 +149,14 @@ class ShootingMethod(NnmMethod):
         groups = [by_region[region] for region in sorted(by_region)]
         return [group[len(group) // 2] for group in groups]
 
-    def crossings(self, branch: Branch[Point]) -> Iterator[Crossing]:
+    def crossings(self, branch: Branch[Point]) -> Iterator[CrossingBranch]:
         """The branches that cross at the kinds of special points in ``nnm.switch``."""
         for kind in self.options.switch:
             special = [p for p in branch.points if p.kind == kind]
             for number, point in enumerate(special, 1):
                 start = partial(switch, self.shooting, point, self.options.switch_amplitude)
-                yield Crossing(f"{branch.name}-{kind}-{number}", start)
+                yield CrossingBranch(name=f"{branch.name}-{kind}-{number}", start=start, rule=self._crossing_rule)
 
-    def crossing_rule(self, problem: Problem[Point], start: Point, done: int) -> StepRule[Point]:
+    def _crossing_rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Steps by [nnm] in the relative chart: the crossing branch has its own contacts at the start of its arc."""
         return guarded_steps(problem, self.crossing_options, done)

@@ -9,7 +9,7 @@ from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.kinds import stored_kinds
 from vipetsc.modes.branches.layout import Table
-from vipetsc.modes.branches.sweeps import Sweep, swept, with_stable_folds
+from vipetsc.modes.branches.sweeps import ParameterSweep, swept, with_stable_folds
 from vipetsc.modes.response.steady import Measures, Response
 
 
@@ -142,13 +142,13 @@ def sweep_down(branch: Branch[Response]) -> list[int]:
     return swept(_sweep(branch, -1), way_up[-1]) if way_up else []
 
 
-def _sweep(branch: Branch[Response], sign: int) -> Sweep:
+def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
     """The states of a curve for a sweep up (``sign`` 1) or down (-1)."""
     # With the sign a sweep down is one up as well; -1 unstable perturbations mean that stability is undecided.
     stable = measure(branch, "unstable") == 0
     fold = branch.is_kind("fold")
     parameter = sign * measure(branch, branch.about["over"])
-    return Sweep(parameter, size=measure(branch, "largest")[:, 0], stable=with_stable_folds(stable, fold))
+    return ParameterSweep(parameter, size=measure(branch, "largest")[:, 0], stable=with_stable_folds(stable, fold))
 
 
 def _complex(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method
-from vipetsc.modes.problem import ContinuationError, FlowError, Problem
+from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
 from vipetsc.modes.response.steady import Response, SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
 
@@ -69,17 +69,17 @@ class ResponseMethod(Method[Response]):
         _, restitution, fixed = self.curves[job]
         return SteadyStates(self.case, restitution, fixed)
 
-    def start(self, problem: Problem[Response], job: int) -> Response:
+    def start(self, problem: PeriodicProblem[Response], job: int) -> Response:
         """The state at the beginning of the range."""
         assert isinstance(problem, SteadyStates)
         return first_state(problem)
 
-    def rule(self, problem: Problem[Response], start: Response, done: int) -> TurningSteps:
+    def rule(self, problem: PeriodicProblem[Response], start: Response, done: int) -> TurningSteps:
         """Steps to the end of the range; the start counts among ``nfrc.points``."""
         assert isinstance(problem, SteadyStates)
         return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
 
-    def assess(self, problem: Problem[Response], point: Response) -> Response:
+    def assess(self, problem: PeriodicProblem[Response], point: Response) -> Response:
         """The state with its measures."""
         assert isinstance(problem, SteadyStates)
         return replace(point, measures=problem.measured(point.xi))

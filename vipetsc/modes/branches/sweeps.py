@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Sweep(NamedTuple):
+class ParameterSweep(NamedTuple):
     """States of a curve in order: the ``parameter``, which the sweep lets grow, a ``size``, and the ``stable`` ones.
 
     Of several stable states with one parameter the sweep jumps to that whose size is nearest.
@@ -22,7 +22,7 @@ def with_stable_folds(stable: np.ndarray, fold: np.ndarray) -> np.ndarray:
     return stable | (fold & neighbour)
 
 
-def swept(sweep: Sweep, start: int | None = None) -> list[int]:
+def swept(sweep: ParameterSweep, start: int | None = None) -> list[int]:
     """Numbers of the states that a slow sweep passes from ``start``, else from the first stable state.
 
     At a fold, or where a state becomes unstable, it jumps to a stable state with the parameter's value; it ends where
@@ -43,7 +43,7 @@ def swept(sweep: Sweep, start: int | None = None) -> list[int]:
         passed.add(path[-1])
 
 
-def _neighbours_ahead(sweep: Sweep, i: int, passed: set[int]) -> list[int]:
+def _neighbours_ahead(sweep: ParameterSweep, i: int, passed: set[int]) -> list[int]:
     """Stable neighbours of state ``i`` on the curve with a larger parameter."""
     # On a branch beyond a fold the parameter grows towards the state before: both neighbours count.
     p = sweep.parameter
@@ -54,7 +54,7 @@ def _neighbours_ahead(sweep: Sweep, i: int, passed: set[int]) -> list[int]:
     return ahead
 
 
-def _states_across(sweep: Sweep, i: int, passed: set[int]) -> list[int]:
+def _states_across(sweep: ParameterSweep, i: int, passed: set[int]) -> list[int]:
     """States to which a sweep may jump from state ``i``: ends of stable steps of the curve that pass its parameter."""
     # A step between a stable and an unstable state leaves open where on it stability ends.
     p = sweep.parameter

@@ -1,9 +1,9 @@
 """Pseudo-arclength continuation as an iterator over points; the caller owns the loop.
 
-A method (``modes.problem.Problem``) has n equations H = 0 in n + 1 unknowns, whose solutions form a branch: a curve.
-Around the last point it gives a *frame*: the unknowns ``xi`` (n + 1,), scaled to order one by a *chart*, those of the
-point itself, and the unit tangent t of the branch there. A step of the arclength s predicts xi + s t, and Newton's
-method corrects the prediction to the solution xi_new of
+A method (``modes.problem.PeriodicProblem``) has n equations H = 0 in n + 1 unknowns, whose solutions form a curve, a
+branch. Around the last point it gives a *frame*: the unknowns ``xi`` (n + 1,), scaled to order one by a *chart*, those
+of the point itself, and the unit tangent t of the branch there. A step of the arclength s predicts xi + s t, and
+Newton's method corrects the prediction to the solution xi_new of
 
     H(xi_new) = 0,    t . (xi_new - xi) = s,
 
@@ -27,7 +27,7 @@ import numpy as np
 from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.continuation.guards import GUARDED, strain
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, Problem, S
+from vipetsc.modes.problem import Attempt, ContinuationError, PeriodicProblem, S
 
 # These numbers decide how many points lie on a branch, not its course: each point solves the equations and keeps the
 # guards. None is sharp. On the out-of-phase branch of the paper's reduced model up to 10 kJ (176 points, 21 attempts in
@@ -73,7 +73,7 @@ class StepRule(Protocol[S]):
 
     One run computes ``points`` at most, without the start; ``points_key`` is the key of the case file that says how
     many. A step below ``smallest_step`` ends the branch with a ContinuationError, whose text ``stuck`` gives. ``chart``
-    is the name of the chart for ``Problem.frame``; "" where the problem offers no choice.
+    is the name of the chart for ``PeriodicProblem.frame``; "" where the problem offers no choice.
     """
 
     points: int
@@ -110,7 +110,7 @@ class GuardedSteps:
     points_key = "nnm.points"
     no_step = Verdict(False, 0.0, "no step tried", "nnm.max_newton or nnm.tolerance")
 
-    def __init__(self, problem: Problem[Point], control: NnmTable) -> None:
+    def __init__(self, problem: PeriodicProblem[Point], control: NnmTable) -> None:
         self.problem = problem
         self.control = control
         self.points = control.points
@@ -179,7 +179,7 @@ class Continuation(Generic[S]):
 
     def __init__(
         self,
-        problem: Problem[S],
+        problem: PeriodicProblem[S],
         start: S,
         control: NnmTable | StepRule[S],
         direction: int = 1,

@@ -10,7 +10,7 @@ import numpy as np
 
 from vipetsc.case.nnm import NnmTable
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Problem
+from vipetsc.modes.problem import PeriodicProblem
 
 # The change that a guard limits, for messages, and the key with its bound.
 GUARDED = {
@@ -33,7 +33,7 @@ class Strain(NamedTuple):
 
 
 def strain(
-    problem: Problem[Point], control: NnmTable, before: Point, after: Point, geometry: dict[str, float]
+    problem: PeriodicProblem[Point], control: NnmTable, before: Point, after: Point, geometry: dict[str, float]
 ) -> Strain:
     """The largest strain of a step between two points, whose ``geometry`` has its ``corrector`` and ``turn``."""
     changes = {"contacts": float(abs(after.episodes - before.episodes)), **geometry}

@@ -10,7 +10,7 @@ from typing import Generic, NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from vipetsc.modes.problem import Problem, S, SpecialKind
+from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
 
 # A point of a segment is nearer to where it was sought than this fraction of its length.
 FURTHEST = 0.5
@@ -37,7 +37,7 @@ class Segment(Generic[S]):
     their slopes at the arclengths found so far, the ends at first: they give the first guess at others.
     """
 
-    def __init__(self, problem: Problem[S], chart: str, left: S, right: S, begin: float = 0.0) -> None:
+    def __init__(self, problem: PeriodicProblem[S], chart: str, left: S, right: S, begin: float = 0.0) -> None:
         self.problem = problem
         self.left = left
         self.right = right

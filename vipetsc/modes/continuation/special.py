@@ -2,11 +2,11 @@
 
 from vipetsc.modes.continuation.segment import Segment
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Problem, S, SpecialKind
+from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
 
 
 def locate(
-    problem: Problem[S],
+    problem: PeriodicProblem[S],
     left: S,
     right: S,
     chart: str = "relative",
@@ -36,7 +36,9 @@ def locate(
     return sorted(points, key=lambda p: p.step)
 
 
-def at_energy(problem: Problem[Point], left: Point, right: Point, energy: float, chart: str = "relative") -> Point:
+def at_energy(
+    problem: PeriodicProblem[Point], left: Point, right: Point, energy: float, chart: str = "relative"
+) -> Point:
     """The orbit of an ``energy`` in J between two consecutive points on both sides of it, of the kind regular.
 
     Raises ArithmeticError if Newton's method fails.

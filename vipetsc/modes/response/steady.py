@@ -83,7 +83,7 @@ class LinearMotion(NamedTuple):
     wave: IncidentWave | None
 
 
-class Parameter(NamedTuple):
+class ContinuationParameter(NamedTuple):
     """Parameter of a curve, "amplitude" or "frequency", the value of the other one, and the parameter's unit."""
 
     over: str
@@ -149,7 +149,12 @@ class SteadyEquations(ABC):
     guards: frozenset[str] = frozenset()
 
     def __init__(
-        self, balance: HarmonicBalance, clearance: float, parameter: Parameter, tolerance: float, max_newton: int
+        self,
+        balance: HarmonicBalance,
+        clearance: float,
+        parameter: ContinuationParameter,
+        tolerance: float,
+        max_newton: int,
     ) -> None:
         self.balance = balance
         self.clearance = clearance
@@ -245,7 +250,7 @@ class SteadyStates(SteadyEquations):
         super().__init__(
             balance=HarmonicBalance(self.compliance, self.forces, options.harmonics, options.symmetric, cosines=False),
             clearance=clearance,
-            parameter=Parameter(options.over, fixed, self._scale(clearance)),
+            parameter=ContinuationParameter(options.over, fixed, self._scale(clearance)),
             tolerance=options.tolerance,
             max_newton=options.max_newton,
         )
