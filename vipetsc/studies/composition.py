@@ -171,8 +171,9 @@ class Network:
 
         size = right.size
         operator = LinearOperator((size, size), left, dtype=complex)
-        # The tolerance is well below CLOSE, at which the outer iteration ends.
-        x, _ = gmres(operator, right.ravel(), guess.ravel(), tol=1e-5, atol=0.0, restart=40, maxiter=5)
+        # SciPy's own relative tolerance, 1e-5, is well below CLOSE, at which the outer iteration ends. Its name is not
+        # written: it was `tol` before SciPy 1.12, and is `rtol` alone from 1.14 on.
+        x, _ = gmres(operator, right.ravel(), guess.ravel(), atol=0.0, restart=40, maxiter=5)
         return np.asarray(x).reshape(right.shape)
 
     def _over_clearance(self, c: np.ndarray, c3: np.ndarray) -> np.ndarray:
