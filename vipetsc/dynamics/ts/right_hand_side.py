@@ -48,7 +48,9 @@ def observe(t: float, y: np.ndarray, lattice: LatticeRecord, motion: np.ndarray)
     for i in range(motion.shape[0]):
         w, rate = relative_motion(y, lattice.site_dofs, i)
         force, _ = contact_force(lattice.contacts, i, w, rate)
-        host, resonator = lattice.site_dofs[i].host, lattice.site_dofs[i].resonator
+        force -= lattice.contacts[i].preload
+        host = lattice.site_dofs[i].host
+        resonator = lattice.site_dofs[i].resonator
         at_host = _acceleration(t, y, lattice, host.cell, host.mass, force)
         at_resonator = _acceleration(t, y, lattice, resonator.cell, resonator.mass, -force)
         motion[i, 0] = w
@@ -73,11 +75,13 @@ def observe_pairs(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord, motion: 
 @kernel
 def _add_contacts(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
     """Add the accelerations by contacts to ``f``, and put in what they dissipate."""
-    n, d = lattice.shape.cells, lattice.shape.dofs
+    n = lattice.shape.cells
+    d = lattice.shape.dofs
     for i in range(lattice.site_dofs.size):
         power = 0.0
         if lattice.contacts[i].mode != FREE:
-            host, resonator = lattice.site_dofs[i].host, lattice.site_dofs[i].resonator
+            host = lattice.site_dofs[i].host
+            resonator = lattice.site_dofs[i].resonator
             w, rate = relative_motion(y, lattice.site_dofs, i)
             force, power = contact_force(lattice.contacts, i, w, rate)
             force -= lattice.contacts[i].preload
@@ -94,7 +98,8 @@ def _add_contacts(y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
 def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeRecord) -> None:
     """Time derivative ``f`` (owned,) of the state ``y`` (ghosted,): velocities, accelerations, powers."""
     shape = lattice.shape
-    n, d = shape.cells, shape.dofs
+    n = shape.cells
+    d = shape.dofs
     for k in range(d * n):
         f[k] = y[d * n + k]
 
@@ -152,7 +157,8 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     if error != 0:
         return error
 
-    at, size = context.address, context.length
+    at = context.address
+    size = context.length
     lattice = LatticeRecord(
         shape,
         carray(pointer(at.masses), (size.masses,), MASS),

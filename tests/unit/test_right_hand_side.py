@@ -1,0 +1,282 @@
+"""The right-hand side of a lattice with every kind of force, against sums over its springs, contacts and drives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.case import Model
+from vipetsc.contact.law import CLOSED, FREE
+from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, right_hand_side
+from vipetsc.lattice import Chain, Contact, Drive, Spring, UnitCell
+from vipetsc.lattice.chain import Pair
+
+CELLS = 7
+SITES = (0, 3, 4, 6)
+CLEARANCE = 1e-5
+# Static loads in N of the contacts, of which the third one is pressed.
+PRELOADS = (0.0, 0.0, 0.125, 0.0)
+# Springs that harden and soften, within the cell and between cells: a wrong end or sign shows in the sums.
+SPRINGS = (
+    Spring(0, 0, 3e4, next_cell=True, damping=0.4, quadratic=2e7, cubic=5e11),
+    Spring(0, 1, 2e4, damping=0.2),
+    Spring(1, 2, 1e4, damping=0.1, quadratic=-3e7, cubic=4e11),
+)
+CELL = UnitCell((0.02, 0.01, 0.005), SPRINGS, host=1, resonator=2, grounding=(0.3, 0.2, 0.1))
+LAW = Contact("hertz", 5e6, 0.7)
+ENDS = pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+
+
+class Motion(NamedTuple):
+    """Displacements and velocities (cell, dof) of a whole lattice in m and m/s, and the time in s."""
+
+    u: np.ndarray
+    v: np.ndarray
+    t: float
+
+    def at(self, cell: int, mass: int) -> np.ndarray:
+        """Displacement and velocity of a mass; those of ground, mass -1, are zero."""
+        if mass < 0:
+            return np.zeros(2)
+        cell = cell % CELLS
+        return np.array([self.u[cell, mass], self.v[cell, mass]])
+
+
+def lattice(ends: str, pairs: tuple[Pair, ...] = ()) -> Model:
+    """A short lattice with dashpots, nonlinear springs, four contacts and three drives."""
+    model = small_case(lattice={"cells": 24}, contacts={"sites": [1]}).model()
+    chain = Chain(CELL, CELLS, ends, SITES, (CLEARANCE,) * len(SITES), pairs=pairs)
+    wave = model.drives[0].waveform
+    # The first drive acts on the host of the second site, the others on masses that only look like a site's.
+    targets = [(SITES[1], CELL.host), (SITES[1], 0), (SITES[1] - 1, CELL.resonator)]
+    factors = (1.0, 0.5, 2.0)
+    drives = [
+        Drive(replace(wave, amplitude=factor * wave.amplitude), cell=cell, mass=mass)
+        for (cell, mass), factor in zip(targets, factors, strict=True)
+    ]
+    return replace(model, chain=chain, contact=LAW, drives=tuple(drives))
+
+
+def random_motion(model: Model) -> Motion:
+    rng = np.random.default_rng(5)
+    shape = (CELLS, CELL.dofs)
+    return Motion(u=2e-5 * rng.normal(size=shape), v=1e-2 * rng.normal(size=shape), t=0.3 * model.drive.duration)
+
+
+def set_contacts(lattice: LatticeRecord) -> None:
+    """Close the first site on its side +, the second on its side -, and press the third; the last one stays free."""
+    contacts = lattice.contacts
+    contacts["mode"] = [CLOSED, -CLOSED, CLOSED, FREE]
+    contacts["approach"] = [0.02, -0.03, 0.05, 0.01]
+    contacts["preload"] = PRELOADS
+
+
+def contact_forces(chain: Chain, motion: Motion) -> tuple[list[float], list[float]]:
+    """Forces in N on the hosts and powers in W that are dissipated, of sites in the modes of ``set_contacts``."""
+    sides = [1.0, -1.0, 1.0]
+    approaches = [0.02, 0.03, 0.05]
+    forces = [0.0] * len(SITES)
+    powers = [0.0] * len(SITES)
+    for i, (side, approach) in enumerate(zip(sides, approaches, strict=True)):
+        pair = chain.contact_pairs[i]
+        host = motion.at(SITES[i], pair.host)
+        resonator = motion.at(SITES[i] + pair.next_cell, pair.resonator)
+        w, rate = side * (resonator - host)
+        x = w - CLEARANCE
+        # Also at x < 0: a closed site's force is continued until the change of mode is landed on.
+        elastic = LAW.stiffness * np.sign(x) * abs(x) ** 1.5
+        factor = 1.0 + LAW.damping * rate / approach
+        forces[i] = side * elastic * factor
+        powers[i] = elastic * (factor - 1.0) * rate
+    return forces, powers
+
+
+def accelerations(model: Model, motion: Motion) -> np.ndarray:
+    """Accelerations (cell, dof) by springs, dashpots, contacts and drives, in m/s^2."""
+    chain = model.chain
+    u = motion.u.ravel()
+    v = motion.v.ravel()
+    force = -(chain.stiffness_matrix() @ u + chain.damping_rows(0, CELLS) @ v).reshape(motion.u.shape)
+
+    for spring in chain.cell.springs:
+        for left in range(-1, CELLS):
+            right = left + spring.next_cell
+            if chain.ends == "periodic":
+                right = right % CELLS
+            # Cell -1 stands for the wall on the left, which holds springs to the next cell only.
+            if left < 0 and not (spring.next_cell and chain.ends == "fixed"):
+                continue
+            if right == CELLS and chain.ends == "free":
+                continue
+            start = motion.u[left, spring.start] if left >= 0 else 0.0
+            end = motion.u[right, spring.end] if right < CELLS else 0.0
+            pull = float(spring.nonlinear_force(end - start))
+            if left >= 0:
+                force[left, spring.start] += pull
+            if right < CELLS:
+                force[right, spring.end] -= pull
+
+    forces, _ = contact_forces(chain, motion)
+    for i, pair in enumerate(chain.contact_pairs[:3]):
+        push = forces[i] - PRELOADS[i]
+        if pair.host >= 0:
+            force[SITES[i], pair.host] += push
+        force[(SITES[i] + pair.next_cell) % CELLS, pair.resonator] -= push
+
+    for drive in model.drives:
+        force[drive.cell, drive.mass] += float(drive.waveform.force(motion.t))
+    return force / np.array(chain.cell.masses)
+
+
+class Evaluated(NamedTuple):
+    """A layout, its record, the state with its ghosts, and the rates by ``right_hand_side``, with theirs."""
+
+    layout: Layout
+    lattice: LatticeRecord
+    y: np.ndarray
+    rates: np.ndarray
+
+
+def evaluate(model: Model, motion: Motion, dashpots: bool = True) -> Evaluated:
+    """Evaluate the right-hand side in a motion, with the sites in the modes of ``set_contacts``."""
+    layout = Layout(model, MPI.COMM_SELF, dashpots=dashpots)
+    record = create_record(model, layout)
+    set_contacts(record)
+
+    state = layout.create_vector()
+    layout.place(np.hstack([motion.u, motion.v]), 0.0, state.array)
+    state.ghostUpdate()
+    with state.localForm() as local:
+        y = local.array.copy()
+
+    rates = state.duplicate()
+    # What is not written stays a NaN.
+    rates.array[:] = np.nan
+    right_hand_side(motion.t, y, rates.array, record)
+    rates.ghostUpdate()
+    with rates.localForm() as local:
+        return Evaluated(layout, record, y, local.array.copy())
+
+
+PAIRS = {
+    "the cell's pair": (),
+    # To ground, to the next cell, and within the cell.
+    "any pair": (Pair(-1, 0), Pair(2, 1, next_cell=True), Pair(0, 2), Pair(1, 2)),
+}
+
+
+@pytest.mark.parametrize("pairs", PAIRS)
+@ENDS
+def test_the_rates_are_those_of_all_forces(ends, pairs):
+    model = lattice(ends, PAIRS[pairs])
+    motion = random_motion(model)
+    found = evaluate(model, motion)
+    half = CELLS * CELL.dofs
+    layout = found.layout
+    shape = found.lattice.shape
+
+    expected = accelerations(model, motion)
+    np.testing.assert_array_equal(found.rates[:half], motion.v.T.ravel())
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(found.rates[half : 2 * half], expected.T.ravel(), atol=1e-13 * scale)
+
+    works = [float(drive.waveform.force(motion.t)) * motion.v[drive.cell, drive.mass] for drive in model.drives]
+    _, powers = contact_forces(model.chain, motion)
+    assert found.rates[shape.work : shape.work + 3] == pytest.approx(works)
+    assert found.rates[layout.dissipated : layout.size] == pytest.approx(powers)
+
+    # Every dashpot's power stands in one cell's ledger.
+    v = motion.v.ravel()
+    dissipated = v @ model.chain.damping_rows(0, CELLS) @ v
+    ledger = found.rates[shape.damping : shape.damping + CELLS]
+    assert ledger.sum() == pytest.approx(dissipated)
+    assert ledger.min() > 0
+
+
+@ENDS
+def test_the_sites_motion_is_that_of_the_rates(ends):
+    """That of the cell's pairs is computed site by site, that of other pairs comes from the rates of all masses."""
+    for name, pairs in PAIRS.items():
+        model = lattice(ends, pairs)
+        motion = random_motion(model)
+        found = evaluate(model, motion)
+        expected = np.zeros((len(SITES), 3))
+        acceleration = accelerations(model, motion)
+        for i, pair in enumerate(model.chain.contact_pairs):
+            right = (SITES[i] + pair.next_cell) % CELLS
+            host = motion.at(SITES[i], pair.host)
+            expected[i, :2] = motion.at(right, pair.resonator) - host
+            expected[i, 2] = acceleration[right, pair.resonator]
+            if pair.host >= 0:
+                expected[i, 2] -= acceleration[SITES[i], pair.host]
+
+        seen = np.full((len(SITES), 3), np.nan)
+        if pairs:
+            observe_pairs(found.y, found.rates, found.lattice, seen)
+        else:
+            observe(motion.t, found.y, found.lattice, seen)
+        np.testing.assert_allclose(seen, expected, rtol=1e-11, err_msg=name)
+
+
+def test_a_rank_writes_only_to_what_it_owns():
+    """A site that another rank shares acts here on the one mass that this rank owns, and has no ledger here."""
+    model = lattice("fixed", PAIRS["any pair"])
+    motion = random_motion(model)
+    whole = evaluate(model, motion)
+    n = CELLS
+    d = CELL.dofs
+
+    layout, record, y, _ = evaluate(model, motion)
+    # Of the pressed site, which joins masses 1 and 3 of a cell, the host belongs to another rank; the last site too.
+    record.site_dofs["host"]["cell"][2] = -1
+    record.site_dofs["resonator"]["cell"][1] = -1
+    record.site_dofs["ledger"][3] = -1
+    rates = np.full(layout.size, np.nan)
+    right_hand_side(motion.t, y, rates, record)
+
+    forces, _ = contact_forces(model.chain, motion)
+    expected = whole.rates[: layout.size].copy()
+    expected[d * n + SITES[2]] -= (forces[2] - PRELOADS[2]) / CELL.masses[0]
+    expected[(d + 1) * n + SITES[1] + 1] += forces[1] / CELL.masses[1]
+    expected[layout.dissipated + 3] = np.nan
+    np.testing.assert_allclose(rates, expected, rtol=1e-12)
+
+
+def test_an_engine_that_keeps_no_ledger_of_dashpots_has_the_components_of_drives_and_sites_alone():
+    model = lattice("fixed")
+    motion = random_motion(model)
+    with_ledger = evaluate(model, motion)
+    undamped = evaluate(replace(model, chain=replace(model.chain, cell=undamped_cell())), motion)
+    half = CELLS * CELL.dofs
+
+    assert undamped.lattice.shape.damping == -1
+    assert undamped.layout.size == with_ledger.layout.size - CELLS
+    assert not np.isnan(undamped.rates[: undamped.layout.size]).any()
+    np.testing.assert_array_equal(undamped.rates[2 * half :], with_ledger.rates[2 * half + CELLS :])
+
+
+def undamped_cell() -> UnitCell:
+    """``CELL`` without its dashpots."""
+    springs = tuple(replace(spring, damping=0.0) for spring in SPRINGS)
+    return replace(CELL, springs=springs, grounding=())
+
+
+def test_pressed_contacts_at_rest_are_not_accelerated():
+    """The static load balances the contact force in what the search for changes sees, too."""
+    model = small_case(contacts={"side": "plus", "precompression": 3e-4, "restitution": 1.0}).model()
+    layout = Layout(model, MPI.COMM_SELF)
+    record = create_record(model, layout)
+    rest = np.zeros(layout.size)
+    motion = np.full((3, 3), np.nan)
+    observe(0.0, rest, record, motion)
+    assert record.contacts["preload"].min() > 1.0
+    # 1e-12 of what the load alone would give, 4e3 m/s^2: the force at w = 0 is computed twice, in numpy and compiled.
+    assert np.abs(motion).max() < 1e-9
