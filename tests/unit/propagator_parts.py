@@ -1,0 +1,92 @@
+"""Parts of the propagator by themselves: a small chain with its series, and a mass on a stop with an exact motion."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+
+from tests.conftest import small_case
+from vipetsc.case import Model
+from vipetsc.contact.law import CLOSED, PERMANENT, create_contacts
+from vipetsc.dynamics.drives import create_drives
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.nodes import collocation
+from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.stencil import HaloRegions
+from vipetsc.dynamics.propagator.substeps import HISTORY, SUBSTEP_STATE, Cluster, create_tape, create_trial
+
+# The mass on a stop: its mass in kg, its velocity at the onset in m/s, and the stop's (k/m)^1/2 in rad/s.
+MASS = 0.02
+SPEED = 0.5
+RATE = 3e4
+
+
+class ChainParts(NamedTuple):
+    """A chain's model, its layout on one rank, the series of a step and the halo that the series needs."""
+
+    model: Model
+    layout: Layout
+    series: StepSeries
+    halo: HaloRegions
+
+
+def chain_parts(ends: str, interval: float, tolerance: float, sites: tuple[int, ...] = (5, 6, 12)) -> ChainParts:
+    """Return the parts of a propagator for a chain of 24 cells on one rank."""
+    model = small_case(lattice={"ends": ends}, contacts={"sites": list(sites)}).model()
+    layout = Layout(model, MPI.COMM_SELF)
+    return ChainParts(model, layout, StepSeries(model.chain, interval, tolerance), HaloRegions(layout))
+
+
+def mass_on_stop(damping: float = 0.0) -> Cluster:
+    """Return a mass on a bilinear stop at w = 1 m: w - 1 = SPEED sin(RATE t)/RATE unless it is damped."""
+    interval = 1e-4
+    contact = small_case(contacts={"law": "bilinear"}).model().contact
+    contacts = create_contacts(contact, [1.0])
+    contacts["mode"] = CLOSED
+    contacts["approach"] = SPEED
+    contacts["elastic"]["stiffness"] = MASS * RATE**2
+    contacts["damping"] = damping
+    contacts["floor"] = 0.0
+
+    return Cluster(
+        contacts=contacts,
+        drives=create_drives((), []),
+        # A free mass: an impulse changes its velocity by 1/m, which moves it by H s/m; the table holds H times that.
+        response=np.full((1, 1, 1), interval**2 / MASS),
+        nodes=collocation(2),
+        interval=interval,
+        omega_max_h=1.0,
+        rtol=1e-10,
+        atol=1e-12,
+        first_substep=1.0,
+        taylor=np.array([[1.0, SPEED * interval]]),
+        site_motion=np.zeros((1, 3)),
+        moments=np.zeros((1, 2)),
+        energy=np.zeros(1),
+        history=np.zeros(1, HISTORY),
+        state=np.zeros(1, SUBSTEP_STATE),
+        trial=create_trial(1, 1),
+        tape=create_tape(0, 0),
+    )
+
+
+def pressed_mass(gap: float, side: int = 1) -> Cluster:
+    """Return the mass of ``mass_on_stop`` on a stop at ``gap`` on one side, without modes: it acts always."""
+    cluster = mass_on_stop()
+    cluster.contacts["mode"] = side * PERMANENT
+    cluster.contacts["clearance"] = gap
+    cluster.contacts["clearance_minus"] = gap
+    cluster.contacts["scale"] = 0.5
+
+    # Accelerations need a second term, which is zero: the mass is free between its contacts.
+    response = np.append(cluster.response, np.zeros((1, 1, 1)), axis=2)
+    return cluster._replace(
+        response=response,
+        taylor=np.zeros((1, 4)),
+        moments=np.zeros((1, 4)),
+        nodes=collocation(4),
+        trial=create_trial(1, 2),
+    )

@@ -1,0 +1,137 @@
+"""Collocation of a substep: its nodes, and a mass on a linear stop against its exact motion."""
+
+from math import factorial
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_stop
+from vipetsc.dynamics.propagator.collocation import (
+    accumulate_moments,
+    collocate,
+    error_ratio,
+    evaluate_site_motion,
+    node_responses,
+    update_taylor,
+)
+from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
+
+
+def one_substep(cluster: Cluster, substep: Substep) -> Trial:
+    """Collocate a substep and return it with the series at its end; moments and energy are added to the cluster."""
+    trial = cluster.trial
+    assert collocate(cluster, trial, substep)
+    update_taylor(cluster, trial, substep)
+    accumulate_moments(cluster, trial, substep)
+    return trial
+
+
+def test_nodes_have_the_order_of_gauss_and_follow_roots():
+    """Eight nodes integrate powers up to 15; those of an onset or exit also the power 3/2 of Hertz's law."""
+    table = collocation(4)
+    position = table.position
+    weight = table.weight
+
+    assert weight[PLAIN] @ position[PLAIN] ** 15 == pytest.approx(1 / 16, rel=1e-14)
+    assert abs(weight[PLAIN] @ position[PLAIN] ** 16 - 1 / 17) > 1e-12
+    assert weight[ONSET] @ position[ONSET] ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
+    assert weight[EXIT] @ (1 - position[EXIT]) ** 1.5 == pytest.approx(1 / 2.5, rel=1e-14)
+    assert abs(weight[PLAIN] @ position[PLAIN] ** 1.5 - 1 / 2.5) > 1e-8
+
+    # The last two coefficients of a polynomial of lower degree vanish; those of Legendre's own are found.
+    x = position[PLAIN]
+    assert np.abs(table.tail @ x ** (NODES - 3)).max() < 1e-14
+    legendre = np.polynomial.legendre.legval(2 * x - 1, np.eye(NODES)[NODES - 1])
+    np.testing.assert_allclose(table.tail @ legendre, [0, 1], atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", [PLAIN, ONSET, EXIT])
+def test_a_linear_contact_is_an_oscillator(kind):
+    """A mass on a linear stop moves as a sine; the moments of the force are those of that motion."""
+    cluster = mass_on_stop()
+    interval = cluster.interval
+    begin = 0.25
+    length = 0.3
+    cluster.state["position"] = begin
+
+    trial = one_substep(cluster, Substep(kind, length))
+
+    phase = RATE * length * interval
+    assert trial.taylor[0, 0] - 1 == pytest.approx(SPEED / RATE * np.sin(phase), rel=1e-9)
+    assert trial.taylor[0, 1] / interval == pytest.approx(SPEED * np.cos(phase), rel=1e-10)
+
+    # The moments are those of the force about the end of the step; the first one is the momentum it took.
+    assert cluster.moments[0, 0] == pytest.approx(MASS * SPEED * (np.cos(phase) - 1), rel=1e-9)
+    t = np.linspace(0, length * interval, 20001)
+    force = -MASS * RATE * SPEED * np.sin(RATE * t)
+    # The trapezoidal rule over 20000 intervals is itself good to some 1e-9 of the integral.
+    assert cluster.moments[0, 1] == pytest.approx(trapezoid(force * (1 - begin - t / interval), t), rel=1e-7)
+    assert cluster.energy[0] == 0.0
+
+
+def test_damping_takes_the_energy_that_is_booked():
+    """The mass loses, in kinetic energy and energy of the stop, what the cluster books as dissipated."""
+    cluster = mass_on_stop(damping=0.3)
+
+    trial = one_substep(cluster, Substep(PLAIN, 0.3))
+
+    x = trial.taylor[0, 0] - 1
+    v = trial.taylor[0, 1] / cluster.interval
+    lost = 0.5 * MASS * (SPEED**2 - v**2 - (RATE * x) ** 2)
+    assert cluster.energy[0] == pytest.approx(lost, rel=1e-9)
+    # Of an initial energy of 1/2 m v^2 at least 2 % is lost: the comparison is not one of roundings.
+    assert lost > 1e-2 * MASS * SPEED**2
+
+
+def test_the_error_estimate_falls_as_the_order_says():
+    """Half the substep divides the estimate by 2^6 to 2^8.5, and the allowed error grows with the approach."""
+    ratios = []
+    for length in (0.8, 0.4):
+        cluster = mass_on_stop()
+        trial = one_substep(cluster, Substep(PLAIN, length))
+        ratios.append(error_ratio(cluster, trial, length))
+    # The last two coefficients fall as h^6 and h^7, times the length.
+    assert 6 < np.log2(ratios[0] / ratios[1]) < 8.5
+
+    # rtol |w'_minus| + atol: 1e-10 * 0.5 + 1e-12 till now, 1e-10 * 1.0 + 1e-12 with twice the approach velocity.
+    cluster.contacts["approach"] = 1.0
+    assert error_ratio(cluster, cluster.trial, 0.4) == pytest.approx(ratios[1] * 5.1e-11 / 1.01e-10)
+
+
+def test_a_sites_acceleration_is_that_of_the_free_motion_and_of_the_force():
+    """w'' of a site is the free motion's second derivative less omega^2 times the indentation."""
+    cluster = mass_on_stop()
+    interval = cluster.interval
+    indentation = 2e-6
+    taylor = np.array([[1.0 + indentation, 3.0, 20.0]])
+
+    in_units_of_step = taylor * [1.0, interval, interval * interval]
+    evaluate_site_motion(cluster._replace(taylor=taylor), in_units_of_step, cluster.site_motion)
+
+    expected = [1.0 + indentation, 3.0, 2 * 20.0 - RATE**2 * indentation]
+    assert cluster.site_motion[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_responses_are_added_up_over_all_terms():
+    """A constant force F on an oscillator: m omega^2 w = F (1 - cos omega t), m omega w' = F sin omega t."""
+    omega_h = 1.2
+    terms = 8
+    cluster = mass_on_stop()
+    powers = np.arange(terms)
+    coefficients = (-(omega_h**2)) ** powers / [factorial(2 * m + 1) for m in powers]
+    nodes = collocation(2 * terms)
+    cluster = cluster._replace(
+        response=cluster.response * coefficients, taylor=np.zeros((1, 2 * terms)), nodes=nodes, omega_max_h=omega_h
+    )
+
+    to_w, to_v = np.zeros((2, NODES, NODES))
+    assert node_responses(cluster, Substep(PLAIN, 0.9), 0, 0, to_w, to_v)
+
+    interval = cluster.interval
+    phase = omega_h * 0.9 * nodes.position[PLAIN]
+    displacement = (1 - np.cos(phase)) * interval**2 / (MASS * omega_h**2)
+    velocity = np.sin(phase) * interval / (MASS * omega_h)
+    np.testing.assert_allclose(to_w.sum(axis=0), displacement, rtol=1e-11)
+    np.testing.assert_allclose(to_v.sum(axis=0), velocity, rtol=1e-11)

@@ -1,0 +1,88 @@
+"""Kinks in the force of a contact that is pressed at rest: where they are found, and substeps that end on them."""
+
+import numpy as np
+import pytest
+
+from tests.unit.propagator_parts import MASS, RATE, pressed_mass
+from vipetsc.contact.law import CLOSED
+from vipetsc.dynamics.propagator.advance import DONE, advance_cluster, first_kink
+
+# What first_kink returns without a kink.
+NONE = 2.0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("gap", [0.0, -0.3])
+@pytest.mark.parametrize(
+    ("motion", "kink"),
+    [
+        # At constant velocity: through the kink, away from it, or not as far.
+        ([0.2, -1.0], 0.2),
+        ([-0.2, 1.0], 0.2),
+        ([-0.2, -1.0], NONE),
+        ([0.2, 1.0], NONE),
+        ([1.2, -1.0], NONE),
+        # On the kink at the beginning: the direction decides, and it may come back.
+        ([0.0, 1.0, -2.0], 0.5),
+        ([0.0, -1.0, 2.0], 0.5),
+        ([0.0, 1.0, 0.0], NONE),
+        ([0.0, -1.0, 0.0], NONE),
+        ([2e-11, -1.0, 2.0], 0.5),
+        ([-2e-11, 1.0, -2.0], 0.5),
+        ([1e-10, -1.0, 2.0], 1e-10),
+        ([-1e-10, 1.0, -2.0], 1e-10),
+        # The substep ends on it; it opens and closes inside; it touches from either side.
+        ([1.0, -1.0], NONE),
+        ([-1.0, 1.0], NONE),
+        ([1.0 - 2e-11, -1.0], NONE),
+        ([1.0 - 1e-10, -1.0], 1.0 - 1e-10),
+        ([0.16, -1.0, 1.0], 0.2),
+        ([-0.16, 1.0, -1.0], 0.2),
+        ([0.26, -1.0, 1.0], NONE),
+    ],
+)
+def test_a_kink_is_found_where_a_pressed_contact_opens_or_closes(side, gap, motion, kink):
+    """The first kink is the first root of the indentation, the polynomial ``motion`` in the position in the substep."""
+    cluster = pressed_mass(gap, side)
+    length = 0.5
+    seconds = length * cluster.interval
+    depth = np.polynomial.Polynomial(motion)
+    for site_motion, position in ((cluster.site_motion, 0.0), (cluster.trial.site_motion, 1.0)):
+        site_motion[0, 0] = side * (depth(position) + gap)
+        site_motion[0, 1] = side * depth.deriv()(position) / seconds
+        site_motion[0, 2] = side * depth.deriv(2)(position) / seconds**2
+
+    assert first_kink(cluster, cluster.trial, length) == pytest.approx(kink, rel=1e-9)
+
+    # Other contacts have modes, which are searched for elsewhere.
+    cluster.contacts["mode"] = side * CLOSED
+    assert first_kink(cluster, cluster.trial, length) == NONE
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_substeps_end_where_a_pressed_contact_opens_and_closes(side):
+    """A mass pressed on a bilinear stop by a load P = k p: w'' = -omega^2 w while w > -p, then w'' = P/m, and back."""
+    speed = 0.13
+    depth = 4e-6
+    cluster = pressed_mass(-depth, side)
+    interval = cluster.interval
+    cluster.contacts["preload"] = side * MASS * RATE**2 * depth
+    cluster.taylor[0, 1] = -side * speed * interval
+    cluster.state["length"] = 1.0
+
+    assert advance_cluster(cluster) == DONE
+
+    # The phase at which it opens, the time in the air, and the rest of the step on the stop again.
+    opening = np.arcsin(depth * RATE / speed) / RATE
+    rebound = np.sqrt(speed**2 - (depth * RATE) ** 2)
+    flight = 2 * rebound / (RATE**2 * depth)
+    remaining = interval - opening - flight
+    assert remaining > 0
+
+    phase = RATE * remaining
+    w = -depth * np.cos(phase) + rebound / RATE * np.sin(phase)
+    v = RATE * depth * np.sin(phase) + rebound * np.cos(phase)
+    # Each substep may err by rtol = 1e-10, of which the errors of the few substeps here use a part.
+    assert cluster.taylor[0, 0] == pytest.approx(side * w, abs=1e-10 * depth)
+    assert cluster.taylor[0, 1] / interval == pytest.approx(side * v, abs=1e-10 * speed)
+    assert cluster.state["position"] == 1.0

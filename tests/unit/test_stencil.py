@@ -1,0 +1,87 @@
+"""The stencil of a linear step: the matrix exponential within its bound, and the same sum in every cell."""
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import small_case
+from tests.unit.propagator_parts import chain_parts
+from tests.unit.test_exact_lattices import exponential
+from vipetsc.case import Case
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.vectors import LANES
+
+
+def stencil_matrix(layout: Layout, series: StepSeries, halo: HaloRegions) -> np.ndarray:
+    """Return the matrix of a step, column by column from unit states."""
+    stencil = create_stencil(series, layout, halo)
+    bound = halo.bind_columns([])
+    shape = (2 * layout.dofs, layout.cells)
+    size = shape[0] * shape[1]
+
+    matrix = np.empty((size, size))
+    for column in range(size):
+        state = np.zeros(shape)
+        state.ravel()[column] = 1.0
+        out = np.empty(shape)
+        exchange(bound, 0, state)
+        apply_propagator(stencil, state, bound.columns, out)
+        matrix[:, column] = out.ravel()
+    return matrix
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+@pytest.mark.parametrize(("interval", "tolerance"), [(1e-4, 1e-14), (2e-4, 1e-6), (5e-4, 1e-10)])
+def test_the_stencil_is_the_exponential_within_its_bound(ends, interval, tolerance):
+    """The stencil differs from the matrix exponential by no more than the truncation that its series states."""
+    _, layout, series, halo = chain_parts(ends, interval, tolerance)
+    matrix = stencil_matrix(layout, series, halo)
+
+    # The bound is one of amplitudes, in which a velocity counts as omega_max u.
+    is_displacement = np.arange(len(matrix)) < len(matrix) // 2
+    scale = np.where(is_displacement, series.omega_max_h / interval, 1.0)
+    difference = np.abs(matrix - exponential(series.chain, interval))
+    error = (difference * scale[:, None] / scale).sum(axis=1).max()
+
+    # The last term is for rounding, which exceeds the finest tolerance.
+    assert error <= series.truncation + 2e-14
+    assert series.truncation < tolerance
+    # A bound a thousand times too large would pass as well, and cost needless cells of reach.
+    if tolerance > 1e-12:
+        assert error > 1e-3 * series.truncation
+
+
+# One vector and a half; a last vector that overlaps the one before it; cells one by one at both borders.
+@pytest.mark.parametrize("cells", [24, LANES + 12, 3 * LANES + 17])
+@pytest.mark.parametrize("name", ["diatomic", "three-mass", "four-band"])
+def test_every_cell_is_the_same_sum_to_the_last_bit(name, cells):
+    """In a ring every cell gets the sum of the interior stencil in the same order, in vectors of cells or alone."""
+    case = Case.load(f"runs/{name}.toml", [f"lattice.cells={cells}", "lattice.ends=periodic", "contacts.sites=[5]"])
+    model = case.model()
+    layout = Layout(model, MPI.COMM_SELF)
+    series = StepSeries(model.chain, 2e-4, 1e-10)
+    halo = HaloRegions(layout)
+    stencil = create_stencil(series, layout, halo)
+    halo = halo.bind_columns([])
+
+    state = np.random.default_rng(3).normal(size=(2 * layout.dofs, cells))
+    out = np.full_like(state, np.nan)
+    exchange(halo, 0, state)
+    apply_propagator(stencil, state, halo.columns, out)
+
+    expected = np.zeros_like(state)
+    for total, entry in zip(expected, series.interior(), strict=True):
+        for row, column in np.argwhere(entry):
+            total += entry[row, column] * np.roll(state[row], series.reach - column)
+    assert out.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("interval", [1e-4, 3e-4])
+def test_the_bound_keeps_below_every_tolerance(interval):
+    """The truncation of a series stays below the tolerance that was asked for, over eleven decades of it."""
+    chain = small_case().model().chain
+    for tolerance in np.geomspace(1e-14, 1e-3, 34):
+        assert StepSeries(chain, interval, tolerance).truncation < tolerance

@@ -1,0 +1,58 @@
+"""The propagator at its limits: contacts too stiff to follow, and ten thousand sites."""
+
+import re
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.dynamics.engine import FillResult
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.engine import Propagator
+from vipetsc.dynamics.propagator.tangent import no_samples
+
+
+def test_contacts_that_cannot_be_followed_end_the_run():
+    """A contact of 1e45 N/m ends a run with a sentence that names it, in the state of the last sample before it."""
+    model = small_case(contacts={"sites": [1, 6], "law": "bilinear", "stiffness": 1e45}).model()
+    layout = Layout(model, MPI.COMM_SELF)
+    engine = Propagator(model, layout)
+
+    # In the first samples the driven cell moves by less than the clearance.
+    assert engine.fill(no_samples(model, layout, 4)) == FillResult(0)
+    assert engine.steps == 3
+    assert engine.time == 3 * model.sample_interval
+
+    stalled = engine.fill(no_samples(model, layout, model.samples)).stalled
+    assert re.match(r"the contacts of sites 1 at 0.0\d+ s", stalled)
+    # The state is the last one before.
+    assert engine.time == engine.steps * model.sample_interval
+    time_of_stall = float(stalled.split()[-2])
+    assert 0 < time_of_stall - engine.time < model.sample_interval
+    engine.destroy()
+
+
+@pytest.mark.slow
+def test_ten_thousand_sites_are_set_up_and_restored():
+    """An engine for 10 000 sites is restored from the checkpoint of another one to the same checkpoint."""
+    sites = {"first": 5, "spacing": 10, "count": 10_000}
+    case = small_case(lattice={"cells": 100_100}, contacts={"sites": sites}, time={"sample_interval": 1e-4})
+    model = case.model()
+    assert Propagator.refusal(model) is None
+    layout = Layout(model, MPI.COMM_SELF)
+    engine = Propagator(model, layout)
+    assert engine.fill(no_samples(model, layout, 2)) == FillResult(0)
+
+    state = engine.checkpoint()
+    other = Propagator(model, layout)
+    other.restore([state])
+    restored = other.checkpoint()
+
+    assert len(state["sites"]) == 10_000
+    assert len(state["losses"]) == 10_000
+    for name, table in state.items():
+        # Texts are compared because NaN differs from itself as a number.
+        assert repr(table.tolist()) == repr(restored[name].tolist()), name
+    engine.destroy()
+    other.destroy()
