@@ -149,7 +149,8 @@ class Case(CaseFile):
 
     @cached_property
     def _model(self) -> Model:
-        contacts, time = self.contacts, self.time
+        contacts = self.contacts
+        time = self.time
         # ``read`` has replaced both words by numbers; the assertion narrows their types.
         assert time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
@@ -185,7 +186,8 @@ class Case(CaseFile):
 
     def _tolerances(self, scale: float) -> tuple[float, float]:
         """Absolute tolerances of displacements in m and velocities in m/s where waves have the ``scale`` in m."""
-        time, drive = self.time, self.drive
+        time = self.time
+        drive = self.drive
         assert drive.frequency is not None
         if time.atol == "scaled":
             small = WEAKEST * time.rtol * scale
@@ -242,7 +244,8 @@ class Case(CaseFile):
 
 def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem]]:
     """Motion at t = 0, None for a lattice at rest, and the problems with it."""
-    initial, drive = sections.get("initial"), sections["drive"]
+    initial = sections.get("initial")
+    drive = sections["drive"]
     if initial is None or not initial.moves:
         return None, []
     frequency = None
@@ -272,7 +275,8 @@ def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[
 
 def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
     """A lattice without a force needs a motion to begin with, and a tolerance that is no part of the force."""
-    drive, initial = sections["drive"], sections.get("initial")
+    drive = sections["drive"]
+    initial = sections.get("initial")
     if drive.amplitude != 0:
         return
     moves = initial is not None and initial.moves

@@ -55,7 +55,8 @@ def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Seque
     ``modulus`` is the stiffness, which is proportional to it.
     """
     cell = lattice.unit_cell()
-    sites, clearance = contacts.sites, contacts.clearance
+    sites = contacts.sites
+    clearance = contacts.clearance
     assert isinstance(sites, list) and isinstance(clearance, list)
     stiffness = [contacts.stiffness] if contacts.stiffness else []
     return {
@@ -77,7 +78,8 @@ def scatter(
     ``given`` are the contacts before they were resolved. A drive and times that follow from the cell are those of the
     case without scatter.
     """
-    lattice, contacts = sections["lattice"], sections["contacts"]
+    lattice = sections["lattice"]
+    contacts = sections["contacts"]
     if not (disorder.quantities() or disorder.cells):
         remedy = "names nothing that scatters, as in: clearance = { relative = 0.01 }"
         return {}, [Problem("disorder", disorder.seed, remedy)]

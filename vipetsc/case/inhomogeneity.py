@@ -31,10 +31,16 @@ def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
         return None
     masses_or_grounding, mass, spring, of_spring = match.groups()
     if masses_or_grounding:
-        name, index, count = masses_or_grounding, int(mass) - 1, cell.dofs
+        name = masses_or_grounding
+        index = int(mass) - 1
+        count = cell.dofs
     else:
-        name, index, count = of_spring, int(spring) - 1, len(cell.springs)
-    return (name, index) if index < count else None
+        name = of_spring
+        index = int(spring) - 1
+        count = len(cell.springs)
+    if index >= count:
+        return None
+    return name, index
 
 
 def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
@@ -57,7 +63,9 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
         new[at] = given.value
         return new, ""
     new[at] = given.factor * values[at]
-    return new, "" if values[at].any() else "is 0, and so is any factor of it: give value"
+    if not values[at].any():
+        return new, "is 0, and so is any factor of it: give value"
+    return new, ""
 
 
 def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:

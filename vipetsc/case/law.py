@@ -123,9 +123,11 @@ class LawCase(Case):
 
     def one_site(self) -> OneSite:
         """The lattice and the times of the law's runs (see ``studies.ring``)."""
-        law, model = self.law, self.model()
+        law = self.law
+        model = self.model()
         assert law.distance is not None and law.clearance is not None
-        cell, interval = model.chain.cell, model.sample_interval
+        cell = model.chain.cell
+        interval = model.sample_interval
         band, slow, _ = packet_speeds(cell, model.drive, model.drive_mass)
         end = law.distance / max(slow, SLOWEST) + law.settle * model.drive.duration
         samples = int(np.ceil(end / interval))
@@ -146,7 +148,8 @@ class LawCase(Case):
 
     def _nearest_site(self) -> tuple[int, int]:
         """Cells from the driven one to the nearest site in another (0 without any), and whether up (1) or down (-1)."""
-        drive, cells = self.drive.cell, self.lattice.cells
+        drive = self.drive.cell
+        cells = self.lattice.cells
         assert isinstance(self.contacts.sites, list)
         offsets = [site - drive for site in self.contacts.sites if site != drive]
         if self.lattice.ends == "periodic":  # along the shorter arc of the ring

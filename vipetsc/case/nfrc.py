@@ -69,7 +69,8 @@ class NfrcCase(Case):
         if problems:
             return sections, problems
 
-        nfrc, cell = sections["nfrc"], sections["lattice"].unit_cell()
+        nfrc = sections["nfrc"]
+        cell = sections["lattice"].unit_cell()
         update: dict[str, Any] = {"restitutions": nfrc.restitutions or [sections["contacts"].restitution]}
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
@@ -134,9 +135,11 @@ def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:
     """Problems with frequencies where a curve begins and the band has no wave."""
     if nfrc.source != "wave":
         return
-    key, frequencies = "nfrc.range", nfrc.range[:1]
+    key = "nfrc.range"
+    frequencies = nfrc.range[:1]
     if nfrc.over == "amplitude":
-        key, frequencies = "nfrc.fixed", nfrc.fixed
+        key = "nfrc.fixed"
+        frequencies = nfrc.fixed
     for frequency in frequencies:
         if nfrc.band not in [band for band, *_ in waves_at(cell, frequency)]:
             where = "in no pass band" if nfrc.band is None else f"not in band {nfrc.band}"

@@ -167,7 +167,8 @@ class NnmCase(CaseFile):
 
         fields, problems = super().read(with_default_preset(table))
         problems += refuse_disorder(cls, table)
-        lattice, contacts = fields["lattice"], fields["contacts"]
+        lattice = fields["lattice"]
+        contacts = fields["contacts"]
         if not (problems or has_no_lattice or contacts.clearance):
             count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
             fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
@@ -185,7 +186,9 @@ class NnmCase(CaseFile):
         """Problems between keys."""
         if not valid("lattice", "contacts", "nnm"):
             return []
-        lattice, contacts, nnm = sections["lattice"], sections["contacts"], sections["nnm"]
+        lattice = sections["lattice"]
+        contacts = sections["contacts"]
+        nnm = sections["nnm"]
         # A system of one's own ignores the section [lattice].
         refusable = {"contacts": contacts} if nnm.system == "own" else {"contacts": contacts, "lattice": lattice}
         problems = [*_check_options(nnm), *refusals(cls, refusable, valid)]
@@ -194,7 +197,8 @@ class NnmCase(CaseFile):
             problems += check_per_site(contacts, 0, [], valid)
 
         # Masses of the system, and how many of its lowest modes are motions as a whole.
-        dofs, rigid = 2, 0
+        dofs = 2
+        rigid = 0
         if nnm.system == "own":
             dofs = len(nnm.custom.masses) if nnm.custom else 0
             if nnm.custom and not problems:
@@ -213,12 +217,9 @@ class NnmCase(CaseFile):
             dofs = cell.dofs * lattice.cells if cell else 2
             rigid = int(lattice.ends != "fixed")  # nothing holds it
             problems += _check_shooting(nnm, dofs)
-            most, what = MOST_MASSES, "with dense matrices"
-            if nnm.is_krylov(dofs):
-                most, what = MOST_OF_LATTICE, "on all ranks"
-            if dofs > most:
-                remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
-                return [*problems, Problem("lattice.cells", lattice.cells, remedy)]
+            too_large = _check_size(nnm, lattice, dofs)
+            if too_large:
+                return [*problems, *too_large]
         elif nnm.shooting == "krylov" or (nnm.multipliers and nnm.system != "condensed"):
             remedy = '"krylov" is for "chain", multipliers for that and "condensed"'
             problems.append(Problem("nnm.system", nnm.system, remedy))
@@ -226,10 +227,7 @@ class NnmCase(CaseFile):
         if nnm.system == "condensed":
             return [*problems, *_check_condensed(lattice, contacts, nnm, valid)]
         if nnm.system == "reduced":
-            if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
-                problems.append(Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact"))
-            if contacts.clearance is None and lattice.preset is None:
-                problems.append(Problem("contacts.clearance", None, "missing; give the clearance in m"))
+            problems += _check_one_clearance(lattice, contacts)
         problems += check_stiffness(contacts, nnm.custom is None or bool(nnm.custom.contacts), valid)
 
         still = [mode for mode in nnm.modes if mode <= rigid]
@@ -292,15 +290,41 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
             yield Problem(f"nnm.own.{key}", [start, end], f"is not a pair of the {masses} masses (0 is the ground)")
 
 
+def _check_size(nnm: NnmTable, lattice: LatticeTable, dofs: int) -> list[Problem]:
+    """Problems with a chain of ``dofs`` masses, of which the way that orbits are solved for allows so many."""
+    most = MOST_MASSES
+    what = "with dense matrices"
+    if nnm.is_krylov(dofs):
+        most = MOST_OF_LATTICE
+        what = "on all ranks"
+
+    if dofs <= most:
+        return []
+    remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
+    return [Problem("lattice.cells", lattice.cells, remedy)]
+
+
+def _check_one_clearance(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
+    """Problems with the clearance of the reduced model, which has one contact."""
+    if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
+        yield Problem("contacts.clearance", contacts.clearance, "the reduced model has one contact")
+    if contacts.clearance is None and lattice.preset is None:
+        yield Problem("contacts.clearance", None, "missing; give the clearance in m")
+
+
 def _check_method(nnm: NnmTable) -> Iterator[Problem]:
     """Keys that belong to the other method than the one by which motions are found."""
     foreign: tuple[str, ...]
     if nnm.system == "condensed" or nnm.method == "condensed":
-        method, foreign = "shot", ("compare", "switch")
+        method = "shot"
+        foreign = ("compare", "switch")
     elif nnm.system == "chain":
-        method, foreign = "condensed", ("start_sites",)  # the frequency begins a branch of localised motions
+        # A start frequency begins a branch of localised motions of a chain: it is not foreign here.
+        method = "condensed"
+        foreign = ("start_sites",)
     else:
-        method, foreign = "condensed", ("start_frequency", "start_sites")
+        method = "condensed"
+        foreign = ("start_frequency", "start_sites")
     for key in foreign:
         given = getattr(nnm, key)
         if given:

@@ -176,7 +176,8 @@ class OptimiseCase(CaseFile):
 
     def variables(self) -> list[Variable]:
         """Variables of the search, in the order of the values of a design."""
-        bounds, numbers = self.options.variables, range(1, len(self.sites) + 1)
+        bounds = self.options.variables
+        numbers = range(1, len(self.sites) + 1)
         rows: list[tuple[list[str], Any, str, Any]] = [
             ([f"clearance {i}" for i in numbers], bounds.clearance, "m", "log"),
             (["first clearance", "last clearance"], bounds.profile, "m", "log"),
@@ -189,7 +190,8 @@ class OptimiseCase(CaseFile):
 
     def begin(self, clearance: Sequence[float] = ()) -> np.ndarray:
         """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
-        bounds, cell = self.options.variables, self.base.lattice.unit_cell()
+        bounds = self.options.variables
+        cell = self.base.lattice.unit_cell()
         gaps = list(clearance or self.base.model().chain.clearances)
         values: list[float] = []
         if bounds.clearance:
@@ -226,7 +228,8 @@ class OptimiseCase(CaseFile):
 
     def design(self, values: np.ndarray) -> Case:
         """The case with ``values`` (variable); raises CaseError if it is impossible."""
-        bounds, count = self.options.variables, len(self.sites)
+        bounds = self.options.variables
+        count = len(self.sites)
         # Values carry no names: they are consumed in the order of ``variables`` and ``begin``.
         left = iter(map(float, values))
         table = with_preset(copy.deepcopy(self.table))
@@ -242,7 +245,8 @@ class OptimiseCase(CaseFile):
 
         if bounds.masses or bounds.springs:
             cell = self.base.lattice.undamped_cell()
-            masses, stiffness = list(cell.masses), [spring.stiffness for spring in cell.springs]
+            masses = list(cell.masses)
+            stiffness = [spring.stiffness for spring in cell.springs]
             for number in bounds.masses:
                 masses[int(number) - 1] = next(left)
             for number in bounds.springs:
@@ -313,7 +317,8 @@ def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator
 def _problems_of(objective: ObjectiveTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
     """Problems with an objective, of a cell that stays as it is unless ``varied``."""
     bands = pass_bands(base.lattice.unit_cell())
-    band, part = objective.band, objective.part
+    band = objective.band
+    part = objective.part
 
     # The top of the driven band and of those that overlap it.
     top = base.drive.frequency or 0.0

@@ -174,7 +174,8 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
     """Problems with the cells of the contacts and with their clearances."""
-    sites, clearance = contacts.sites, contacts.clearance
+    sites = contacts.sites
+    clearance = contacts.clearance
     count = 0 if isinstance(sites, list) else sites.count if isinstance(sites, Span) else sites
     if count > lattice.cells:  # before so many are placed
         yield Problem("contacts.sites", count, f"more sites than the lattice has cells, {lattice.cells}")
@@ -278,7 +279,9 @@ def _resolved_contacts(contacts: ContactsTable, lattice: LatticeTable) -> Contac
     if contacts.damping == "paper":
         update["damping"] = None  # as if left out: the same case
 
-    modulus, radius, poisson = contacts.modulus, contacts.radius, contacts.poisson
+    modulus = contacts.modulus
+    radius = contacts.radius
+    poisson = contacts.poisson
     if contacts.stiffness is None and modulus is not None and radius is not None and poisson is not None:
         update |= {"stiffness": float(contact_stiffness(modulus, radius, poisson)), "modulus": None, "poisson": None}
         if lattice.preset and radius == CONTACTS["radius"]:

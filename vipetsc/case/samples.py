@@ -57,7 +57,8 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
         return drive, [Problem(key, samples["file"], "give it or time and value, not both")]
     file = Path(samples["file"]).resolve()
     try:
-        rows, digest = _read(file, samples.get("dataset")), file_hash(file)
+        rows = _read(file, samples.get("dataset"))
+        digest = file_hash(file)
     except (OSError, ValueError, KeyError) as error:
         return drive, [Problem(key, samples["file"], str(error))]
 

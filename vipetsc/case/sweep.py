@@ -229,7 +229,8 @@ def _values(value: Any) -> tuple[Any, ...]:
         raise ValueError(remedy)
     # What is left is checked step by step, so that the message is about the first thing that is wrong.
     (kind,) = value.keys() - {"count"}
-    ends, count = value[kind], value["count"]
+    ends = value[kind]
+    count = value["count"]
     if not (isinstance(ends, list) and len(ends) == 2 and all(type(end) in (int, float) for end in ends)):
         raise ValueError(remedy)
     if type(count) is not int or not 1 <= count <= MOST_MEMBERS:

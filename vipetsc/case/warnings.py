@@ -62,7 +62,8 @@ def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
 
 def wave_warnings(model: Model) -> Iterator[str]:
     """Warnings of evanescent and slow waves."""
-    cell, drive = model.chain.cell, model.drive
+    cell = model.chain.cell
+    drive = model.drive
     if not model.is_driven or not cell.springs:
         return
 
@@ -82,7 +83,9 @@ def wave_warnings(model: Model) -> Iterator[str]:
 
 def length_warnings(model: Model) -> Iterator[str]:
     """Warnings of waves that are long for the lattice, and of a run that ends before its drive."""
-    cell, drive, cells = model.chain.cell, model.drive, model.chain.cells
+    cell = model.chain.cell
+    drive = model.drive
+    cells = model.chain.cells
     if model.is_driven and not cell.springs:
         return
 
@@ -103,7 +106,9 @@ def length_warnings(model: Model) -> Iterator[str]:
 
 def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     """Warnings of a wave that returns from an end to the sites, or without sites to the window or the drive."""
-    chain, drive, at = model.chain, model.drive, model.drive_cell
+    chain = model.chain
+    drive = model.drive
+    at = model.drive_cell
     if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
         return
     # Sites are what a run is about; without them it is what is kept, or what is near the drive.

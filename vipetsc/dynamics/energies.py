@@ -76,7 +76,8 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
         inside = energies.size - leaves
         begin = spring.start * n + first
         end = spring.end * n + first + spring.next_cell
-        here, other = y[begin : begin + inside], y[end : end + inside]
+        here = y[begin : begin + inside]
+        other = y[end : end + inside]
 
         for i in range(inside):
             stretch = other[i] - here[i]

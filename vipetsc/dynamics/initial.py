@@ -22,12 +22,14 @@ def set_in_motion(setup: Setup) -> None:
 
     Raises CaseError on all ranks if the state's file is gone or has changed.
     """
-    layout, meter = setup.layout, setup.meter
+    layout = setup.layout
+    meter = setup.meter
     state = layout.create_vector()
     layout.place(np.hstack(_fields(setup.model, layout)), work=0.0, y=state.array)
     state.ghostUpdate()
     with state.localForm() as local:
-        y, site_dofs = local.array, meter.lattice.site_dofs
+        y = local.array
+        site_dofs = meter.lattice.site_dofs
         sums = measure(y, meter.lattice, meter.unit)
         relative = [relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))]
 

@@ -24,8 +24,10 @@ from vipetsc.parallel import Progress
 RUNAWAY = 0.1
 # ... where the lattice has more energy than rounding of the sums, as a fraction of the largest that they hold.
 NEGLIGIBLE = 1e-12
-# Errors of the ledger over the largest work that are as expected: in tolerances, and bounds of that.
-LEDGER_PER_RTOL, LEAST_LEDGER, MOST_LEDGER = 100.0, 1e-8, 1e-4
+# Errors of the ledger over the largest work that are as expected: in relative tolerances, and bounds of that.
+LEDGER_PER_RTOL = 100.0
+LEAST_LEDGER = 1e-8
+MOST_LEDGER = 1e-4
 
 
 class RunawayError(RuntimeError):
@@ -119,7 +121,8 @@ class Guard(Observer):
             k = int(refused[0])
             reason = "the state is not finite"
             if finite[k]:
-                total, work = energies.total[k], energies.work[k]
+                total = energies.total[k]
+                work = energies.work[k]
                 reason = f"the energy runs away: {total:.4g} J in the lattice, {work:.4g} J of work done"
             raise RunawayError(reason, k)
         self.most_work = float(most_work[-1])

@@ -149,7 +149,8 @@ def _optima(grids: Mapping[Reading, CellSearch], values: Mapping[str, Any]) -> d
             best = grid.optimum(cost)
             if best is None:
                 continue
-            lam, eta = grid.lam[best[0]], grid.eta[best[1]]
+            lam = grid.lam[best[0]]
+            eta = grid.eta[best[1]]
             cell = four_band(reading, lam, eta)
             waves = bloch(cell, grid.wavenumber)
             optima["optimum_lambda"][i, j] = lam

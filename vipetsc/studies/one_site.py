@@ -119,7 +119,8 @@ class ScatteringRuns:
 
         # The run is simulated twice: its last sample in all cells and all samples of the site fit where all would not.
         motion = PairMotion.of(self.ring.run_at_site(1.0, with_site=False), self.cell)
-        w, rate = motion.displacement[:, 0], motion.velocity[:, 0]
+        w = motion.displacement[:, 0]
+        rate = motion.velocity[:, 0]
         return {
             "peak": motion.largest()[0],
             "time": motion.time.tolist(),

@@ -32,7 +32,8 @@ from vipetsc.studies.sweep import is_whole
 
 POPULATION = 24  # of NSGA-II
 # Designs are compared at so many amplitudes, from the least over this to the largest times this.
-CURVE_POINTS, CURVE_SPREAD = 11, 4.0
+CURVE_POINTS = 11
+CURVE_SPREAD = 4.0
 # Shown of every design, whatever its objective: a large transfer may go with a large loss.
 SHOWN = ("upper_share_at_end", "dissipated")
 

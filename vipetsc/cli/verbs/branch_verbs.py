@@ -94,9 +94,13 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         amplitude_unit = "N"
 
     if options.over == "amplitude":
-        over_unit, fixed, fixed_unit = amplitude_unit, "frequency", "rad/s"
+        over_unit = amplitude_unit
+        fixed = "frequency"
+        fixed_unit = "rad/s"
     else:
-        over_unit, fixed, fixed_unit = "rad/s", "amplitude", amplitude_unit
+        over_unit = "rad/s"
+        fixed = "amplitude"
+        fixed_unit = amplitude_unit
 
     low, high = options.range
     count = len(case.curves())

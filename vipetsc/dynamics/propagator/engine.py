@@ -37,8 +37,10 @@ LARGEST_OMEGA_H = 3.2
 MOST_PARTS = 16
 # Sites of one cluster beyond which plain time stepping costs less.
 MOST_SITES = 32
-# Rough costs that decide the step's length, in us: a step, a cell in it, a sample's contacts per site of a cluster.
-STEP_COST, CELL_COST, SITE_COST = 20.0, 0.03, 10.0
+# Rough costs in us that decide the step's length.
+STEP_COST = 20.0  # of a step
+CELL_COST = 0.03  # of a cell in a step
+SITE_COST = 10.0  # of a sample's contacts, for each site of a cluster
 # The series is cut off at this fraction of the run's relative tolerance, or where rounding makes it as large.
 SERIES_TOLERANCE = 1e-4
 LEAST_TOLERANCE = 1e-15

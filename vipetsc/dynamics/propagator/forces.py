@@ -199,8 +199,11 @@ def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: Step
     """Create the record of all clusters at rest, one for each of ``groups``."""
     count = len(groups.numbers)
     terms = series.terms
+
     state = np.zeros(len(groups.first) - 1, SUBSTEP_STATE)
     state["length"] = 1.0
+
+    # The error of a substep grows with the power ORDER of its length.
     tolerance = (model.rtol / FIRST_TOLERANCE) ** (1 / ORDER)
     drives = np.where(groups.numbers < 0, -1 - groups.numbers, -1)
     return Cluster(

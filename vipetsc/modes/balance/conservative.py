@@ -22,14 +22,18 @@ from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Special
 FEWEST = 15
 # The harmonics change where the part left out is outside these fractions of what is allowed, and then so that it
 # becomes the fraction AIM of it: far enough from both ends that they do not change at every point.
-FEWER, AIM, MORE = 0.02, 0.2, 0.5
+FEWER = 0.02
+MORE = 0.5
+AIM = 0.2
 # Step along the tangent by whose two ends the energy's slope is taken.
 SLOPE_STEP = 1e-5
 # Largest size of a describing function, in clearances.
 LARGEST = 1e3
 # As the harmonics above the first are brought in: first step of their weight, how far the motion may change in one,
 # and the smallest.
-FIRST_WEIGHT, FURTHEST, SMALLEST_WEIGHT = 0.1, 0.1, 1e-4
+FIRST_WEIGHT = 0.1
+FURTHEST = 0.1
+SMALLEST_WEIGHT = 1e-4
 # A contact episode whose middle lies within this phase (rad) of the arc's ends is on the end: counted once.
 PHASE_ROUNDING = 1e-9
 
@@ -93,7 +97,8 @@ class HarmonicFrame:
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
         """The motion that an attempt has converged to, where ``direction`` is the branch's unit tangent or empty."""
-        balance, xi = self.balance, attempt.xi
+        balance = self.balance
+        xi = attempt.xi
         x, omega = self.motion(xi)
         series = balance.series(x, omega)
         tangent = np.empty(0)

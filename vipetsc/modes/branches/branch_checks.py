@@ -92,7 +92,8 @@ def is_jump(problem: Shooting, left: Point, right: Point, control: NnmTable) -> 
 def jumps(points: list[Point], problem: Shooting, control: NnmTable) -> Iterator[str]:
     """Sentences about steps that jumped to another arc; only suspicious ones are followed again."""
     for i, why in suspects(problem, points):
-        a, b = points[i], points[i + 1]
+        a = points[i]
+        b = points[i + 1]
         if is_jump(problem, a, b, control):
             yield (
                 f"jump between points {a.index} and {b.index} (E = {a.energy:.6g} -> {b.energy:.6g} J, "

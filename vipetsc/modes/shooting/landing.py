@@ -17,8 +17,8 @@ from vipetsc.contact.search import first_upcrossing_after_start
 
 # Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
 NONE, CROSSING, EXTREMUM = 0, 1, 2
-# Attempts at an extremum, and of one landing in all.
-EXTREMUM_ATTEMPTS, MOST_ATTEMPTS = 40, 120
+EXTREMUM_ATTEMPTS = 40  # attempts at one extremum
+MOST_ATTEMPTS = 120  # attempts of one landing in all
 # Coefficients of a polynomial of degree 5 in the position in a step, from 0 to 1, the lowest first.
 Coefficients = tuple[float, float, float, float, float, float]
 # A slope at the start below this fraction of the curvature is the rounding of an extremum.

@@ -96,7 +96,8 @@ class ShootingFrame(Generic[A]):
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
         """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent or empty."""
-        problem, chart = self.problem, self.chart
+        problem = self.problem
+        chart = self.chart
         x, period = chart.decode(attempt.xi)
         arc = problem.arc(x, period)
         traces, largest = problem.stability(arc)
@@ -145,7 +146,8 @@ class ShootingEquations(ABC, Generic[A]):
         self.map = shooting_map
         self.tolerance = tolerance
         n = system.dofs
-        displacements, velocities = slice(0, n), slice(n, 2 * n)
+        displacements = slice(0, n)
+        velocities = slice(n, 2 * n)
         # the half of the state that is free at the arc's start, and the half that should vanish at its end
         self.free = displacements if shooting_map.start == "rest" else velocities
         self.zero = velocities if shooting_map.end == "rest" else displacements

@@ -16,11 +16,13 @@ ROUNDING = 1e-9  # by which a measured number may miss its threshold
 LAWS = ("hertz", "bilinear")
 
 # Constants of quantities: what is counted or measured, rather than what decides.
-STRAIGHT, STRAIGHT_EVERYWHERE = 0.95, 0.9  # adjusted R^2 of a power law (SPEC 11, C7 and C8)
+STRAIGHT = 0.95  # adjusted R^2 of a power law (SPEC 11, C7)
+STRAIGHT_EVERYWHERE = 0.9  # adjusted R^2 of the power law of each curve (SPEC 11, C8)
 QUIET = 0.1  # normalised entropy that is still "nearly zero" (sec. II.C)
 ABRUPT = 10**0.5  # ratio of amplitudes, half a decade, in which an abrupt rise leads from QUIET to half the peak
 PEAK = (0.9, 1.8)  # N (sec. II.C; SPEC 4: 1.1-1.4 N)
-HIGH, SEVERAL = 10.0, 3  # N, the paper's high amplitude; sites that are several
+HIGH = 10.0  # N, the paper's high amplitude
+SEVERAL = 3  # the fewest sites that are several
 BESIDE = 0.02  # half-width of the band about a Bloch branch over the top edge of the pass bands
 NATIVE = (7, 8)  # wavenumber bins that the packet starts in (SPEC 11, C5)
 PAPER_CELL = (0.1, 0.5)  # (lambda, eta) of the paper (SPEC 11, C10; Suppl. 3)
