@@ -73,8 +73,8 @@ class Hill:
         self.least = LEAST_OF_FINITE if finite else LEAST
         orders = np.arange(-order, order + 1)
         self._blocks = [orders[1 - order % 2 :: 2], orders[order % 2 :: 2]] if odd else [orders]
-        # Compliances by block and exponent, and the latest forces with their reduced Jacobians.
-        self._compliances: dict[tuple[int, complex], np.ndarray] = {}
+        # Compliances by block, number of its orders and exponent, and the latest forces with their reduced Jacobians.
+        self._compliances: dict[tuple[int, int, complex], np.ndarray] = {}
         self._reduced: tuple[ForceSeries, list[np.ndarray | None]] | None = None
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
@@ -84,20 +84,24 @@ class Hill:
         out = np.ones(len(exponents), complex)
         for block, (orders, jacobian) in enumerate(zip(self._blocks, self._reduced[1], strict=True)):
             low = orders if jacobian is None else orders[np.abs(orders) <= KEPT]
-            self._evaluate(block, low, exponents.tolist())
-            for i, mu in enumerate(exponents.tolist()):
+            compliances = self._at(block, low, exponents.tolist())
+            for i, (mu, g) in enumerate(zip(exponents.tolist(), compliances, strict=True)):
                 matrix = _flat(series.jacobian(mu, low)) if jacobian is None else jacobian
-                phase, log = np.linalg.slogdet(_plus_one(self._compliances[block, mu], matrix))
+                phase, log = np.linalg.slogdet(_plus_one(g, matrix))
                 out[i] *= phase * np.exp(min(log, LARGEST_LOG))
         return out
 
-    def _evaluate(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> None:
-        """Keep the compliances of a block's ``orders`` at ``exponents`` where they are new: all in one call."""
-        new = [mu for mu in exponents if (block, mu) not in self._compliances]
+    def _at(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> list[np.ndarray]:
+        """The compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
+        # At one frequency a state without contact needs its low orders alone, one with dissipation all of them.
+        keys = [(block, len(orders), mu) for mu in exponents]
+        new = [key for key in keys if key not in self._compliances]
         if new:
-            g = self.compliance.at(((orders - 1j * np.array(new)[:, None]) * self.omega).ravel())
+            at = np.array([mu for *_, mu in new])
+            g = self.compliance.at(((orders - 1j * at[:, None]) * self.omega).ravel())
             parts = g.reshape(len(new), len(orders), *g.shape[1:])
-            self._compliances |= {(block, mu): part for mu, part in zip(new, parts, strict=True)}
+            self._compliances |= dict(zip(new, parts, strict=True))
+        return [self._compliances[key] for key in keys]
 
     def _eliminated(self, series: ForceSeries, orders: np.ndarray) -> np.ndarray | None:
         """J (order pair, order pair) of the orders kept, with what the others do; None if it depends on lambda."""

@@ -1,0 +1,137 @@
+"""Stability of states with dissipation and many harmonics, next to states without contact at the same frequency."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from tests.verify.test_nfrc import case, start_of
+from vipetsc.lattice import Contact, DenseCompliance
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.hill import LEAST_OF_FINITE, Hill
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+
+pytestmark = pytest.mark.parallel(1)
+
+
+@pytest.mark.parametrize("last", [61, 119])
+def test_determinants_do_not_depend_on_the_states_before(last):
+    """Without contact the orders beyond 48 are eliminated, with dissipation they are all kept: at 119 sizes divide."""
+    omega = 1.8
+    forces = SiteForces([(Contact("hertz", 50.0, restitution=0.7), 1.0)])
+    compliance = DenseCompliance(np.ones(1), np.eye(1), np.eye(1))
+    balance = HarmonicBalance(compliance, forces, last, True, cosines=False)
+    amplitudes = [0.9, 1.1]
+    free, touching = (balance.series(balance.pack(np.eye(1, last + 1, 1) * a + 0j), omega) for a in amplitudes)
+    exponents = np.array([0.02, 0.1 + 0.2j, 0.01 + 0.4j])
+
+    def alone(series):
+        return Hill(compliance, omega, last, odd=True, finite=True).determinants(series, exponents)
+
+    hill = Hill(compliance, omega, last, odd=True, finite=True)
+    for series in (free, touching, free):
+        assert np.array_equal(hill.determinants(series, exponents), alone(series))
+    assert not np.allclose(alone(free), alone(touching), rtol=1e-3)
+
+
+class ForcedCell:
+    """A lattice with one dissipative contact under a harmonic force, integrated from phase to phase of the force."""
+
+    def __init__(self, states: SteadyStates, omega: float, force: float) -> None:
+        model = states.case.model()
+        chain = model.chain
+        dofs = chain.cell.dofs
+        first = chain.sites[0] * dofs
+        self.contact = states.case.contact(states.restitution)
+        self.clearance = chain.clearances[0]
+        self.masses = chain.masses()
+        self.stiffness = chain.stiffness_matrix().toarray()
+        self.pair = np.zeros(len(self.masses))
+        self.pair[first + chain.cell.resonator] = 1
+        self.pair[first + chain.cell.host] = -1
+        self.load = np.zeros(len(self.masses))
+        self.load[model.drive_cell * dofs + model.drive_mass] = force
+        self.omega = omega
+
+    def rate(self, t, y, side, approach):
+        u, v = np.split(y, 2)
+        force = self.load * np.cos(self.omega * t) - self.stiffness @ u
+        if side:
+            # Up to rounding the contact is closed while it is in contact.
+            w = side * max(side * self.pair @ u, self.clearance)
+            force -= self.pair * self.contact.force(w, self.clearance, self.pair @ v, approach)
+        return np.concatenate([v, force / self.masses])
+
+    def gap(self, t, y, side, approach):
+        w = self.pair @ np.split(y, 2)[0]
+        return side * w - self.clearance if side else abs(w) - self.clearance
+
+    def one_period(self, state, phase):
+        """Displacement and velocity a period after the ``phase``, at which the contact is open."""
+        t = phase / self.omega
+        end = t + 2 * np.pi / self.omega
+        y = state
+        side = 0.0
+        approach = 1.0
+
+        def change(*arguments):
+            return self.gap(*arguments)
+
+        change.terminal = True
+        while t < end:
+            change.direction = -1 if side else 1
+            done = solve_ivp(self.rate, (t, end), y, "DOP853", events=change, args=(side, approach), rtol=1e-11,
+                             atol=1e-14, max_step=2e-4)  # fmt: skip
+            t = done.t[-1]
+            y = done.y[:, -1]
+            u, v = np.split(y, 2)
+            side = 0.0 if side else float(np.sign(self.pair @ u))
+            approach = self.pair @ v
+        return y
+
+    def multipliers(self, state, scale, phase):
+        """Eigenvalues of the derivative of the period's map, by central differences of ``scale``."""
+        columns = []
+        for step, change in zip(scale, np.diag(scale), strict=True):
+            after = self.one_period(state + change, phase)
+            before = self.one_period(state - change, phase)
+            columns.append((after - before) / (2 * step))
+        return np.linalg.eigvals(np.array(columns).T)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("force", "last"), [(19.5, 61), (25.0, 119)])
+def test_stability_of_a_dissipative_state_is_that_of_its_period_map(force, last):
+    """r = .7, two cells: an unstable and a stable state, after a state without contact at the same frequency."""
+    omega = 1700.0
+    of = case({"cells": 2}, {"sites": [1], "restitution": 0.7}, source="force", infinite=False, harmonics=last,
+              range=[force, 26.0], fixed=[omega], largest_step=0.5)  # fmt: skip
+    states = SteadyStates(of, 0.7, omega)
+    xi = first_state(states).xi
+
+    # The motion of the linear lattice, at a force that does not touch.
+    linear = 0.5 * states.parameter.scale * states.linear_motion(omega).harmonics
+    free = np.append(states.balance.pack(linear) / states.clearance, 0.5)
+    assert states.measured(free).unstable == 0
+    measures = states.measured(xi)
+    assert measures.episodes > 0
+
+    # The period begins at a phase at which the contact is open.
+    phases = np.linspace(0, np.pi, 2001)
+    z = measures.harmonics[0]
+    w = (z * np.exp(1j * np.arange(len(z)) * phases[:, None])).sum(axis=1).real
+    phase = phases[np.argmin(np.abs(w))]
+
+    motion = ForcedCell(states, omega, force)
+    start = np.concatenate([part.ravel() for part in start_of(states, xi, np.arange(2), phase)])
+    scale = 1e-5 * states.clearance * np.repeat([1, omega], len(start) // 2)
+    # Harmonics left out, of a force that jumps at the onsets, move the stronger contact's state by 6e-5 clearances.
+    assert np.abs((motion.one_period(start, phase) - start) / scale).max() < 10
+    sizes = np.abs(motion.multipliers(start, scale, phase))
+    assert measures.unstable == np.count_nonzero(sizes > np.exp(2 * np.pi * LEAST_OF_FINITE))
+    assert (measures.unstable > 0) == (force < 20)
+    if measures.unstable:
+        assert np.exp(2 * np.pi * measures.growth) == pytest.approx(sizes.max(), rel=1e-4)
