@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
+from vipetsc.modes.callbacks import CallbackErrors
 from vipetsc.modes.problem import Attempt, FlowError
 
 # A Newton step below this, in unknowns of order one, is rounding.
@@ -39,11 +40,12 @@ class BorderedNewton(ABC, Generic[E]):
     """
 
     def __init__(self, size: int, max_newton: int = 7) -> None:
+        self._errors = CallbackErrors()
         self._xi, jacobian = self._allocate(size)
         self._snes = snes = PETSc.SNES().create(self._xi.comm)
         snes.setOptionsPrefix("nnm_")
-        snes.setFunction(self._evaluate, self._xi.duplicate())
-        snes.setJacobian(self._differentiate, jacobian)
+        snes.setFunction(self._errors.keep(self._evaluate), self._xi.duplicate())
+        snes.setJacobian(self._errors.keep(self._differentiate), jacobian)
         snes.setTolerances(max_it=max_newton)
         # PETSc's own test would also accept a residual that has fallen by 1e-8, whatever the tolerance of the problem.
         snes.setConvergenceTest(self._test)
@@ -69,7 +71,8 @@ class BorderedNewton(ABC, Generic[E]):
         self._history = []
         self._xi.setArray(self._local(guess))
         try:
-            self._snes.solve(None, self._xi)
+            with self._errors.raised_after():
+                self._snes.solve(None, self._xi)
         except FlowError as error:
             # Raised on all ranks that solve together, so that all leave the collective solve here.
             return Attempt(False, str(error), self._history, guess, left_domain=True)

@@ -19,6 +19,7 @@ G. W. Stewart, A Krylov-Schur algorithm for large eigenproblems, SIAM J. Matrix 
 
 import logging
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 from mpi4py import MPI
@@ -27,6 +28,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.dynamics.eigen import load_slepc
+from vipetsc.modes.callbacks import CallbackErrors
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.point import Point
 from vipetsc.modes.system import System
@@ -45,7 +47,7 @@ logger = logging.getLogger(__name__)
 
 
 class Monodromy:
-    """The map of variations over an ``arc``, times ``sign``, in scaled blocks; as a PETSc matrix, its ``POWER``."""
+    """The map of variations over an ``arc``, times ``sign``, in scaled blocks, and its ``POWER``, a PETSc matrix."""
 
     def __init__(self, arc: LatticeArc, scale: np.ndarray, sign: int) -> None:
         self.arc = arc
@@ -56,8 +58,8 @@ class Monodromy:
         """The map once, on blocks (number, 2 dof, owned cell)."""
         return self.sign * self.scale * self.arc.move(blocks / self.scale)
 
-    def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The power of the map times ``x``."""
+    def multiply(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Set ``y`` to the power of the map times ``x``."""
         block = x.getArray(readonly=True).reshape(1, *self.scale.shape)
         for _ in range(POWER):
             block = self.apply(block)
@@ -122,7 +124,9 @@ def _krylov_basis(monodromy: Monodromy, phase: np.ndarray, seed: np.ndarray, wan
     """Orthonormal blocks (number, 2 dof, owned cell) that hold the eigenvectors of the largest multipliers."""
     slepc = load_slepc()
     shape = phase.shape
-    shell = PETSc.Mat().createPython(((phase.size, None),) * 2, monodromy, comm=comm)
+    errors = CallbackErrors()
+    products = SimpleNamespace(mult=errors.keep(monodromy.multiply))
+    shell = PETSc.Mat().createPython(((phase.size, None),) * 2, products, comm=comm)
     shell.setUp()
     deflated = shell.createVecRight()
     deflated.setArray(phase.ravel())
@@ -140,7 +144,8 @@ def _krylov_basis(monodromy: Monodromy, phase: np.ndarray, seed: np.ndarray, wan
     eps.setInitialSpace([first])
     eps.setOptionsPrefix("multipliers_")
     eps.setFromOptions()
-    eps.solve()
+    with errors.raised_after():
+        eps.solve()
 
     blocks = [vector.getArray(readonly=True).reshape(shape).copy() for vector in eps.getInvariantSubspace()]
     for petsc_object in (eps, shell, deflated, first):

@@ -7,6 +7,7 @@ rank: GMRES needs few products, and no preconditioner (options of PETSc begin wi
 """
 
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Protocol
 
 from mpi4py import MPI
@@ -79,7 +80,8 @@ class KrylovNewton(BorderedNewton[KrylovEquations]):
     def _allocate(self, size: int) -> tuple[PETSc.Vec, PETSc.Mat]:
         first, stop = self._ranges[self._comm.rank]
         sizes = (stop - first, size)
-        shell = PETSc.Mat().createPython((sizes, sizes), self, comm=self._comm)
+        products = SimpleNamespace(mult=self._errors.keep(self._multiply))
+        shell = PETSc.Mat().createPython((sizes, sizes), products, comm=self._comm)
         shell.setUp()
         return PETSc.Vec().createMPI(sizes, comm=self._comm), shell
 
@@ -99,8 +101,8 @@ class KrylovNewton(BorderedNewton[KrylovEquations]):
         self._at = self._whole(x)
         matrix.assemble()
 
-    def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The bordered derivative times ``x``."""
+    def _multiply(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Set ``y`` to the bordered derivative times ``x``."""
         change = self._whole(x)
         product = self._equations.product(self._at, change)
         y.setArray(self._local(np.append(product, self._row[0] @ change)))
@@ -115,7 +117,8 @@ class KrylovNewton(BorderedNewton[KrylovEquations]):
         right = self._xi.duplicate()
         x = self._xi.duplicate()
         right.setArray(self._local(np.append(np.zeros(len(xi) - 1), 1.0)))
-        ksp.solve(right, x)
+        with self._errors.raised_after():
+            ksp.solve(right, x)
         vector = self._whole(x)
         return vector / np.linalg.norm(vector)
 

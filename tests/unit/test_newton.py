@@ -1,0 +1,98 @@
+"""Newton's method of PETSc: what the equations raise comes out as it is, and the solver goes on afterwards."""
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import pytest
+
+from vipetsc.modes.lattice.krylov import KrylovNewton
+from vipetsc.modes.newton import DenseNewton
+from vipetsc.modes.problem import FlowError
+
+
+class Circle:
+    """x^2 + y^2 = 1; the evaluation of number ``fails_at`` raises ``error``, and none of what follows is asked for."""
+
+    def __init__(self, fails_at: dict[str, int] | None = None, error: BaseException | None = None) -> None:
+        self.error = error
+        self.left = {"residual": 99, "jacobian": 99, "product": 99} | (fails_at or {})
+        self.failed = False
+
+    def _count(self, name: str) -> None:
+        assert not self.failed, "evaluated after it has failed"
+        self.left[name] -= 1
+        if self.left[name] < 0:
+            self.failed = True
+            raise self.error
+
+    def residual(self, xi):
+        self._count("residual")
+        return np.array([xi @ xi - 1])
+
+    def jacobian(self, xi):
+        self._count("jacobian")
+        return 2 * xi[None]
+
+    def product(self, xi, change):
+        self._count("product")
+        return np.array([2 * xi @ change])
+
+
+ROW = np.array([1.0, -1.0])
+GUESS = np.array([0.8, 0.5])
+
+dense = pytest.param(lambda: DenseNewton(2, 20), ["residual", "jacobian"], id="dense")
+krylov = pytest.param(lambda: KrylovNewton([0, 2], MPI.COMM_SELF, 20), ["residual", "product"], id="krylov")
+
+
+def meets_the_circle(newton) -> bool:
+    attempt = newton.solve(Circle(), GUESS, ROW, 0.0, 1e-12)
+    return attempt.converged and np.allclose(attempt.xi, np.sqrt(0.5), atol=1e-10)
+
+
+@pytest.mark.parametrize("make, names", [dense, krylov])
+@pytest.mark.parametrize("error", [ZeroDivisionError("no such orbit"), KeyboardInterrupt("stop")])
+def test_what_the_equations_raise_comes_out(make, names, error):
+    newton = make()
+    for name in names:
+        for evaluations in (0, 1):
+            with pytest.raises(type(error)) as caught:
+                newton.solve(Circle({name: evaluations}, error), GUESS, ROW, 0.0, 1e-12)
+            assert caught.value is error
+            assert meets_the_circle(newton)
+
+
+@pytest.mark.parametrize("make, names", [dense, krylov])
+def test_leaving_the_domain_is_an_attempt_that_failed(make, names):
+    newton = make()
+    for name in names:
+        for evaluations in (0, 1):
+            attempt = newton.solve(Circle({name: evaluations}, FlowError("no flow")), GUESS, ROW, 0.0, 1e-12)
+            assert not attempt.converged
+            assert attempt.left_domain
+            assert attempt.reason == "no flow"
+            assert np.isfinite(attempt.history).all()
+            assert np.array_equal(attempt.xi, GUESS)
+            assert meets_the_circle(newton)
+
+
+def test_a_null_vector_that_cannot_be_computed_raises():
+    newton = KrylovNewton([0, 2], MPI.COMM_SELF, 20)
+    with pytest.raises(FlowError, match="no flow"):
+        newton.null_vector(Circle({"product": 0}, FlowError("no flow")), GUESS, ROW)
+    assert meets_the_circle(newton)
+
+
+def test_an_error_that_petsc_makes_of_it_does_not_hide_it(petsc_options):
+    petsc_options(nnm_snes_error_if_not_converged=True)
+    newton = DenseNewton(2, 20)
+    with pytest.raises(ZeroDivisionError):
+        newton.solve(Circle({"residual": 1}, ZeroDivisionError("no such orbit")), GUESS, ROW, 0.0, 1e-12)
+
+
+def test_errors_of_petsc_itself_pass(petsc_options):
+    petsc_options(nnm_snes_error_if_not_converged=True)
+    newton = DenseNewton(2, 1)
+    with pytest.raises(PETSc.Error):
+        newton.solve(Circle(), GUESS, ROW, 0.0, 1e-12)
