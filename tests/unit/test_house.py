@@ -1,7 +1,12 @@
 """Sizes of functions and files; names that say what they hold; the manual."""
 
+from __future__ import annotations
+
 import ast
 import re
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import vipetsc
@@ -9,87 +14,120 @@ import vipetsc
 ROOT = Path(vipetsc.__file__).parent
 SOURCES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob("*.py"))}
 MOST_LINES_IN_A_FILE = 400
-MOST_STATEMENTS_IN_A_FUNCTION = 50  # blank lines, comments and docstrings do not count
+# Blank lines, comments and docstrings do not count.
+MOST_STATEMENTS_IN_A_FUNCTION = 50
 MOST_ARGUMENTS = 7
-COMPILED = {"njit", "jit", "cfunc", "kernel", "inlined"}  # decorators of compiled functions
+# Decorators of compiled functions.
+COMPILED = {"njit", "jit", "cfunc", "kernel", "inlined"}
 # Words that were a dialect of this package; the field has names for what they held.
 DIALECT = {"awake", "again", "loud", "heard", "alike", "letter", "found", "own", "words", "kept", "there"}
 
 
-def functions():
-    for name, text in SOURCES.items():
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef):
-                yield name, node
+# To parse the package takes a second, and six tests look at the same trees.
+@cache
+def nodes() -> list[tuple[str, ast.AST]]:
+    """Return every node of every syntax tree of the package with its file."""
+    return [(file, node) for file, text in SOURCES.items() for node in ast.walk(ast.parse(text))]
 
 
-def statements(function):
-    """How many statements a function has without its docstring, those of the functions in it among them."""
-    docstring = ast.get_docstring(function) is not None
-    return sum(isinstance(node, ast.stmt) for node in ast.walk(function)) - 1 - docstring
+def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
+    """Yield every function of the package under its name with its file."""
+    for file, node in nodes():
+        if isinstance(node, ast.FunctionDef):
+            yield f"{file}:{node.name}", node
 
 
-def is_compiled(function):
+def statements(function: ast.FunctionDef) -> int:
+    """Count the statements of a function without its docstring, those of the functions in it among them."""
+    count = sum(isinstance(node, ast.stmt) for node in ast.walk(function))
+    has_docstring = ast.get_docstring(function) is not None
+    # The definition itself is a statement, too.
+    return count - 1 - has_docstring
+
+
+def is_compiled(function: ast.FunctionDef) -> bool:
+    """Return whether a decorator compiles the function."""
     for decorator in function.decorator_list:
-        called = decorator.func if isinstance(decorator, ast.Call) else decorator
-        if (called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")) in COMPILED:
+        # @njit and @njit(...), @numba.njit and @njit.
+        name = decorator.func if isinstance(decorator, ast.Call) else decorator
+        text = name.attr if isinstance(name, ast.Attribute) else getattr(name, "id", "")
+        if text in COMPILED:
             return True
     return False
 
 
 def test_files_are_short():
-    assert {name: text.count("\n") for name, text in SOURCES.items() if text.count("\n") > MOST_LINES_IN_A_FILE} == {}
+    """No file of the package is longer than 400 lines."""
+    lengths = {file: text.count("\n") for file, text in SOURCES.items()}
+    assert {file: length for file, length in lengths.items() if length > MOST_LINES_IN_A_FILE} == {}
 
 
 def test_functions_are_short():
-    long = {f"{name}:{f.name}": statements(f) for name, f in functions()}
-    assert {name: count for name, count in long.items() if count > MOST_STATEMENTS_IN_A_FUNCTION} == {}
+    """No function has more than 50 statements."""
+    lengths = {name: statements(function) for name, function in functions()}
+    assert {name: length for name, length in lengths.items() if length > MOST_STATEMENTS_IN_A_FUNCTION} == {}
 
 
 def test_kernels_take_records():
-    counts = {f"{name}:{f.name}": len(f.args.args) for name, f in functions() if is_compiled(f)}
+    """No compiled function takes more than 7 arguments."""
+    counts = {name: len(function.args.args) for name, function in functions() if is_compiled(function)}
+
+    # A decorator of another name would empty the list without a word.
     assert len(counts) > 40
     assert {name: count for name, count in counts.items() if count > MOST_ARGUMENTS} == {}
 
 
 def test_names_are_the_fields():
+    """No argument, variable, function or class has a name of the package's former dialect."""
     names = set()
-    for name, text in SOURCES.items():
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.arg):
-                names.add((name, node.arg))
-            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-                names.add((name, node.id))
-            elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-                names.add((name, node.name))
+    for file, node in nodes():
+        if isinstance(node, ast.arg):
+            names.add((file, node.arg))
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add((file, node.id))
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add((file, node.name))
+
     assert {(file, name) for file, name in names if name in DIALECT} == set()
 
 
-def test_no_private_scipy_and_no_print_outside_the_command_line():
-    for name, text in SOURCES.items():
-        assert not re.search(r"scipy\.\w+(\.\w+)*\._", text), name
-        if not name.startswith("cli/"):
-            calls = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
-            assert "print" not in {call.func.id for call in calls}, name
+def test_no_private_part_of_scipy_is_used():
+    """No source imports or calls a name of SciPy that begins with an underscore."""
+    private = re.compile(r"scipy\.\w+(\.\w+)*\._")
+    assert [file for file, text in SOURCES.items() if private.search(text)] == []
+
+
+def test_the_command_line_alone_prints():
+    """Outside ``cli`` no module calls print: its text would stand in the output of every rank."""
+    printing = set()
+    for file, node in nodes():
+        is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        if is_call and node.func.id == "print" and not file.startswith("cli/"):
+            printing.add(file)
+
+    assert printing == set()
 
 
 def test_every_chapter_is_in_the_index_and_every_link_leads_somewhere():
+    """The index lists every chapter, files that the manual links to exist, and the README stays within 150 lines."""
     manual = ROOT / "manual"
+    readme = ROOT.parent / "README.md"
     chapters = {path.name for path in manual.glob("*.md")}
     index = (manual / "index.md").read_text(encoding="utf-8")
     assert set(re.findall(r"\]\((\w[\w-]*\.md)\)", index)) == chapters - {"index.md"}
-    for page in [*manual.rglob("*.md"), ROOT.parent / "README.md"]:
+
+    for page in [*manual.rglob("*.md"), readme]:
         for target in re.findall(r"\]\((?!https:)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
-    assert (ROOT.parent / "README.md").read_text(encoding="utf-8").count("\n") <= 150
+
+    assert readme.read_text(encoding="utf-8").count("\n") <= 150
 
 
 def test_no_two_classes_have_one_name():
     """A name means one thing in the whole package; a private class may repeat one."""
-    places = {}
-    for file, text in SOURCES.items():
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                places.setdefault(node.name, []).append(file)
+    places = defaultdict(list)
+    for file, node in nodes():
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            places[node.name].append(file)
 
     assert {name: files for name, files in places.items() if len(files) > 1} == {}

@@ -6,32 +6,43 @@ from itertools import islice
 
 import pytest
 
-from tests.faults.mutations import judge, mutations, run_shortly
+from tests.faults.mutations import judge, mutations
 from vipetsc.case import CaseError
 from vipetsc.case.verb_cases import load_every
 
-SWEEPS = ("interband", "scattering", "scattering-neighbours")  # of thousands of members, seconds each
+# Sweeps of thousands of members, each of which takes seconds to resolve.
+SWEEPS = ("interband", "scattering", "scattering-neighbours")
 CELL = "[lattice]\ncells = 20\n[lattice.cell]\nmasses = [1.0, 2.0, 3.0]\ncontact = [1, 2]\nsprings = [{}]\n"
 CHAIN = "{ start = 1, end = 1, stiffness = 3.0, next_cell = true }, { start = 1, end = 2, stiffness = 4.0 }"
 TIED = CELL.format(CHAIN + ", { start = 1, end = 3, stiffness = 4.0 }")
 OWN = '[nnm]\nsystem = "own"\nmodes = [1]\n[nnm.own]\nmasses = [1.0, 1.0]\nsprings = [{}]\n'
 
 
-def read(path, text, *overrides):
+def load(path, text, *overrides):
+    """Write a case file and return the cases of all verbs that read it."""
     path.write_text(text, encoding="utf-8")
     return load_every(path, overrides)
 
 
 @pytest.mark.slow
 def test_spoilt_cases_are_read_or_refused(tmp_path):
-    verdicts = [(m, judge(m, tmp_path / "case.toml")) for m in islice(mutations(11, without=SWEEPS), 150)]
-    assert [(m.parent, m.changes, v.defect) for m, v in verdicts if v.defect] == []
-    assert len([v for _, v in verdicts if v.refusal]) > 75
-    assert len([v for _, v in verdicts if v.cases]) > 15
+    """Of 150 case files with random changes each is read or refused by a sentence; both occur often."""
+    spoilt = list(islice(mutations(11, without=SWEEPS), 150))
+    verdicts = [judge(mutation, tmp_path / "case.toml") for mutation in spoilt]
+
+    defects = []
+    for mutation, verdict in zip(spoilt, verdicts, strict=True):
+        if verdict.defect:
+            defects.append((mutation.parent, mutation.changes, verdict.defect))
+    assert defects == []
+
+    # Changes that all end one way would test nothing of the other.
+    assert sum(bool(verdict.refusal) for verdict in verdicts) > 75
+    assert sum(bool(verdict.cases) for verdict in verdicts) > 15
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[nnm]\nmodes = 'foo'", "nnm.modes = 'foo'"),
         ("[nnm]\nmodes = [2, 2]", "nnm.modes = [2, 2]: names 2 more than once"),
@@ -64,38 +75,47 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
         ("x = " + "9" * 5000, "not a TOML file"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_named_with_its_remedy(tmp_path, text, said):
+def test_what_cannot_be_is_named_with_its_remedy(tmp_path, text, message):
+    """A case that cannot be is refused with its key, its value and what would be right."""
     with pytest.raises(CaseError) as caught:
-        read(tmp_path / "case.toml", text)
-    assert said in str(caught.value)
+        load(tmp_path / "case.toml", text)
+    assert message in str(caught.value)
 
 
 def test_a_byte_order_mark_is_no_key(tmp_path):
-    (case,) = read(tmp_path / "case.toml", "\ufeff[lattice]\ncells = 40\n")
+    """A file that Windows editors begin with a byte order mark is read as if it had none."""
+    (case,) = load(tmp_path / "case.toml", "\ufeff[lattice]\ncells = 40\n")
     assert case.lattice.cells == 40
 
 
 def test_a_standing_wave_may_be_driven_for_a_given_time(tmp_path):
-    (case,) = read(tmp_path / "case.toml", "[drive]\nband = 2\nwavenumber = 'pi'\n[time]\nend = 0.1\n")
+    """At kappa = pi, where the group velocity is 0, the end of the run cannot follow from it and may be given."""
+    (case,) = load(tmp_path / "case.toml", "[drive]\nband = 2\nwavenumber = 'pi'\n[time]\nend = 0.1\n")
+    # The upper edge of band 2, (k2/m)^1/2 = (1e4/0.005)^1/2.
     assert case.drive.frequency == pytest.approx(1414.2136)
 
 
 def test_a_key_can_be_taken_out(tmp_path):
+    """``--set key=`` removes a key, so that another one can take its place; a key that is not there is refused."""
     text = "[drive]\nband = 2\nwavenumber = 1.0\n"
-    (case,) = read(tmp_path / "case.toml", text, "drive.wavenumber=", "drive.band=", "drive.frequency=1000")
+    (case,) = load(tmp_path / "case.toml", text, "drive.wavenumber=", "drive.band=", "drive.frequency=1000")
     assert case.drive.frequency == 1000
+
     with pytest.raises(CaseError, match=r"--set drive\.bnad: is not in the case"):
-        read(tmp_path / "case.toml", text, "drive.bnad=")
+        load(tmp_path / "case.toml", text, "drive.bnad=")
 
 
 def test_a_cell_of_ones_own_needs_no_contacts(tmp_path):
-    (case,) = read(tmp_path / "case.toml", TIED + "[drive]\nfrequency = 1.0\n[time]\nend = 10.0\n")
+    """A lattice of a cell of one's own without a section [contacts] has no sites; tests/verify steps one."""
+    (case,) = load(tmp_path / "case.toml", TIED + "[drive]\nfrequency = 1.0\n[time]\nend = 10.0\n")
     assert case.model().chain.sites == ()
-    assert run_shortly(case, samples=3) == ""
 
 
 def test_a_sweep_may_give_what_a_run_lacks(tmp_path):
+    """A key without a default may stand in [sweep] alone: the run of the same file takes its first value."""
     text = TIED + "[time]\nend = 1.0\nsample_interval = 0.1\n[sweep.drive]\nfrequency = [0.5, 1.0]\n"
-    run, sweep = read(tmp_path / "case.toml", text)
+
+    run, sweep = load(tmp_path / "case.toml", text)
+
     assert run.drive.frequency == 0.5
     assert sweep.shape == (2,)

@@ -13,78 +13,96 @@ from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 
 
 def measured() -> xr.Dataset:
-    """A dataset with everything that occurs: groups with dimensions of their own, texts, scalars, nothing at all."""
-    return xr.Dataset(
-        {
-            "time": variable("time", [0.0, 0.5, 1.0], "s", "time"),
-            "cell": variable("cell", [3, 7], "1", "cell, counted from 1"),
-            "site": variable("site", np.zeros(0, int), "1", "contact site"),
-            "velocity": variable(("time", "cell"), np.arange(6.0).reshape(3, 2), "m/s", "velocity"),
-            "sites/cell": variable("site", np.zeros(0, int), "1", "cell of the site"),
-            "bands/part": variable("bands/part", np.array([1, 2, 3]), "1", "part"),
-            "bands/energy": variable(("bands/part", "time"), np.eye(3), "J", "energy", parts=["A", "gap", "B"]),
-            "bands/cell": variable("bands/part", np.array([7, 7, 3], np.int8), "1", "not the coordinate of the root"),
-            "coarse/time": variable("coarse/time", [0.0, 1.0], "s", "a time of the group's own"),
-            "coarse/total": variable("coarse/time", [3.0, 4.0], "J", "kinetic energy"),
-            "law": variable("law", ["hertz", "bilinear"], "1", "contact law"),
-            "ibtet": variable((), 0.25, "1", "transfer", start=0.5),
-        },
-        attrs={"case": "name = 'x'", "statistics": {"steps": 3}, "complete": True, "bands/start": 0.5},
-    )
+    """Return a dataset with everything that occurs: groups with dimensions of their own, texts, scalars, nothing."""
+    variables = {
+        "time": variable("time", [0.0, 0.5, 1.0], "s", "time"),
+        "cell": variable("cell", [3, 7], "1", "cell, counted from 1"),
+        "site": variable("site", np.zeros(0, int), "1", "contact site"),
+        "velocity": variable(("time", "cell"), np.arange(6.0).reshape(3, 2), "m/s", "velocity"),
+        "sites/cell": variable("site", np.zeros(0, int), "1", "cell of the site"),
+        "bands/part": variable("bands/part", np.array([1, 2, 3]), "1", "part"),
+        "bands/energy": variable(("bands/part", "time"), np.eye(3), "J", "energy", parts=["A", "gap", "B"]),
+        # In xarray's DataTree a group inherits the root's coordinate of that name in its place.
+        "bands/cell": variable("bands/part", np.array([7, 7, 3], np.int8), "1", "not the coordinate of the root"),
+        "coarse/time": variable("coarse/time", [0.0, 1.0], "s", "a time of the group's own"),
+        "coarse/total": variable("coarse/time", [3.0, 4.0], "J", "kinetic energy"),
+        "law": variable("law", ["hertz", "bilinear"], "1", "contact law"),
+        "ibtet": variable((), 0.25, "1", "transfer", start=0.5),
+    }
+    attributes = {"case": "name = 'x'", "statistics": {"steps": 3}, "complete": True, "bands/start": 0.5}
+    return xr.Dataset(variables, attrs=attributes)
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    write_netcdf(tmp_path / "a.h5", measured())
-    with open_netcdf(tmp_path / "a.h5", "run", ("velocity", "bands", "bands/energy", "case")) as data:
+    """Values, dimensions, types and attributes of every variable survive a file, and coordinates select in it."""
+    path = tmp_path / "a.h5"
+    write_netcdf(path, measured())
+
+    with open_netcdf(path, "run", ("velocity", "bands", "bands/energy", "case")) as data:
         assert data.variables.keys() == measured().variables.keys()
         for name, item in measured().variables.items():
             np.testing.assert_array_equal(data[name].values, item.values, err_msg=name)
             assert data[name].dims == item.dims, name
             assert data[name].attrs.keys() == item.attrs.keys(), name
         assert data["bands/cell"].dtype == np.int8
+
         assert json.loads(data.attrs["statistics"]) == {"steps": 3}
         assert data.attrs["bands/start"] == 0.5
+
         assert data["coarse/total"].sel({"coarse/time": 1.0}).item() == 4.0
         assert data["velocity"].sel(cell=7, time=0.5).item() == 3.0
         assert data["bands/energy"].sel({"bands/part": 2}).values.tolist() == [0, 1, 0]
 
 
 def test_the_file_is_netcdf_4_for_other_tools(tmp_path):
-    write_netcdf(tmp_path / "a.h5", measured())
-    with h5py.File(tmp_path / "a.h5") as file:
+    """Dimension scales, texts and attributes of groups are where h5py and xarray look for them in netCDF-4."""
+    path = tmp_path / "a.h5"
+    write_netcdf(path, measured())
+
+    with h5py.File(path) as file:
         assert file["velocity"].dims[1][0] == file["cell"]
         assert file["bands/energy"].dims[0][0] == file["bands/part"]
         assert file["bands/energy"].dims[1][0] == file["time"]
         assert file["law"].asstr()[...].tolist() == ["hertz", "bilinear"]
         assert file["bands"].attrs["start"] == 0.5
-    with xr.open_dataset(tmp_path / "a.h5", engine="h5netcdf", group="bands") as bands:
+
+    with xr.open_dataset(path, engine="h5netcdf", group="bands") as bands:
         assert bands["energy"].dims == ("part", "time")
         assert bands["energy"].attrs["units"] == "J"
 
 
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    """A dataset without a needed coordinate is refused; the file that was there keeps its bytes, alone."""
     path = tmp_path / "a.h5"
     write_netcdf(path, measured())
     before = path.read_bytes()
+
     with pytest.raises(ValueError, match="velocity: its dimension cell has no coordinate"):
         write_netcdf(path, measured().drop_vars("cell"))
+
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_fields_stay_in_the_file_until_they_are_used(tmp_path):
+    """Opening a file loads coordinates alone: fields may be larger than memory."""
     write_netcdf(tmp_path / "a.h5", measured())
+
     with open_netcdf(tmp_path / "a.h5", "run") as data:
         variables = data.drop_vars(list(data.indexes)).variables.values()
-        assert variables and not any(variable._in_memory for variable in variables)
+        assert variables
+        assert not any(variable._in_memory for variable in variables)
 
 
 def test_files_of_another_kind_are_refused(tmp_path):
+    """A missing file, one that is no HDF5 and one of another program are refused with what they lack."""
     with pytest.raises(OSError, match="missing"):
         open_netcdf(tmp_path / "missing.h5", "run")
+
     (tmp_path / "text.h5").write_text("no HDF5")
     with pytest.raises(OSError, match=r"text\.h5"):
         open_netcdf(tmp_path / "text.h5", "run")
+
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["values"] = np.zeros((2, 2))
     with pytest.raises(ValueError, match=r"foreign\.h5 is not a run of vipetsc: it has no time, energy/kinetic, case"):
@@ -93,6 +111,7 @@ def test_files_of_another_kind_are_refused(tmp_path):
 
 @pytest.mark.slow
 def test_it_loads_neither_petsc_nor_mpi():
+    """A script that reads results needs no MPI: the module imports neither petsc4py nor mpi4py."""
     code = "import sys, vipetsc.io.netcdf; print(*{'petsc4py', 'mpi4py'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""

@@ -1,5 +1,7 @@
 """Panels that figures share show their data where the axes say, with the marks that belong there."""
 
+import itertools
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -8,7 +10,8 @@ from matplotlib.colors import to_rgba
 from vipetsc.figures import panels, style
 from vipetsc.lattice import bloch, diatomic, four_band, gaps, pass_bands
 
-TIME, CELLS = np.linspace(0.0, 0.3, 4), np.arange(5, 12)
+TIME = np.linspace(0.0, 0.3, 4)
+CELLS = np.arange(5, 12)
 
 
 @pytest.fixture
@@ -17,67 +20,89 @@ def axes():
         yield style.new_figure(3, 2).subplots()
 
 
-def field():
-    """A field (t, cell) with one value that stands out: at the second time in the cell 10."""
-    values = np.full((len(TIME), len(CELLS)), 1e-3)
-    values[1, 5] = 2.0
-    return xr.DataArray(values, {"time": TIME, "cell": CELLS}, ("time", "cell"))
-
-
 def spans(axes):
-    """The shaded spans of ``axes``: lower left and upper right corner."""
-    return [patch.get_extents().transformed(axes.transData.inverted()).get_points() for patch in axes.patches]
+    """Return the shaded spans of ``axes``: lower left and upper right corner of each."""
+    to_data = axes.transData.inverted()
+    return [patch.get_extents().transformed(to_data).get_points() for patch in axes.patches]
 
 
 def test_a_map_shows_every_value_at_its_coordinates(axes):
-    image = panels.space_time_map(axes, field(), panels.log_norm(2.0))
-    row, column = np.unravel_index(image.get_array().argmax(), image.get_array().shape)
+    """The brightest pixel of a map lies at the time and cell of the largest value."""
+    values = np.full((len(TIME), len(CELLS)), 1e-3)
+    values[1, 5] = 2.0
+    field = xr.DataArray(values, {"time": TIME, "cell": CELLS}, ("time", "cell"))
+
+    image = panels.space_time_map(axes, field, panels.log_norm(2.0))
+
+    pixels = image.get_array()
+    row, column = np.unravel_index(pixels.argmax(), pixels.shape)
     left, right, bottom, top = image.get_extent()
     assert left + (column + 0.5) * (right - left) / len(TIME) == pytest.approx(TIME[1])
-    assert bottom + (row + 0.5) * (top - bottom) / len(CELLS) == pytest.approx(10)
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Time (s)", "Cell")
+    assert bottom + (row + 0.5) * (top - bottom) / len(CELLS) == pytest.approx(CELLS[5])
+    assert axes.get_xlabel() == "Time (s)"
+    assert axes.get_ylabel() == "Cell"
+    # Half a cell beyond the first and the last one.
     assert axes.get_ylim() == (4.5, 11.5)
 
 
 def test_colours_follow_the_data(axes):
+    """The scale ends at the largest value, whatever its unit, and at 1 where nothing is positive."""
     for largest in (1e-9, 2.0, 3e7):
         norm = panels.log_norm(largest, 0.5 * largest, decades=3)
-        assert (norm.vmin, norm.vmax) == pytest.approx((1e-3 * largest, largest))
-    assert panels.log_norm(0.0).vmax == panels.log_norm(np.nan).vmax == 1.0
+        assert norm.vmin == pytest.approx(1e-3 * largest)
+        assert norm.vmax == pytest.approx(largest)
+
+    assert panels.log_norm(0.0).vmax == 1.0
+    assert panels.log_norm(np.nan).vmax == 1.0
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_sites_are_marked_at_their_cells(axes, along):
+    """Each site within the recorded cells has a line and a mark; those in cells 3 and 12 are outside."""
     run = xr.Dataset({"sites/cell": ("site", [3, 6, 11, 12])}, {"cell": CELLS})
+
     panels.mark_sites(axes, run, along=along)
-    *lines, marks = axes.lines
-    data = [line.get_xdata() if along == "x" else line.get_ydata() for line in (*lines, marks)]
-    assert [list(d) for d in data] == [[6, 6], [11, 11], [6, 11]]
+
+    data = [line.get_xdata() if along == "x" else line.get_ydata() for line in axes.lines]
+    *lines, marks = [list(values) for values in data]
+    assert lines == [[6, 6], [11, 11]]
+    assert marks == [6, 11]
 
 
 @pytest.mark.parametrize("cell", [diatomic(), four_band()])
 def test_the_dispersion_has_every_branch_over_it(axes, cell):
-    kappa, omega = np.linspace(0, np.pi, 21), np.linspace(0, 4000.0, 31)
+    """The spectrum's pixels are centred on their wavenumbers and frequencies, and every band of the cell is a line."""
+    kappa = np.linspace(0, np.pi, 21)
+    omega = np.linspace(0, 4000.0, 31)
     energy = np.outer(np.ones(21), np.arange(31.0))
     spectrum = xr.DataArray(energy, {"wavenumber": kappa, "frequency": omega}, ("wavenumber", "frequency"))
+
     image = panels.dispersion_map(axes, spectrum, panels.log_norm(30.0), cell)
+
     np.testing.assert_array_equal(image.get_array(), energy.T)
+    # Half a bin beyond each end: pi/20 in units of pi, 4000/30 in krad/s.
     assert image.get_extent() == pytest.approx((-0.025, 1.025, -4 / 60, 4 + 4 / 60))
+    assert axes.get_xlim() == (0, 1)
+    assert axes.get_ylim() == (0, 4)
+
     assert len(axes.lines) == cell.dofs
-    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 1), (0, 4))
-    for j, line in enumerate(axes.lines):
-        np.testing.assert_allclose(1e3 * line.get_ydata(), bloch(cell, np.pi * line.get_xdata()).frequency[:, j])
+    for band, line in enumerate(axes.lines):
+        expected = bloch(cell, np.pi * line.get_xdata()).frequency[:, band]
+        np.testing.assert_allclose(1e3 * line.get_ydata(), expected)
 
 
 def test_gaps_are_shaded_and_pass_bands_are_not(axes):
+    """A band diagram shades the gaps, draws each band in its colour over its range, and the drive as a line."""
     bands = pass_bands(four_band())
+
     panels.band_diagram(axes, four_band(), 1000.0)
+
     shaded = [(low, high) for (_, low), (_, high) in spans(axes)]
     np.testing.assert_allclose(shaded, np.array(gaps(bands)) / 1e3)
+
     *branches, drive = axes.lines
-    assert [to_rgba(line.get_color()) for line in branches] == [
-        to_rgba(c) for c in (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE)
-    ]
+    colours = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE)
+    assert [to_rgba(line.get_color()) for line in branches] == [to_rgba(colour) for colour in colours]
     assert list(drive.get_ydata()) == [1.0, 1.0]
     for line, band in zip(branches, bands, strict=True):
         assert line.get_ydata().min() == pytest.approx(band.low / 1e3, abs=1e-6)
@@ -85,23 +110,34 @@ def test_gaps_are_shaded_and_pass_bands_are_not(axes):
 
 
 def test_bands_are_shaded_along_either_axis(axes):
+    """A band of 100 to 300 rad/s along x is a span from 0.1 to 0.3 krad/s."""
     panels.shade_bands(axes, [(100.0, 300.0)], "x")
+
     ((low, _), (high, _)) = spans(axes)[0]
-    assert (low, high) == pytest.approx((0.1, 0.3))
+    assert low == pytest.approx(0.1)
+    assert high == pytest.approx(0.3)
 
 
 def test_regions_follow_one_another(axes):
-    energy, region = np.geomspace(1.0, 1e4, 9), np.array([1, 1, 2, 2, 3, 3, 3, 4, 4])
+    """Each region is shaded from the end of the one before to its own last point, and is named."""
+    energy = np.geomspace(1.0, 1e4, 9)
+    region = np.array([1, 1, 2, 2, 3, 3, 3, 4, 4])
     axes.set(xscale="log", xlim=(0.1, 1e4))
+
     panels.shade_regions(axes, energy, region, 0.5, at_top=True)
-    ends = [energy[region == k].max() for k in range(1, 5)]
-    np.testing.assert_allclose([(a, b) for (a, _), (b, _) in spans(axes)], list(zip([0.5, *ends], ends)))  # noqa: B905
+
+    ends = [0.5, *(energy[region == k].max() for k in range(1, 5))]
+    shaded = [(low, high) for (low, _), (high, _) in spans(axes)]
+    np.testing.assert_allclose(shaded, list(itertools.pairwise(ends)))
     assert [text.get_text() for text in axes.texts] == ["I", "II", "III", "IV"]
 
 
 def test_means_over_blocks_keep_the_mean():
+    """1300 rows are more than a picture shows: each of 434 is the mean of three, the last one of what is left."""
     values = np.random.default_rng(1).random((1300, 7))
+
     pooled = panels.block_means(values)
+
     assert pooled.shape == (434, 7)
     np.testing.assert_allclose(pooled[3], values[9:12].mean(axis=0))
     np.testing.assert_allclose(pooled[-1], values[-1])

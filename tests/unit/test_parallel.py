@@ -20,33 +20,50 @@ def as_in_a_terminal():
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_is_a_request_and_a_second_one_the_end(number):
+    """The first signal is a request and restores the default action, so that a second one ends the process."""
     before = {other: signal.getsignal(other) for other in STOP_SIGNALS}
     with StopRequest().listening() as stop:
         assert not stop.requested
         signal.raise_signal(number)
         assert stop.requested
         assert {signal.getsignal(other) for other in STOP_SIGNALS} == {signal.SIG_DFL}
+
     assert {other: signal.getsignal(other) for other in STOP_SIGNALS} == before
 
 
-def test_a_signal_that_is_sent_twice_is_one_request(tmp_path):
-    script = "import os, signal, vipetsc.parallel as p\nwith p.StopRequest().listening() as stop:\n"
-    script += "    print(os.getpid(), flush=True)\n    while not stop.requested: pass\n"
-    script += "    os.system('sleep 0.2')\n    print('saved')"
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
+# A program that saves for a fifth of a second after a request to stop.
+SAVES = """
+import os, vipetsc.parallel as p
+with p.StopRequest().listening() as stop:
+    print(os.getpid(), flush=True)
+    while not stop.requested:
+        pass
+    os.system('sleep 0.2')
+    print('saved')
+"""
+
+
+@pytest.mark.slow
+def test_a_signal_that_is_sent_twice_is_one_request():
+    """``timeout`` sends its signal twice: a repeat within 30 ms does not end a program that saves its state."""
+    with subprocess.Popen([sys.executable, "-c", SAVES], stdout=subprocess.PIPE, text=True) as process:
         number = process.stdout.readline().strip()
         subprocess.run(["sh", "-c", f"kill -TERM {number}; sleep 0.03; kill -TERM {number}"], check=True)
+
         assert process.stdout.read() == "saved\n"
     assert process.returncode == 0
 
 
 def test_what_has_nothing_to_save_ends_at_once():
+    """Where nothing is to be saved, the signal raises StoppedError."""
     with pytest.raises(StoppedError), StopRequest().listening(at_once=True):
         signal.raise_signal(signal.SIGUSR1)
 
 
 def test_a_signal_that_nohup_ignores_stays_ignored():
+    """SIGHUP is no request to a process that was started to ignore it."""
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
     with StopRequest().listening() as stop:
         signal.raise_signal(signal.SIGHUP)
         assert not stop.requested

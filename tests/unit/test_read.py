@@ -36,9 +36,10 @@ AMPLITUDES = [0.1, 0.3]
 
 @pytest.fixture
 def run(tmp_path):
-    """A run of 30 cells, of which every third from the second on is recorded, with every second sample's fields."""
+    """Write a run of 30 cells: every third from the second on is recorded, with every second sample's fields."""
     time = np.arange(9) * 0.5
     cells = np.arange(2, 31, 3)
+    velocity = np.arange(5 * len(cells) * 2.0).reshape(5, -1, 2)
     data = {
         "time": ("time", time),
         "field_time": ("field_time", time[::2]),
@@ -47,31 +48,37 @@ def run(tmp_path):
         "site": ("site", [1, 2, 3]),
         "sites/cell": ("site", [3, 20, 14]),
         "energy/kinetic": ("time", time**2),
-        "velocity": (("field_time", "cell", "dof"), np.arange(5 * len(cells) * 2.0).reshape(5, -1, 2)),
+        "velocity": (("field_time", "cell", "dof"), velocity),
     }
+
     path = tmp_path / "run.h5"
-    write_netcdf(path, xr.Dataset(data, attrs={"case": '[lattice]\ncells = 30\nends = "fixed"\n[drive]\ncell = 12'}))
+    case = '[lattice]\ncells = 30\nends = "fixed"\n[drive]\ncell = 12'
+    write_netcdf(path, xr.Dataset(data, attrs={"case": case}))
     return path
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """A sweep over law, (sites, cycles) and amplitude; the first member of the second law failed."""
+    """Write a sweep over law, (sites, cycles) and amplitude; the first member of the second law failed."""
+    dims = ("law", "sites", "amplitude")
+    # Each member's value is its number, so that a selection shows which members it has.
     value = np.arange(12.0).reshape(2, 3, 2)
-    dims = "law", "sites", "amplitude"
+    names = np.array([f"m{i:02d}" for i in range(12)], dtype=object).reshape(2, 3, 2)
     data = {
         "law": ("law", LAWS),
         "sites": ("sites", [5, 5, 1]),
         "cycles": ("sites", [30, 15, 30], {"long_name": "drive.cycles"}),
         "amplitude": ("amplitude", AMPLITUDES),
         "status": (dims, np.zeros((2, 3, 2), np.int8)),
-        "member": (dims, np.array([f"m{i:02d}" for i in range(12)], dtype=object).reshape(2, 3, 2)),
+        "member": (dims, names),
         "contact_episodes": (dims, np.where(value == 6, np.nan, value)),
         "ibtet": (dims, value),
         "entropy/masked": (dims, -value),
         "fits/ibtet/exponent": (dims[:2], value[..., 0]),
     }
     write_netcdf(tmp_path / "ensemble.h5", xr.Dataset(data, attrs={"case": ENSEMBLE}))
+
+    # Two members were kept whole.
     for name in ("m00", "m07"):
         (tmp_path / name).mkdir()
         for file in ("run.h5", "analysis.h5"):
@@ -80,9 +87,13 @@ def folder(tmp_path):
 
 
 def test_a_run_is_read_by_name(run):
+    """A run's variables, the site nearest to the drive, the nearest recorded cell and the fields' times."""
     with open_run(run) as data:
-        assert list(data["sites/cell"].values) == [3, 20, 14]  # not the recorded cells, which have the same name
+        # Not the recorded cells, which have the same name.
+        assert list(data["sites/cell"].values) == [3, 20, 14]
+        # The drive is in cell 12, two cells from the third site.
         assert leading_site(data) == 2
+
         assert [nearest_cell(data, cell) for cell in (1, 4, 20, 99)] == [0, 1, 6, 9]
         assert list(field_time(data)) == [0, 1, 2, 3, 4]
         assert field_interval(data) == 1
@@ -91,28 +102,39 @@ def test_a_run_is_read_by_name(run):
 
 
 def test_other_files_are_refused(tmp_path, folder):
+    """An absent file, one of another kind and results of an earlier version are refused with what is wrong."""
     with pytest.raises(OSError):
         open_run(tmp_path / "absent.h5")
+
     with pytest.raises(ValueError, match=r"ensemble\.h5 is not a run of vipetsc: it has no time, cell, energy"):
         open_run(folder / "ensemble.h5")
+
     with h5py.File(tmp_path / "ensemble.h5", "w") as file:
         file["time"] = 1.0
     with pytest.raises(ValueError, match="is not a sweep's ensemble of vipetsc: it has no status, case"):
         open_ensemble(tmp_path)
+
+    # Sweeps once kept their contact-free runs in a folder of this name.
     (folder / "linear").mkdir()
     with pytest.raises(ValueError, match="holds a sweep of an earlier version"):
         open_ensemble(folder)
 
 
 def test_members_are_selected_by_the_values_of_swept_keys(folder):
+    """Members are selected by values of swept keys, single or together; a value that no member has is named."""
     ensemble = open_ensemble(folder)
-    assert dict(ensemble["cycles"].sizes) == {"sites": 3} and "cycles" in ensemble.coords
+    assert dict(ensemble["cycles"].sizes) == {"sites": 3}
+    assert "cycles" in ensemble.coords
+
     # Keys that vary together have to meet in one member.
     assert select(ensemble, sites=1, cycles=30)["ibtet"].values.tolist() == [[4, 5], [10, 11]]
     assert select(ensemble, law="bilinear", sites=5, cycles=15)["entropy/masked"].values.tolist() == [-8, -9]
+    # A value that several members have takes the first of them.
     assert select(ensemble, sites=5)["ibtet"].values.tolist() == [[0, 1], [6, 7]]
+    # 0.1 + 0.2 differs from 0.3 by a rounding.
     assert select(ensemble["ibtet"], law="hertz", amplitude=0.1 + 0.2).values.tolist() == [1, 3, 5]
     assert select(ensemble, law="bilinear")["fits/ibtet/exponent"].values.tolist() == [6, 8, 10]
+
     with pytest.raises(KeyError, match="no member has cycles = 15 beside sites"):
         select(ensemble, sites=1, cycles=15)
     with pytest.raises(KeyError, match=r"amplitude = 0\.2"):
@@ -122,10 +144,13 @@ def test_members_are_selected_by_the_values_of_swept_keys(folder):
 
 
 def test_members_lead_to_their_folders(folder):
+    """Each curve has the number of its first member that did not fail; members that were kept lead to their folders."""
     ensemble = open_ensemble(folder)
+
     found = list(curves(ensemble))
     assert [number for _, number in found] == [0, 2, 4, 7, 8, 10]
     assert [curve["ibtet"].values.tolist() for curve, _ in found] == np.arange(12).reshape(6, 2).tolist()
     assert not list(curves(ensemble, "wavenumber"))
+
     whole = [(float(member["ibtet"]), path) for member, path in whole_members(ensemble)]
     assert whole == [(0, folder / "m00"), (7, folder / "m07")]

@@ -12,54 +12,73 @@ from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_
 coefficient = st.floats(-1, 1, allow_subnormal=False)
 
 
-def quintic(w0, v0, a0, w1, v1, a1, h):
-    b = np.empty(6)
-    bernstein(np.array([w0, v0, a0]), np.array([w1, v1, a1]), h, b)
-    return b
+def quintic(start, end, length):
+    """Return the Bernstein coefficients of the quintic through (w, w', w'') at ``start`` and ``end``."""
+    coefficients = np.empty(6)
+    bernstein(np.array(start), np.array(end), length, coefficients)
+    return coefficients
 
 
-@given(st.tuples(*[coefficient] * 6), st.floats(0.1, 3))
-def test_bernstein_form_matches_the_hermite_data(data, h):
-    w0, v0, a0, w1, v1, a1 = data
-    b = quintic(*data, h)
-    oracle = BPoly.from_derivatives([0, h], [[w0, v0, a0], [w1, v1, a1]])
-    s = np.linspace(0, 1, 17)
-    np.testing.assert_allclose([evaluate(b, x, np.empty(6)) for x in s], oracle(s * h), atol=1e-12)
+@given(
+    start=st.tuples(coefficient, coefficient, coefficient),
+    end=st.tuples(coefficient, coefficient, coefficient),
+    length=st.floats(0.1, 3),
+)
+def test_bernstein_form_matches_the_hermite_data(start, end, length):
+    """Between the two ends the quintic is SciPy's interpolant of the same values and derivatives."""
+    coefficients = quintic(start, end, length)
+    expected = BPoly.from_derivatives([0, length], [list(start), list(end)])
+
+    position = np.linspace(0, 1, 17)
+    values = [evaluate(coefficients, s, np.empty(6)) for s in position]
+    np.testing.assert_allclose(values, expected(position * length), atol=1e-12)
 
 
 @given(st.lists(coefficient, min_size=6, max_size=6))
-def test_first_rise_is_the_first_sign_change(b):
-    b = np.array(b)
-    root = first_upcrossing(b)
-    s = np.linspace(0, 1, 4001)
-    values = BPoly(b[:, None], [0, 1])(s)
-    positive = np.nonzero(values > 1e-12)[0]
+def test_first_rise_is_the_first_sign_change(coefficients):
+    """Nothing is positive before the first upcrossing, nor anywhere if there is none; the value there is zero."""
+    coefficients = np.array(coefficients)
+    root = first_upcrossing(coefficients)
+    position = np.linspace(0, 1, 4001)
+    values = BPoly(coefficients[:, None], [0, 1])(position)
+
+    # The search says 2 where there is no root. What is positive by rounding alone may be missed.
     if root > 1:
-        assert positive.size == 0
+        assert values.max() <= 1e-12
         return
-    before = values[s < root - 1e-9]
+
+    before = values[position < root - 1e-9]
     assert np.all(before <= 1e-12)
-    if b[0] < -1e-9:
-        assert abs(evaluate(b, root, np.empty(6))) < 1e-9
+    # Otherwise it begins on zero, which counts as a root whatever the rounding.
+    if coefficients[0] < -1e-9:
+        assert abs(evaluate(coefficients, root, np.empty(6))) < 1e-9
 
 
 def test_a_pair_of_crossings_inside_one_step_is_found():
     """The interpolant is below zero at both ends and above it for a thousandth of the step."""
-    peak, width = 0.37, 5e-4
+    peak = 0.37
+    width = 5e-4
     # -(s - a)(s - b)(1 + s^2) with a, b = peak -+ width: exactly of degree four.
     polynomial = -np.poly1d([1, -2 * peak, peak**2 - width**2]) * np.poly1d([1, 0, 1])
-    first, second = polynomial.deriv(), polynomial.deriv(2)
-    b = quintic(polynomial(0), first(0), second(0), polynomial(1), first(1), second(1), 1.0)
-    assert b[0] < 0
-    assert b[5] < 0
-    np.testing.assert_allclose(first_upcrossing(b), peak - width, atol=1e-10)
-    np.testing.assert_allclose(first_upcrossing(b - 1.01 * polynomial(peak)), 2)
+    first = polynomial.deriv()
+    second = polynomial.deriv(2)
+
+    at_ends = [[polynomial(s), first(s), second(s)] for s in (0, 1)]
+    coefficients = quintic(*at_ends, 1.0)
+
+    assert coefficients[0] < 0
+    assert coefficients[5] < 0
+    np.testing.assert_allclose(first_upcrossing(coefficients), peak - width, atol=1e-10)
+    # Lowered by a little more than its peak, it never rises through zero.
+    np.testing.assert_allclose(first_upcrossing(coefficients - 1.01 * polynomial(peak)), 2)
 
 
 def test_a_start_that_has_just_landed_is_no_crossing():
     """s (s - .4), raised by the rounding of a landing: on zero and falling at first."""
-    b = np.array([0.0, -0.2, 0.6]) + 1e-12
-    assert first_upcrossing(b) == 0.0
-    np.testing.assert_allclose(first_upcrossing_after_start(b, 1e-10), 0.4, atol=1e-10)
-    assert first_upcrossing_after_start(b, 1e-13) == 0.0
-    assert first_upcrossing_after_start(-b, 1e-10) == 0.0
+    coefficients = np.array([0.0, -0.2, 0.6]) + 1e-12
+
+    assert first_upcrossing(coefficients) == 0.0
+    np.testing.assert_allclose(first_upcrossing_after_start(coefficients, 1e-10), 0.4, atol=1e-10)
+    # A tolerance below that rounding leaves the start a crossing; so does one that rises at once.
+    assert first_upcrossing_after_start(coefficients, 1e-13) == 0.0
+    assert first_upcrossing_after_start(-coefficients, 1e-10) == 0.0
