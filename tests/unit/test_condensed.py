@@ -1,14 +1,21 @@
 """Harmonics of contact forces, and the balance at the places where a system is nonlinear."""
 
 import itertools
+from typing import Literal
 
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Contact, Spring
+from vipetsc.modes.balance import conservative
+from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces, arcs
+from vipetsc.modes.problem import ContinuationError
+
+Symmetry = Literal["at rest", "odd", "any"]
 
 CONSERVATIVE = [Contact("bilinear", 3.0), Contact("hertz", 3.0)]
 DISSIPATIVE = [
@@ -20,68 +27,92 @@ DISSIPATIVE = [
 OMEGA = 0.77
 
 
-class DenseCompliance:
-    """G of a system with dense matrices, as it is defined."""
+class DefinedCompliance:
+    """G = b^T (K - omega^2 M)^-1 b of a system with dense matrices, solved for at each frequency."""
 
-    def __init__(self, masses, stiffness, rows):
-        self.masses, self.stiffness, self.rows = np.asarray(masses, float), stiffness, rows
+    def __init__(self, masses: np.ndarray, stiffness: np.ndarray, rows: np.ndarray) -> None:
+        self.masses = masses
+        self.stiffness = stiffness
+        self.rows = rows
 
-    def at(self, omegas):
+    def at(self, omegas: np.ndarray) -> np.ndarray:
         kind = np.result_type(np.asarray(omegas), float)
-        dynamic = (self.stiffness - omega**2 * np.diag(self.masses) for omega in np.asarray(omegas))
-        return np.array([self.rows @ np.linalg.solve(d, self.rows.T.astype(kind)) for d in dynamic])
+        values = []
+        for omega in np.asarray(omegas):
+            dynamic = self.stiffness - omega**2 * np.diag(self.masses)
+            values.append(self.rows @ np.linalg.solve(dynamic, self.rows.T.astype(kind)))
+        return np.array(values)
 
 
-def motion_of(forces, last, seed, kind):
-    """Random harmonics (pairs, last + 1) that fall by .7 each and pass the clearances."""
+def random_harmonics(forces: SiteForces, order: int, seed: int, symmetry: Symmetry) -> np.ndarray:
+    """Random harmonics (pairs, order + 1) that pass the clearances; ``at rest`` ones are odd and at rest at phase 0."""
     rng = np.random.default_rng(seed)
-    z = rng.normal(size=(forces.pairs, last + 1)) + 1j * rng.normal(size=(forces.pairs, last + 1))
-    z *= 0.7 ** np.arange(last + 1)
-    z[:, 0], z[:, 1] = 0.2 * z[:, 0].real, z[:, 1] + 2
-    if kind != "any":
+    z = rng.normal(size=(forces.pairs, order + 1)) + 1j * rng.normal(size=(forces.pairs, order + 1))
+    # They fall as those of a smooth motion, and the first one passes the clearances.
+    z *= 0.7 ** np.arange(order + 1)
+    z[:, 0] = 0.2 * z[:, 0].real
+    z[:, 1] += 2
+    if symmetry != "any":
         z[:, ::2] = 0
-    return z.real + 0j if kind == "at rest" else z
+    if symmetry == "at rest":
+        return z.real + 0j
+    return z
 
 
-def balance_of(forces, last, kind):
+def random_balance(forces: SiteForces, order: int, symmetry: Symmetry) -> HarmonicBalance:
+    """The equations of a random system with five degrees of freedom, on which ``forces`` act."""
     rng = np.random.default_rng(3)
     root = rng.normal(size=(5, 5))
-    compliance = DenseCompliance(np.ones(5), root @ root.T + np.eye(5), rng.normal(size=(forces.pairs, 5)))
-    return HarmonicBalance(compliance, forces, last, odd=kind != "any", cosines=kind == "at rest")
+    stiffness = root @ root.T + np.eye(5)
+    compliance = DefinedCompliance(np.ones(5), stiffness, rng.normal(size=(forces.pairs, 5)))
+    return HarmonicBalance(compliance, forces, order, odd=symmetry != "any", cosines=symmetry == "at rest")
 
 
-def series_of(samples, orders):
-    out = np.fft.rfft(samples)[..., :orders] / samples.shape[-1] * 2
-    out[..., 0] /= 2
-    return out
+def harmonics_of(samples: np.ndarray, orders: int) -> np.ndarray:
+    """One-sided harmonics of a period sampled uniformly."""
+    harmonics = np.fft.rfft(samples)[..., :orders] / samples.shape[-1] * 2
+    harmonics[..., 0] /= 2
+    return harmonics
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", CONSERVATIVE)
 @pytest.mark.parametrize("seed", range(3))
 def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
-    forces, last, theta = SiteForces([(law, 1.0), (law, 0.8)]), 9, np.linspace(0, 2 * np.pi, 2**18, endpoint=False)
-    z = motion_of(forces, last, seed, "any")
-    w = np.sum(z[..., None] * np.exp(1j * np.arange(last + 1)[:, None] * theta), axis=1).real
+    forces = SiteForces([(law, 1.0), (law, 0.8)])
+    order = 9
+    z = random_harmonics(forces, order, seed, "any")
+
     series = forces.series(z, OMEGA)
-    dense = np.array([law.force(row, clearance) for row, (law, clearance) in zip(w, forces.contacts, strict=True)])
-    assert series.forces == pytest.approx(series_of(dense, 2 * last + 1), abs=1e-9 * np.abs(dense).max())
-    potential = [law.potential(row, clearance).mean() for row, (law, clearance) in zip(w, forces.contacts, strict=True)]
+
+    theta = np.linspace(0, 2 * np.pi, 2**18, endpoint=False)
+    phasors = np.exp(1j * np.arange(order + 1)[:, None] * theta)
+    w = np.sum(z[..., None] * phasors, axis=1).real
+    pairs = list(zip(w, forces.contacts, strict=True))
+    sampled = np.array([law.force(row, clearance) for row, (law, clearance) in pairs])
+    potential = [law.potential(row, clearance).mean() for row, (law, clearance) in pairs]
+    # 2**18 samples of a force that begins linearly: its kinks are off by half a sample, squared.
+    assert series.forces == pytest.approx(harmonics_of(sampled, 2 * order + 1), abs=1e-9 * np.abs(sampled).max())
     assert series.potential == pytest.approx(potential, rel=1e-9)
     assert np.abs(series.loss).max() < 1e-10
+    # The closed part of a period is counted in whole samples.
     assert series.closed == pytest.approx(np.mean(np.abs(w) > [[1.0], [0.8]], axis=1), abs=1e-4)
 
 
 def test_smooth_springs_have_the_harmonics_of_powers_of_a_cosine():
-    series = SiteForces([], [Spring(0, 1, 0.0, quadratic=2.0, cubic=0.5)]).series(np.array([[0.0, 3.0]]), OMEGA)
-    assert series.forces[0] == pytest.approx([9.0, 0.5 * 27 * 0.75, 9.0], abs=1e-12)  # 2 cos^2 = 1 + cos 2
+    spring = Spring(0, 1, 0.0, quadratic=2.0, cubic=0.5)
+    series = SiteForces([], [spring]).series(np.array([[0.0, 3.0]]), OMEGA)
+    # 2 cos^2 = 1 + cos 2 and 4 cos^3 = 3 cos + cos 3.
+    assert series.forces[0] == pytest.approx([9.0, 0.5 * 27 * 0.75, 9.0], abs=1e-12)
 
 
 @pytest.mark.parametrize("law", DISSIPATIVE)
-def test_a_dissipative_contact_loses_what_its_law_says(law):
+def test_a_dissipative_contact_loses_the_work_of_its_force(law):
     forces = SiteForces([(law, 0.5)])
+
     series = forces.series(np.array([[0.0, 1.0]], complex), OMEGA)
-    # w = cos theta passes -1/2 and 1/2 with |w'| = sqrt(3)/2 and is back there symmetrically
+
+    # w = cos theta passes -1/2 and 1/2 with |w'| = sqrt(3)/2 and is back there symmetrically.
     theta = np.linspace(-np.pi / 3, np.pi / 3, 400001)
     approach = OMEGA * np.sqrt(0.75)
     force = law.force(np.cos(theta), 0.5, -OMEGA * np.sin(theta), approach)
@@ -89,46 +120,63 @@ def test_a_dissipative_contact_loses_what_its_law_says(law):
     assert series.loss[0] == pytest.approx(loss, rel=1e-8)
     assert series.loss[0] > 0
     assert [episode.side for episode in series.episodes] == [1, -1]
-    assert [episode.approach for episode in series.episodes] == pytest.approx([max(approach, law.approach_floor)] * 2)
+    floored = max(approach, law.approach_floor)
+    assert [episode.approach for episode in series.episodes] == pytest.approx([floored] * 2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("law", "kind"),
+    ("law", "symmetry"),
     [*itertools.product(CONSERVATIVE, ("at rest", "odd", "any")), *itertools.product(DISSIPATIVE, ("odd", "any"))],
 )
-def test_derivatives_are_those_of_the_residual(law, kind):
-    spring = Spring(0, 1, 0.0, quadratic=0.3 if kind == "any" else 0.0, cubic=0.2)
-    forces = SiteForces([(law, 1.0), (law, 0.8)], [spring])
-    balance = balance_of(forces, 7, kind)
-    x = balance.pack(motion_of(forces, 7, 1, kind))
-    step = 1e-6
+def test_derivatives_are_those_of_the_residual(law, symmetry):
+    # A quadratic spring would break the symmetry of odd motions.
+    quadratic = 0.3 if symmetry == "any" else 0.0
+    forces = SiteForces([(law, 1.0), (law, 0.8)], [Spring(0, 1, 0.0, quadratic=quadratic, cubic=0.2)])
+    balance = random_balance(forces, 7, symmetry)
+    x = balance.pack(random_harmonics(forces, 7, 1, symmetry))
     shift = balance.shift(OMEGA)
+
     jacobian, rate = balance.derivative(x, OMEGA, shift)
-    differences = [
-        (balance.residual(x + step * e, OMEGA, shift) - balance.residual(x - step * e, OMEGA, shift)) / (2 * step)
-        for e in np.eye(balance.size)
-    ]
-    assert jacobian == pytest.approx(np.transpose(differences), abs=2e-8 * np.abs(jacobian).max())
-    if not law.approach_floor:  # its small part of the derivative is left out
-        ahead, behind = (balance.residual(x, OMEGA + s, shift) for s in (step, -step))
+
+    assert_derivatives_by_differences(balance, x, shift, jacobian)
+    # Of a force with a floor of the approach velocity, a small part of the derivative is left out.
+    if not law.approach_floor:
+        step = 1e-6
+        ahead = balance.residual(x, OMEGA + step, shift)
+        behind = balance.residual(x, OMEGA - step, shift)
         assert rate == pytest.approx((ahead - behind) / (2 * step), abs=2e-8 * np.abs(rate).max())
+
+
+def assert_derivatives_by_differences(
+    balance: HarmonicBalance, x: np.ndarray, shift: np.ndarray, jacobian: np.ndarray
+) -> None:
+    """``jacobian`` agrees with central differences of the residual, whose error is 1e-8 with this step."""
+    step = 1e-6
+    columns = []
+    for e in np.eye(balance.size):
+        ahead = balance.residual(x + step * e, OMEGA, shift)
+        behind = balance.residual(x - step * e, OMEGA, shift)
+        columns.append((ahead - behind) / (2 * step))
+    assert jacobian == pytest.approx(np.transpose(columns), abs=2e-8 * np.abs(jacobian).max())
 
 
 @pytest.mark.parametrize("law", [CONSERVATIVE[1], DISSIPATIVE[0]])
 def test_a_growing_perturbation_has_the_derivative_of_its_frozen_growth(law):
-    """Over one episode: exp(mu theta) dz is a perturbation like another, and mu = i shifts the orders by one."""
+    """Over one episode, exp(mu theta) dz is a perturbation like another, and mu = i shifts the orders by one."""
     series = SiteForces([(law, 0.5)]).series(np.array([[0.1, 1.0, 0.2j, 0.1]]), OMEGA)
     orders = np.arange(-3, 4)
-    here, there = series.jacobian(1j, orders[:-1]), series.jacobian(0.0, orders[1:])
-    assert here == pytest.approx(there, abs=1e-13 * np.abs(here).max())
+    growing = series.jacobian(1j, orders[:-1])
+    shifted = series.jacobian(0.0, orders[1:])
+    assert growing == pytest.approx(shifted, abs=1e-13 * np.abs(growing).max())
 
 
 def test_short_arcs_are_not_missed():
     theta = np.linspace(0, 2 * np.pi, 64, endpoint=False) + 0.3
-    w = np.cos(theta) - 1, -np.sin(theta), -np.cos(theta)
+    motion = np.stack([np.cos(theta) - 1, -np.sin(theta), -np.cos(theta)], axis=1)
+    # The shortest of these arcs is a thousandth of the distance between samples.
     for depth in (1e-3, 1e-6, 1e-9):
-        ((start, end),) = arcs(np.stack(w, axis=1), -depth)
+        ((start, end),) = arcs(motion, -depth)
         assert (end - start) / 2 == pytest.approx(np.arccos(1 - depth), rel=3e-3)
         assert (start + end) / 2 % (2 * np.pi) == pytest.approx(2 * np.pi - 0.3, abs=1e-4)
 
@@ -137,23 +185,105 @@ def test_an_arc_that_ends_exactly_with_the_period_is_not_missed():
     theta = np.linspace(0, 2 * np.pi, 64, endpoint=False) + 0.3
     motion = np.stack([np.cos(theta), -np.sin(theta), -np.cos(theta)], axis=1)
     ((start, end),) = arcs(motion, motion[0, 0])
-    assert (start, end) == (pytest.approx(2 * np.pi - 0.6), pytest.approx(2 * np.pi))
+    assert start == pytest.approx(2 * np.pi - 0.6)
+    assert end == pytest.approx(2 * np.pi)
 
 
-def test_a_contact_that_never_separates():
+def test_a_contact_that_never_separates_is_a_spring_if_it_is_conservative_and_refused_else():
     z = np.array([[3.0, 1.0]], complex)
     series = SiteForces([(CONSERVATIVE[0], 1.0)]).series(z, OMEGA)
     assert series.forces[0] == pytest.approx([6.0, 3.0, 0.0], abs=1e-13)
     assert series.closed == [1.0]
+
+    # Its loss goes with the approach velocity of an onset that there is not.
     with pytest.raises(ArithmeticError, match="never separates"):
         SiteForces([(DISSIPATIVE[0], 1.0)]).series(z, OMEGA)
 
 
+def hardening_forces() -> SiteForces:
+    return SiteForces([(CONSERVATIVE[1], 1.0)], [Spring(0, 1, 0.0, cubic=0.2)])
+
+
 def test_the_solution_does_not_depend_on_the_shift():
-    forces = SiteForces([(CONSERVATIVE[1], 1.0)], [Spring(0, 1, 0.0, cubic=0.2)])
-    balance = balance_of(forces, 5, "odd")
-    x = balance.pack(motion_of(forces, 5, 2, "odd"))
-    z, force = balance.unpack(x), balance.series(x, OMEGA).forces[:, :6]
+    forces = hardening_forces()
+    balance = random_balance(forces, 5, "odd")
+    x = balance.pack(random_harmonics(forces, 5, 2, "odd"))
+    z = balance.unpack(x)
+    force = balance.series(x, OMEGA).forces[:, :6]
+    # Any motion is a solution under the linear motion Z + G F.
     linear = z + np.einsum("kij,jk->ik", balance.compliance.at(np.arange(6) * OMEGA), force)
     for shift in (balance.shift(OMEGA), -balance.shift(OMEGA)):
         assert balance.residual(x, OMEGA, shift, linear) == pytest.approx(np.zeros(balance.size), abs=1e-14)
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.4, 1.0])
+@pytest.mark.parametrize("symmetry", ["odd", "any"])
+def test_a_weight_multiplies_the_compliance_of_all_harmonics_but_the_first(symmetry, weight):
+    forces = hardening_forces()
+    whole = random_balance(forces, 5, symmetry)
+    balance = whole.weighted(weight)
+    x = balance.pack(random_harmonics(forces, 5, 2, symmetry))
+    z = balance.unpack(x)
+    assert (balance.size, balance.weight, whole.weight) == (whole.size, weight, 1.0)
+
+    # Under the linear motion Z + weight G F the motion is a solution; the first harmonic has the whole compliance.
+    factor = np.full(6, weight)
+    factor[1] = 1.0
+    compliance = factor[:, None, None] * whole.compliance.at(np.arange(6) * OMEGA)
+    linear = z + np.einsum("kij,jk->ik", compliance, balance.series(x, OMEGA).forces[:, :6])
+    shift = balance.shift(OMEGA)
+    assert balance.residual(x, OMEGA, shift, linear) == pytest.approx(np.zeros(balance.size), abs=1e-14)
+
+    jacobian, _ = balance.derivative(x, OMEGA, shift)
+    assert_derivatives_by_differences(balance, x, shift, jacobian)
+
+
+def test_the_shift_is_the_effective_mass_of_the_system_whatever_the_weight():
+    """The compliance is shifted by k^2 omega^2 m, and G falls as -1/(omega^2 m) beyond all modes."""
+    forces = hardening_forces()
+    whole = random_balance(forces, 9, "odd")
+    mass = 1 / np.diag(whole.compliance.rows @ whole.compliance.rows.T).mean()
+    # Its stiffnesses are of the order 10, so that at 1e3 rad/s the inertia alone is left.
+    omega = 1e3
+    for weight in (0.1, 1.0):
+        shift = whole.weighted(weight).shift(omega)
+        assert np.abs(shift[:, 0, 0]) == pytest.approx(mass * (whole.orders * omega) ** 2, rel=1e-3)
+
+
+def gap_motions(**options: object) -> ConservativeMotions:
+    """The motions of two masses with a hardening contact, whose breathers have frequencies above both modes."""
+    stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
+    compliance = DefinedCompliance(np.ones(2), stiffness, np.array([[1.0, 0.0]]))
+    control = NnmTable(tolerance=1e-12, truncation=1e-4, **options)
+    return ConservativeMotions(compliance, SiteForces([(CONSERVATIVE[1], 1.0)]), control)
+
+
+def record_weights(monkeypatch) -> list[float]:
+    """The weights with which the harmonics above the first are tried from now on."""
+    tried: list[float] = []
+    weighted = HarmonicBalance.weighted
+
+    def record(balance: HarmonicBalance, weight: float) -> HarmonicBalance:
+        tried.append(weight)
+        return weighted(balance, weight)
+
+    monkeypatch.setattr(HarmonicBalance, "weighted", record)
+    return tried
+
+
+def test_the_harmonics_above_the_first_are_brought_in_by_growing_weights(monkeypatch):
+    tried = record_weights(monkeypatch)
+    point = gap_motions().from_gap(2.1, np.array([1.0]))
+    # Steps of 0.1, 0.16, 0.256, 0.4096, and what is left.
+    assert tried == pytest.approx([0.1, 0.26, 0.516, 0.9256, 1.0])
+    assert point.frequency == pytest.approx(2.1 / (2 * np.pi), rel=1e-14)
+    assert point.residual < 1e-11
+
+
+def test_a_weight_at_which_the_motion_changes_too_much_is_tried_again_shorter(monkeypatch):
+    tried = record_weights(monkeypatch)
+    # No change is small enough: steps of 0.1 times powers of 0.4, until the next one is below the smallest.
+    monkeypatch.setattr(conservative, "FURTHEST", 0.0)
+    with pytest.raises(ContinuationError, match=r"no breather at 2\.1 rad/s: with 0 of the harmonics above the first"):
+        gap_motions().from_gap(2.1, np.array([1.0]))
+    assert tried == pytest.approx(0.1 * 0.4 ** np.arange(8))
