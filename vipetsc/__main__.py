@@ -5,11 +5,15 @@ import os
 import sys
 from importlib.util import find_spec
 
+from vipetsc.cli.streams import check_standard_streams
+
 BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"  # which no wheel brings
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb on all ranks; returns the exit code: 0 done, 2 bad input, 75 stopped on request, 1 failed."""
+    check_standard_streams()
+
     # One thread a rank: the ranks are the parallelism, and threads would fight over the cores.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")

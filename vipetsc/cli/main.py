@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 from mpi4py import MPI
 
@@ -11,10 +11,11 @@ import vipetsc
 from vipetsc.case import CaseError, Problem
 from vipetsc.cli.arguments import OF_EVERY_VERB
 from vipetsc.cli.messages import echo, reporting
+from vipetsc.cli.streams import report_unwritten
 from vipetsc.cli.verb import BAD_INPUT, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.folder import FolderError
-from vipetsc.parallel import StoppedError, StopRequest
+from vipetsc.parallel import StoppedError, StopRequest, on_root
 
 ABOUT_THE_PROGRAM = "-h", "--help", "--version"
 
@@ -25,6 +26,10 @@ class Parser(argparse.ArgumentParser):
     def _print_message(self, message: str, file: Any = None) -> None:
         if message and MPI.COMM_WORLD.rank == 0:
             super()._print_message(message, file)
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """End the program; what --help could not print decides the exit code."""
+        super().exit(status or on_root(MPI.COMM_WORLD, lambda: report_unwritten([sys.stdout])), message)
 
 
 def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
@@ -37,13 +42,17 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
     # --list asks for an answer, which --quiet does not silence.
     is_answer = VERBS[options.verb].is_answer or getattr(options, "list", False)
     try:
-        with reporting(MPI.COMM_WORLD, options, is_answer):
-            return _call(options, petsc or {})
+        with reporting(MPI.COMM_WORLD, options, is_answer) as streams:
+            code = _call(options, petsc or {})
     except FolderError as error:
         # The file of --log cannot be written, so that nothing else is set up to report it.
         if MPI.COMM_WORLD.rank == 0:
             print(f"vipetsc: {error}", file=sys.stderr, flush=True)
         return BAD_INPUT
+
+    # Rank 0 prints for all, and all end with one code.
+    unwritten = on_root(MPI.COMM_WORLD, lambda: report_unwritten(streams))
+    return code or unwritten
 
 
 def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:

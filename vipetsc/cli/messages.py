@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import Any, TextIO
 
 from mpi4py import MPI
 
+from vipetsc.cli.streams import CheckedStream
 from vipetsc.io.lock import FolderError
 from vipetsc.parallel import BAR, on_root
 
@@ -41,17 +43,18 @@ def echo_warnings(comm: MPI.Comm, warnings: Iterable[str]) -> None:
 
 
 @contextmanager
-def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[None]:
+def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[list[TextIO]]:
     """Print within the block what ``options`` (quiet, verbose, log) want; an answer that was asked for even when quiet.
 
-    All ranks must call it. Raises FolderError if the file of ``--log`` cannot be written.
+    Gives the streams that have to take all of it, for ``report_unwritten``. All ranks must call it. Raises FolderError
+    if the file of ``--log`` cannot be opened.
     """
     handlers = _stream_handlers(quiet=options.quiet, is_answer=is_answer)
+    streams = [sys.stdout]
     if options.log:
         # All ranks must learn of it: those that went on would wait for rank 0 in the first collective.
-        on_root(comm, lambda: _check_writable(options.log))
-        if comm.rank == 0:
-            handlers.append(_file_handler(options.log))
+        on_root(comm, lambda: streams.append(_open_log(options.log)))
+        handlers += [_log_handler(stream) for stream in streams[1:]]
 
     # Without propagation: the front door's own handler would print everything again.
     is_verbose = options.verbose and comm.rank == 0
@@ -66,22 +69,24 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
         sys.addaudithook(_report_phase)
 
     try:
-        yield
+        yield streams
     except Exception as error:
         # In the file alone: on stderr the process's own hook reports it.
         for handler in handlers:
-            if isinstance(handler, logging.FileHandler):
+            if handler.stream in streams[1:]:
                 handler.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))
         raise
     finally:
         for handler in handlers:
             logger.removeHandler(handler)
             handler.close()
+        for stream in streams[1:]:
+            stream.close()
         logger.propagate = True
         logger.setLevel(level)
 
 
-def _stream_handlers(quiet: bool, is_answer: bool) -> list[logging.Handler]:
+def _stream_handlers(quiet: bool, is_answer: bool) -> "list[logging.StreamHandler[TextIO]]":
     """The handlers of stdout, for answers, and of stderr, for all else."""
     out = logging.StreamHandler(sys.stdout)
     out.addFilter(lambda record: record.name == answers.name and (is_answer or not quiet))
@@ -91,18 +96,19 @@ def _stream_handlers(quiet: bool, is_answer: bool) -> list[logging.Handler]:
     return [out, err]
 
 
-def _file_handler(path: Path) -> logging.Handler:
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    return handler
-
-
-def _check_writable(path: Path) -> None:
+def _open_log(path: Path) -> CheckedStream:
+    """The file of ``--log``, to whose end messages are added."""
     try:
-        # For appending, which keeps the messages of earlier commands.
-        path.open("a").close()
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     except OSError as error:
         raise FolderError(f"--log {path}: {error.strerror}; name a file that can be written") from error
+    return CheckedStream(descriptor, f"--log {path}", encoding="utf-8")
+
+
+def _log_handler(stream: TextIO) -> "logging.StreamHandler[TextIO]":
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    return handler
 
 
 def _report_phase(event: str, arguments: tuple[Any, ...]) -> None:

@@ -1,0 +1,139 @@
+"""Answers and logs that cannot be written: the exit code says so, and results are whole all the same."""
+
+from __future__ import annotations
+
+import array
+import fcntl
+import os
+import subprocess
+import sys
+import termios
+import time
+
+import pytest
+
+from tests.conftest import clean_environment
+
+pytestmark = pytest.mark.slow
+
+TINY = ("run", "--set", "lattice.cells=12", "--set", "contacts.sites=[4]", "--set", "drive.cycles=3",
+        "--set", "time.end=0.02", "--set", "time.engine=propagator", "--set", "output.figures=false",
+        "--set", "contacts.clearance=2e-4", "--out", "out")  # fmt: skip
+CAPACITY_OF_A_PIPE = 65536  # bytes
+ANSWERS = {
+    "schema": ("schema",),
+    "manual": ("manual", "case-file"),
+    "validate": ("validate",),
+    "bands": ("bands", "--json", "--out", "bands"),
+    "help": ("law", "--help"),
+    "run": TINY,
+}
+
+
+@pytest.fixture
+def by_shell(tmp_path):
+    """Call the program in a folder of its own, with its streams led as a shell's ``redirection`` says."""
+
+    def call(words: tuple[str, ...], redirection: str) -> subprocess.CompletedProcess:
+        command = [
+            "bash",
+            "-c",
+            f'set -o pipefail; "$@" {redirection}',
+            "bash",
+            sys.executable,
+            "-m",
+            "vipetsc",
+            *words,
+        ]
+        return subprocess.run(
+            command, cwd=tmp_path, env=clean_environment(), capture_output=True, text=True, timeout=100, check=False
+        )
+
+    return call
+
+
+@pytest.mark.parametrize("answer", ANSWERS)
+def test_an_answer_that_a_full_device_does_not_take_is_a_failure(by_shell, tmp_path, answer):
+    ended = by_shell(ANSWERS[answer], ">/dev/full")
+    assert ended.returncode == 1, ended.stderr
+    assert "vipetsc: stdout: No space left on device" in ended.stderr
+    assert "Traceback" not in ended.stderr and "Logging error" not in ended.stderr
+    if answer == "run":
+        assert (tmp_path / "out/run.h5").exists()
+
+
+@pytest.mark.parametrize("answer", ["schema", "run"])
+def test_an_answer_to_a_closed_stdout_is_a_failure(by_shell, tmp_path, answer):
+    ended = by_shell(ANSWERS[answer], ">&-")
+    assert ended.returncode == 1, ended.stderr
+    assert "vipetsc: stdout: Bad file descriptor" in ended.stderr
+    assert "properties" not in ended.stderr and "complete: " not in ended.stderr
+    if answer == "run":
+        assert (tmp_path / "out/run.h5").exists()
+
+
+def test_no_file_takes_the_number_of_a_closed_stream(tmp_path):
+    """Else libraries would print into it."""
+    script = "import os; from vipetsc.cli.streams import check_standard_streams as check; check(); "
+    script += "os.write(os.open('file', os.O_WRONLY | os.O_CREAT), b'content'); os.write(1, b'message')"
+    command = ["bash", "-c", '"$@" >&-', "bash", sys.executable, "-c", script]
+    ended = subprocess.run(
+        command, cwd=tmp_path, env=clean_environment(), capture_output=True, text=True, timeout=100, check=False
+    )
+    assert (tmp_path / "file").read_text() == "content"
+    assert "Bad file descriptor" in ended.stderr
+
+
+def test_closed_streams_are_no_failure_where_nothing_is_told(by_shell, tmp_path):
+    ended = by_shell((*TINY, "--quiet"), "<&- >&- 2>&-")
+    assert ended.returncode == 0
+    assert (tmp_path / "out/run.h5").exists()
+
+
+@pytest.mark.parametrize("answer", ["schema", "run"])
+def test_a_reader_that_has_seen_enough_hears_nothing_more(by_shell, tmp_path, answer):
+    ended = by_shell(ANSWERS[answer], "| true")
+    assert ended.returncode == 141
+    for complaint in ("stdout", "Traceback", "Broken"):
+        assert complaint not in ended.stderr
+    if answer == "run":
+        assert (tmp_path / "out/run.h5").exists()
+
+
+@pytest.mark.parametrize("words", [("schema",), TINY])
+def test_a_log_on_a_full_device_is_a_failure(by_shell, tmp_path, words):
+    ended = by_shell((*words, "--log", "/dev/full"), ">printed")
+    assert ended.returncode == 1, ended.stderr
+    assert ended.stderr.count("vipetsc: --log /dev/full: No space left on device") == 1
+    assert "Traceback" not in ended.stderr
+    assert (tmp_path / "printed").stat().st_size > 100
+
+
+def test_a_reader_that_is_slow_gets_all(tmp_path):
+    """A pipe may be one that does not wait: another of its users may have set it so."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    command = [sys.executable, "-m", "vipetsc", "schema"]
+    with subprocess.Popen(command, stdout=writing, cwd=tmp_path, env=clean_environment()) as process:
+        os.close(writing)
+        held = array.array("i", [0])
+        while process.poll() is None and held[0] < CAPACITY_OF_A_PIPE:
+            time.sleep(0.05)
+            fcntl.ioctl(reading, termios.FIONREAD, held)
+        # Time enough for a second attempt at a full pipe.
+        time.sleep(0.5)
+        with os.fdopen(reading, "rb") as pipe:
+            whole = pipe.read()
+    assert process.returncode == 0
+    assert len(whole) > CAPACITY_OF_A_PIPE
+    assert whole.rstrip().endswith(b"}")
+
+
+@pytest.mark.mpirun
+def test_all_ranks_end_with_the_code_of_the_first(tmp_path):
+    # A rank whose code is another than 0 has the others ended: both say how they ended before they end.
+    of_rank = f"{sys.executable} -m vipetsc manual >/dev/full; echo $? >{tmp_path}/code-$OMPI_COMM_WORLD_RANK"
+    command = ["mpirun", "--oversubscribe", "-n", "2", "bash", "-c", of_rank]
+    ended = subprocess.run(command, capture_output=True, text=True, env=clean_environment(), timeout=100, check=False)
+    assert ended.stderr.count("vipetsc: stdout: No space left on device") == 1
+    assert [(tmp_path / f"code-{rank}").read_text() for rank in range(2)] == ["1\n", "1\n"]
