@@ -1,11 +1,17 @@
 """Kinks in the force of a contact that is pressed at rest: where they are found, and substeps that end on them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from tests.unit.propagator_parts import MASS, RATE, pressed_mass
 from vipetsc.contact.law import CLOSED
-from vipetsc.dynamics.propagator.advance import DONE, advance_cluster, first_kink
+from vipetsc.contact.search import MOST_ATTEMPTS
+from vipetsc.dynamics.propagator import advance
+from vipetsc.dynamics.propagator.advance import CUT, DONE, SHORTEST, advance_cluster, first_kink
+from vipetsc.dynamics.propagator.nodes import EXIT
+from vipetsc.dynamics.propagator.substeps import Substep
 
 # What first_kink returns without a kink.
 NONE = 2.0
@@ -86,3 +92,62 @@ def test_substeps_end_where_a_pressed_contact_opens_and_closes(side):
     assert cluster.taylor[0, 0] == pytest.approx(side * w, abs=1e-10 * depth)
     assert cluster.taylor[0, 1] / interval == pytest.approx(side * v, abs=1e-10 * speed)
     assert cluster.state["position"] == 1.0
+
+
+class SubstepsOnKinks:
+    """The loop that ends substeps on kinks, in Python, with kinks and substeps that a test prescribes.
+
+    ``lengths`` are those of the substeps that were tried; ``state`` is the cluster's.
+    """
+
+    def __init__(self, monkeypatch, kinks: list[float], *, converges: bool = True) -> None:
+        self.lengths: list[float] = []
+        self.state = SimpleNamespace(rejected=3, length=9.0)
+        remaining = iter(kinks)
+
+        def try_substep(cluster: object, trial: object, substep: Substep) -> bool:
+            self.lengths.append(substep.length)
+            return converges
+
+        monkeypatch.setattr(advance, "first_kink", lambda cluster, trial, length: next(remaining, NONE))
+        monkeypatch.setattr(advance, "_try_substep", try_substep)
+
+    def end(self, length: float) -> Substep:
+        cluster = SimpleNamespace(state=[self.state])
+        return advance._end_on_kink.py_func(cluster, None, Substep(EXIT, length))
+
+
+def test_a_substep_is_repeated_until_no_kink_is_inside(monkeypatch):
+    loop = SubstepsOnKinks(monkeypatch, [0.5, 0.75])
+    assert loop.end(0.4) == Substep(EXIT, 0.5 * 0.75 * 0.4)
+    assert loop.lengths == [0.5 * 0.4, 0.75 * 0.2]
+    assert (loop.state.rejected, loop.state.length) == (3, 9.0)
+
+
+def test_a_substep_without_a_kink_is_not_repeated(monkeypatch):
+    loop = SubstepsOnKinks(monkeypatch, [])
+    assert loop.end(0.4) == Substep(EXIT, 0.4)
+    assert loop.lengths == []
+
+
+@pytest.mark.parametrize(("factor", "is_cut"), [(0.99, False), (1.01, True)])
+def test_no_substep_is_cut_shorter_than_the_shortest(monkeypatch, factor, is_cut):
+    fraction = factor * SHORTEST / 0.4
+    loop = SubstepsOnKinks(monkeypatch, [fraction])
+    expected = fraction * 0.4 if is_cut else 0.4
+    assert loop.end(0.4) == Substep(EXIT, expected)
+
+
+def test_repetitions_end_although_each_substep_has_a_kink(monkeypatch):
+    # Rounding could keep a kink just inside for ever.
+    loop = SubstepsOnKinks(monkeypatch, [0.9] * (MOST_ATTEMPTS + 5))
+    assert loop.end(0.4).length == pytest.approx(0.4 * 0.9**MOST_ATTEMPTS)
+    assert len(loop.lengths) == MOST_ATTEMPTS
+
+
+def test_a_substep_that_cannot_be_repeated_is_rejected_and_the_next_one_is_shorter(monkeypatch):
+    loop = SubstepsOnKinks(monkeypatch, [0.5, 0.5], converges=False)
+    assert loop.end(0.4).length == -1.0
+    assert loop.lengths == [0.2]
+    assert loop.state.rejected == 4
+    assert loop.state.length == pytest.approx(CUT * 0.2)
