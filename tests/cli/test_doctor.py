@@ -51,7 +51,7 @@ def version_of(monkeypatch):
 def test_a_package_that_is_too_old(version_of, name, version, remedy):
     version_of(name, version)
     check = check_package(NAMED[name])
-    assert check.found == version
+    assert check.value == version
     assert f"too old, {NAMED[name].oldest} or newer is needed" in check.fault
     assert remedy in check.fault
 
@@ -84,7 +84,7 @@ def test_this_machine_has_no_fault():
 @pytest.mark.parametrize("scalar", [np.complex128, np.float32])
 def test_scalars_other_than_real_doubles(scalar):
     check = check_scalars(scalar)
-    assert check.found == np.dtype(scalar).name
+    assert check.value == np.dtype(scalar).name
     for remedy in ("petsc-dev", "--with-scalar-type=real", "--with-precision=double"):
         assert remedy in check.fault
 
@@ -95,7 +95,7 @@ def test_one_mpi_for_all():
     assert not check_mpi(ours, 2, {"OMPI_COMM_WORLD_SIZE": "2"}).fault
     two = check_mpi([*ours, other], 1, {})
     assert "built for different MPIs" in two.fault
-    assert ours[0] in two.found and other in two.found
+    assert ours[0] in two.value and other in two.value
 
 
 @pytest.mark.parametrize("launcher", ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"])

@@ -96,3 +96,18 @@ def test_errors_of_petsc_itself_pass(petsc_options):
     newton = DenseNewton(2, 1)
     with pytest.raises(PETSc.Error):
         newton.solve(Circle(), GUESS, ROW, 0.0, 1e-12)
+
+
+@pytest.mark.parametrize("make, names", [dense, krylov])
+@pytest.mark.parametrize("residual", [np.nan, np.inf])
+def test_a_residual_that_is_not_finite_ends_the_attempt(make, names, residual):
+    newton = make()
+    # PETSc looks at the residual itself before it asks, in most of its versions.
+    assert newton._test(newton._snes, 1, (0.8, 0.1, residual)) < 0
+
+    equations = Circle()
+    equations.residual = lambda xi: np.array([residual])
+    attempt = newton.solve(equations, GUESS, ROW, 0.0, 1e-12)
+    assert not attempt.converged
+    assert "nan" in attempt.reason
+    assert meets_the_circle(newton)

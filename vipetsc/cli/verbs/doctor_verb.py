@@ -21,17 +21,17 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     """The checks as a table, and whether the program can work here; all ranks must call it."""
-    found = checks(comm)
-    names = {check.name for check in found}
+    results = checks(comm)
+    names = {check.name for check in results}
     about = {name.replace("_version", ""): str(value) for name, value in provenance(comm).items()}
     rows = [(name, value) for name, value in about.items() if name not in names]
-    rows += [(check.name, check.text) for check in found]
+    rows += [(check.name, check.text) for check in results]
     # Collective, so all ranks build the table although rank 0 alone prints it.
     hosts = comm.allgather(MPI.Get_processor_name())
     rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
 
     # Hosts may differ.
-    by_rank = comm.allgather([check.name for check in found if check.fault])
+    by_rank = comm.allgather([check.name for check in results if check.fault])
     faults = sorted(set().union(*by_rank))
     if faults:
         ranks = [str(rank) for rank, names_of_rank in enumerate(by_rank) if names_of_rank]
